@@ -14,7 +14,7 @@ cameras (`benchmarks/crop_boxes.py`): a detector's box is off to the side where 
 
 import logging
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.files.documents import Document, Points68, digest, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
-from facerf_cli.network.inputs import MEAN_RADIANCE, resize
+from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, resize
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME
@@ -83,7 +83,7 @@ _DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not 
 
 
 @dataclass(frozen=True)
-class CropPairs:
+class CropPairs(Batch):
     """B pairs of crops of the same people, scene-linear, in the fixed camera of crops of side S.
 
     source and target [B, 3, S, S], their detected landmarks [B, 68, 2] in crop pixels, the unit vector
@@ -96,10 +96,6 @@ class CropPairs:
     target_landmarks_px: Tensor
     light: Tensor
     people: Tensor
-
-    def to(self, device: torch.device) -> "CropPairs":
-        """Copy the pairs to `device`."""
-        return CropPairs(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,15 +242,11 @@ class _PhotoRecord(Document):
 
 
 @dataclass(frozen=True)
-class PhotoCrops:
+class PhotoCrops(Batch):
     """B crops of photos [B, 3, S, S], scene-linear, and detected landmarks [B, 68, 2] in crop pixels."""
 
     crops: Tensor
     landmarks_px: Tensor
-
-    def to(self, device: torch.device) -> "PhotoCrops":
-        """Copy the crops to `device`."""
-        return PhotoCrops(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

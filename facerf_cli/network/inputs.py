@@ -6,10 +6,10 @@ These are exposure, colour cast, roots, resizing and head pose.
 import json
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cache
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -153,6 +153,24 @@ WidthsOfFour = Annotated[  # for group normalisation
     tuple[Annotated[int, Field(ge=4, le=512, multiple_of=4)], ...], Field(min_length=3, max_length=6)
 ]
 Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=8)], ...], Field(min_length=3, max_length=6)]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Base of dataclasses whose fields are tensors [B, ...], or such dataclasses again."""
+
+    def to(self, device: torch.device) -> Self:
+        """Copy all of them to `device`."""
+        return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
+
+
+Samples = TypeVar("Samples", bound=Batch)
+
+
+def concatenate(samples: Sequence[Samples]) -> Samples:
+    """Join samples into a batch."""
+    parts = [[getattr(sample, field.name) for sample in samples] for field in fields(samples[0])]
+    return type(samples[0])(*(concatenate(x) if isinstance(x[0], Batch) else torch.cat(x) for x in parts))
 
 
 class SavedNetwork(nn.Module):

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.light.sh import mirror_signs, sh_basis
-from facerf_cli.network.inputs import MEAN_RADIANCE, Blocks, Classes, Side, WidthsOfFour
+from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, Blocks, Classes, Side, WidthsOfFour
 from facerf_cli.network.parsing import Residual, UNet
 
 SKIN = 1  # index of the class whose mean exposes the image
@@ -48,7 +48,7 @@ class PortraitSettings:
 
 
 @dataclass(frozen=True)
-class PortraitInputs:
+class PortraitInputs(Batch):
     """Inputs of the network for B people in squares of side S; camera space.
 
     image [B, 3, S, S] scene-linear, exposed so that the mean of the skin is `MEAN_RADIANCE`; classes
@@ -64,10 +64,6 @@ class PortraitInputs:
     covered: Tensor
     reached: Tensor
     own: Tensor
-
-    def to(self, device: torch.device) -> "PortraitInputs":
-        """Move the inputs to `device`."""
-        return PortraitInputs(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
     def mirrored(self) -> "PortraitInputs":
         """The people as a mirror shows them."""

@@ -6,9 +6,7 @@ in which training stays. Spherical harmonics of order 2 cannot represent a singl
 not used with one: a target is a sum of several. All are at the network's exposure.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,12 +15,11 @@ from torch import Tensor, nn
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
-from facerf_cli.network.inputs import to_root
+from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, concatenate, metrics_by_pose, seeded
+from facerf_cli.training.loop import Objective, Validation, metrics_by_pose
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 
-_VALIDATION_SEED = 12345
 _SHEET_FACES = 5
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
 _UNEVEN = 2.0  # exponent of the uniform draws: some sums are nearly a single light
@@ -40,7 +37,7 @@ class SumSettings:
 
 
 @dataclass(frozen=True)
-class DiffuseBatch:
+class DiffuseBatch(Batch):
     """B faces with M targets each: fields as in `Sample`, and the targets' lights.
 
     source, normals_source, normals_target [B, 3, T, T], visible and weight [B, 1, T, T], targets
@@ -55,11 +52,6 @@ class DiffuseBatch:
     coefficients: Tensor
     weight: Tensor
     heads: Tensor
-
-    def to(self, device: torch.device) -> "DiffuseBatch":
-        """Copy the batch to `device`."""
-        moved = {name: tensor.to(device) for name, tensor in self.__dict__.items() if name != "heads"}
-        return DiffuseBatch(**moved, heads=self.heads)
 
 
 class DiffuseObjective(Objective):
@@ -80,21 +72,19 @@ class DiffuseObjective(Objective):
         self.source = source
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
-        self._validation: list[DiffuseBatch] = []
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> DiffuseBatch:
-        """Draw `count` faces, sample i from `generator_of(i)` alone."""
-        drawn = []
-        for i in range(count):
-            generator = generator_of(i)
-            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-            drawn.append(self._sums(head, generator))
-        return concatenate(drawn)
+    def draw_one(self, generator: torch.Generator) -> DiffuseBatch:
+        """Draw a face."""
+        return self._sums(self.heads[torch.randint(len(self.heads), (1,), generator=generator)], generator)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> DiffuseBatch:
+        """Draw a held-out face."""
+        return self._sums(torch.tensor([person]), generator)
 
     def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
         """Compute `source`, for the light alone, and `targets`, for the albedo; means over faces."""
         with self.mixed_precision():
-            estimate = self._network()(batch.source, batch.normals_source, batch.visible)
+            estimate = self.network(batch.source, batch.normals_source, batch.visible)
         source = (batch.source / estimate.exposure)[:, None]
         targets = batch.targets / estimate.exposure[:, None]
         own, _ = predicted_images(estimate._replace(albedo=estimate.albedo.detach()), batch)
@@ -110,14 +100,12 @@ class DiffuseObjective(Objective):
 
         The sheet has two rows a face: source and targets; predicted source and targets, albedo and shading.
         """
-        network = self._network()
-        device = next(network.parameters()).device
         errors: list[tuple[Tensor, Tensor]] = []
         same_pose: list[bool] = []
         rows: list[np.ndarray] = []
-        for batch in self._held_out():
-            there = batch.to(device)
-            estimate = network(there.source, there.normals_source, there.visible)
+        for batch in self.held_out_samples():
+            there = batch.to(self.device)
+            estimate = self.network(there.source, there.normals_source, there.visible)
             own, relit = (image.cpu() for image in predicted_images(estimate, there))
             of_source = clipped_si_mse(own, batch.source[:, None], batch.visible).mean()
             errors.append((clipped_si_mse(relit, batch.targets, batch.weight).mean(), of_source))
@@ -126,24 +114,11 @@ class DiffuseObjective(Objective):
             rows += [_sheet_rows(batch, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
         return Validation(_metrics(torch.tensor(errors), torch.tensor(same_pose)), np.concatenate(rows))
 
-    def _held_out(self) -> Iterator[DiffuseBatch]:
-        """Yield the held-out batches of one face each, drawn once."""
-        if not self._validation:
-            self._validation = [
-                self._sums(head[None], seeded(_VALIDATION_SEED, int(head), draw))
-                for draw in range(self.settings.held_out_draws)
-                for head in self.held_out
-            ]
-        yield from self._validation
-
     def _sums(self, heads: Tensor, generator: torch.Generator) -> DiffuseBatch:
         """Draw a face and random sums of its single lights."""
         sample = self.source.draw(heads, self.settings.lights, generator)
         weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
         return sum_lights(sample, weights, heads)
-
-    def _network(self) -> Any:
-        return self.networks["diffuse_sh"]
 
 
 def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:

@@ -5,7 +5,6 @@ Contour landmarks do not slide, for here hidden ones are known, too. The targets
 those of the fit to the same landmarks, for the network's estimate is where that fit starts.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,11 +16,11 @@ from facerf_cli.face.fit import FitSettings
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
-from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation
 
-_VALIDATION_SEED = 20211
 _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
 
 
@@ -41,6 +40,7 @@ class GeometryObjectiveSettings:
 class GeometryObjective(Objective):
     """Errors of landmarks, pose and coefficients on rendered faces."""
 
+    validation_seed = 20211
     mean_m: Tensor
     identity_m: Tensor
     expression_m: Tensor
@@ -68,16 +68,15 @@ class GeometryObjective(Objective):
         self.register_buffer("mean_m", points[0][0])
         self.register_buffer("identity_m", points[1][: own.identity])
         self.register_buffer("expression_m", points[2][: own.expression])
-        self._validation: FaceCrops | None = None
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> FaceCrops:
-        """Draw `count` crops of random heads."""
-        drawn = []
-        for i in range(count):
-            generator = generator_of(i)
-            head = int(self.heads[torch.randint(len(self.heads), (), generator=generator)])
-            drawn.append(self.faces.draw(head, self.side, generator))
-        return concatenate(drawn)
+    def draw_one(self, generator: torch.Generator) -> FaceCrops:
+        """Draw a crop of a random head."""
+        head = int(self.heads[torch.randint(len(self.heads), (), generator=generator)])
+        return self.faces.draw(head, self.side, generator)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> FaceCrops:
+        """Draw a crop of a held-out head."""
+        return self.faces.draw(person, self.side, generator)
 
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over faces."""
@@ -102,7 +101,7 @@ class GeometryObjective(Objective):
 
     def estimate(self, crops: Tensor) -> GeometryEstimate:
         """Run the network on crops [B, 3, S, S]."""
-        found: GeometryEstimate = self.networks["geometry"](crops)
+        found: GeometryEstimate = self.network(crops)
         return found
 
     def landmarks_px(self, estimate: GeometryEstimate, side: int) -> Tensor:
@@ -124,10 +123,7 @@ class GeometryObjective(Objective):
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure mean errors on held-out heads; landmarks in percent of the inter-ocular distance."""
-        if self._validation is None:
-            self._validation = self._held_out()
-        device = next(self.networks.parameters()).device
-        batch = self._validation.to(device)
+        batch = concatenate(self.held_out_samples()).to(self.device)
         estimate = self.estimate(batch.crops)
         distance_px = (self.landmarks_px(estimate, self.side) - batch.landmarks_px).norm(dim=-1)
         left, right = OUTER_EYE_CORNERS
@@ -143,15 +139,6 @@ class GeometryObjective(Objective):
             "depth_percent": float(100 * depth.mean()),
         }
         return Validation(metrics, self._sheet(batch, estimate))
-
-    def _held_out(self) -> FaceCrops:
-        return concatenate(
-            [
-                self.faces.draw(int(head), self.side, seeded(_VALIDATION_SEED, int(head), index))
-                for index in range(self.settings.held_out_draws)
-                for head in self.held_out
-            ]
-        )
 
     def _sheet(self, batch: FaceCrops, estimate: GeometryEstimate) -> np.ndarray:
         """Held-out crops with the true landmarks in green and the estimated ones in red."""

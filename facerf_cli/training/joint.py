@@ -31,11 +31,11 @@ from facerf_cli.face.topology import (
 from facerf_cli.network.checkpoint import VGG16_LICENCE
 from facerf_cli.network.features import VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
-from facerf_cli.network.inputs import SourceColours, resize, without_cast
+from facerf_cli.network.inputs import SourceColours, concatenate, resize, without_cast
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
-from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation, seeded
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -315,8 +315,7 @@ class JointObjective(Objective):
 
     def _features(self, name: str) -> Features:
         network: Any = self.feature_networks[name]
-        device = next(self.networks.parameters()).device
-        return Features(network, self.feature_powers[name].to(device))
+        return Features(network, self.feature_powers[name].to(self.device))
 
     @torch.no_grad()
     def validate(self) -> Validation:
@@ -328,11 +327,10 @@ class JointObjective(Objective):
             self._validation = self._held_out_pairs()
         metrics: dict[str, float] = {}
         errors, distances, rows = [], [], []
-        device = next(self.networks.parameters()).device
         for kind, pairs in self._validation.items():
             of_kind = []
             for index, pair in enumerate(pairs):
-                batch = pair.to(device)
+                batch = pair.to(self.device)
                 landmarks_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
                 _, heads = self._heads(torch.cat([batch.source, batch.target]), landmarks_px)
                 relit = self._relit(batch, heads)

@@ -6,9 +6,7 @@ L_L compares. Textures are the Reflectance Network's targets, of one light each,
 does not see the face.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,17 +17,16 @@ from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
-from facerf_cli.network.inputs import head_rotation, resize
+from facerf_cli.network.inputs import Batch, concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation
 
 _NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
-_VALIDATION_SEED = 12345
 _SHEET_FACES = 6
 
 
 @dataclass(frozen=True)
-class LightTextures:
+class LightTextures(Batch):
     """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
 
     The lights are unit vectors in the head's frame; `heads` [B] are the heads' indices.
@@ -39,18 +36,14 @@ class LightTextures:
     lights_head: Tensor
     heads: Tensor
 
-    def to(self, device: torch.device) -> "LightTextures":
-        """Copy the batch to `device`."""
-        return LightTextures(self.textures.to(device), self.lights_head.to(device), self.heads)
-
 
 @dataclass(frozen=True)
 class LightFeaturesSettings:
-    """Lights of a face and step, and held-out heads, each drawn `held_out_views` times."""
+    """Lights of a face and step, and held-out heads, each drawn `held_out_draws` times."""
 
     lights: int = 8
     held_out_heads: int = 12
-    held_out_views: int = 4
+    held_out_draws: int = 4
 
 
 class LightFeaturesObjective(Objective):
@@ -70,50 +63,34 @@ class LightFeaturesObjective(Objective):
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
         self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
-        self._validation: LightTextures | None = None
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> LightTextures:
-        """Draw `count` faces, sample i from `generator_of(i)` alone."""
-        drawn = []
-        for i in range(count):
-            generator = generator_of(i)
-            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-            drawn.append(self._textures(head, generator))
-        return concatenate(drawn)
+    def draw_one(self, generator: torch.Generator) -> LightTextures:
+        """Draw a face."""
+        head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+        return self._textures(head, generator)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> LightTextures:
+        """Draw a held-out face."""
+        return self._textures(torch.tensor([person]), generator)
 
     def forward(self, batch: LightTextures) -> dict[str, Tensor]:
         """Compute the term `light`, a mean over faces and lights."""
         with self.mixed_precision():
-            return {"light": 1 - _cosines(self._network(), batch).mean()}
+            return {"light": 1 - _cosines(self.network, batch).mean()}
 
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure mean and median angles in degrees to the true light, also for front and back lights."""
-        if self._validation is None:
-            self._validation = self._held_out()
-        network = self._network()
-        batch = self._validation.to(next(network.parameters()).device)
-        cosines = torch.cat([_cosines(network, face) for face in _one_by_one(batch)])
+        faces = self.held_out_samples()
+        cosines = torch.cat([_cosines(self.network, face.to(self.device)) for face in faces])
+        batch = concatenate(faces).to(self.device)
         angles = torch.rad2deg(cosines.double().clamp(-1, 1).acos())
         metrics = {"angle_deg": float(angles.mean()), "angle_median_deg": float(angles.median())}
         front = batch.lights_head[..., 2] > 0  # of the plane of the face
         for name, lights in (("angle_front_deg", front), ("angle_behind_deg", ~front)):
             if lights.any():
                 metrics[name] = float(angles[lights].mean())
-        return Validation(metrics, _sheet(network, self._validation))
-
-    def _network(self) -> LightNetwork:
-        network: Any = self.networks["light_features"]
-        return network
-
-    def _held_out(self) -> LightTextures:
-        return concatenate(
-            [
-                self._textures(head[None], seeded(_VALIDATION_SEED, int(head), view))
-                for view in range(self.settings.held_out_views)
-                for head in self.held_out
-            ]
-        )
+        return Validation(metrics, _sheet(self.network, concatenate(faces)))
 
     def _textures(self, heads: Tensor, generator: torch.Generator) -> LightTextures:
         sample = self.source.draw(heads, self.settings.lights, generator)
@@ -121,12 +98,6 @@ class LightFeaturesObjective(Objective):
         head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
         lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
         return LightTextures(sample.target * seen[:, None], lights_head, heads)
-
-
-def _one_by_one(batch: LightTextures) -> Iterator[LightTextures]:
-    for i in range(len(batch.textures)):
-        one = slice(i, i + 1)
-        yield LightTextures(batch.textures[one], batch.lights_head[one], batch.heads[one])
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
@@ -189,9 +160,9 @@ class AppearanceObjective(Objective):
         self.settings = settings
         self._validation: tuple[CropPairs, CropPairs] | None = None
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> CropPairs:
-        """Draw `count` pairs, sample i from `generator_of(i)` alone."""
-        return concatenate([self._train.draw(generator_of(i)) for i in range(count)])
+    def draw_one(self, generator: torch.Generator) -> CropPairs:
+        """Draw a pair."""
+        return self._train.draw(generator)
 
     def forward(self, batch: CropPairs) -> dict[str, Tensor]:
         """Compute the terms `people` and `light`, means over images."""
@@ -204,8 +175,7 @@ class AppearanceObjective(Objective):
         }
 
     def _found(self, batch: CropPairs) -> tuple[Tensor, Tensor]:
-        network = self.networks["appearance_features"]
-        scores, lights = network(torch.cat([batch.source, batch.target]))
+        scores, lights = self.network(torch.cat([batch.source, batch.target]))
         return scores, lights
 
     @torch.no_grad()
@@ -219,8 +189,7 @@ class AppearanceObjective(Objective):
                 for reader in readers
             )
         assert self._validation
-        device = next(self.networks.parameters()).device
-        known, strangers = (batch.to(device) for batch in self._validation)
+        known, strangers = (batch.to(self.device) for batch in self._validation)
         scores, _ = self._found(known)
         right = scores.argmax(1) == torch.cat([known.people, known.people])
         _, lights = self._found(strangers)

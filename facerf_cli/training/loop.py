@@ -11,11 +11,11 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.network.checkpoint import load_networks, save_networks
-from facerf_cli.network.inputs import SourceColours, mixed_precision
+from facerf_cli.network.inputs import Batch, SourceColours, concatenate, mixed_precision
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.training.run_folder import (
     RunLog,
@@ -55,31 +55,28 @@ class Validation:
     sheet: np.ndarray | None  # contact sheet [H, W, 3], scene-linear
 
 
-class Batch(Protocol):
-    """Samples of one step, on the CPU until moved."""
-
-    def to(self, device: torch.device) -> Self:
-        """Copy the batch to `device`."""
-
-
 class Objective(nn.Module):
     """A training stage: its batches, its loss terms and its validation.
 
-    Subclasses set the first three attributes after `super().__init__()` and implement `draw`, `forward` and
-    `validate`.
+    Subclasses set the first three attributes after `super().__init__()`, and `held_out` and `settings` where
+    they use `held_out_samples`; they implement `draw_one`, `forward` and `validate`.
     """
 
-    networks: nn.ModuleDict  # trained, averaged, saved: by the names of network.saved.FORMS
+    networks: nn.ModuleDict  # trained, averaged, saved: by the names of `network/checkpoint.py`
     chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
     provenance: dict[str, Any]  # for the checkpoint; 'licence' is that of the whole
     inputs: dict[str, Any]  # entries of `INPUTS`
     source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
     skips_networks: bool = False  # True if a batch may leave some weights without a gradient
     bf16: bool = False  # set by the loop, for `mixed_precision`
+    held_out: Any  # numbers of the people that are not trained on
+    settings: Any  # with `held_out_draws`, of each of them
+    validation_seed: int = 12345
 
     def __init__(self) -> None:
         super().__init__()
         self.inputs = {}
+        self._held_out_samples: list[Any] = []
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:
         """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.
@@ -87,7 +84,25 @@ class Objective(nn.Module):
         A choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
         CPU and without the networks.
         """
+        return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
+
+    def draw_one(self, generator: torch.Generator) -> Any:
+        """Draw one sample of a random person, B = 1."""
         raise NotImplementedError
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
+        """Draw one sample of a held-out person, B = 1."""
+        raise NotImplementedError
+
+    def held_out_samples(self) -> list[Any]:
+        """Samples of the held-out people, B = 1, drawn once."""
+        if not self._held_out_samples:
+            self._held_out_samples = [
+                self.draw_held_out(int(person), seeded(self.validation_seed, int(person), index))
+                for index in range(self.settings.held_out_draws)
+                for person in self.held_out
+            ]
+        return self._held_out_samples
 
     def forward(self, batch: Any) -> dict[str, Tensor]:
         """Compute the weighted terms of the loss, each a mean over samples; the loop minimises their sum."""
@@ -99,8 +114,18 @@ class Objective(nn.Module):
 
     def mixed_precision(self) -> torch.autocast:
         """Context for the networks in `forward`; geometry and losses need single precision."""
-        device = next(self.networks.parameters()).device
-        return mixed_precision(device, self.bf16)
+        return mixed_precision(self.device, self.bf16)
+
+    @property
+    def network(self) -> Any:
+        """The network of a stage that trains one."""
+        (network,) = self.networks.values()
+        return network
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the networks."""
+        return next(self.networks.parameters()).device
 
 
 def seeded(*numbers: int) -> torch.Generator:
@@ -113,18 +138,6 @@ def metrics_by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
     """Mean Si-MSE of errors [N]: of all, and by whether the target has the source's pose [N]."""
     parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
     return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}
-
-
-Samples = TypeVar("Samples")
-
-
-def concatenate(samples: Sequence[Samples]) -> Samples:
-    """Join samples into a batch; they are dataclasses whose fields are all tensors [B, ...]."""
-    first: Any = samples[0]
-    joined: Samples = type(first)(
-        *(torch.cat([getattr(sample, field.name) for sample in samples]) for field in fields(first))
-    )
-    return joined
 
 
 _TIMEOUT = datetime.timedelta(hours=24)  # others wait while the first process bakes heads or validates

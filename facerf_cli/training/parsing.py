@@ -5,7 +5,6 @@ the matte and of its gradient. A landmark's error is weighed by the error that t
 (Wood et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +14,12 @@ from torch import Tensor, nn
 
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation
 
-_VALIDATION_SEED = 20212
 _SHEET_ROWS, _SHEET_COLUMNS = 6, 4
 _RARE = ("brows", "eyes", "lips", "mouth", "beard", "ears", "glasses", "headwear", "hand")
 _LEAST_EYES = 0.03  # sides of the crop; smaller distances of the eyes are taken as this
@@ -43,6 +42,7 @@ class ParsingObjectiveSettings:
 class ParsingObjective(Objective):
     """Errors of classes, matte, landmarks and presence on synthetic portraits."""
 
+    validation_seed = 20212
     rarity: Tensor
 
     def __init__(
@@ -62,18 +62,19 @@ class ParsingObjective(Objective):
         self.people, self.held_out = portraits.people(settings.held_out_people)
         rarity = [settings.rare if name in _RARE else 1.0 for name in CLASSES]
         self.register_buffer("rarity", torch.tensor(rarity), persistent=False)
-        self._validation: PortraitCrops | None = None
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> PortraitCrops:
-        """Draw `count` crops of random people."""
-        return concatenate(
-            [self.portraits.draw(self.people, self.side, generator_of(i)) for i in range(count)]
-        )
+    def draw_one(self, generator: torch.Generator) -> PortraitCrops:
+        """Draw a crop of a random person."""
+        return self.portraits.draw(self.people, self.side, generator)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitCrops:
+        """Draw a crop of a held-out person."""
+        return self.portraits.draw([person], self.side, generator)
 
     def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over crops."""
         with self.mixed_precision():
-            found: Parsing = self.networks["parsing"](batch.crops)
+            found: Parsing = self.network(batch.crops)
         settings = self.settings
         log_share = found.logits.float().log_softmax(1)
         covered = log_share.gather(1, batch.label[:, None])[:, 0]
@@ -98,9 +99,7 @@ class ParsingObjective(Objective):
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure held-out people: IoU by class, error of the matte, landmarks in inter-ocular distances."""
-        if self._validation is None:
-            self._validation = self._drawn()
-        batch = self._validation.to(next(self.networks.parameters()).device)
+        batch = concatenate(self.held_out_samples()).to(self.device)
         found = self._found(batch)
         label = torch.where(batch.alpha >= 0.5, batch.label, 0)
         chosen, counted = found.logits.argmax(1), batch.weight > 0
@@ -128,17 +127,8 @@ class ParsingObjective(Objective):
         return Validation(metrics, self._sheet(batch, found))
 
     def _found(self, batch: PortraitCrops) -> Parsing:
-        parts = [self.networks["parsing"](crops) for crops in torch.split(batch.crops, 16)]
+        parts = [self.network(crops) for crops in torch.split(batch.crops, 16)]
         return Parsing(*(torch.cat(part) for part in zip(*parts, strict=True)))
-
-    def _drawn(self) -> PortraitCrops:
-        return concatenate(
-            [
-                self.portraits.draw([person], self.side, seeded(_VALIDATION_SEED, person, index))
-                for index in range(self.settings.held_out_draws)
-                for person in self.held_out
-            ]
-        )
 
     def _sheet(self, batch: PortraitCrops, found: Parsing) -> np.ndarray:
         """Held-out crops with true landmarks in green and found ones in red, beside the found classes."""

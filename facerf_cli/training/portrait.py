@@ -6,7 +6,6 @@ others (Yeh et al., *Learning to relight portrait images via a virtual light sta
 adaptation*, 2022).
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,12 +13,12 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.bank.transport import SMALL, PortraitSample, PortraitSource
-from facerf_cli.training.loop import Objective, Validation, concatenate, seeded
+from facerf_cli.training.loop import Objective, Validation
 
-_VALIDATION_SEED = 20216
 _ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black
 _SCALE = (0.4, 2.5)  # of exposure between prediction and truth that is forgiven
 _SHEET_ROWS = 8
@@ -51,6 +50,8 @@ class PortraitObjectiveSettings:
 class PortraitObjective(Objective):
     """Errors of the images that the Portrait Network predicts."""
 
+    validation_seed = 20216
+
     def __init__(
         self,
         portraits: PortraitSource,
@@ -64,12 +65,14 @@ class PortraitObjective(Objective):
         self.portraits = portraits
         self.settings = settings
         self.people, self.held_out = portraits.people(settings.held_out_people)
-        self._validation: PortraitSample | None = None
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> PortraitSample:
-        """Draw `count` samples of random people."""
-        targets = self.settings.targets
-        return concatenate([self.portraits.draw(self.people, targets, generator_of(i)) for i in range(count)])
+    def draw_one(self, generator: torch.Generator) -> PortraitSample:
+        """Draw a sample of a random person."""
+        return self.portraits.draw(self.people, self.settings.targets, generator)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitSample:
+        """Draw a sample of a held-out person."""
+        return self.portraits.draw([person], self.settings.targets, generator)
 
     def forward(self, batch: PortraitSample) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over samples."""
@@ -98,16 +101,14 @@ class PortraitObjective(Objective):
 
     def _maps(self, batch: PortraitSample) -> PortraitMaps:
         with self.mixed_precision():
-            maps: PortraitMaps = self.networks["portrait"](batch.inputs)
+            maps: PortraitMaps = self.network(batch.inputs)
         return maps
 
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure held-out people: relative error by region under one scale of the head, and its SSIM."""
-        if self._validation is None:
-            self._validation = self._drawn()
-        batch = self._validation.to(next(self.networks.parameters()).device)
-        parts = [_part(batch, index) for index in range(len(batch.image))]
+        parts = [sample.to(self.device) for sample in self.held_out_samples()]
+        batch = concatenate(parts)
         found = torch.cat([self._maps(p).olats(p.lights, _larger(p.visible, p.image)) for p in parts])
         scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1], clamp=False)
         squared = (found * scale - batch.targets).square().mean(2)
@@ -121,15 +122,6 @@ class PortraitObjective(Objective):
         metrics["error"] = float(root)
         return Validation(metrics, self._sheet(batch, found * scale))
 
-    def _drawn(self) -> PortraitSample:
-        return concatenate(
-            [
-                self.portraits.draw([person], self.settings.targets, seeded(_VALIDATION_SEED, person, index))
-                for index in range(self.settings.held_out_draws)
-                for person in self.held_out
-            ]
-        )
-
     def _sheet(self, batch: PortraitSample, found: Tensor) -> np.ndarray:
         """Held-out photos, each with pairs of predicted and true images."""
         rows = []
@@ -137,12 +129,6 @@ class PortraitObjective(Objective):
             pairs = torch.stack([found[index], batch.targets[index]], 1).flatten(0, 1)
             rows.append(torch.cat([batch.image[index], *pairs], -1))
         return torch.cat(rows, 1).permute(1, 2, 0).cpu().numpy()
-
-
-def _part(batch: PortraitSample, index: int) -> PortraitSample:
-    return PortraitSample(
-        *(getattr(batch, name)[index : index + 1] for name in PortraitSample.__dataclass_fields__)
-    )
 
 
 def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:

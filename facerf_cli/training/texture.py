@@ -3,7 +3,6 @@
 With S_f the paper's feature loss on textures, L_L, is added to the default form's loss.
 """
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,13 +12,12 @@ from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.features import LightNetwork, feature_distance
-from facerf_cli.network.inputs import SourceColours, from_root, mean_colours, without_cast
+from facerf_cli.network.inputs import Batch, SourceColours, from_root, mean_colours, without_cast
 from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, concatenate, metrics_by_pose, seeded
+from facerf_cli.training.loop import Objective, Validation, metrics_by_pose, seeded
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 
-_VALIDATION_SEED = 12345
 _COLOUR_SEED, _COLOURS_MEASURED = 31415, 192
 _SHEET_FACES = 5
 
@@ -36,15 +34,11 @@ class TextureObjectiveSettings:
 
 
 @dataclass(frozen=True)
-class TextureBatch:
+class TextureBatch(Batch):
     """Samples and the indices of their heads [B]."""
 
     sample: Sample
     heads: Tensor
-
-    def to(self, device: torch.device) -> "TextureBatch":
-        """Copy the batch to `device`."""
-        return TextureBatch(self.sample.to(device), self.heads)
 
 
 class TextureObjective(Objective):
@@ -69,21 +63,19 @@ class TextureObjective(Objective):
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
         self.source_colours = _measure_colours(source, self.heads)
-        self._validation: list[Sample] = []
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> TextureBatch:
-        """Draw `count` faces, sample i from `generator_of(i)` alone."""
-        samples, heads = [], []
-        for i in range(count):
-            generator = generator_of(i)
-            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-            samples.append(self.source.draw(head, self.settings.lights, generator))
-            heads.append(head)
-        return TextureBatch(concatenate(samples), torch.cat(heads))
+    def draw_one(self, generator: torch.Generator) -> TextureBatch:
+        """Draw a face."""
+        head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+        return TextureBatch(self.source.draw(head, self.settings.lights, generator), head)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Sample:
+        """Draw a held-out face."""
+        return self.source.draw(torch.tensor([person]), self.settings.held_out_lights, generator)
 
     def forward(self, batch: TextureBatch) -> dict[str, Tensor]:
         """Compute the term `root` and, with S_f, `light_features`, means over faces."""
-        network, sample = self._network(), batch.sample
+        network, sample = self.network, batch.sample
         with self.mixed_precision():
             encoded = self._encoded(sample)
             root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
@@ -104,38 +96,22 @@ class TextureObjective(Objective):
 
         The sheet has two rows a face: source and true OLATs; visible source and predicted OLATs.
         """
-        network = self._network()
-        device = next(network.parameters()).device
         errors: list[Tensor] = []
         same_pose: list[bool] = []
         rows: list[np.ndarray] = []
-        for sample in self._held_out():
-            there = sample.to(device)
+        for sample in self.held_out_samples():
+            there = sample.to(self.device)
             encoded = self._encoded(there)
-            predicted = network.decode(encoded, there.normals_target, there.lights).cpu()
+            predicted = self.network.decode(encoded, there.normals_target, there.lights).cpu()
             errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean())
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
         return Validation(metrics_by_pose(torch.stack(errors), torch.tensor(same_pose)), np.concatenate(rows))
 
-    def _held_out(self) -> Iterator[Sample]:
-        """Yield the held-out samples of one face each, drawn once."""
-        lights = self.settings.held_out_lights
-        if not self._validation:
-            self._validation = [
-                self.source.draw(head[None], lights, seeded(_VALIDATION_SEED, int(head), draw))
-                for draw in range(self.settings.held_out_draws)
-                for head in self.held_out
-            ]
-        yield from self._validation
-
-    def _network(self) -> Any:
-        return self.networks["reflectance"]
-
     def _encoded(self, sample: Sample) -> Any:
         source = without_cast(sample.source, sample.visible, self.source_colours)
-        return self._network().encode(source, sample.normals_source, sample.visible)
+        return self.network.encode(source, sample.normals_source, sample.visible)
 
 
 def _measure_colours(source: SampleSource, heads: Tensor) -> SourceColours:

@@ -12,7 +12,7 @@ from facerf_cli.training.light_features import LightFeaturesObjective, LightFeat
 from facerf_cli.training.loop import seeded
 from tests.toy_faces import ToyFaces
 
-SETTINGS = LightFeaturesSettings(lights=4, held_out_heads=2, held_out_views=3)
+SETTINGS = LightFeaturesSettings(lights=4, held_out_heads=2, held_out_draws=3)
 
 
 def objective(bank: Bank) -> LightFeaturesObjective:

@@ -1,10 +1,9 @@
-"""Banks of training data: folders of safetensors, and batches of samples that are drawn from them."""
+"""Banks of training data: folders of safetensors."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import torch
 from safetensors.torch import save_file
@@ -15,15 +14,6 @@ from facerf_cli.run.workers import in_shards
 
 T = TypeVar("T")
 Entries = Iterable[tuple[Path, dict[str, Tensor]]]
-
-
-@dataclass(frozen=True)
-class Batch:
-    """A dataclass of tensors."""
-
-    def to(self, device: torch.device) -> Self:
-        """Move all tensors to `device`."""
-        return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
 
 
 def fill(

@@ -23,12 +23,13 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, MIRROR_68, grid_uv, landmark_weights
+from facerf_cli.network.inputs import Batch
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.people import hair_albedo
 from facerf_cli.synth.appearance.skin import Skin, draw_skin
-from facerf_cli.synth.bank import Batch, Entries, fill
+from facerf_cli.synth.bank import Entries, fill
 from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, photograph_head
 from facerf_cli.synth.bank.texture_samples import HeadFields, draw_light, head_fields
 from facerf_cli.synth.head.body import draw_body

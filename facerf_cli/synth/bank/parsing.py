@@ -24,10 +24,10 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.image.colour import linear_to_srgb
+from facerf_cli.network.inputs import Batch
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.synth.bank import Batch
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.random_fields import Uniform

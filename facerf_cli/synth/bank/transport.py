@@ -26,7 +26,7 @@ from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.inputs import MEAN_RADIANCE
+from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_harmonics, mirrored_x, reached_by
 from facerf_cli.portrait.find import find_faces
@@ -36,7 +36,7 @@ from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
-from facerf_cli.synth.bank import Batch, Entries, fill
+from facerf_cli.synth.bank import Entries, fill
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
