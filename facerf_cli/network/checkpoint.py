@@ -1,6 +1,6 @@
 """Checkpoints: safetensors files of networks, with configuration, provenance and metrics as JSON metadata.
 
-Batch are named `<network>.<tensor>`; the metadata holds the form and the settings of each network. No
+Tensors are named `<network>.<tensor>`; the metadata holds the form and the settings of each network. No
 pickle is loaded.
 """
 
