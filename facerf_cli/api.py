@@ -161,7 +161,7 @@ def fit_photo(
 
 
 @dataclass(frozen=True)
-class _Photo:
+class _KeyedPhoto:
     """A photo [H, W, 3] as a key of a cache; two are one by their values."""
 
     digest: bytes
@@ -169,7 +169,7 @@ class _Photo:
 
 
 @lru_cache(maxsize=1)
-def _person(models: Models, photo: _Photo, head: Head, kind: RelightKind, network_alone: bool) -> Person:
+def _person(models: Models, photo: _KeyedPhoto, head: Head, kind: RelightKind, network_alone: bool) -> Person:
     """The person of the last call is kept, so that each further light costs what a light costs."""
     pixels = photo.pixels.copy()  # the caller may change its own
     return Person(models, pixels, head, reflectance_of(models, head, kind, network_alone, photo=pixels))
@@ -227,7 +227,7 @@ def relight(
     photo, rig = _checked(photo), light._rig()
     if not np.allclose(head.fit.crop.apply(photo), head.cropped, rtol=0, atol=_ALIKE * head.cropped.max()):
         raise ValueError("photo is not the one that the head was fitted in; fit it again")
-    pixels = _Photo(hashlib.blake2b(photo.data).digest(), photo)
+    pixels = _KeyedPhoto(hashlib.blake2b(photo.data).digest(), photo)
     with torch.no_grad():
         image = _person(models, pixels, head, reflectance, network_alone).image(rig, target)
     return image.pixels if image.alpha is None else np.dstack([image.pixels, image.alpha])

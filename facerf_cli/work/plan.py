@@ -1,4 +1,4 @@
-"""What a photo costs in memory (docs/memory.md): who is refused, how many lights are held, what goes to disk.
+"""Memory of a photo's work (docs/memory.md): what is refused, how many lights are held, what goes to disk.
 
 Readers ask, by a file's header, for what they decode; what work makes of a photo is asked for here alone.
 """
@@ -36,22 +36,22 @@ _FLOATS = ("rgb", "A", "person.A", "position", "depth", "uv")
 
 
 def beside_photo(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
-    """What is read meanwhile is held with a photo [H, W]."""
+    """Count a photo [H, W] with what is read meanwhile."""
     return memory.holding(_PHOTO_PX * math.prod(size_px))
 
 
 def beside_person(size_px: tuple[int, ...], images: int = 0) -> AbstractContextManager[None]:
-    """What is read meanwhile is held with a photo [H, W], its person and further images of its size."""
+    """Count a photo [H, W], its person and further images of its size with what is read meanwhile."""
     return memory.holding((_PERSON_PX + images * _IMAGE_PX) * math.prod(size_px))
 
 
 def beside_stack(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
-    """What is read meanwhile is held with a stack of images [H, W]."""
+    """Count a stack of images [H, W] with what is read meanwhile."""
     return memory.holding(_STACK_PX * math.prod(size_px))
 
 
 def prediction_bytes() -> int:
-    """What a network's prediction may take."""
+    """Bytes that a network's prediction may take."""
     return memory.limit_bytes()
 
 

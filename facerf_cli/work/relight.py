@@ -122,7 +122,7 @@ def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _LitScene:
     """People of a photo, or a stack: its composer, the lights of every setup, and what is behind."""
 
     composer: Composer
@@ -132,7 +132,7 @@ class _Scene:
     behind: Behind | None = None
 
 
-Scenes = Iterator[tuple[str, _Scene]]  # each with the tag of its files
+Scenes = Iterator[tuple[str, _LitScene]]  # each with the tag of its files
 
 
 def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
@@ -195,7 +195,7 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     return _exposures_ev(parts, lambda part: _relit(scene, part), scene, work)
 
 
-def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _Scene:
+def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _LitScene:
     """People of one photo in one image; the nearest first."""
     lights = lights_over_rig(work.setups, work.rig, work.sampling)
     by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
@@ -206,10 +206,10 @@ def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Re
         return single_lights(each_alone(setup))
 
     if work.composite != "photo":
-        return _Scene(composer, lights, apart)
+        return _LitScene(composer, lights, apart)
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
     alpha = image.alpha if work.background.kind == "photo" else None
-    return _Scene(composer, lights, apart, alpha, _backdrop(work, camera))
+    return _LitScene(composer, lights, apart, alpha, _backdrop(work, camera))
 
 
 def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> Composition:
@@ -267,7 +267,7 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
         composer, facts = RenderedStack(header, item.input_path), {}
     else:
         composer, facts = _face_of_stack(item, header, work)
-    scene = _Scene(composer, of_setups, lambda setup: lights(each_alone(setup)), behind=behind)
+    scene = _LitScene(composer, of_setups, lambda setup: lights(each_alone(setup)), behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
     return iter([("", scene)]), dict(metadata), facts
 
@@ -332,14 +332,14 @@ def _fit_of(item: Item) -> Iterator[None]:
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
 
 
-def _relit(scene: _Scene, part: slice) -> list[Any]:
+def _relit(scene: _LitScene, part: slice) -> list[Any]:
     return list(scene.composer.relit(scene.lights[part]))
 
 
 def _write_setups(
     item: Item,
     tag: str,
-    scene: _Scene,
+    scene: _LitScene,
     work: Relight,
     metadata: Mapping[str, Any],
     chosen_ev: Mapping[str, float] | None = None,
@@ -374,7 +374,7 @@ def _write_setups(
 
 
 def _rendered(
-    scene: _Scene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
+    scene: _LitScene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
@@ -407,7 +407,7 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    parts: Iterable[slice], relit_by_part: Callable[[slice], list[Any]], scene: _Scene, work: Relight
+    parts: Iterable[slice], relit_by_part: Callable[[slice], list[Any]], scene: _LitScene, work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(work.exposure, float):

@@ -1,4 +1,4 @@
-"""What is read in one photo, as files: its person cut out (`segment`), its fitted face (`fit-geometry`)."""
+"""Files of one photo: its person cut out (`segment`), its fitted face (`fit-geometry`)."""
 
 import math
 from collections.abc import Callable, Sequence

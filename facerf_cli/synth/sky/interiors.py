@@ -47,7 +47,7 @@ class Box:
 
 
 @dataclass
-class Lights:
+class RoomLights:
     """Light sources of a room: their image in the map, and the direction and power of each."""
 
     grid: Grid
@@ -73,7 +73,7 @@ class Room:
     albedo: np.ndarray  # [H, W, 3]
     crease: np.ndarray  # [H, W] share of the ambient light, from about 0.5 in corners to 1
 
-    def lit(self, lights: Lights) -> np.ndarray:
+    def lit(self, lights: RoomLights) -> np.ndarray:
         """Compute the radiance [H, W, 3] of the walls under lights."""
         direct = np.zeros(self.points.shape)
         for centre, power, flat in lights.sources:
@@ -161,7 +161,7 @@ _MAX_HALL_LIGHTS = 12  # ceiling lights that illuminate the room; the image show
 
 def windows(grid: Grid, random: Random) -> np.ndarray:
     """Draw a room with one to four windows on sky and land; some have direct sun or a ceiling light."""
-    room, lights = draw_room(grid, random, (0.35, 0.75)), Lights(grid)
+    room, lights = draw_room(grid, random, (0.35, 0.75)), RoomLights(grid)
     azimuth_deg = random.uniform(-180, 180)
     wide, high = random.uniform(0.12, 0.45), random.uniform(0.25, 0.7)
     day = draw_white(random, 0, 0.3) * np.exp(random.uniform(1.2, 4))
@@ -230,7 +230,7 @@ def _sunlit(grid: Grid, room: Room, pane: Rectangle, random: Random) -> np.ndarr
 
 def hall(grid: Grid, random: Random) -> np.ndarray:
     """Draw a large room, such as an office or a shop, with rows of lights on its ceiling."""
-    room, lights = draw_room(grid, random, (0.25, 0.75), largest_m=10.0), Lights(grid)
+    room, lights = draw_room(grid, random, (0.25, 0.75), largest_m=10.0), RoomLights(grid)
     spacing_m = random.uniform(1.2, 3.5, 2)
     size_m = random.choice([np.array([0.09, 0.09]), np.array([0.6, 0.15]), np.array([0.3, 0.3])])
     offset_m = random.uniform(0, 1, 2) * spacing_m
@@ -254,7 +254,7 @@ def hall(grid: Grid, random: Random) -> np.ndarray:
 
 
 def _add_ceiling_light(
-    room: Room, lights: Lights, radiance: np.ndarray, at_m: np.ndarray, size_m: np.ndarray
+    room: Room, lights: RoomLights, radiance: np.ndarray, at_m: np.ndarray, size_m: np.ndarray
 ) -> None:
     """Add a ceiling light at `at_m` [3] (m, box axes), of half sizes [2], if it lies inside the room."""
     inside = ((at_m >= room.box.low) & (at_m <= room.box.high)).all()
@@ -267,7 +267,7 @@ def _add_ceiling_light(
 
 def studio(grid: Grid, random: Random) -> np.ndarray:
     """Draw a photo studio: softboxes, strip lights and bare bulbs between dark to white walls."""
-    room, lights = draw_room(grid, random, (0.001, 0.6)), Lights(grid)
+    room, lights = draw_room(grid, random, (0.001, 0.6)), RoomLights(grid)
     if random.random() < 0.5:
         room = _with_backdrop(grid, random, room)
     for _ in range(random.integers(1, 5)):
@@ -302,7 +302,7 @@ def _with_backdrop(grid: Grid, random: Random, room: Room) -> Room:
 
 def stage(grid: Grid, random: Random) -> np.ndarray:
     """Draw a nearly black hall with two to six strongly coloured lights."""
-    room, lights = draw_room(grid, random, (0.005, 0.25), largest_m=10.0), Lights(grid)
+    room, lights = draw_room(grid, random, (0.005, 0.25), largest_m=10.0), RoomLights(grid)
     for _ in range(random.integers(2, 7)):
         rgb = 0.05 + random.dirichlet([0.5, 0.5, 0.5])
         centre = toward(random.uniform(-180, 180), random.uniform(-10, 75))

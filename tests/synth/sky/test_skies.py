@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.synth.sky.interiors import Lights, draw_room
+from facerf_cli.synth.sky.interiors import RoomLights, draw_room
 from facerf_cli.synth.sky.outdoors import (
     SUN_RADIUS_DEG,
     Land,
@@ -137,7 +137,7 @@ def test_clouds_hide_the_sun_and_veil_the_sky() -> None:
 
 def test_a_room_is_brightest_near_its_light() -> None:
     grid, random = make_grid(64), np.random.default_rng(2)
-    room, lights = draw_room(grid, random, (0.4, 0.5)), Lights(grid)
+    room, lights = draw_room(grid, random, (0.4, 0.5)), RoomLights(grid)
     centre = toward(70, 20)
     lights.add(centre, paint(disc(grid, centre, 4), [100.0, 100, 100]), flat=False)
     light = room.lit(lights).mean(-1) / room.albedo.mean(-1)
