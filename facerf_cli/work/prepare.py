@@ -110,7 +110,8 @@ def prepare_capture(
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
     networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     if checking.checks == "only" and not batch.dry_run:
-        return check_all(CheckOnly(source.opened), items, batch, checking.strict, settings)
+        checks = CheckOnly(source.opened, networks)
+        return check_all(checks, items, batch, checking.strict, settings)
     model_sha256 = _model_digest(content.face_model)
     made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
     if not overwrite:
