@@ -1,7 +1,6 @@
 """`facerf face-model` from the command line."""
 
 import json
-import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,21 +134,3 @@ def test_fetch_prints_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert main(["face-model", "fetch", "ict-facekit"]) == 0
     out, err = capsys.readouterr()
     assert out == f"{tmp_path / 'ict-facekit.tar.gz'}\n" and "face-model import ict-facekit" in err
-
-
-def test_offline_fetch_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
-    with socket.socket() as taken:  # bound, but nobody listens
-        taken.bind(("127.0.0.1", 0))
-        url = f"http://127.0.0.1:{taken.getsockname()[1]}/a.tar.gz"
-        monkeypatch.setitem(published.PUBLISHED, "ict-facekit", replace(published.ICT_FACEKIT, url=url))
-        monkeypatch.setattr(published, "cache_folder", lambda: tmp_path)
-        assert main(["face-model", "fetch", "ict-facekit"]) == 1
-    out, err = capsys.readouterr()
-    line = err.splitlines()[-1]
-    assert (
-        out == ""
-        and "run again with a network" in line
-        and str(tmp_path / "face-models" / "a.tar.gz") in line
-    )

@@ -92,9 +92,9 @@ def photographed(model: MorphableModel, seed: int, noise_iod: float = 0.012) -> 
     return head, (world, views)
 
 
-@pytest.fixture(scope="module", params=[1, 2])
-def someone(request: pytest.FixtureRequest, model: MorphableModel) -> Someone:
-    return photographed(model, request.param)[1]
+@pytest.fixture(scope="module")
+def someone(model: MorphableModel) -> Someone:
+    return photographed(model, 1)[1]
 
 
 def test_all_cameras_together_know_the_shape_best(model: MorphableModel) -> None:
@@ -119,7 +119,7 @@ def error_against(model: MorphableModel, joint: JointFit, world: Tensor, camera:
     return float((a - b).norm(dim=-1).mean()) / iod_px(camera)
 
 
-@pytest.mark.parametrize("blind", [0, 2, 3])
+@pytest.mark.parametrize("blind", [0, 2])
 def test_a_camera_without_landmarks_is_fitted_by_the_calibration(
     model: MorphableModel, someone: Someone, blind: int
 ) -> None:
@@ -134,16 +134,10 @@ def test_the_world_may_lie_anywhere(model: MorphableModel, someone: Someone) -> 
     _, landmarks = someone
     turn = pose_to_rotation(100, 70, -30).double()
     shift = torch.tensor([5.0, -3.0, 8.0]).double()
+    turns = [camera.rotation @ turn.mT for camera in CAMERAS]
     moved_cameras = [
-        PosedCamera(
-            c.focal_px,
-            c.centre_px,
-            c.width_px,
-            c.height_px,
-            c.rotation @ turn.mT,
-            c.translation_m - c.rotation @ turn.mT @ shift,
-        )
-        for c in CAMERAS
+        replace(camera, rotation=moved, translation_m=camera.translation_m - moved @ shift)
+        for camera, moved in zip(CAMERAS, turns, strict=True)
     ]
     here, there = fit_views(model, CAMERAS, landmarks), fit_views(model, moved_cameras, landmarks)
     assert torch.allclose(here.alpha, there.alpha, atol=1e-6)
@@ -171,9 +165,7 @@ def test_no_face_at_all_is_an_input_error(model: MorphableModel) -> None:
         fit_views(model, CAMERAS, [None] * len(CAMERAS))
 
 
-@pytest.mark.parametrize(
-    ("distance_m", "most_iod"), [(0.8, 0.005), (1.1, 0.005), (1.5, 0.008), (10.0, 0.018)]
-)
+@pytest.mark.parametrize(("distance_m", "most_iod"), [(0.8, 0.005), (1.5, 0.008), (10.0, 0.018)])
 def test_the_crop_sees_the_head_where_the_camera_does(
     model: MorphableModel, distance_m: float, most_iod: float
 ) -> None:
