@@ -140,7 +140,7 @@ def test_help_does_not_import_what_is_heavy() -> None:
 def test_a_reader_that_goes_away_is_no_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "facerf_cli", "doctor", "--json"]
+    command = [sys.executable, "-m", "facerf_cli", "config", "relight"]
     result = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     os.close(writer)
     assert (result.returncode, result.stderr) == (141, "")
@@ -188,19 +188,27 @@ def test_threads_wait_asleep_unless_the_user_says_otherwise(given: dict[str, str
     assert result.stdout.splitlines()[1] == spins
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_shell_completion(shell: str) -> None:
+@pytest.mark.parametrize(
+    ("shell", "words", "offered"),
+    [
+        ("bash", "facerf do", "doctor"),
+        ("zsh", "facerf do", "doctor"),
+        ("fish", "facerf do", "doctor"),
+        ("bash", "facerf relight --exposure-group ", "photo\nfolder\nsequence"),
+    ],
+)
+def test_shell_completion(shell: str, words: str, offered: str) -> None:
     protocol = {
         "_FACERF_COMPLETE": f"complete_{shell}",
-        "_TYPER_COMPLETE_ARGS": "facerf do",
+        "_TYPER_COMPLETE_ARGS": words,
         "_TYPER_COMPLETE_FISH_ACTION": "get-args",
-        "COMP_WORDS": "facerf do",
-        "COMP_CWORD": "1",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(words.count(" ")),
     }
     result = run(
         "import sys; sys.argv = ['facerf']; from facerf_cli.main import run; run()", env=os.environ | protocol
     )
-    assert "doctor" in result.stdout and result.stderr == ""
+    assert offered in result.stdout and result.stderr == ""
 
 
 def test_ctrl_c_outside_of_a_verb_is_one_line(

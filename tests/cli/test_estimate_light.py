@@ -13,9 +13,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.main import main
-from tests.cli.test_relight import PHOTO, given
-
-__all__ = ["given"]  # the fixture
+from tests.astronaut import PATH as PHOTO
 
 
 def estimate(given: Path, output: Path, *line: str, photo: Path = PHOTO, lights: str = "12") -> int:

@@ -13,12 +13,11 @@ from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
-from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.texture import render_texture
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from tests import astronaut
+from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
 
-PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 NAMES = ("texture.exr", "texture.png", "normals.exr", "normals.png", "mesh.glb", "mesh.obj", "mesh.mtl")
 ENDINGS = {f"_{name}" for name in (*NAMES, "overlay.jpg", "fit.npz")}
 Capture = pytest.CaptureFixture[str]
@@ -28,8 +27,7 @@ Capture = pytest.CaptureFixture[str]
 def landmarks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the photo's landmarks."""
     folder = tmp_path_factory.mktemp("landmarks")
-    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
-    (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
+    (folder / "astronaut.json").write_text(json.dumps(astronaut.face().landmarks_px.tolist()))
     return folder
 
 

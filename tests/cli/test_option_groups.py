@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.options import with_groups
-from facerf_cli.option import Only, option
+from facerf_cli.option import Only, Without, option
 
 
 @dataclass(frozen=True)
@@ -67,3 +67,25 @@ def test_a_verb_may_have_some_of_a_group() -> None:
 
     assert run(verb, "--kind", "ink").exit_code == 0
     assert run(verb, "--size", "4").exit_code == 2
+
+
+@dataclass(frozen=True)
+class Picture:
+    paint: Annotated[Paint, Without("kind")]
+    share: float = option(0.5, "Share.", typed=float, default_text=50.0, parse=lambda percent: percent / 100)
+    words: tuple[str, ...] = option((), "Words.", parse=lambda text: tuple(text.split(",")))
+    shape: Literal["round", "square"] = option("round", "Shape.", typed=Literal["round", "square"] | None)
+
+
+def test_groups_hold_groups_and_parse_what_is_typed() -> None:
+    made: list[Picture] = []
+
+    def verb(picture: Picture) -> None:
+        made.append(picture)
+
+    assert run(verb).exit_code == 0
+    assert run(verb, "--size", "3", "--share", "20", "--words", "a,b", "--shape", "square").exit_code == 0
+    plain, given = made
+    assert plain == Picture(Paint(Settings(seed=5)))
+    assert given == Picture(Paint(Settings(seed=5), side_px=3), 0.2, ("a", "b"), "square")
+    assert run(verb, "--kind", "ink").exit_code == run(verb, "--shape", "flat").exit_code == 2

@@ -15,10 +15,10 @@ from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.image import colour
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas
-from tests.cli.test_relight import PHOTO, given, relight
+from tests.astronaut import PATH as PHOTO
+from tests.cli.test_relight import relight
 from tests.exr_layers import exr_layers
 
-__all__ = ["given"]  # the fixture
 NAME = "astronaut_light_40_10"
 LIGHT = ("--light", "40,10")
 

@@ -16,29 +16,24 @@ from facerf_cli.image.colour import luminance
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
-from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.viewer.page import strip_of
+from tests.astronaut import PATH as PHOTO
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.files.test_relight_web import Decoder
 
-PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 SIDES = "70,0;-70,0;0,80"
 Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a checkpoint and the photo's landmarks."""
-    folder = tmp_path_factory.mktemp("given")
-    network = save_toy_checkpoint(folder / "lambert.safetensors")
-    save_networks(folder / "other.safetensors", {"reflectance": network}, {"layout_version": 99})
+def given(given: Path) -> Path:
+    """The folder with two checkpoints that do not fit, too."""
+    network = save_toy_checkpoint(given / "toy.safetensors")
+    save_networks(given / "other.safetensors", {"reflectance": network}, {"layout_version": 99})
     torn = {"layout_version": LAYOUT_VERSION, "networks": {"reflectance": network.as_metadata()}}
-    save_checkpoint(folder / "torn.safetensors", {}, torn)
-    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
-    (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
-    return folder
+    save_checkpoint(given / "torn.safetensors", {}, torn)
+    return given
 
 
 def predict(given: Path, output: Path, *line: str, photo: Path = PHOTO, checkpoint: str = "lambert") -> int:

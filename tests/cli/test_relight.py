@@ -12,31 +12,11 @@ from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
-from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.field import Field
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.sky.skies import kind_of
-from tests.cli.toy_checkpoint import save_toy_checkpoint
+from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
-
-PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
-
-
-@pytest.fixture(scope="module")
-def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a checkpoint, the photo's landmarks and two maps."""
-    folder = tmp_path_factory.mktemp("given")
-    save_toy_checkpoint(folder / "lambert.safetensors")
-    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
-    (folder / "astronaut.json").write_text(json.dumps(face.landmarks_px.tolist()))
-    (folder / "maps").mkdir()
-    grey = np.full((8, 16, 3), 0.3, np.float32)
-    right = grey.copy()
-    right[3:5, 3:5] = 9.0
-    write_exr(folder / "maps/grey.exr", grey)
-    write_exr(folder / "maps/right.0007.exr", right)
-    return folder
 
 
 def relight(given: Path, output: Path, *line: str, photo: Path = PHOTO) -> int:
@@ -97,10 +77,12 @@ def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     assert len(row["exposure_ev"]) == 3 and len(set(row["exposure_ev"].values())) == 1
 
 
-@pytest.mark.parametrize("composite", ["photo", "face"])
 @pytest.mark.parametrize(
-    ("lights", "kept"),
-    [(["--light", "40,10", "--light=-40,10"], 0), (["--light", "a=40,10", "--light", "b=0,40"], 1)],
+    ("composite", "lights", "kept"),
+    [
+        ("photo", ["--light", "40,10", "--light=-40,10"], 0),
+        ("face", ["--light", "a=40,10", "--light", "b=0,40"], 1),
+    ],
 )  # of the second image its two lights, beside their sum
 def test_lights_that_are_written_are_given_up_before_others_are_relit(
     composite: str, lights: list[str], kept: int, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -229,27 +211,7 @@ def test_a_matte_of_another_size(given: Path, tmp_path: Path, capsys: pytest.Cap
     assert "--matte " in capsys.readouterr().err
 
 
-def test_a_stack_gives_what_its_photo_gives(given: Path, tmp_path: Path) -> None:
-    checkpoint = ["--checkpoint", str(given / "lambert.safetensors")]
-    landmarks = ["--landmarks", str(given / "astronaut.json")]
-    assert (
-        main(
-            [
-                *checkpoint,
-                "predict-olat",
-                str(PHOTO),
-                "-o",
-                str(tmp_path / "olat"),
-                "--lights",
-                "12",
-                "--frame",
-                "uv",
-                *landmarks,
-            ]
-        )
-        == 0
-    )
-    stack = next((tmp_path / "olat").glob("*.exr"))
+def test_a_stack_gives_what_its_photo_gives(given: Path, stack: Path, tmp_path: Path) -> None:
     envmap = ["--envmap", str(given / "maps")]
     field = ["--composite", "face", "--reflectance", "field"]
     assert relight(given, tmp_path / "a", *envmap, *field) == 0
@@ -355,19 +317,9 @@ def test_the_network_alone(given: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert np.abs(corrected.pixels - alone.pixels).max() > 0.01
     assert "facerf:network_alone" in alone.metadata and "facerf:network_alone" not in corrected.metadata
     checkpoint, landmarks = str(given / "lambert.safetensors"), str(given / "astronaut.json")
-    stack = [
-        "predict-olat",
-        str(PHOTO),
-        "--lights",
-        "4",
-        "--frame",
-        "uv",
-        "--landmarks",
-        landmarks,
-        "-o",
-        str(tmp_path / "olat"),
-    ]
-    assert main(["--checkpoint", checkpoint, *stack, "--network-alone"]) == 0
+    olat = ["predict-olat", str(PHOTO), "--landmarks", landmarks, "-o", str(tmp_path / "olat")]
+    olat += ["--lights", "4", "--frame", "uv", "--network-alone"]
+    assert main(["--checkpoint", checkpoint, *olat]) == 0
     stack_path = tmp_path / "olat/astronaut_olat.exr"
     assert "facerf:network_alone" in read_olat_header(stack_path).metadata
     assert relight(given, tmp_path / "c", "--light", "1,2", "--network-alone", photo=stack_path) == 1
@@ -426,25 +378,12 @@ def face_sides_of(path: Path) -> float:
 
 
 def test_near_lights_need_the_photo_or_a_pose_of_it(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    given: Path, stack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     near = ["--light", "at=0.6,0,0.4"]
     assert relight(given, tmp_path / "pose", *near, "--pose", "20,0,0") == 0
     left, right = face_sides(tmp_path / "pose/astronaut_light_at_0.6_0_0.4.exr")
     assert right > 1.5 * left
-    fixed = ["--checkpoint", str(given / "lambert.safetensors")]
-    olat = [
-        "predict-olat",
-        str(PHOTO),
-        "--lights",
-        "4",
-        "--frame",
-        "uv",
-        "--landmarks",
-        str(given / "astronaut.json"),
-    ]
-    assert main([*fixed, *olat, "-o", str(tmp_path / "olat")]) == 0
-    stack = tmp_path / "olat/astronaut_olat.exr"
     assert relight(given, tmp_path / "a", *near, photo=stack) == 1
     assert "a stack holds far lights" in capsys.readouterr().err
     assert relight(given, tmp_path / "b", "--light", "from=30,0;size_deg=20", photo=stack) == 0

@@ -9,18 +9,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import all_or_none
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.main import main
-from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
-
-PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+from tests.astronaut import PATH as PHOTO
 
 
 @pytest.fixture(scope="module")
-def landmarks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("landmarks") / "face.json"
-    face = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0]
-    path.write_text(str(face.landmarks_px.tolist()))
-    return path
+def landmarks(given: Path) -> Path:
+    return given / "astronaut.json"
 
 
 def refused(photo: Path, landmarks: Path, output: Path, capsys: pytest.CaptureFixture[str]) -> str:

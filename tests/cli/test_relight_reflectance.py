@@ -18,8 +18,6 @@ from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.files import SHIPPED
 from tests.cli import test_relight as relighting
 
-given = relighting.given  # the fixture
-
 
 @pytest.fixture(autouse=True)
 def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
