@@ -42,6 +42,13 @@ class Sides:
 class Networks:
     """The trained networks, each loaded when it is first needed, and kept on the device."""
 
+    reflectance: ReflectanceNetwork
+    geometry: nn.Module
+    diffuse_sh: DiffuseNetwork  # of the baseline of this name
+    light_features: LightNetwork  # S_f, frozen
+    parsing: ParsingNetwork
+    portrait: PortraitNetwork
+
     def __init__(
         self,
         files: Mapping[str, Path] = SHIPPED,
@@ -57,40 +64,21 @@ class Networks:
             return Networks, (self.files, self.device, self._given)
         return _networks_once, (tuple(self.files.items()), self.device)
 
-    @property
-    def reflectance(self) -> ReflectanceNetwork:
-        """The Reflectance Network."""
-        return self._get("reflectance")
-
-    @property
-    def geometry(self) -> nn.Module:
-        """The Geometry Network."""
-        return self._get("geometry")
-
-    @property
-    def diffuse_sh(self) -> DiffuseNetwork:
-        """The network of the baseline diffuse-sh."""
-        return self._get("diffuse_sh")
-
-    @property
-    def light_features(self) -> LightNetwork:
-        """The feature network S_f, frozen."""
-        return self._get("light_features")
-
-    @property
-    def parsing(self) -> ParsingNetwork:
-        """The Parsing Network."""
-        return self._get("parsing")
-
-    @property
-    def portrait(self) -> PortraitNetwork:
-        """The Portrait Network."""
-        return self._get("portrait")
+    def __getattr__(self, name: str) -> Any:
+        if name not in SHIPPED:
+            raise AttributeError(f"there is no network {name}")
+        if name not in self._loaded:
+            path = self.files[name]
+            network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
+            if name in _CHECKS:
+                _CHECKS[name](path, network)
+            self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
+        return self._loaded[name]
 
     def load(self, names: Iterable[str]) -> None:
         """Load networks by name; raises InputError for a file that is damaged or of another version."""
         for name in names:
-            self._get(name)
+            getattr(self, name)
 
     def with_networks(self, **networks: nn.Module) -> "Networks":
         """Return the same networks with others in place of some."""
@@ -104,15 +92,6 @@ class Networks:
         """File and SHA-256 of each network that was needed so far, for reports."""
         names = [name for name in SHIPPED if name in self._loaded]
         return {name: described_file(self.files[name]) for name in names}
-
-    def _get(self, name: str) -> Any:
-        if name not in self._loaded:
-            path = self.files[name]
-            network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
-            if name in _CHECKS:
-                _CHECKS[name](path, network)
-            self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
-        return self._loaded[name]
 
 
 @cache
