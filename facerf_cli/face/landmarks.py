@@ -7,7 +7,7 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_landmarks
 from facerf_cli.files.documents import Document, Points68, checked
-from facerf_cli.files.texts import read_json, require_regular
+from facerf_cli.files.texts import read_json, read_text, require_regular
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import strips
 
@@ -67,14 +67,11 @@ class _LandmarksDocument(Document):
 
 def _read_pts(path: Path) -> np.ndarray:
     try:
-        with path.open("rb") as stream:
-            _, opening, rest = stream.read(_MAX_BYTES).decode().partition("{")
+        _, opening, rest = read_text(path, _MAX_BYTES, _ADVICE).partition("{")
         body, closing, _ = rest.partition("}")
         if not opening or not closing:
             raise ValueError("it has no points between { and }")
         rows = [[float(token) for token in line.split()] for line in body.splitlines() if line.strip()]
         return np.array(rows, np.float64) - _PTS_FIRST_PIXEL
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); {_ADVICE}") from None
     except ValueError as error:
         raise InputError(f"{path}: no landmarks ({error}); {_ADVICE}") from None
