@@ -17,6 +17,8 @@ from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.field import photo_evidence, weighted_sum
 from facerf_cli.relighting.models import Models
+from facerf_cli.run import memory
+from facerf_cli.work.plan import require_face
 from tests import astronaut
 
 
@@ -183,3 +185,12 @@ def test_sums_of_lights_do_not_depend_on_how_they_are_batched() -> None:
     olats, weights = torch.rand(7, 3, 4, 5, generator=generator), torch.rand(2, 7, 3, generator=generator)
     whole = torch.einsum("mlc,lcij->mcij", weights, olats)
     torch.testing.assert_close(weighted_sum(torch.split(olats, 3), weights), whole)
+
+
+def test_a_face_beyond_the_budget_is_refused(models: Models, head: Head) -> None:
+    size, unit = (512, 512), 1 << 20
+    memory.set_limit(64 * unit)
+    require_face(models.face, head.fit, size)
+    memory.set_limit(34 * unit)
+    with pytest.raises(InputError, match=r"a face of \d+ x \d+ pixels: needs .* of memory.*smaller photo"):
+        require_face(models.face, head.fit, size)

@@ -3,12 +3,10 @@
 from pathlib import Path
 
 import pytest
-from skimage.data import astronaut
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import Outcome, _Work
 from facerf_cli.batch.settings import Settings
-from facerf_cli.files.images import write_display
 from facerf_cli.main import global_options_first, main
 from facerf_cli.run import memory
 
@@ -30,17 +28,6 @@ def test_a_photo_beyond_the_budget_is_refused_before_it_is_decoded(
     )
     assert main([*line, "--memory", "0.8"]) == 1 and "cut short" in said(capsys)
     assert main([*line, "--memory", "inf"]) == 2 and main([*line, "--memory", "0"]) == 2
-
-
-def test_a_face_beyond_the_budget_is_refused_by_the_photos_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_display(tmp_path / "me.png", astronaut() / 255.0)
-    monkeypatch.setattr("facerf_cli.work.plan._STRIP_BYTES", 1 << 30)
-    line = ["relight", str(tmp_path / "me.png"), "-o", str(tmp_path / "out"), "--light", "40,20"]
-    assert main([*line, "--memory", "1"]) == 1
-    text = said(capsys)
-    assert "me.png: a face of " in text and "give --memory 1.01 or a smaller photo" in text
 
 
 def test_jobs_have_a_share_each_unless_one_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
