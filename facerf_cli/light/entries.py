@@ -99,12 +99,13 @@ def _lines(path: Path) -> list[str]:
 
 
 @dataclass(frozen=True)
-class GivenLight:
-    """A light that an entry gives: one, or in a sweep one for each frame. A light with a name is a layer."""
+class LitImage:
+    """Lights that shine together in one image, or in each of numbered frames; names are those of layers."""
 
-    name: str | None
-    frames: tuple[StudioLight, ...]
-    sweeps: bool = False
+    frames: tuple[tuple[StudioLight, ...], ...]
+    is_numbered: bool = False
+    names: tuple[str, ...] = ()
+    name: str = ""  # of the image; '' while others may join its lights
 
 
 def read_keys(text: str) -> dict[str, str] | None:
@@ -122,7 +123,7 @@ def read_keys(text: str) -> dict[str, str] | None:
     return {key: value.strip() for key, (_, _, value) in zip(keys, pairs, strict=True)}
 
 
-def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> GivenLight:
+def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> LitImage:
     """Check the settings of a light and make it; raises UsageError that begins with `where`."""
     if wrong := [key for key in given if key not in KEYS]:
         raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
@@ -147,11 +148,12 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Giv
         size_deg=number("size_deg", "DEG", _SIZE_DEG) or 0.0,
         spot_deg=number("spot", "DEG", _SPOT_DEG),
     )
+    names = () if name is None else (name,)
     if is_far:
         sweeps = any(is_sweep(given.get(key, "")) for key in ("az", "el"))
-        frames = tuple(replace(common, azel_deg=azel_deg) for azel_deg in _directions(given, where))
-        return GivenLight(name, frames, sweeps)
-    return GivenLight(name, (replace(common, at_m=_place(given["at"], where)),))
+        frames = tuple((replace(common, azel_deg=azel_deg),) for azel_deg in _directions(given, where))
+        return LitImage(frames, sweeps, names)
+    return LitImage(((replace(common, at_m=_place(given["at"], where)),),), names=names)
 
 
 def _shown(given: Mapping[str, str]) -> str:
@@ -197,27 +199,17 @@ def _angles(text: str, option: str) -> list[float]:
     return sweep(text, option) if is_sweep(text) else numbers(text, ("DEG or FROM:TO:N",), option)
 
 
-@dataclass(frozen=True)
-class LitImage:
-    """Lights that shine together in one image, or in each of numbered frames; names are those of layers."""
-
-    name: str
-    frames: tuple[tuple[StudioLight, ...], ...]
-    is_numbered: bool
-    names: tuple[str, ...]
-
-
 def lit_images(entries: Sequence[str]) -> list[LitImage]:
     """Parse all `--light` entries; lights with names share one image, the last."""
     images: list[LitImage] = []
-    named: list[GivenLight] = []
+    named: list[LitImage] = []
     for text in entries:
         if (path := _rig_path(text)) is not None:
             images.append(_rig(path))
         elif (settings := read_keys(text)) is not None:
             name = settings.pop("name", None)
             light = light_by_keys(settings, "--light", name)
-            if light.name is None:
+            if not light.names:
                 images.append(_together(_file_name(text), [light], "--light"))
             else:
                 named.append(light)
@@ -226,7 +218,7 @@ def lit_images(entries: Sequence[str]) -> list[LitImage]:
         else:
             images.append(_short(text))
     if named:
-        all_names = "+".join(light.name or "" for light in named)
+        all_names = "+".join(name for light in named for name in light.names)
         images.append(_together(f"light_{all_names}", named, "--light"))
     return images
 
@@ -261,20 +253,20 @@ def _rig(path: Path) -> LitImage:
         raise InputError(str(error)) from None
 
 
-def _together(image: str, lights: Sequence[GivenLight], where: str) -> LitImage:
+def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     """Lights in one image; those that do not sweep shine in every frame of those that do."""
-    names = tuple(light.name for light in lights if light.name is not None)
+    names = tuple(name for light in lights for name in light.names)
     for name in names:
         if not _NAME.fullmatch(name) or names.count(name) > 1:
             raise UsageError(f"{where} {name!r}: give each light a name of its own, letters and digits")
-    counts = {len(light.frames) for light in lights if light.sweeps} or {1}
+    counts = {len(light.frames) for light in lights if light.is_numbered} or {1}
     if len(counts) > 1:
         raise UsageError(f"{where} sweeps of {min(counts)} and {max(counts)} frames; give one N")
     frames = tuple(
-        tuple(light.frames[number if light.sweeps else 0] for light in lights)
+        tuple(one for light in lights for one in light.frames[number if light.is_numbered else 0])
         for number in range(max(counts))
     )
-    return LitImage(image, frames, any(light.sweeps for light in lights), names)
+    return LitImage(frames, any(light.is_numbered for light in lights), names, image)
 
 
 def _short(text: str) -> LitImage:
@@ -282,13 +274,13 @@ def _short(text: str) -> LitImage:
     parts = [part for part in text.split(";") if part.strip()] or [""]
     given = [azel(part, _FORMS, "--light") for part in parts]
     name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
-    return _together(f"light_{name}", [GivenLight(None, (_far(values),)) for values in given], "--light")
+    return _together(f"light_{name}", [LitImage(((_far(values),),)) for values in given], "--light")
 
 
-def _short_named(part: str) -> GivenLight:
+def _short_named(part: str) -> LitImage:
     """Parse `NAME=az,el[,r,g,b]`."""
     name, _, text = part.partition("=")
-    return GivenLight(name.strip(), (_far(azel(text, _FORMS, "--light")),))
+    return LitImage(((_far(azel(text, _FORMS, "--light")),),), names=(name.strip(),))
 
 
 def _far(values: Sequence[float]) -> StudioLight:
