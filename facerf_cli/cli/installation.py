@@ -76,8 +76,8 @@ def as_screen(facts: Facts) -> str:
 
 def _rows(facts: Facts) -> Iterator[tuple[str, str, str]]:
     """Yield section, part and text of each row; a section's name stands in its first row only."""
-    own = facts["facerf"]
-    yield "facerf", "", f"{own['version']}, Python {own['python']}, {own['system']}"
+    facerf = facts["facerf"]
+    yield "facerf", "", f"{facerf['version']}, Python {facerf['python']}, {facerf['system']}"
     yield "packages", "", "  ".join(_whole(f"{name} {found}") for name, found in facts["packages"].items())
     for command in facts["add"]:
         yield "", "", f"to add what is missing: {_whole(command)}"
@@ -135,8 +135,8 @@ def read_config(path: Path, group: Any) -> dict[str, Any]:
         tables = read_toml(path, _LIMIT_BYTES, too_long, "mend it")
     except InputError as error:
         raise UsageError(f"--config {error}") from None
-    own = tables.pop(GLOBAL, {})
-    return _checked(path, GLOBAL, own, group) | _by_verb(path, "", tables, group)
+    of_all = tables.pop(GLOBAL, {})
+    return _checked(path, GLOBAL, of_all, group) | _by_verb(path, "", tables, group)
 
 
 def _by_verb(path: Path, above: str, tables: Mapping[str, Any], group: Any) -> dict[str, Any]:
@@ -210,9 +210,9 @@ def config(
     defaults = []
     for parameter in _options(command):
         if parameter.name in given:
-            print(f"{parameter.opts[0]} = {_shown(given[parameter.name])}  ({source})")
+            print(f"{parameter.opts[0]} = {_as_text(given[parameter.name])}  ({source})")
         elif parameter.name != "help" and not parameter.required:
-            defaults.append(f"# {parameter.opts[0]} = {_shown(parameter.get_default(context))}")
+            defaults.append(f"# {parameter.opts[0]} = {_as_text(parameter.get_default(context))}")
     print("\n".join(["# not set, and so by default:", *defaults]))
 
 
@@ -221,8 +221,8 @@ def _print_given(tables: Mapping[str, Any], source: str, above: str) -> None:
         if isinstance(value, Mapping):
             _print_given(value, source, f"{above}{name} ")
         else:
-            print(f"{above}--{name.strip('_').replace('_', '-')} = {_shown(value)}  ({source})")
+            print(f"{above}--{name.strip('_').replace('_', '-')} = {_as_text(value)}  ({source})")
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return "not set" if value is None or value == () else str(value)

@@ -129,12 +129,12 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
         raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
     is_far = bool(given.keys() & {"from", "az", "el"})
     if is_far == ("at" in given) or ("from" in given and given.keys() & {"az", "el"}):
-        raise UsageError(f"{where} {_shown(given)}: give one of at=X,Y,Z, from=AZ,EL, or az and el")
+        raise UsageError(f"{where} {_typed(given)}: give one of at=X,Y,Z, from=AZ,EL, or az and el")
     if "size_deg" in given and given.get("from") == _AROUND:
-        raise UsageError(f"{where} {_shown(given)}: a light from all around has no size; leave size_deg out")
+        raise UsageError(f"{where} {_typed(given)}: a light from all around has no size; leave size_deg out")
     if wrong := sorted(given.keys() & ({"size", "spot"} if is_far else {"size_deg"})):
         right = "is of near lights (at=); a far one has size_deg" if is_far else "is of far lights; give size"
-        raise UsageError(f"{where} {_shown(given)}: {wrong[0]} {right}")
+        raise UsageError(f"{where} {_typed(given)}: {wrong[0]} {right}")
 
     def number(key: str, form: str, limits: tuple[float, float]) -> float | None:
         return _numbers(given[key], form, limits, f"{where} {key}")[0] if key in given else None
@@ -156,7 +156,7 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
     return LitImage(((replace(common, at_m=_place(given["at"], where)),),), names=names)
 
 
-def _shown(given: Mapping[str, str]) -> str:
+def _typed(given: Mapping[str, str]) -> str:
     return repr(";".join(f"{key}={value}" for key, value in given.items()))
 
 
@@ -187,7 +187,7 @@ def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float
     azimuths, elevations = (_angles(given.get(key, "0"), f"{where} {key}") for key in ("az", "el"))
     count = max(len(azimuths), len(elevations))
     if min(len(azimuths), len(elevations)) not in (1, count):
-        raise UsageError(f"{where} {_shown(given)}: az and el sweep in another number of frames; give one N")
+        raise UsageError(f"{where} {_typed(given)}: az and el sweep in another number of frames; give one N")
     pairs = [(azimuths[k % len(azimuths)], elevations[k % len(elevations)]) for k in range(count)]
     for pair in pairs:
         azel(f"{pair[0]},{pair[1]}", ("AZ,EL",), where)

@@ -119,21 +119,16 @@ def collect_setups(
     rotations = parse_rotations(rotate)
     words = [entry for entry in envmaps if entry.startswith(DRAWN)]
     paths = [path for entry in envmaps if entry not in words for path in _expand_glob(entry)]
-    setups = [
-        LightSetup(drawn.name + turn, number, drawn, degrees)
-        for drawn in drawn_maps(words, seed)
-        for turn, number, degrees in rotations
+    files = collect_items(paths, output, MAP_SUFFIXES) if paths else []
+    short = map(split_frame, _short_names(files))
+    maps: list[tuple[str, str, Path | DrawnMap | PhotoLight]] = [
+        *((drawn.name, "", drawn) for drawn in drawn_maps(words, seed)),
+        *((name, frame, file.input_path) for (name, frame), file in zip(short, files, strict=True)),
+        *((photo.name, "", photo) for photo in lit),
     ]
-    maps = collect_items(paths, output, MAP_SUFFIXES) if paths else []
-    for item, short in zip(maps, _short_names(maps), strict=True):
-        name, frame = split_frame(short)
-        setups += [
-            LightSetup(name + turn, frame + number, item.input_path, degrees)
-            for turn, number, degrees in rotations
-        ]
-    setups += [
-        LightSetup(photo.name + turn, number, photo, degrees)
-        for photo in lit
+    setups = [
+        LightSetup(name + turn, frame + number, envmap, degrees)
+        for name, frame, envmap in maps
         for turn, number, degrees in rotations
     ]
     for image in lit_images(sources.light or ()):

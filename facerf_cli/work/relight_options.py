@@ -341,8 +341,8 @@ class Relight:
 
     def leader_of(self, item: Item) -> Item | None:
         """The photo whose exposure an item shares; None without groups."""
-        own = self._group(item)
-        return next((leader for leader in self.leaders if self._group(leader) == own), None)
+        group = self._group(item)
+        return next((leader for leader in self.leaders if self._group(leader) == group), None)
 
     def _group(self, item: Item) -> Path:
         if self.exposure_group == "folder":
@@ -351,14 +351,14 @@ class Relight:
 
     def refuse_meeting(self, items: Sequence[Item]) -> None:
         """Raise UsageError where two images would have one path, as a --name may make them."""
-        seen: set[Path] = set()
+        paths: set[Path] = set()
         for item in items:
             for path in self.outputs_of(item):
-                if path in seen:
+                if path in paths:
                     raise UsageError(
                         f"{item.input_path}: {path} would be the name of two images; give --name more fields"
                     )
-                seen.add(path)
+                paths.add(path)
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of every output, which holds the light of its own setup alone."""
