@@ -108,10 +108,9 @@ def prepare_capture(
     capture = source.opened()
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
-    networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     if checking.checks == "only" and not batch.dry_run:
-        checks = CheckOnly(source.opened, networks)
-        return check_all(checks, items, batch, checking.strict, settings)
+        return check_all(CheckOnly(source.opened), items, batch, checking.strict, settings)
+    networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     model_sha256 = _model_digest(content.face_model)
     made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
     if not overwrite:
