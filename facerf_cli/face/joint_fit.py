@@ -179,9 +179,9 @@ def _fit_found(
     problem = Problem(basis, target, _UNIT_CAMERA, trust.sqrt() / noise, settings.huber)
     # Each camera alone gives a start, in its own space; the one of least cost over all cameras is taken.
     parts = (alone.rotation, alone.translation_m, alone.coordinates)
-    states = zip(*(part.split(1) for part in parts), strict=True)
+    states = [FitState(*(part[i : i + 1] for part in parts)) for i in range(len(cameras))]
     starts = [
-        (_Joint.seen_from(camera, cameras, problem), FitState(*state))
+        (_Joint.seen_from(camera, cameras, problem), state)
         for camera, state in zip(cameras, states, strict=True)
     ]
     costs = torch.cat([joint.cost(head, joint.residuals(head)) for joint, head in starts])

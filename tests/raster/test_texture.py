@@ -111,12 +111,7 @@ def test_unwrap_undoes_render(scale: int, texture_side: int) -> None:
     found, visible = unwrap(image.permute(2, 0, 1), vertices, TRIANGLES, camera, texture_side)
     assert found.shape == texture.shape and visible.shape == texture.shape[1:]
     seen = visible > 0.9
-    seen[:2], seen[-2:], seen[:, :2], seen[:, -2:] = (
-        False,
-        False,
-        False,
-        False,
-    )  # these mix with the background
+    seen[[0, 1, -2, -1]] = seen[:, [0, 1, -2, -1]] = False  # these mix with the background
     assert 0.5 < seen.float().mean() < 0.9
     assert (found - texture)[:, seen].abs().mean() < 0.01
     assert (found - texture)[:, seen].abs().quantile(0.99) < 0.05
@@ -133,13 +128,13 @@ def test_a_texel_averages_over_the_pixels_that_it_covers() -> None:
 
 def test_texels_behind_the_nose_are_hidden_and_those_before_are_not() -> None:
     vertices = head((25.0, 0, 0))
-    _, visible = unwrap(torch.ones(3, 220, 300), vertices, TRIANGLES, CAMERA, 128)
-    points = bake_attributes(vertices, SIDE, 128).permute(1, 2, 0)
-    normals = normal_map(vertices, TRIANGLES, 128).permute(1, 2, 0)
+    _, visible = unwrap(torch.ones(3, 220, 300), vertices, TRIANGLES, CAMERA, 96)
+    points = bake_attributes(vertices, SIDE, 96).permute(1, 2, 0)
+    normals = normal_map(vertices, TRIANGLES, 96).permute(1, 2, 0)
     cosine = -(normals * torch.nn.functional.normalize(points, dim=-1)).sum(-1)
     free = first_hit(vertices, points)
     hidden, seen = visible[~free & (cosine > 0.2)], visible[free & (cosine > 0.4)]
-    assert len(hidden) > 100 and len(seen) > 8000
+    assert len(hidden) > 50 and len(seen) > 4500
     # Only along the shadow's rim may the mask be off, by a texel.
     assert (hidden > 0.1).float().mean() < 0.1 and (seen < 0.9).float().mean() < 0.01
     assert visible[cosine < 0.1].max() < 0.01
@@ -180,7 +175,7 @@ def test_unwrap_refuses_an_image_of_another_size() -> None:
         unwrap(torch.ones(3, 300, 220), head(), TRIANGLES, CAMERA, 32)
 
 
-@pytest.mark.parametrize("side", [64, 96, 75])
+@pytest.mark.parametrize("side", [64, 75])
 def test_inpaint_keeps_the_seen_and_fills_the_rest_from_nearby(side: int) -> None:
     texture = torch.ones(3, side, side)
     texture[0, :, side // 2 :] = 5  # left and right differ in red
