@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.fit import FaceFit, fit_to_arrays
+from facerf_cli.face.fit import fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
@@ -67,7 +67,7 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
         if work.frame == "photo":
             header, olats = _of_person(item, image, face, directions, work, tiles)
         else:
-            header, olats = _header(item, face, directions, work), _olats(face, directions, work, tiles)
+            header, olats = _of_face(item, face, directions, work, tiles)
         if work.format == "exr":
             write_olat_stack(stack, header, olats)
         else:
@@ -138,76 +138,57 @@ def _of_person(
     normals = filled(composition.layers(("normal",), first), *size)["normal"]
     header = StackHeader(
         kind="photo",
-        directions=directions.numpy(),
         rotation=head.fit.rotation.numpy(),
         source=photo,
         seen=composition.matte,
         normals=normals,
-        layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(head.fit),
-        metadata=_metadata(item, work),
+        **_about(item, directions, work),
     )
     return header, olats()
 
 
-def _metadata(item: Item, work: PredictOlat) -> dict[str, str | int]:
-    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name())
-    return metadata | ({"facerf:network_alone": 1} if work.network_alone else {})
-
-
-def _olats(
-    face: FittedFace, directions: Tensor, work: PredictOlat, tiles: list[np.ndarray]
-) -> Iterator[Tensor]:
-    """Yield OLATs in batches [l, 3, H, W], textures or images; small images [l, h, w, 3] go to `tiles`."""
-    models = load_models_once(work.photo)
-    large = _uv_and_coverage(face, work)
-    small = _uv_and_coverage(face, work, 2 * _tile_px(len(directions)))
-    olats = predict_olat(
-        models,
-        face.head,
-        directions,
-        rotation_of(work.pose),
-        work.network_alone,
-        prediction_bytes(),
-        work.precision == "bf16",
-    )
-    for textures in olats:
-        tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
-        yield render_face(textures, *large) if work.frame == "face" else textures
-
-
-def _uv_and_coverage(
-    face: FittedFace, work: PredictOlat, side_px: int | None = None
-) -> tuple[Tensor, Tensor]:
-    """`see_face` in the asked pose, by the crop's camera, its image `side_px` wide."""
-    vertices = _posed(face, work).vertices_camera(load_models_once(work.photo).face)
-    return see_face(vertices, crop_camera(side_px or face.fit.crop.size_px))
-
-
-def _posed(face: FittedFace, work: PredictOlat) -> FaceFit:
-    rotation = rotation_of(work.pose)
-    return face.fit if rotation is None else replace(face.fit, rotation=rotation)
-
-
-def _header(item: Item, face: FittedFace, directions: Tensor, work: PredictOlat) -> StackHeader:
-    posed, uv_maps = _posed(face, work), face.head.face
-    source, normals, seen = uv_maps.texture, uv_maps.normals, uv_maps.visible
+def _of_face(
+    item: Item, face: FittedFace, directions: Tensor, work: PredictOlat, tiles: list[np.ndarray]
+) -> tuple[StackHeader, Iterator[Tensor]]:
+    """The header and OLATs [l, 3, H, W] of the face alone, images or textures; small images go to `tiles`."""
+    models, maps, rotation = load_models_once(work.photo), face.head.face, rotation_of(work.pose)
+    posed = face.fit if rotation is None else replace(face.fit, rotation=rotation)
+    vertices, side_px = posed.vertices_camera(models.face), face.fit.crop.size_px
+    large, small = (
+        see_face(vertices, crop_camera(px)) for px in (side_px, 2 * _tile_px(len(directions)))
+    )  # (u, v) and coverage
+    source, normals, seen = maps.texture, maps.normals, maps.visible
     if work.frame == "face":
-        uv, seen = _uv_and_coverage(face, work)
-        turn = face.fit.turn_to(posed.rotation)
-        both = torch.stack([source, torch.einsum("dc,cij->dij", turn, normals)])
-        source, normals = render_face(both, uv, seen)
-    return StackHeader(
+        turned = torch.einsum("dc,cij->dij", face.fit.turn_to(posed.rotation), normals)
+        source, normals = render_face(torch.stack([source, turned]), *large)
+        seen = large[1]
+
+    def olats() -> Iterator[Tensor]:
+        alone, bf16 = work.network_alone, work.precision == "bf16"
+        for textures in predict_olat(
+            models, face.head, directions, rotation, alone, prediction_bytes(), bf16
+        ):
+            tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
+            yield render_face(textures, *large) if work.frame == "face" else textures
+
+    header = StackHeader(
         kind="image" if work.frame == "face" else "texture",
-        directions=directions.numpy(),
         rotation=posed.rotation.numpy(),
         source=source.permute(1, 2, 0).numpy(),
         seen=seen.numpy(),
         normals=normals.permute(1, 2, 0).numpy(),
-        layout_version=LAYOUT_VERSION,
         fit=fit_to_arrays(face.fit),
-        metadata=_metadata(item, work),
+        **_about(item, directions, work),
     )
+    return header, olats()
+
+
+def _about(item: Item, directions: Tensor, work: PredictOlat) -> dict[str, Any]:
+    """Entries of a header that say what the stack is of."""
+    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name())
+    metadata |= {"facerf:network_alone": 1} if work.network_alone else {}
+    return {"directions": directions.numpy(), "layout_version": LAYOUT_VERSION, "metadata": metadata}
 
 
 def _tile_px(lights: int) -> int:
