@@ -12,14 +12,11 @@ from facerf_cli.capture.chart import (
     area_corners,
     centres,
     fit_colours,
-    four_turns,
     homography,
-    is_convex,
     neutral_matrix,
     project,
     published_colours,
     sample,
-    shrunk,
 )
 from facerf_cli.image.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
@@ -122,28 +119,3 @@ def test_noise_and_clipping_are_counted() -> None:
     grey = 1.13 * published_colours()[19, 1]
     assert patches.noise[19] == pytest.approx(0.02 * np.sqrt(grey + 0.01), rel=0.15)
     assert 0.2 < patches.at_white[18] < 0.9 and not patches.at_white[[0, 5, 20]].any()
-
-
-def test_a_patch_outside_the_image_has_no_pixels() -> None:
-    patches = sample(np.ones((20, 30, 3), np.float32), CORNERS)
-    assert patches.counts.min() == 0 and not patches.colours[patches.counts == 0].any()
-
-
-def test_turns_are_clockwise_whichever_way_corners_go() -> None:
-    turns = four_turns(CORNERS)
-    assert [turn[0].tolist() for turn in turns] == CORNERS.tolist()
-    backward = four_turns(CORNERS[::-1])
-    assert {tuple(turn.ravel()) for turn in turns} == {tuple(turn.ravel()) for turn in backward}
-
-
-def test_convex() -> None:
-    assert is_convex(CORNERS) and is_convex(CORNERS[::-1])
-    assert not is_convex(CORNERS[[0, 2, 1, 3]])  # crossed
-    assert not is_convex(np.array([[0.0, 0], [10, 0], [3, 3], [0, 10]])) and not is_convex(np.ones((4, 2)))
-
-
-def test_shrunk_is_the_mean() -> None:
-    image = np.arange(7 * 9 * 3, dtype=np.float32).reshape(7, 9, 3)
-    small, scale = shrunk(image, 3)
-    assert scale == 3 and small.shape == (2, 3, 3)
-    assert small[1, 2] == pytest.approx(image[3:6, 6:9].mean((0, 1)))

