@@ -5,19 +5,30 @@ Both are registered on the orientation of their gradients alone (G. Tzimiropoulo
 scale-invariant image registration with image gradients*, PAMI 2010), so that remaining shading errors count
 little.
 
-**Shifts.** Each frame is registered with its prediction from the frames of neighbouring lights. A pixel is a
-Gaussian process over the light's direction (C. Rasmussen, C. Williams, *Gaussian Processes for Machine
-Learning*, 2006), so that the prediction is the same weighted sum of frames at all pixels (there, equation
-5.12), with cast shadows and highlights. Shifts as small as those measured on still heads are not applied.
+**Shifts.** First the path of a slowly drifting head is fitted to those offsets, which reach far but are
+coarse. Then each frame's own motion is measured against the frames of neighbouring lights. Shifts as small as
+those measured on still heads are not applied.
+
+**Path.** An offset is the sum of the head's path, which bends slowly in the order of the lights; the error of
+the shading model, which is similar under neighbouring lights; and the frame's own motion. Each is a Gaussian
+process (C. Rasmussen, C. Williams, *Gaussian Processes for Machine Learning*, 2006, sections 2.2 and 5.4).
+The size of the path maximises the likelihood of the offsets; on a still head it is 0.
+
+**Own motion.** Each pixel is a Gaussian process over the light's direction. Its prediction of a frame from
+the others is the same weighted sum of frames at all pixels (there, equation 5.12), with cast shadows and
+highlights.
 """
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy import ndimage
+from scipy.linalg import cho_factor, cho_solve
 
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.frames import CameraFrames, read_frames
@@ -32,10 +43,18 @@ _IN_FRONT = 0.3  # cosine of light and camera axis: other lights leave most of t
 _MOVED_PX = 1.0  # synthetic frames without motion are off by 0.2 in the median and by 0.5 at most
 _LEAST_GAIN = 0.1  # of a perfect match: least gain of an offset beyond `_MOVED_PX`
 _FINE_PX, _COARSER = 192, 2  # longest side of the fine frames; fine pixels per coarse one
-_OWN_FRONT = 0.2  # least cosine to the camera's axis; lights behind light only edges
-_OWN_LEVELS = (_COARSER, _COARSER, _COARSER, 1, 1)  # fine pixels per pixel, a registration each
+_PATH_FRONT, _OWN_FRONT = -0.2, 0.2  # least cosines to the camera's axis; lights behind light only edges
+_PATH_ITERATIONS, _OWN_LEVELS = 3, (_COARSER, _COARSER, _COARSER, 1, 1)
 _SHRINK = {_COARSER: 0.1, 1: 0.03}  # ridge of `own_motion`, by fine pixels per pixel
 _LEAST_OWN_PX = 0.6  # in fine pixels; still synthetic faces give up to 0.55
+# Path: the tried standard deviations, in pixels.
+_BENDS = (8.0, 20.0, 50.0)  # frames over which a path bends
+_PATHS_PX = (0.25, 0.5, 1.0, 2.0, 4.0)  # of a path, down and right each
+_NO_PATH = (1.0, 0.0)
+_MODEL_ERRORS_PX, _MODEL_WIDTH = (0.3, 0.6), 0.6  # of the shading model; its reach on the unit sphere
+_OWN_MOTIONS_PX = (0.15, 0.4, 1.0, 2.0)  # of a frame's own motion
+_SURE = 5.0  # least gain in log likelihood of a path; a lower one finds paths in Extended Yale B
+_MOST_FRAMES = 300  # by which the sizes are chosen, at a cost of their cube
 # Prediction of a frame from the frames of neighbouring lights.
 _WIDTH = 0.6  # reach of a light's influence on the unit sphere
 _NOISE = 0.05
@@ -67,11 +86,12 @@ def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
     yield frames.warning("motion", words, frames=int(moved.sum()), worst_px=round(float(worst_px), 2))
 
 
-def measure_motion(frames: CameraFrames, stereo: Stereo) -> Motion:
-    """Measure frames under lights in front against their predictions by photometric stereo."""
+def measure_motion(frames: CameraFrames, stereo: Stereo, least_front: float = _IN_FRONT) -> Motion:
+    """Measure frames against predictions, for lights of a cosine to the camera's axis over `least_front`."""
     predicted = np.zeros(frames.grey.shape)
     predicted[:, stereo.lit] = stereo.predicted(frames.directions)
-    return motion_between(frames.grey, predicted, stereo.lit, frames.directions[:, 2] > _IN_FRONT)
+    front = frames.directions[:, 2] > least_front
+    return motion_between(frames.grey, predicted, stereo.lit, front)
 
 
 def motion_between(seen: np.ndarray, predicted: np.ndarray, mask: np.ndarray, judged: np.ndarray) -> Motion:
@@ -137,30 +157,100 @@ def align_shifts(
 
 def head_motion(frames: CameraFrames) -> np.ndarray:
     """Motion [L, 2] of the head in each frame, in pixels of the frames down and right."""
-    own = np.zeros((len(frames.light_ids), 2))
+    path = _fit_path(frames)
     judged = frames.directions[:, 2] > _OWN_FRONT
     if not judged.any() or fit_stereo(frames) is None:
-        return own
-    weights = weights_of_others(frames.directions)
+        return path
+    own, weights = np.zeros(path.shape), weights_of_others(frames.directions)
     for size in _OWN_LEVELS:
-        grey = _coarser(_moved_back(frames.grey, own), size)
+        grey = _coarser(_moved_back(frames, path + own), size).grey
         predicted = np.tensordot(weights.astype(np.float32), grey, 1)
         found = motion_between(grey, predicted, lit_pixels(grey), judged)
         more = own_motion(weights, found.moved_px, found.trusted, _SHRINK[size])
         own += size * np.where(judged[:, None], more, 0)
         own[judged] -= np.median(own[judged], axis=0)  # a common offset is not motion between frames
-    return np.where((np.hypot(*own.T) > _LEAST_OWN_PX)[:, None], own, 0)
+    return path + np.where((np.hypot(*own.T) > _LEAST_OWN_PX)[:, None], own, 0)
 
 
-def _moved_back(grey: np.ndarray, moved_px: np.ndarray) -> np.ndarray:
-    pairs = zip(grey, moved_px, strict=True)
-    return np.stack(
-        [ndimage.shift(image, -by, order=1, mode="nearest") if by.any() else image for image, by in pairs]
-    )
+def _fit_path(frames: CameraFrames) -> np.ndarray:
+    path = np.zeros((len(frames.light_ids), 2))
+    for _ in range(_PATH_ITERATIONS):
+        view = _coarser(_moved_back(frames, path), _COARSER)
+        stereo = fit_stereo(view)
+        if stereo is None:
+            return path
+        found = measure_motion(view, stereo, _PATH_FRONT)
+        path = head_path(path + _COARSER * found.moved_px, found.trusted, frames.directions)
+        if not path.any():
+            return path
+    return path
 
 
-def _coarser(grey: np.ndarray, size: int) -> np.ndarray:
-    return F.avg_pool2d(torch.from_numpy(grey)[:, None], size)[:, 0].numpy()
+def _moved_back(frames: CameraFrames, moved_px: np.ndarray) -> CameraFrames:
+    pairs = zip(frames.grey, moved_px, strict=True)
+    grey = [ndimage.shift(image, -by, order=1, mode="nearest") if by.any() else image for image, by in pairs]
+    return replace(frames, grey=np.stack(grey) if grey else frames.grey)
+
+
+def _coarser(frames: CameraFrames, size: int) -> CameraFrames:
+    if size == 1 or not len(frames.grey):
+        return frames
+    grey = F.avg_pool2d(torch.from_numpy(frames.grey)[:, None], size)[:, 0].numpy()
+    return replace(frames, grey=grey, scale=frames.scale * size)
+
+
+def head_path(moved_px: np.ndarray, trusted: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Fit the head's path [L, 2] at all frames to the offsets [L, 2] of the `trusted` [L] ones."""
+    rows = np.flatnonzero(trusted)
+    if not len(rows):
+        return np.zeros(moved_px.shape)
+    few = rows[:: max(math.ceil(len(rows) / _MOST_FRAMES), 1)]
+    near = _model_correlation(directions[few])
+
+    def likeliest(paths: Iterable[tuple[float, float]]) -> tuple[float, _PathModel]:
+        errors = list(product(_MODEL_ERRORS_PX, _OWN_MOTIONS_PX))
+        tries = [_PathModel(*path, *error) for path in paths for error in errors]
+        found = [_log_likelihood(model.covariance(few, near), moved_px[few]) for model in tries]
+        return max(found), tries[int(np.argmax(found))]
+
+    still, _ = likeliest([_NO_PATH])
+    best, model = likeliest(product(_BENDS, _PATHS_PX))
+    if best <= still + _SURE:
+        return np.zeros(moved_px.shape)
+    covariance = model.covariance(rows, _model_correlation(directions[rows]))
+    shared = model.path_covariance(np.arange(len(trusted))[:, None] - rows)
+    return shared @ cho_solve(cho_factor(covariance), moved_px[rows])
+
+
+@dataclass(frozen=True)
+class _PathModel:
+    """Standard deviations in pixels of the parts of an offset, and the frames over which the path bends."""
+
+    frames: float
+    path_px: float
+    model_px: float
+    own_px: float
+
+    def path_covariance(self, apart: np.ndarray) -> np.ndarray:
+        """Covariance of the path at frames that are `apart` in the order of the lights."""
+        return self.path_px**2 * np.exp(-(apart**2) / (2 * self.frames**2))
+
+    def covariance(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Covariance [N, N] of the offsets of frames [N]; `near` [N, N] correlates the model's errors."""
+        shared = self.path_covariance(rows[:, None] - rows)
+        return shared + self.model_px**2 * near + self.own_px**2 * np.eye(len(rows))
+
+
+def _model_correlation(directions: np.ndarray) -> np.ndarray:
+    """Correlation [N, N] of the shading model's errors under lights from directions [N, 3]."""
+    return np.exp((directions @ directions.T - 1) / _MODEL_WIDTH**2)
+
+
+def _log_likelihood(covariance: np.ndarray, seen: np.ndarray) -> float:
+    """Log likelihood of two columns of offsets [N, 2], up to a constant."""
+    factor = cho_factor(covariance)
+    log_volume = 2 * np.log(np.diag(factor[0])).sum()
+    return float(-0.5 * (seen * cho_solve(factor, seen)).sum() - log_volume)
 
 
 def weights_of_others(directions: np.ndarray) -> np.ndarray:

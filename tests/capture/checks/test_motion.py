@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from facerf_cli.capture.capture import shift_image
-from facerf_cli.capture.checks.motion import align_shifts, with_alignment
+from facerf_cli.capture.checks.motion import align_shifts, head_path, with_alignment
 from facerf_cli.capture.checks.shading import parabola_vertex
 from facerf_cli.capture.stage_json import read_capture
 from tests.capture.checks.egg_stage import CAMERA, IDS, SUBJECT, directions, images, write_stage
@@ -86,3 +86,22 @@ def test_the_vertex_of_a_parabola_that_is_sampled_unevenly(sign: int) -> None:
     assert parabola_vertex(x, y, 2) == pytest.approx(1.3)
     assert parabola_vertex(x, y, 0) == 0.0 and parabola_vertex(x, y, 3) == 3.0
     assert parabola_vertex(x, np.ones(4), 2) == 1.5
+
+
+def test_a_path_is_told_from_errors_of_shading_and_from_jumps() -> None:
+    """Errors are the same under neighbouring lamps, a path bends slowly in the order of the list."""
+    generator, turn = np.random.default_rng(0), np.arange(120) * 2.399963
+    front = np.linspace(0.95, -0.9, 120)
+    flat = np.sqrt(1 - front**2)
+    lamps = np.stack([flat * np.cos(turn), flat * np.sin(turn), front], 1)
+    shading = 0.5 * lamps[:, :2] + generator.normal(size=(120, 2)) * 0.2
+    path = 2 * np.stack([np.sin(np.arange(120) / 20), np.cos(np.arange(120) / 25)], 1)
+    jumps = np.zeros((120, 2))
+    jumps[::9] = 5 * generator.normal(size=(14, 2))
+    told = lamps[:, 2] > -0.2
+    assert not head_path(shading, told, lamps).any()
+    assert not head_path(shading + jumps, told, lamps).any()
+    listed = np.argsort(lamps[:, 0])  # then errors of shading bend slowly, too
+    assert not head_path(shading[listed], told[listed], lamps[listed]).any()
+    off = np.hypot(*(head_path(shading + path, told, lamps) - path).T)
+    assert off[told].mean() < 0.4 < np.hypot(*path.T).mean() and off[~told][:10].max() < 1.0
