@@ -9,9 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-# Panels of a verb's options in its help, in this order, after those of its own. What must be given, --output
-# and --help have none: they stand first, under Options.
-LIGHT, IMAGE, FACE, METHOD, BATCH = PANELS = ("Light", "Image", "Face", "Method", "Batch")
+# Panels of a verb's options in its help, in this order, after others. What must be given, --output and --help
+# have none: they stand first, under Options.
+LIGHT, IMAGE, FACE, METHOD, BATCH = "Light", "Image", "Face", "Method", "Batch"
+RUN, DATA, LENGTH, LOSSES, SPEED = "The run", "Data", "Length", "Losses and ablations", "Speed"
+METHODS, MEASURES = "Methods", "Measures"
+PANELS = (RUN, DATA, METHODS, MEASURES, LENGTH, LOSSES, SPEED, LIGHT, IMAGE, FACE, METHOD, BATCH)
 
 
 @dataclass(frozen=True)

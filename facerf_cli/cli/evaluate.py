@@ -9,10 +9,8 @@ import typer
 
 from facerf_cli.cli.options import EPILOG, HELP_NAMES, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
-from facerf_cli.option import Only, Without
+from facerf_cli.option import DATA, METHODS, Only, Without
 from facerf_cli.work.evaluation_settings import (
-    DATA,
-    METHODS,
     EvaluateOptions,
     PairsOptions,
     SplitOptions,

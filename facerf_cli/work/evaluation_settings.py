@@ -10,10 +10,7 @@ from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation import folder_name
-from facerf_cli.option import option
-
-# Panels of a protocol's options in its help.
-DATA, METHODS, MEASURES = "Data", "Methods", "Measures"
+from facerf_cli.option import DATA, MEASURES, METHODS, option
 
 
 @dataclass(frozen=True)

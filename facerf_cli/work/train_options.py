@@ -8,11 +8,10 @@ from typing import Any, get_args
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
-from facerf_cli.option import option
+from facerf_cli.option import DATA, LENGTH, LOSSES, RUN, SPEED, option
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
 from facerf_cli.work.photo_options import Geometry
 
-_RUN, _DATA, _LENGTH, _LOSSES, _SPEED = "The run", "Data", "Length", "Losses and ablations", "Speed"
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 _DEFAULT_TIME = "2h"
 
@@ -36,13 +35,13 @@ class TrainOptions:
 
     settings: Settings
     output: Path = option(
-        Path(), "Write the run to this folder.", "DIR", flags=("--output", "-o"), panel=_RUN, required=True
+        Path(), "Write the run to this folder.", "DIR", flags=("--output", "-o"), panel=RUN, required=True
     )
     preset: Preset = option(
         "default",
         "Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or small ones "
         "for trials (tiny).",
-        panel=_RUN,
+        panel=RUN,
     )
     form: str = option(
         "default",
@@ -50,7 +49,7 @@ class TrainOptions:
         "NAME",
         shown_default="paper with --preset paper, else default",
         typed=str | None,
-        panel=_RUN,
+        panel=RUN,
     )
     stage: Stage = option(
         "reflectance",
@@ -58,24 +57,24 @@ class TrainOptions:
         "STAGE",
         shown_default="joint with --preset paper, else reflectance",
         typed=Stage | None,
-        panel=_RUN,
+        panel=RUN,
     )
     resume: bool = option(
-        False, "Continue the run in DIR from its last save; give the same options.", panel=_RUN
+        False, "Continue the run in DIR from its last save; give the same options.", panel=RUN
     )
     start_from: Path | None = option(
         None,
         "Start from a checkpoint; networks that the stage does not train are copied.",
         "FILE",
         shown_default="none",
-        panel=_RUN,
+        panel=RUN,
     )
     dataset: Path | None = option(
         None,
         "Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.",
         "DIR",
         shown_default="synthetic heads",
-        panel=_DATA,
+        panel=DATA,
     )
     texture_size: int | None = option(
         None,
@@ -85,75 +84,73 @@ class TrainOptions:
         shown_default="128, joint 256; with --preset paper 512",
         least=32,
         most=1024,
-        panel=_DATA,
+        panel=DATA,
     )
     photos: Path | None = option(
         None,
         "Train on photos of faces, too, in a fifth of the batches of the stage joint.",
         "DIR",
         shown_default="none",
-        panel=_DATA,
+        panel=DATA,
     )
     heads_from: str = option(
         "builtin",
         "Draw synthetic heads from this face model; of whole people, from several with commas.",
         "NAME|PATH",
-        panel=_DATA,
+        panel=DATA,
     )
     fit_with: str = option(
-        "builtin", "Fit this face model to the heads; a dataset's own model.", "NAME|PATH", panel=_DATA
+        "builtin", "Fit this face model to the heads; a dataset's own model.", "NAME|PATH", panel=DATA
     )
     heads: int | None = option(
-        None, "Bake so many synthetic heads.", shown_default="240; tiny 16", least=2, panel=_DATA
+        None, "Bake so many synthetic heads.", shown_default="240; tiny 16", least=2, panel=DATA
     )
     views: int | None = option(
-        None, "Fit so many views of each head.", shown_default="8; tiny 2", least=1, panel=_DATA
+        None, "Fit so many views of each head.", shown_default="8; tiny 2", least=1, panel=DATA
     )
     bank: Path | None = option(
-        None, "Keep baked heads in this folder.", "DIR", shown_default="DIR/bank", panel=_DATA
+        None, "Keep baked heads in this folder.", "DIR", shown_default="DIR/bank", panel=DATA
     )
-    jobs: int = option(
-        2, "Bake or unwrap in so many processes.", flags=("--jobs", "-j"), least=1, panel=_DATA
-    )
+    jobs: int = option(2, "Bake or unwrap in so many processes.", flags=("--jobs", "-j"), least=1, panel=DATA)
     vgg_weights: str | None = option(
         None,
         "Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a file.",
         "imagenet|PATH",
         shown_default="without this loss",
-        panel=_LOSSES,
+        panel=LOSSES,
     )
     appearance_features: Path | None = option(
         None,
         "Use a checkpoint of the stage appearance-features in place of --vgg-weights.",
         "FILE",
         shown_default="without this loss",
-        panel=_LOSSES,
+        panel=LOSSES,
     )
     light_features: Path | None = option(
         None,
         "Add the feature loss on textures, with a checkpoint of the stage light-features.",
         "FILE",
         shown_default="without this loss",
-        panel=_LOSSES,
+        panel=LOSSES,
     )
     without_normals: bool = option(
-        False, "Train the Reflectance Network without normal maps (ablation).", panel=_LOSSES
+        False, "Train the Reflectance Network without normal maps (ablation).", panel=LOSSES
     )
     mean_face: bool = option(
-        False, "Fit poses alone, with the mean face for everyone (ablation).", panel=_LOSSES
+        False, "Fit poses alone, with the mean face for everyone (ablation).", panel=LOSSES
     )
     geometry: Geometry = option(
         "network",
         "Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train the "
         "Reflectance Network alone.",
-        panel=_LOSSES,
+        panel=LOSSES,
     )
     workers: int | None = option(
         None,
         "Draw samples ahead in so many processes.",
         shown_default="1 on a CPU of more than one core, 4 on a GPU",
         least=0,
-        panel=_SPEED,
+        panel=SPEED,
     )
     training: TrainSettings = field(default_factory=TrainSettings)
 
@@ -167,10 +164,10 @@ class PaceOptions:
         "Set the highest learning rate.",
         shown_default=_by_preset(lambda settings: settings.optimizer.learning_rate),
         least=1e-9,
-        panel=_RUN,
+        panel=RUN,
     )
     steps: int | None = option(
-        None, "Stop after so many steps.", shown_default="no limit", least=1, panel=_LENGTH
+        None, "Stop after so many steps.", shown_default="no limit", least=1, panel=LENGTH
     )
     max_time: float | None = option(
         None,
@@ -178,7 +175,7 @@ class PaceOptions:
         "TIME",
         shown_default=f"{_DEFAULT_TIME}; no limit with --steps",
         parse=_seconds,
-        panel=_LENGTH,
+        panel=LENGTH,
     )
     validate_every: int | None = option(
         None,
@@ -186,24 +183,24 @@ class PaceOptions:
         "STEPS",
         shown_default=_by_preset(lambda settings: settings.validate_every),
         least=1,
-        panel=_LENGTH,
+        panel=LENGTH,
     )
     batch: int | None = option(
         None,
         "Use so many samples a step, of all processes together.",
         shown_default=_by_preset(lambda settings: settings.batch),
         least=1,
-        panel=_SPEED,
+        panel=SPEED,
     )
     bf16: bool | None = option(
         None,
         "Train in mixed precision (bfloat16), where the device has instructions for it.",
         flags=("--bf16/--no-bf16",),
         shown_default="on; presets paper and tiny, and --form paper, off",
-        panel=_SPEED,
+        panel=SPEED,
     )
     compile: bool = option(
-        False, "Compile the networks with torch; the first steps take minutes.", panel=_SPEED
+        False, "Compile the networks with torch; the first steps take minutes.", panel=SPEED
     )
 
     def of_run(self, options: TrainOptions) -> TrainSettings:
