@@ -1,16 +1,18 @@
 """Layers lie where the network saw them; others in the photo are left out."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from facerf_cli.image.strips import filled
 from facerf_cli.portrait import segment as module
-from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.parse import Square, SquareView
-from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
+from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
+from facerf_cli.portrait.segment import Segmentation, segment, with_ears, with_outline
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
 
@@ -188,3 +190,118 @@ def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
     ]
     assert 1 - at_chest[0] == pytest.approx(matte, abs=1e-3)
     assert at_chest[CLASSES.index(name)] == pytest.approx(matte, abs=1e-3)
+
+
+EARS, HAIR, SKIN, GLASSES = (class_index(name) for name in ("ears", "hair", "skin", "glasses"))
+
+
+def ears_seen() -> SquareView:
+    """A face 100 pixels large whose ears are upright lines at x 10 and x 90."""
+    points = np.full((LANDMARKS, 2), 50.0)
+    points[0], points[1] = (0, 0), (100, 100)
+    for side, x in (("left", 10.0), ("right", 90.0)):
+        for part, y in (("top", 40.0), ("back", 50.0), ("lobe", 60.0)):
+            points[68 + MORE_LANDMARKS.index(f"{side} ear {part}")] = x, y
+    return replace(seen_of(Square(50, 50, 170), {}), landmarks_px=points)
+
+
+def lifted(shares: dict[str, float], x: float, y: float) -> torch.Tensor:
+    """Shares [C] at a place, of a pixel that had some shares."""
+    classes = torch.zeros(len(CLASSES), 1, 1)
+    for name, share in shares.items():
+        classes[class_index(name)] = share
+    return with_ears(classes, ears_seen(), np.array([[[x, y]]]))[:, 0, 0]
+
+
+@pytest.mark.parametrize("x", [10.0, 90.0])
+def test_a_doubtful_pixel_of_an_ear_becomes_one(x: float) -> None:
+    found = lifted({"ears": 0.35, "skin": 0.45, "hair": 0.2}, x, 47)
+    assert found[EARS] > 0.55 and found.sum() == pytest.approx(1, abs=1e-5)
+    assert found[SKIN] / found[HAIR] == pytest.approx(0.45 / 0.2, rel=1e-4)
+
+
+def test_the_odds_are_multiplied_by_one_factor() -> None:
+    def odds(share: float) -> float:
+        found = float(lifted({"ears": share, "skin": 1 - share}, 10, 50)[EARS])
+        return found / (1 - found) / (share / (1 - share))
+
+    assert odds(0.2) == pytest.approx(odds(0.7), rel=1e-3) and 2 < odds(0.2) < 5
+
+
+def test_far_from_the_ears_nothing_changes() -> None:
+    assert lifted({"ears": 0.4, "skin": 0.6}, 50, 50)[EARS] == pytest.approx(0.4, abs=1e-4)
+    assert lifted({"ears": 0.4, "skin": 0.6}, 10, 90)[EARS] == pytest.approx(0.4, abs=1e-4)
+
+
+def test_sure_hair_and_glasses_stay() -> None:
+    assert lifted({"ears": 0.02, "hair": 0.98}, 10, 50)[HAIR] > 0.9
+    assert lifted({"ears": 0.3, "glasses": 0.7}, 10, 50)[GLASSES] == pytest.approx(0.7)
+
+
+_SIDE, _BORDER, _EXTENT_PX = 64, 40, 50.0
+_UNSURE = slice(_BORDER - 6, _BORDER + 6)  # columns of which the network is unsure
+
+
+def _two_colours() -> Tensor:
+    """A person of one colour on the left, a background of another on the right."""
+    image = torch.tensor([0.7, 0.4, 0.3]).view(3, 1, 1).repeat(1, _SIDE, _SIDE)
+    image[:, :, _BORDER:] = torch.tensor([0.3, 0.5, 0.3]).view(3, 1, 1)
+    return image
+
+
+def _classes_of(person: Tensor) -> Tensor:
+    """Classes of a person of hair and skin in equal parts, of which a share [h, w] is seen."""
+    classes = torch.zeros(len(CLASSES), _SIDE, _SIDE)
+    classes[0] = 1 - person
+    classes[[class_index("hair"), class_index("skin")]] = person / 2
+    return classes
+
+
+def _seen_to_border(share: float) -> Tensor:
+    person = torch.zeros(_SIDE, _SIDE)
+    person[:, :_BORDER], person[:, _UNSURE] = 1, share
+    return _classes_of(person)
+
+
+def test_what_the_network_is_unsure_of_goes_to_the_side_of_its_colours() -> None:
+    for share in (0.3, 0.7):
+        found = 1 - with_outline(_seen_to_border(share), _two_colours(), _EXTENT_PX)[0]
+        assert found[:, :_BORDER].min() > 0.85
+        assert found[:, _BORDER:].max() < 0.15
+
+
+def test_what_the_network_is_sure_of_stays() -> None:
+    classes = _classes_of((torch.arange(_SIDE) < _BORDER + 10).float().expand(_SIDE, -1))
+    torch.testing.assert_close(with_outline(classes, _two_colours(), _EXTENT_PX)[..., 50:], classes[..., 50:])
+
+
+def test_colours_that_both_sides_share_leave_it_to_the_network() -> None:
+    seen = _seen_to_border(0.3)
+    even = torch.full((3, _SIDE, _SIDE), 0.5)
+    middle = with_outline(seen, even, _EXTENT_PX)[0, :, _BORDER - 1 : _BORDER + 1]
+    torch.testing.assert_close(middle, seen[0, :, _BORDER - 1 : _BORDER + 1], atol=0.02, rtol=0)
+
+
+def test_classes_sum_to_1_and_share_the_person_as_before() -> None:
+    found = with_outline(_seen_to_border(0.7), _two_colours(), _EXTENT_PX)
+    torch.testing.assert_close(found.sum(0), torch.ones(_SIDE, _SIDE))
+    torch.testing.assert_close(found[class_index("hair")], found[class_index("skin")])
+
+
+def test_without_sure_pixels_of_both_sides_nothing_changes() -> None:
+    for share in (0.0, 0.5, 1.0):
+        classes = _classes_of(torch.full((_SIDE, _SIDE), share))
+        torch.testing.assert_close(with_outline(classes, _two_colours(), _EXTENT_PX), classes)
+
+
+def test_colours_add_no_islands() -> None:
+    classes, image = _seen_to_border(0.3), _two_colours()
+    island = slice(28, 32), slice(56, 60)
+    image[:, *island] = image[:, 0, 0].view(3, 1, 1)
+    classes[:, *island] = _classes_of(torch.full((_SIDE, _SIDE), 0.3))[:, *island]
+    found = 1 - with_outline(classes, image, _EXTENT_PX)[0]
+    assert found[island].max() <= 0.3
+    image[:, 28:32, :60] = image[:, 0, 0].view(3, 1, 1)
+    classes[:, 28:32, _BORDER:60] = _classes_of(torch.full((_SIDE, _SIDE), 0.3))[:, 28:32, _BORDER:60]
+    found = 1 - with_outline(classes, image, _EXTENT_PX)[0]
+    assert found[island].min() > 0.85  # a strand of hair
