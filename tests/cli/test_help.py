@@ -1,6 +1,9 @@
 """The help: verbs in the order of a day, options in panels, texts of a line or two at any width."""
 
+import shutil
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,6 +25,7 @@ def commands() -> Iterator[tuple[str, Any]]:
 
 
 COMMANDS = dict(commands())
+MAN = Path(__file__).parents[2] / "man"
 
 
 def test_the_order_is_that_of_a_day(capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,3 +76,26 @@ def test_the_longest_help_is_under_160_lines(
     monkeypatch.setenv("COLUMNS", "100")
     assert main(["relight", "--help"]) == 0
     assert 60 < len(capsys.readouterr().out.splitlines()) < 160
+
+
+def test_man_is_in_step_with_the_app() -> None:
+    assert {path.name: path.read_text() for path in MAN.glob("*.1")} == manual.pages(), "run `make man`"
+
+
+def test_a_page_that_has_no_verb_any_more_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "facerf-gone.1").touch()
+    manual.main(["man", str(tmp_path)])
+    assert {path.name for path in tmp_path.iterdir()} == set(manual.pages())
+
+
+def test_hyphens_and_backslashes_and_leading_dots_survive_troff() -> None:
+    assert manual._text(".a-b\\c") == "\\&.a\\-b\\ec"
+
+
+@pytest.mark.skipif(shutil.which("groff") is None, reason="groff is not installed")
+@pytest.mark.parametrize("name", sorted(path.name for path in MAN.glob("*.1")))
+def test_groff_has_no_complaint(name: str) -> None:
+    result = subprocess.run(
+        ["groff", "-man", "-Tascii", "-ww", str(MAN / name)], capture_output=True, text=True, check=True
+    )
+    assert result.stderr == "" and "OPTIONS" in result.stdout

@@ -4,7 +4,9 @@ import io
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from facerf_cli.batch.inputs import (
     PHOTO_SUFFIXES,
@@ -15,6 +17,7 @@ from facerf_cli.batch.inputs import (
     split_frame,
 )
 from facerf_cli.errors import UsageError
+from facerf_cli.main import main
 
 
 @pytest.fixture
@@ -157,3 +160,34 @@ def test_frame_numbers_at_the_end_of_a_name() -> None:
     assert split_frame("sky.0012") == ("sky", ".0012")
     assert split_frame("v2.final") == ("v2.final", "")
     assert split_frame("a\nb.01") == ("a\nb", ".01")
+
+
+VERBS = {
+    "predict-olat": "_olat.exr",
+    "fit-geometry": "_mesh.glb",
+    "estimate-light": "_light.exr",
+    "segment": "_segment.exr",
+}
+
+
+@pytest.fixture
+def plates(tmp_path: Path) -> Path:
+    folder = tmp_path / "plates"
+    (folder / "a").mkdir(parents=True)
+    for name in ("a/me.jpg", "a/me.png", "shot.0007.png"):
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(folder / name)
+    return folder
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = [verb, str(plates), "-o", str(plates.parent / "out"), "--dry-run"]
+    assert main([*line, "--name", "{parent}/{stem}_{ext}_{frame:06}"]) == 0
+    said = capsys.readouterr().out
+    for name in ("a/me_jpg", "a/me_png", "plates/shot_png_000007"):
+        assert f" -> {plates.parent / 'out' / name}{VERBS[verb]}\n" in said
+    assert main([*line, "--name", "{dir}/{stem}"]) == 2
+    assert "--name names them alike; give it more fields" in capsys.readouterr().err
+    assert main([*line, "--name", "{stem}_{light}"]) == 2
+    assert "{light} is no field" in capsys.readouterr().err
+    assert main([*line, "--name", "../{stem}"]) == 2
