@@ -125,6 +125,22 @@ def test_words_and_photos_that_do_not_fit(page: dict[str, Any]) -> None:
         facerf.predict_olat(models, head, np.ones((2, 3)))
 
 
+def test_the_person_is_read_once_for_all_lights(
+    page: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models, photo, head = (page[name] for name in ("models", "photo", "head"))
+    facerf.relight(models, photo, head, facerf.Light.single(0, 0), reflectance="field")
+
+    def read_again(*given: object, **more: object) -> None:
+        raise AssertionError("read again")
+
+    monkeypatch.setattr("facerf_cli.api.reflectance_of", read_again)
+    image = facerf.relight(models, photo.copy(), head, facerf.Light.single(20, 0), reflectance="field")
+    assert np.isfinite(image).all()
+    with pytest.raises(AssertionError, match="read again"):  # of another photo, if only a little
+        facerf.relight(models, photo * np.float32(1.0005), head, page["two"], reflectance="field")
+
+
 def test_importing_it_loads_nothing_heavy() -> None:
     code = "import sys, facerf_cli; print('torch' in sys.modules, 'numpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
