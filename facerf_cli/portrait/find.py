@@ -131,8 +131,8 @@ def detect_faces(
         return [Face(*found) for found in detect_landmarks(image_srgb)]
     found: list[SquareView] = []
     for squares in _attempts(image_srgb):
-        seen = [one for one in look(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
-        refined = [again for one in _distinct(seen) if (again := _refined(parsing, image_srgb, one))]
+        views = [one for one in look(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
+        refined = [again for one in _distinct(views) if (again := _refined(parsing, image_srgb, one))]
         found = _distinct([*found, *refined])
         if not everyone and _sure(found):
             break
@@ -143,8 +143,8 @@ def detect_faces(
 def face_near(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
     """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
     check_display(image_srgb)
-    (seen,) = look(parsing, image_srgb, [_around(landmarks_px)])
-    again = _refined(parsing, image_srgb, seen) if _is_face(seen, image_srgb) else None
+    (view,) = look(parsing, image_srgb, [_around(landmarks_px)])
+    again = _refined(parsing, image_srgb, view) if _is_face(view, image_srgb) else None
     return _as_face(again) if again else None
 
 
@@ -159,17 +159,17 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     yield _tiles(image)
 
 
-def _refined(parsing: ParsingNetwork, image: np.ndarray, seen: SquareView) -> SquareView | None:
+def _refined(parsing: ParsingNetwork, image: np.ndarray, view: SquareView) -> SquareView | None:
     """Look twice more at a face, large and upright; None where it turns out to be none."""
     for last in (False, True):
-        seen = look(parsing, image, [_around(seen.landmarks_px[:68])], mirrored=last)[0]
-        if not _is_face(seen, image):
+        view = look(parsing, image, [_around(view.landmarks_px[:68])], mirrored=last)[0]
+        if not _is_face(view, image):
             return None
-    if seen.relative_error > _MOST_ERROR:
+    if view.relative_error > _MOST_ERROR:
         return None
-    landmarks_px = seen.landmarks_px[:68]
+    landmarks_px = view.landmarks_px[:68]
     others = (_around(landmarks_px, *pair) for pair in zip(_MORE_SIDES, _MORE_TURNS_RAD, strict=True))
-    return averaged([seen, *look(parsing, image, list(others))])
+    return averaged([view, *look(parsing, image, list(others))])
 
 
 def averaged(views: list[SquareView]) -> SquareView:
@@ -179,21 +179,21 @@ def averaged(views: list[SquareView]) -> SquareView:
     return replace(views[0], landmarks_px=(weights * places).sum(0) / weights.sum(0))
 
 
-def _as_face(seen: SquareView) -> Face:
-    landmarks_px = seen.landmarks_px[:68]
-    return Face(box_of(from_landmarks(landmarks_px, 1)), _score(seen), landmarks_px, view=seen)
+def _as_face(view: SquareView) -> Face:
+    landmarks_px = view.landmarks_px[:68]
+    return Face(box_of(from_landmarks(landmarks_px, 1)), _score(view), landmarks_px, view=view)
 
 
-def _score(seen: SquareView) -> float:
+def _score(view: SquareView) -> float:
     """Rate from 0 to 1 how surely a face is there and well seen."""
-    return seen.presence * math.exp(-seen.relative_error / _MOST_ERROR)
+    return view.presence * math.exp(-view.relative_error / _MOST_ERROR)
 
 
-def _is_face(seen: SquareView, image: np.ndarray) -> bool:
+def _is_face(view: SquareView, image: np.ndarray) -> bool:
     """Tell if a head is there, with its middle in the photo."""
-    x_px, y_px = seen.landmarks_px[:68].mean(0)
+    x_px, y_px = view.landmarks_px[:68].mean(0)
     inside = 0 <= x_px <= image.shape[1] and 0 <= y_px <= image.shape[0]
-    return bool(seen.presence >= _LEAST_PRESENCE and inside)
+    return bool(view.presence >= _LEAST_PRESENCE and inside)
 
 
 def _around(face: np.ndarray, sides: float = _FACE_SIDES, more_rad: float = 0.0) -> Square:
@@ -225,10 +225,10 @@ def _tiles(image: np.ndarray) -> list[Square]:
     return [Square(float(x), float(y), side_px) for y in np.unique(rows) for x in np.unique(columns)]
 
 
-def _distinct(seen: list[SquareView]) -> list[SquareView]:
+def _distinct(views: list[SquareView]) -> list[SquareView]:
     """Faces, the surest first, without the less sure ones of those that lie on each other."""
     kept: list[SquareView] = []
-    for face in sorted(seen, key=lambda one: -_score(one)):
+    for face in sorted(views, key=lambda one: -_score(one)):
         if all(_overlap(face, other) < _SAME for other in kept):
             kept.append(face)
     return kept

@@ -76,13 +76,13 @@ class PersonColours:
         height, width = matte.shape
         scale = min(1.0, _COLOURS_PX / max(matte.shape))
         size = max(1, round(height * scale)), max(1, round(width * scale))
-        seen, share = shrunk(photo, size), shrunk(matte, size)
-        person = own = background = seen
+        mixture, share = shrunk(photo, size), shrunk(matte, size)
+        person = own = background = mixture
         for reach in _COLOUR_REACH:
             span = max(3, 2 * round(reach * max(size)) + 1)
             own = _weighted_mean(person, share, span)
             background = _weighted_mean(background, 1 - share, span)
-            person = _unmixed(seen, share, own, background)
+            person = _unmixed(mixture, share, own, background)
         self._means = np.concatenate([own, background], -1)
         self.small = person * (share > 0)[..., None]  # [h, w, 3], of at most `_COLOURS_PX`
 
@@ -93,8 +93,8 @@ class PersonColours:
         if len(mixed[0]):
             y = mixed[0] + range(self.shape[0])[rows].start
             own, background = np.split(_looked_up(self._means, y, mixed[1], self.shape), 2, -1)
-            seen, share = photo[mixed], matte[mixed]
-            found[mixed] = np.minimum(_unmixed(seen, share, own, background), seen / share[:, None])
+            mixture, share = photo[mixed], matte[mixed]
+            found[mixed] = np.minimum(_unmixed(mixture, share, own, background), mixture / share[:, None])
         return found
 
 
@@ -131,10 +131,10 @@ def _averages(large: int, small: int) -> csr_array:
     return csr_array((weights, columns, np.concatenate([[0], counts.cumsum()])), shape=(small, large))
 
 
-def _unmixed(seen: np.ndarray, matte: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
+def _unmixed(mixture: np.ndarray, matte: np.ndarray, own: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Own colours of mixtures [h, w, 3], from likely ones of the person and of the background."""
     share = matte[..., None]
-    rest = seen - share * own - (1 - share) * other
+    rest = mixture - share * own - (1 - share) * other
     return np.asarray((own + share * rest).clip(min=0))
 
 

@@ -154,23 +154,23 @@ def look(
     ]
 
 
-def uncovered(seen: SquareView, crop: Crop) -> np.ndarray:
+def uncovered(view: SquareView, crop: Crop) -> np.ndarray:
     """Share [S, S] of each pixel of a crop that shows the face itself, without hair, glasses or a hand.
 
     Outside of what the network saw it is 1.
     """
-    return _shown(seen.classes, seen.square.to_share(_places(crop)))
+    return _bare(view.classes, view.square.to_share(_places(crop)))
 
 
 def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.ndarray:
     """The share of `uncovered`, by the classes [C, h, w] of a whole photo of H x W pixels."""
-    return _shown(classes, _places(crop) / (size_px[1], size_px[0]))
+    return _bare(classes, _places(crop) / (size_px[1], size_px[0]))
 
 
 def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Band:
     """The same share [H, W] of the photo's own pixels, by the classes [C, h, w] of the whole photo."""
     covered = _covering(classes)[None].numpy()
-    return lambda rows: _share_shown(enlarged(covered, size_px, rows)[0])
+    return lambda rows: _share_bare(enlarged(covered, size_px, rows)[0])
 
 
 def _places(crop: Crop) -> np.ndarray:
@@ -179,11 +179,11 @@ def _places(crop: Crop) -> np.ndarray:
     return np.stack(np.meshgrid(centres + crop.x0_px, centres + crop.y0_px), -1)
 
 
-def _shown(classes: Tensor, shares: np.ndarray) -> np.ndarray:
+def _bare(classes: Tensor, shares: np.ndarray) -> np.ndarray:
     """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
     grid = torch.from_numpy(2 * shares - 1).float()[None]
     sampled = F.grid_sample(_covering(classes)[None, None], grid, align_corners=False)[0, 0]
-    return _share_shown(sampled.numpy())
+    return _share_bare(sampled.numpy())
 
 
 def _covering(classes: Tensor) -> Tensor:
@@ -192,6 +192,6 @@ def _covering(classes: Tensor) -> Tensor:
     return classes[~own].sum(0).float()
 
 
-def _share_shown(covered: np.ndarray) -> np.ndarray:
+def _share_bare(covered: np.ndarray) -> np.ndarray:
     low, high = _SURE
     return (1 - (covered - low) / (high - low)).clip(0, 1)

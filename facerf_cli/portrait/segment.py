@@ -105,8 +105,8 @@ def seen_classes(
     chest = Square.around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
     near = [Square.around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
-    seen = look(parsing, image_srgb, [body, chest, *near])
-    (wide, inside), (middle, feather), *close = (_over_photo(one, size, image_srgb.shape) for one in seen)
+    views = look(parsing, image_srgb, [body, chest, *near])
+    (wide, inside), (middle, feather), *close = (_over_photo(one, size, image_srgb.shape) for one in views)
     classes = torch.lerp(torch.where(inside > 0, wide, _only_background()), middle, feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
     for (one, feather), sides in zip(close, _NEAR_SIDES, strict=True):
@@ -116,7 +116,7 @@ def seen_classes(
         share = torch.maximum(share, feather)
     classes.lerp_(mean / weight.clamp_min(1e-6), share)
     places_px = _places(size, image_srgb.shape)
-    classes = with_ears(_with_likelier_hair(classes), seen[2], places_px)
+    classes = with_ears(_with_likelier_hair(classes), views[2], places_px)
     classes = _of_one_person(classes, landmarks_px, places_px)
     extent_px = max(1.0, Square.around(landmarks_px, 1).side_px * size[1] / width)
     classes = with_outline(classes / classes.sum(0).clamp_min(1e-6), small, extent_px)
@@ -250,7 +250,7 @@ def _only_background() -> Tensor:
     return shares
 
 
-def with_ears(classes: Tensor, seen: SquareView, places_px: np.ndarray) -> Tensor:
+def with_ears(classes: Tensor, view: SquareView, places_px: np.ndarray) -> Tensor:
     """Classes [C, h, w] with likelier ears at pixels that lie at places [h, w, 2] in the photo.
 
     Ears are small, and get the benefit of the doubt near the line through the landmarks of top, back and
@@ -260,17 +260,17 @@ def with_ears(classes: Tensor, seen: SquareView, places_px: np.ndarray) -> Tenso
     lifted, ears = classes.clone(), class_index("ears")
     other = classes[_EAR_OTHERS].sum(0)
     both = classes[ears] + other
-    likelier = classes[ears] * torch.from_numpy(np.exp(_EAR_LIFT * _nearness(seen, places_px))).float()
+    likelier = classes[ears] * torch.from_numpy(np.exp(_EAR_LIFT * _nearness(view, places_px))).float()
     lifted[ears] = both * likelier / (likelier + other).clamp_min(1e-9)
     lifted[_EAR_OTHERS] *= (both - lifted[ears]) / other.clamp_min(1e-9)
     return lifted
 
 
-def _nearness(seen: SquareView, places_px: np.ndarray) -> np.ndarray:
+def _nearness(view: SquareView, places_px: np.ndarray) -> np.ndarray:
     """Nearness [h, w] in 0..1 of places [h, w, 2] to the lines of both ears."""
     near = np.zeros(places_px.shape[:2])
-    width_px = _EAR_WIDTH * max(seen.extent_px, 1.0)
-    for line in (seen.landmarks_px[ear] for ear in _EAR_LINES):
+    width_px = _EAR_WIDTH * max(view.extent_px, 1.0)
+    for line in (view.landmarks_px[ear] for ear in _EAR_LINES):
         low, high = line.min(0) - _EAR_REACH * width_px, line.max(0) + _EAR_REACH * width_px
         around = ((places_px > low) & (places_px < high)).all(-1)
         apart = np.min([_distance(places_px[around], *pair) for pair in pairwise(line)], 0)
@@ -302,10 +302,11 @@ def with_outline(classes: Tensor, image: Tensor, extent_px: float) -> Tensor:
     if not unsure.any() or min(np.sum(sure & compared), np.sum(background & compared)) < _NEAREST:
         return classes
     places = np.stack([x, y], -1) * (_COLOURS_PER_EXTENT / extent_px)
-    seen = np.concatenate([rgb2lab(image.permute(1, 2, 0).numpy()) / 100, places], -1)
+    features = np.concatenate([rgb2lab(image.permute(1, 2, 0).numpy()) / 100, places], -1)
 
     def squared_distance(known: np.ndarray) -> np.ndarray:
-        nearest = cKDTree(seen[known & compared]).query(seen[unsure], range(1, _NEAREST + 1), workers=-1)[0]
+        tree = cKDTree(features[known & compared])
+        nearest = tree.query(features[unsure], range(1, _NEAREST + 1), workers=-1)[0]
         return np.square(nearest).mean(1)
 
     colours = (squared_distance(background) - squared_distance(sure)) / (2 * _COLOUR_SPREAD**2)
