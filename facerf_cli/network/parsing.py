@@ -89,14 +89,17 @@ class UNet(SavedNetwork):
         self.narrow = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in pairs)
         self.decode = nn.ModuleList(Residual(a) for a, _ in pairs)
 
-    def features(self, images: Tensor) -> list[Tensor]:
-        """Features [B, C, H, W] of images [B, C, S, S], from the coarsest to those of side S / 2."""
-        x = self.stem(images)
-        skips = []
+    def halved(self, images: Tensor) -> list[Tensor]:
+        """Features [B, C, H, W] of images [B, C, S, S], from side S / 2 to the coarsest."""
+        found = [self.stem(images)]
         for halving in self.encode:
-            skips.append(x)
-            x = halving(x)
-        found = [x]
+            found.append(halving(found[-1]))
+        return found
+
+    def doubled(self, halved: list[Tensor]) -> list[Tensor]:
+        """Features on the way back from the coarsest to side S / 2, without the coarsest."""
+        *skips, x = halved
+        found = []
         for narrow, decode, skip in reversed(list(zip(self.narrow, self.decode, skips, strict=True))):
             x = decode(skip + F.interpolate(narrow(x), scale_factor=2.0, mode="nearest"))
             found.append(x)
@@ -119,8 +122,9 @@ class ParsingNetwork(UNet):
 
     def forward(self, crops: Tensor) -> Parsing:
         """Parse crops; they may have any side that is a multiple of 32."""
-        coarsest, *_, at_quarter, at_half = self.features(_normalised(crops))
-        judged = self.judge(coarsest.mean((2, 3))).float()
+        halved = self.halved(_normalised(crops))
+        judged = self.judge(halved[-1].mean((2, 3))).float()
+        *_, at_quarter, at_half = self.doubled(halved)
         logits = F.pixel_shuffle(self.classify(at_half), _ALPHA_STEPS)
         landmarks = _means(self.heat(at_quarter).float())
         return Parsing(logits, landmarks, judged[:, 1:], judged[:, 0])

@@ -203,7 +203,7 @@ class PortraitNetwork(UNet):
 
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
         """Predict maps; sides are multiples of 32."""
-        predicted = self.predict(self.last(self.features(inputs.stacked())[-1]))
+        predicted = self.predict(self.last(self.doubled(self.halved(inputs.stacked()))[-1]))
         fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
         parts = [
