@@ -78,7 +78,7 @@ class FreeNetwork(PortraitNetwork):
 
     def forward(self, inputs: PortraitInputs) -> FreeMaps:  # type: ignore[override]
         """Predict maps."""
-        predicted = self.predict(self.features(inputs)).float()
+        predicted = self.predict(self.last(self.doubled(self.halved(inputs.stacked()))[-1])).float()
         fine, coarse = torch.split(predicted, [4 * sum(FINE.values()), sum(COARSE.values())], 1)
         parts = [
             *torch.split(F.pixel_shuffle(fine, 2), list(FINE.values()), 1),
