@@ -25,7 +25,7 @@ from facerf_cli.network.checkpoint import load_networks, load_vgg
 from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
 from facerf_cli.network.features import AppearanceNetwork, AppearanceSettings, LightNetwork, LightSettings
 from facerf_cli.network.files import serving_files
-from facerf_cli.network.geometry import GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.network.geometry import GeometryForm, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
 from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
 from facerf_cli.network.reflectance import make_reflectance_network
@@ -349,7 +349,7 @@ class _Stage:
 
     def _new_geometry(self, mean_translation_m: tuple[float, float, float]) -> GeometryNetwork:
         """Make an untrained network; with --mean-face of the pose alone (paper, 'Ablative Study')."""
-        form = "paper" if self.options.preset == "paper" else "default"
+        form: GeometryForm = "paper" if self.options.preset == "paper" else "default"
         settings = GeometryNetworkSettings(form, mean_translation_m=mean_translation_m)
         if self.options.mean_face:
             settings = replace(settings, identity=0, expression=0)
