@@ -5,7 +5,8 @@ a light's image over the guide, is smooth, so it is small. Both are bytes: the g
 square root.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,20 +37,65 @@ _LIGHTS_AT_ONCE = 10
 _DARK = 5e-3  # added to the guide, as a share of its mean over the person: no ratio divides by 0
 _PERSON = 0.02  # share of the person from which on a pixel has a ratio
 _SURE = 0.5  # share from which on a pixel is skin, or the person's
-_SAMPLES = 700  # pixels of the face, and of the person, by which a page chooses its exposure
+_SAMPLES = 2500  # pixels of the face, and of the person, at most, by which a page chooses its exposure
 _WHITE_PERCENTILE = 99.9  # of a guide and of a ratio: the white of their bytes
 
 
 @dataclass(frozen=True, eq=False)
-class LightSamples:
-    """Pixels of a person by which the exposure is chosen: `face` [L, F, 3] and `person` [L, P, 3].
+class Brightest:
+    """Pixels of a region that are among its brightest under some light, for a percentile under any lights.
 
-    `plate` is the brightness of both in the photo, at the percentiles of `relight`; None shows them well.
+    `luminances` [L, N] are under white lights; `shares` [N, 3] of them, which sum to 1, are of each primary.
+    They stand for the brightest of `total` pixels.
     """
 
-    face: np.ndarray
-    person: np.ndarray
+    luminances: np.ndarray
+    shares: np.ndarray
+    total: float
+
+    @staticmethod
+    def of(images: np.ndarray, mask: np.ndarray, percentile: float) -> "Brightest":
+        """The pixels of a mask [...] in images [L, ..., 3] that decide their percentile of luminance."""
+        values = np.stack([luminance(image[mask].astype(np.float32)) for image in images])
+        if not mask.any():
+            return Brightest(values, np.zeros((0, 3), np.float32), 0.0)
+        least = np.percentile(values, percentile, axis=1, method="lower", keepdims=True)
+        places = np.flatnonzero(((values >= least) & (values > 0)).any(0))
+        step = max(1, math.ceil(len(places) / _SAMPLES))
+        places = places[::step]
+        primaries = images.mean(0, dtype=np.float32)[mask][places] * luminance(np.eye(3, dtype=np.float32))
+        shares = primaries / primaries.sum(1, keepdims=True)
+        return Brightest(values[:, places], shares, int(mask.sum()) / step)
+
+
+@dataclass(frozen=True, eq=False)
+class LightSamples:
+    """Pixels by which the exposure is chosen, as `relight` chooses it.
+
+    With a `face` it is left as bright as in its photo: `plate` is the luminance of face and person there.
+    """
+
+    person: Brightest
+    face: Brightest | None = None
     plate: tuple[float, float] | None = None
+
+    @staticmethod
+    def of(
+        images: np.ndarray,
+        person: np.ndarray,
+        face: np.ndarray | None = None,
+        photo: np.ndarray | None = None,
+    ) -> "LightSamples":
+        """Samples of images [L, h, w, 3]; shares [h, w] of a person and its face, and the photo [h, w, 3]."""
+        body = Brightest.of(images, person > _SURE, AUTO_EXPOSURE_PERCENTILE)
+        if face is None or photo is None or not (face > _SURE).any():
+            return LightSamples(body)
+        plate = luminance(photo)
+        bright = (
+            float(np.percentile(plate[face > _SURE], FACE_PERCENTILE)),
+            float(np.percentile(plate[person > _SURE], AUTO_EXPOSURE_PERCENTILE)),
+        )
+        return LightSamples(body, Brightest.of(images, face > _SURE, FACE_PERCENTILE), bright)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,12 +118,9 @@ class Basis:
         images: np.ndarray,
         mean: np.ndarray,
         matte: np.ndarray,
-        samples: LightSamples | None = None,
+        samples: LightSamples,
     ) -> "Basis":
-        """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W].
-
-        The samples are by default those of the images.
-        """
+        """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W]."""
         dark = np.float32(_DARK * mean.sum() / max(3 * float(matte.sum()), 1.0))
         guide = np.maximum(mean, 0) + dark * matte[..., None]
         white = max(float(np.percentile(guide, _WHITE_PERCENTILE)), 1e-9)
@@ -92,49 +135,13 @@ class Basis:
             ratio = (np.maximum(image.astype(np.float32), 0) / below)[nearest]
             scales[light] = max(float(np.percentile(ratio, _WHITE_PERCENTILE)), 1e-9)
             ratios[light] = np.round(255 * np.sqrt((ratio / scales[light]).clip(0, 1)))
-        if samples is None:
-            person = _some(share > _SURE)
-            straight = images.reshape(len(images), -1, 3)[:, person] / share.reshape(-1, 1)[person]
-            samples = LightSamples(straight, straight)
         return Basis(directions, ratios, scales, encoded, white, samples)
-
-    @property
-    def linear_guide(self) -> np.ndarray:
-        """The guide [H, W, 3], scene-linear, as a page reads it."""
-        return _linear(self.guide, self.white)
 
     def image(self, toward: np.ndarray) -> np.ndarray:
         """The small image [h, w, 3] over black under the light that is nearest to a direction [3]."""
         light = int((self.directions @ toward).argmax())
-        return np.asarray(resized(self.linear_guide, *self.ratios.shape[1:3]) * self._ratio(light))
-
-    def anchored(self, photo: np.ndarray, face: np.ndarray, matte: np.ndarray) -> "Basis":
-        """The basis whose exposure leaves a face, a share [H, W], as bright as in the photo [H, W, 3]."""
-        size = self.ratios.shape[1:3]
-        plate = luminance(resized(photo, *size))
-        share, skin = resized(matte, *size), resized(face, *size)
-        places, masks = (_some(skin > _SURE), _some(share > _SURE)), (skin > _SURE, share > _SURE)
-        straight = resized(self.linear_guide, *size) / share.clip(_PERSON)[..., None]
-        found = [
-            np.stack([self._ratio(light).reshape(-1, 3)[some] for light in range(len(self.ratios))])
-            * straight.reshape(-1, 3)[some]
-            for some in places
-        ]
-        percentiles = (FACE_PERCENTILE, AUTO_EXPOSURE_PERCENTILE)
-        bright = [
-            float(np.percentile(plate[m], p)) if m.any() else 0.0
-            for m, p in zip(masks, percentiles, strict=True)
-        ]
-        return replace(self, samples=LightSamples(found[0], found[1], (bright[0], bright[1])))
-
-    def _ratio(self, light: int) -> np.ndarray:
-        return np.asarray((self.ratios[light].astype(np.float32) / 255) ** 2 * self.scales[light])
-
-
-def _some(mask: np.ndarray) -> np.ndarray:
-    """Places of at most about `_SAMPLES` pixels of a mask [H, W], evenly taken, in its flat order."""
-    places = np.flatnonzero(mask)
-    return places[:: max(1, len(places) // _SAMPLES)]
+        ratio = (self.ratios[light].astype(np.float32) / 255) ** 2 * self.scales[light]
+        return np.asarray(resized(_linear(self.guide, self.white), *ratio.shape[:2]) * ratio)
 
 
 def _linear(encoded: np.ndarray, white: float) -> np.ndarray:
@@ -159,25 +166,14 @@ def basis_of_photo(
         assert relit.surround is not None
         images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
         part = field.maps.albedo[0] * relit.surround[:3] + relit.surround[3:6]
-        coarse.append((part * field.exposure).flatten(1).T.numpy().astype(np.float16))
+        coarse.append((part * field.exposure).permute(1, 2, 0).numpy().astype(np.float16))
         mean = relit if mean is None else mean.plus(torch.ones(1), relit.texture, relit.surround)
     assert mean is not None and mean.surround is not None
     mean = Relit(mean.texture / len(rig), mean.surround / len(rig))
     shown = whole(composition.light_layer(mean), *composition.size_px)
-    samples = _samples(np.stack(coarse), field)
+    classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
+    samples = LightSamples.of(np.stack(coarse), 1 - classes[0], classes[class_index("skin")], source)
     return Basis.of(rig.numpy(), np.stack(images), shown, composition.matte, samples)
-
-
-def _samples(coarse: np.ndarray, field: PortraitField) -> LightSamples:
-    """The samples of a photo's person, whose images [L, S S, 3] are as coarse as the maps of its field."""
-    classes = field.person.classes.numpy()
-    face, person = classes[class_index("skin")] > _SURE, 1 - classes[0] > _SURE
-    photo = luminance(field.person.image.permute(1, 2, 0).numpy())
-    plate = [
-        float(np.percentile(photo[mask], percentile)) if mask.any() else 0.0
-        for mask, percentile in ((face, FACE_PERCENTILE), (person, AUTO_EXPOSURE_PERCENTILE))
-    ]
-    return LightSamples(coarse[:, _some(face)], coarse[:, _some(person)], (plate[0], plate[1]))
 
 
 def _single(composition: Composition, lights: Tensor) -> Iterator[Relit]:
@@ -195,22 +191,32 @@ def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) ->
 
 
 def basis_of_stack(
-    directions: np.ndarray, batches: Callable[[], Iterable[Tensor]], seen: np.ndarray, most_px: int
+    directions: np.ndarray,
+    batches: Iterable[Tensor],
+    seen: np.ndarray,
+    most_px: int,
+    face: np.ndarray | None = None,
+    photo: np.ndarray | None = None,
 ) -> Basis:
     """The basis of a stack, shown with `most_px` pixels at most along the longer side.
 
-    Its images are read in batches [l, 3, H, W] over black; `seen` [H, W] is the person's share.
+    Its images are read in batches [l, 3, H, W] over black; `seen` [H, W] is the person's share, of which
+    `face` is the face's. Its exposure leaves a face as bright as in the `photo` [H, W, 3].
     """
     kept = evenly_spread(directions)
     size = fitted(seen.shape[0], seen.shape[1], most_px)
     small_size = fitted(*size, RATIO_PX)
     mean, images = np.zeros((*seen.shape, 3), np.float32), []
-    each = (image for batch in batches() for image in batch.permute(0, 2, 3, 1).numpy())
+    each = (image for batch in batches for image in batch.permute(0, 2, 3, 1).numpy())
     for light, image in enumerate(each):
         if light in kept:
             mean += image / len(kept)
             images.append(resized(image, *small_size).astype(np.float16))
-    return Basis.of(directions[kept], np.stack(images), resized(mean, *size), resized(seen, *size))
+    small, share = np.stack(images), resized(seen, *small_size)
+    smaller = [None if x is None else resized(x, *small_size) for x in (face, photo)]
+    straight = small / share.clip(_PERSON)[..., None].astype(np.float16)
+    samples = LightSamples.of(straight, share, *smaller)
+    return Basis.of(directions[kept], small, resized(mean, *size), resized(seen, *size), samples)
 
 
 def evenly_spread(directions: np.ndarray, most: int = MOST_LIGHTS) -> list[int]:

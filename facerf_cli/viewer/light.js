@@ -15,6 +15,7 @@ const decoded = (x) => (x <= 0.04045 ? x / 12.92 : ((x + 0.055) / 1.055) ** 2.4)
 const encoded = (x) => (x <= 0.0031308 ? 12.92 * Math.max(0, x) : 1.055 * Math.min(1, x) ** (1 / 2.4) - 0.055);
 const bytesOf = (base64) => Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
 const floatsOf = (base64) => new Float32Array(bytesOf(base64).buffer);
+const triples = (flat) => Array.from({ length: flat.length / 3 }, (_, i) => Array.from(flat.subarray(3 * i, 3 * i + 3)));
 
 function directionOf(azimuth, elevation) {
   const ring = Math.cos(elevation * DEGREE);
@@ -45,10 +46,8 @@ function pixelsOf(image, width, height) {
 
 class Rig {
   constructor(data) {
-    const flat = floatsOf(data.directions);
-    this.lights = Array.from({ length: flat.length / 3 }, (_, i) => Array.from(flat.subarray(3 * i, 3 * i + 3)));
-    const corners = new Uint16Array(bytesOf(data.triangles).buffer);
-    this.triangles = Array.from({ length: corners.length / 3 }, (_, t) => Array.from(corners.subarray(3 * t, 3 * t + 3)));
+    this.lights = triples(floatsOf(data.directions));
+    this.triangles = triples(new Uint16Array(bytesOf(data.triangles).buffer));
     this.inverses = this.triangles.map((triangle) => {
       const [a, b, c] = triangle.map((i) => this.lights[i]);
       const rows = [cross(b, c), cross(c, a), cross(a, b)];
@@ -67,18 +66,20 @@ class Rig {
     for (const [t, rows] of this.inverses.entries()) {
       const shares = rows.map((row) => dot(row, toward));
       const total = shares[0] + shares[1] + shares[2];
-      if (Math.min(...shares) >= -1e-4 && total > 0) return this.triangles[t].map((light, i) => [light, shares[i] / total]);
+      const inside = Math.min(...shares) >= -1e-4 && total > 0;
+      if (inside) return this.triangles[t].map((light, i) => [light, shares[i] / total]);
     }
     return [[this.nearest(toward), 1]];
   }
 
-  // The light that is nearest to each texel of a lat-long grid, found once.
+  // The light that is nearest to each texel of a lat-long grid, computed once.
   get cells() {
-    this.found ??= Uint16Array.from({ length: 2 * MAP_ROWS * MAP_ROWS }, (_, i) => {
+    const degrees = 180 / MAP_ROWS; // of a row, and of a column
+    this.nearestCells ??= Uint16Array.from({ length: 2 * MAP_ROWS * MAP_ROWS }, (_, i) => {
       const [row, column] = [Math.floor(i / (2 * MAP_ROWS)), i % (2 * MAP_ROWS)];
-      return this.nearest(directionOf(180 - (180 * (column + 0.5)) / MAP_ROWS, 90 - (180 * (row + 0.5)) / MAP_ROWS));
+      return this.nearest(directionOf(180 - degrees * (column + 0.5), 90 - degrees * (row + 0.5)));
     });
-    return this.found;
+    return this.nearestCells;
   }
 
   // Weights [lights * 3] under a turned map: its integral over each light's cell, over pi.
@@ -101,10 +102,12 @@ class Rig {
 class LatLong {
   constructor(name, width, height, pixels, command = "", path = name) {
     const rows = Math.min(height, MAP_ROWS);
-    Object.assign(this, { name, command, path, width: 2 * rows, height: rows, pixels: new Float32Array(6 * rows * rows) });
+    Object.assign(this, { name, command, path, width: 2 * rows, height: rows });
+    this.pixels = new Float32Array(6 * rows * rows);
     const counts = new Uint32Array(2 * rows * rows);
     for (let i = 0; i < width * height; i++) {
-      const to = Math.floor((Math.floor(i / width) * rows) / height) * 2 * rows + Math.floor(((i % width) * 2 * rows) / width);
+      const row = Math.floor((Math.floor(i / width) * rows) / height);
+      const to = row * 2 * rows + Math.floor(((i % width) * 2 * rows) / width);
       counts[to]++;
       for (let c = 0; c < 3; c++) this.pixels[3 * to + c] += pixels[3 * i + c];
     }
@@ -126,7 +129,8 @@ async function readMap(file) {
   const isExr = bytes.length > 8 && new DataView(bytes.buffer).getUint32(0, true) === 20000630;
   const { width, height, pixels } = isExr ? await readExr(bytes) : readHdr(bytes);
   if (width !== 2 * height) throw new Error(`${width} x ${height} pixels; a lat-long map is twice as wide as high`);
-  return new LatLong(file.name, width, height, pixels.map((value) => (value > 0 ? Math.min(value, 65504) : 0)));
+  const finite = pixels.map((value) => (value > 0 ? Math.min(value, 65504) : 0));
+  return new LatLong(file.name, width, height, finite);
 }
 
 function newPixels(width, height) {
@@ -200,7 +204,7 @@ async function readExr(bytes) {
   const [width, height] = [right - left + 1, bottom - top + 1];
   const pixels = newPixels(width, height);
   const channels = exrChannels(bytes, view, attributes.channels);
-  const rowBytes = channels.reduce((sum, { type }) => sum + width * EXR_BYTES[type], 0);
+  const rowBytes = channels.reduce((sum, { bytes }) => sum + width * bytes, 0);
   for (let block = 0; block < Math.ceil(height / rows); block++) {
     const at = Number(view.getBigUint64(end + 8 * block, true));
     const first = view.getInt32(at, true) - top;
@@ -228,28 +232,30 @@ function exrHeader(bytes, view) {
     attributes[name] = at + 4;
     at += 4 + Math.max(0, view.getInt32(at, true));
   }
-  if (!("channels" in attributes && "compression" in attributes && "dataWindow" in attributes)) throw new Error(EXR_DAMAGED);
+  if (["channels", "compression", "dataWindow"].some((name) => !(name in attributes))) throw new Error(EXR_DAMAGED);
   return { attributes, end: at + 1 };
 }
 
-// Channels in the order of the file: their type, and which of R, G, B they are (Y is all of them).
+// Channels in the order of the file: bytes of a value, and which of R, G, B they are: Y is all, integers are none.
 function exrChannels(bytes, view, start) {
-  const found = [];
+  const channels = [];
   for (let at = start; bytes[at]; at += 17) {
     let name = "";
     while (bytes[at]) name += String.fromCharCode(bytes[at++]);
     const type = view.getInt32(at + 1, true);
     if (!(type in EXR_BYTES)) throw new Error(EXR_DAMAGED);
-    found.push({ type, to: name === "Y" ? [0, 1, 2] : ["R", "G", "B"].flatMap((c, i) => (c === name ? [i] : [])) });
+    const colours = [0, 1, 2].filter((c) => name === "Y" || "RGB"[c] === name);
+    channels.push({ bytes: EXR_BYTES[type], to: type ? colours : [] });
   }
-  if (!found.some(({ to }) => to.length)) throw new Error("the .exr map has no channels R, G, B; save it as RGB");
-  return found;
+  if (!channels.some(({ to }) => to.length)) throw new Error("the .exr map has no channels R, G, B; save it as RGB");
+  return channels;
 }
 
 // ZIP of EXR: inflated, then differences of bytes, in two halves that are interleaved.
 async function exrUnzipped(packed) {
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const coded = new Uint8Array(await new Response(stream).arrayBuffer().catch(() => Promise.reject(new Error(EXR_DAMAGED))));
+  const inflated = new Response(stream).arrayBuffer();
+  const coded = new Uint8Array(await inflated.catch(() => Promise.reject(new Error(EXR_DAMAGED))));
   for (let i = 1; i < coded.length; i++) coded[i] = coded[i - 1] + coded[i] - 128;
   const half = (coded.length + 1) >> 1;
   return coded.map((_, i) => coded[i & 1 ? half + (i >> 1) : i >> 1]);
@@ -257,10 +263,9 @@ async function exrUnzipped(packed) {
 
 function exrBlock(view, channels, width, pixels) {
   for (let y = 0, at = 0; at < view.byteLength; y++) {
-    for (const { type, to } of channels) {
-      for (let x = 0; x < width; x++, at += EXR_BYTES[type]) {
-        if (!to.length) continue;
-        const value = type === 1 ? halfValue(view.getUint16(at, true)) : type === 2 ? view.getFloat32(at, true) : view.getUint32(at, true);
+    for (const { bytes, to } of channels) {
+      for (let x = 0; x < width; x++, at += bytes) {
+        const value = bytes === 2 ? halfValue(view.getUint16(at, true)) : view.getFloat32(at, true);
         for (const c of to) pixels[3 * (y * width + x) + c] = value;
       }
     }

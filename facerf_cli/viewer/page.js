@@ -3,7 +3,8 @@
 const MOST_LIGHTS = 9;
 const SHOULDER = 0.8; // brightest channel from which on the soft view bends a colour (image/colour.py)
 const WHITENING = 0.3;
-const PLACES = [[-60, 10], [40, 25], [145, 25], [-145, 25], [0, 80], [75, -10], [-90, 40], [0, -50], [180, 15]]; // of new lights
+// Of new lights: azimuth and elevation.
+const PLACES = [[-60, 10], [40, 25], [145, 25], [-145, 25], [0, 80], [75, -10], [-90, 40], [0, -50], [180, 15]];
 
 // ---- The image: by WebGL2, or by the same formulas on a 2D canvas ----
 
@@ -57,8 +58,9 @@ class GpuView {
   static create(canvas, data, images) {
     const gl = canvas.getContext("webgl2", { preserveDrawingBuffer: true, antialias: false });
     if (!gl?.getExtension("EXT_color_buffer_float")) return null;
-    const fits = Math.max(...data.size) <= gl.getParameter(gl.MAX_TEXTURE_SIZE) && data.scales.length <= gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS);
-    return fits ? new GpuView(gl, data, images) : null;
+    const wide = Math.max(...data.size) > gl.getParameter(gl.MAX_TEXTURE_SIZE);
+    const deep = data.scales.length > gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS);
+    return wide || deep ? null : new GpuView(gl, data, images);
   }
 
   constructor(gl, data, images) {
@@ -159,7 +161,8 @@ class CanvasView {
     const sum = new Float32Array(shown.data.length);
     this.ratios.forEach((ratio, light) => {
       const rgb = weights.subarray(3 * light, 3 * light + 3).map((value) => value / 255 ** 2);
-      if (rgb.some(Boolean)) for (let i = 0; i < sum.length; i++) if (i % 4 < 3) sum[i] += rgb[i % 4] * ratio[i] ** 2;
+      if (!rgb.some(Boolean)) return;
+      for (let i = 0; i < sum.length; i += 4) for (let c = 0; c < 3; c++) sum[i + c] += rgb[c] * ratio[i + c] ** 2;
     });
     for (let at = 0; at < sum.length; at += 4) shown.data.set(this.pixel(at, sum, withBackground), at);
     this.context.putImageData(shown, 0, 0);
@@ -168,10 +171,13 @@ class CanvasView {
   pixel(at, sum, withBackground) {
     const share = this.matte[at] / 255;
     const person = [0, 1, 2].map((c) => this.data.white * decoded(this.guide[at + c] / 255) * sum[at + c]);
-    const mixed = person.map((value, c) => (withBackground ? decoded(this.plate[at + c] / 255) + value : value / Math.max(share, 0.001)));
+    if (!withBackground) {
+      const alone = softened(person.map((value) => value / Math.max(share, 0.001)));
+      return [...alone.map((value) => 255 * encoded(value)), 255 * share];
+    }
+    const mixed = person.map((value, c) => decoded(this.plate[at + c] / 255) + value);
     const soft = softened(mixed);
-    const colour = mixed.map((value, c) => 255 * encoded(withBackground ? value + share * (soft[c] - value) : soft[c]));
-    return [...colour, withBackground ? 255 : 255 * share];
+    return [...mixed.map((value, c) => 255 * encoded(value + share * (soft[c] - value))), 255];
   }
 }
 
@@ -185,27 +191,42 @@ function softened(colour) {
 // ---- The exposure of `facerf relight --exposure auto`: the face as bright as in the photo ----
 
 class AutoExposure {
-  constructor(data) {
-    this.about = data.exposure;
-    this.samples = [this.about.face, this.about.person].map(({ scales, count, bytes }) => ({ scales, count, roots: bytesOf(bytes) }));
+  // `face` and `person` of the data with their images of square roots, a row a light.
+  constructor(about, images) {
+    this.about = about;
+    for (const name of ["face", "person"]) {
+      if (!about[name]) continue;
+      const { scales, shares, total } = about[name];
+      const size = [images[name].naturalWidth, scales.length];
+      const roots = pixelsOf(images[name], ...size).filter((_, i) => i % 4 === 0);
+      this[name] = { scales, shares: floatsOf(shares), total, roots };
+    }
   }
 
-  // The luminances of samples under weights [lights * 3].
-  luminances({ scales, count, roots }, weights) {
-    const sum = new Float32Array(3 * count);
+  // The percentile of luminance of a region under weights [lights * 3].
+  bright({ scales, shares, total, roots }, weights, percent) {
+    const [count, sums] = [shares.length / 3, new Float32Array(shares.length)];
+    if (!count) return 0;
     scales.forEach((scale, light) => {
       const rgb = Array.from(weights.subarray(3 * light, 3 * light + 3), (value) => (value * scale) / 255 ** 2);
-      const from = 3 * count * light;
-      if (rgb.some(Boolean)) for (let i = 0; i < sum.length; i++) sum[i] += rgb[i % 3] * roots[from + i] ** 2;
+      if (!rgb.some(Boolean)) return;
+      for (let i = 0; i < count; i++) {
+        const power = roots[light * count + i] ** 2;
+        for (let c = 0; c < 3; c++) sums[3 * i + c] += rgb[c] * power;
+      }
     });
-    return Array.from({ length: count }, (_, i) => luminance(sum.subarray(3 * i, 3 * i + 3)));
+    const values = Float32Array.from({ length: count }, (_, i) => dot(shares.subarray(3 * i), sums.subarray(3 * i)));
+    const sorted = values.sort();
+    const at = Math.max(0, count - 1 - (total - 1) * (1 - percent / 100)); // they are the brightest of the total
+    const [low, high] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
+    return low + (at - Math.floor(at)) * (high - low);
   }
 
   // EV to two decimals under weights [lights * 3].
   ev(weights) {
     const { plate, target, mostOverFront, facePercentile, personPercentile } = this.about;
-    const [faces, people] = this.samples.map((samples) => this.luminances(samples, weights));
-    const [face, person] = [percentile(faces, facePercentile), percentile(people, personPercentile)];
+    const person = this.bright(this.person, weights, personPercentile);
+    const face = plate ? this.bright(this.face, weights, facePercentile) : target;
     if (Math.min(face, person, plate ? plate[0] : 1) < 1e-9) return 0;
     const gain = plate ? Math.min(plate[0] / face, (2 * Math.max(1, plate[1])) / person) : target / person;
     let strength = 0;
@@ -214,18 +235,11 @@ class AutoExposure {
   }
 }
 
-function percentile(values, percent) {
-  if (!values.length) return 0;
-  const sorted = Float32Array.from(values).sort();
-  const at = ((sorted.length - 1) * percent) / 100;
-  const [low, high] = [sorted[Math.floor(at)], sorted[Math.ceil(at)]];
-  return low + (at - Math.floor(at)) * (high - low);
-}
-
 // ---- What is shown: in the address, and as a command ----
 
 const newLight = (azimuth, elevation, colour = "#ffffff", stops = 0) => ({ azimuth, elevation, colour, stops });
-const hexOf = (rgb) => "#" + rgb.map((value) => Math.round(255 * encoded(value)).toString(16).padStart(2, "0")).join("");
+const byteText = (value) => Math.round(255 * encoded(value)).toString(16).padStart(2, "0");
+const hexOf = (rgb) => "#" + rgb.map(byteText).join("");
 const rounded = (value, digits) => Number(value.toFixed(digits));
 
 // Linear rgb [3] of a light: its colour, as shown on a screen, times its intensity.
@@ -252,10 +266,13 @@ function lightText(light) {
   return (rgb.every((value) => value === 1) ? where : [...where, ...rgb]).join(",");
 }
 
-// Read ?light=... or #light=75,20;-120,10&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50&panel=0
+// Read ?light=... or #light=75,20;-120,10&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
 function stateOf(address, maps) {
   const given = new URLSearchParams(address.hash.length > 1 ? address.hash.slice(1) : address.search);
-  const number = (name, low, high) => (given.has(name) && Number.isFinite(Number(given.get(name))) ? limited(Number(given.get(name)), low, high) : null);
+  const number = (name, low, high) => {
+    const value = Number.parseFloat(given.get(name));
+    return Number.isFinite(value) ? limited(value, low, high) : null;
+  };
   const map = maps.find((one) => one.name === given.get("env")) ?? null;
   return {
     lights: lightsOf(given.get("light")) ?? (map ? [] : [newLight(40, 25)]),
@@ -266,19 +283,19 @@ function stateOf(address, maps) {
     exposure: number("ev", -20, 20), // null: automatic
     background: given.get("background") !== "none",
     compare: number("compare", 0, 100), // percent of the frame that shows the photo; null: none
-    panel: given.get("panel") !== "0",
   };
 }
 
 function addressOf(state) {
   const parts = state.lights.length ? ["light=" + state.lights.map(lightText).join(";")] : [];
-  if (state.map?.command) parts.push("env=" + state.map.name);
-  if (state.map?.command && state.rotate) parts.push("rotate=" + state.rotate);
-  if (state.map?.command && state.mapStops) parts.push("mapstops=" + state.mapStops);
+  if (state.map?.command) {
+    parts.push("env=" + state.map.name);
+    if (state.rotate) parts.push("rotate=" + state.rotate);
+    if (state.mapStops) parts.push("mapstops=" + state.mapStops);
+  }
   if (state.exposure !== null) parts.push("ev=" + state.exposure);
   if (!state.background) parts.push("background=none");
   if (state.compare !== null) parts.push("compare=" + state.compare);
-  if (!state.panel) parts.push("panel=0");
   return "#" + parts.join("&");
 }
 
@@ -291,7 +308,8 @@ function commandOf(state, data, ev) {
   if (map) line += ` --envmap ${quoted(map.path)}` + (state.rotate ? ` --rotate ${state.rotate}` : "");
   if (lights.length) line += ` --light '${lights.map(lightText).join(";")}'`;
   const both = Boolean(map) && lights.length > 0;
-  line += ` --exposure ${rounded(ev + (map && !both ? state.mapStops : 0), 2)}`; // one map alone: its intensity is exposure
+  const stops = map && !both ? state.mapStops : 0; // of a map alone: they are exposure
+  line += ` --exposure ${rounded(ev + stops, 2)}`;
   if (data.background && !state.background) line += " --background none";
   const lines = [...(map?.command ? [map.command] : []), line + " -o out"];
   const scale = state.mapStops ? `, that of the map times ${Number((2 ** state.mapStops).toPrecision(3))}` : "";
@@ -305,8 +323,9 @@ class Page {
   constructor(data, images, ratios) {
     this.data = data;
     this.rig = new Rig(data);
-    this.maps = data.envmaps.map((one) => new LatLong(one.name, ...one.size, floatsOf(one.pixels), one.command, one.path));
-    this.auto = new AutoExposure(data);
+    const mapOf = ({ name, size, pixels, command, path }) => new LatLong(name, ...size, floatsOf(pixels), command, path);
+    this.maps = data.envmaps.map(mapOf);
+    this.auto = new AutoExposure(data.exposure, images);
     this.view = this.newView(images);
     ratios.forEach((image, light) => this.view.add(light, pixelsOf(image, ...data.small)));
     byId("before").src = images.photo.src;
@@ -349,10 +368,11 @@ class Page {
     const { lights, map, rotate, mapStops } = this.state;
     const key = map && `${this.maps.indexOf(map)} ${rotate}`;
     if (map && key !== this.mapKey) [this.mapKey, this.mapWeights] = [key, this.rig.mapWeights(map, rotate)];
-    const weights = map ? this.mapWeights.map((value) => value * 2 ** mapStops) : new Float64Array(3 * this.rig.lights.length);
+    const dark = new Float64Array(3 * this.rig.lights.length);
+    const weights = map ? this.mapWeights.map((value) => value * 2 ** mapStops) : dark;
     for (const light of lights) {
-      const rgb = rgbOf(light);
-      for (const [i, share] of this.rig.around(directionOf(light.azimuth, light.elevation))) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
+      const [rgb, around] = [rgbOf(light), this.rig.around(directionOf(light.azimuth, light.elevation))];
+      for (const [i, share] of around) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
     }
     return weights;
   }
@@ -362,7 +382,8 @@ class Page {
     const { state, data } = this;
     const weights = this.weights();
     this.ev = state.exposure ?? this.auto.ev(weights);
-    this.view.draw(weights.map((value, i) => value * data.scales[Math.floor(i / 3)] * 2 ** this.ev), state.background && data.background);
+    const scaled = weights.map((value, i) => value * data.scales[Math.floor(i / 3)] * 2 ** this.ev);
+    this.view.draw(scaled, state.background && data.background);
     this.update();
     document.body.dataset.settled = "true";
     clearTimeout(this.later);
@@ -394,14 +415,14 @@ class Page {
     for (const [id, is] of Object.entries(pressed)) byId(id).setAttribute("aria-pressed", String(is));
     byId("chips").replaceChildren(...state.lights.map((one, i) => this.chip(one, i)));
     byId("command").textContent = commandOf(state, data, this.ev);
-    document.body.classList.toggle("bare", !state.panel);
     this.compare(state.compare);
   }
 
   chip(light, i) {
     const chip = Object.assign(document.createElement("button"), { type: "button", textContent: i + 1 });
     chip.style.setProperty("--light", light.colour);
-    chip.setAttribute("aria-label", `Light ${i + 1}: azimuth ${Math.round(light.azimuth)}, elevation ${Math.round(light.elevation)}`);
+    const [azimuth, elevation] = [light.azimuth, light.elevation].map(Math.round);
+    chip.setAttribute("aria-label", `Light ${i + 1}: azimuth ${azimuth}, elevation ${elevation}`);
     chip.setAttribute("aria-pressed", String(i === this.state.selected));
     chip.onclick = () => this.change({ selected: i });
     return chip;
@@ -428,7 +449,8 @@ class Page {
     change("exposure", (exposure) => this.change({ exposure }));
     change("split", (compare) => this.change({ compare }));
     change("envmap", (map) => this.change({ map: this.maps[map] ?? null }));
-    byId("colour").addEventListener("input", (event) => this.changeLight({ colour: event.target.value, rgb: undefined }));
+    const colour = (event) => this.changeLight({ colour: event.target.value, rgb: undefined });
+    byId("colour").addEventListener("input", colour);
     const actions = {
       add: () => this.add(),
       remove: () => this.remove(),
@@ -455,7 +477,8 @@ class Page {
     const move = (event) => {
       const box = view.getBoundingClientRect();
       const radius = headRadius * Math.min(box.width, box.height);
-      const [x, y] = [(event.clientX - box.left - box.width * headX) / radius, (box.top + box.height * headY - event.clientY) / radius];
+      const x = (event.clientX - box.left - box.width * headX) / radius;
+      const y = (box.top + box.height * headY - event.clientY) / radius;
       const ring = Math.hypot(x, y) || 1;
       const angle = Math.min(ring, 1.95) * 90 * DEGREE;
       const toward = [(Math.sin(angle) * x) / ring, (Math.sin(angle) * y) / ring, Math.cos(angle)];
@@ -471,23 +494,22 @@ class Page {
     view.addEventListener("pointermove", (event) => view.hasPointerCapture(event.pointerId) && move(event));
   }
 
+  // Arrows move the light, but where they move a control.
   key(event) {
     if (event.target.closest("select, input, button") || event.ctrlKey || event.metaKey || event.altKey) return;
     const step = event.shiftKey ? 1 : 5;
     const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
-    const move = moves[event.key];
-    if (move && this.light) {
-      event.preventDefault();
-      this.changeLight({ azimuth: turned(this.light.azimuth + move[0]), elevation: limited(this.light.elevation + move[1], -90, 90) });
-    } else if (event.key === "Delete") this.remove();
-    else if (event.key === "h") this.change({ panel: !this.state.panel });
-    else if (this.state.lights[Number(event.key) - 1]) this.change({ selected: Number(event.key) - 1 });
+    if (!moves[event.key] || !this.light) return;
+    event.preventDefault();
+    const [aside, up] = moves[event.key];
+    const { azimuth, elevation } = this.light;
+    this.changeLight({ azimuth: turned(azimuth + aside), elevation: limited(elevation + up, -90, 90) });
   }
 
   // Add a light where no other one is.
   add() {
-    const taken = (place) => this.state.lights.some((light) => Math.hypot(light.azimuth - place[0], light.elevation - place[1]) < 10);
-    this.state.lights.push(newLight(...(PLACES.find((place) => !taken(place)) ?? PLACES[0])));
+    const isFree = ([x, y]) => this.state.lights.every((light) => Math.hypot(light.azimuth - x, light.elevation - y) > 10);
+    this.state.lights.push(newLight(...(PLACES.find(isFree) ?? PLACES[0])));
     this.change({ selected: this.state.lights.length - 1 });
   }
 
@@ -504,19 +526,22 @@ class Page {
       this.say(`${file.name} is the environment now`);
       this.change({ map: this.maps.at(-1) });
     } catch (error) {
-      this.say(`${file.name}: ${error instanceof RangeError ? "the map is cut short; copy it again" : error.message}`);
+      const isCut = error instanceof RangeError; // of a DataView
+      this.say(`${file.name}: ${isCut ? "the map is cut short; copy it again" : error.message}`);
     }
   }
 
   async copy() {
     getSelection().selectAllChildren(byId("command"));
     const done = navigator.clipboard?.writeText(byId("command").textContent) ?? Promise.reject();
-    await done.then(() => this.say("The command is copied"), () => this.say("Press Ctrl+C to copy the selected command"));
+    const say = (text) => () => this.say(text);
+    await done.then(say("The command is copied"), say("Press Ctrl+C to copy the selected command"));
   }
 
   save() {
     byId("view").toBlob((blob) => {
-      const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${this.data.title}_relit.png` });
+      const link = document.createElement("a");
+      Object.assign(link, { href: URL.createObjectURL(blob), download: `${this.data.title}_relit.png` });
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 1000);
       this.say(`${link.download} is saved`);
@@ -528,6 +553,9 @@ async function start() {
   const data = JSON.parse(byId("data").textContent);
   const images = { photo: await imageOf(data.photo, "jpeg") };
   for (const name of ["guide", "plate", "matte"]) images[name] = await imageOf(data[name], "webp");
+  for (const name of ["face", "person"]) {
+    if (data.exposure[name]) images[name] = await imageOf(data.exposure[name].roots, "webp");
+  }
   const ratios = await Promise.all(data.ratios.map((ratio) => imageOf(ratio, "jpeg")));
   byId("message").textContent = "";
   new Page(data, images, ratios);

@@ -23,7 +23,7 @@ from facerf_cli.image.colour import (
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
-from facerf_cli.viewer.basis import Basis, LightSamples
+from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
 _HERE = Path(__file__).parent
 _RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
@@ -104,10 +104,10 @@ def _triangles(directions: np.ndarray) -> np.ndarray:
 
 
 def _exposure(samples: LightSamples) -> dict[str, Any]:
-    """Pixels under each light by which a page chooses its exposure, and what it compares them with."""
+    """Pixels by which a page chooses its exposure, and what it compares them with."""
     return {
-        "face": _roots(samples.face),
-        "person": _roots(samples.person),
+        "face": samples.face and _brightest(samples.face),
+        "person": _brightest(samples.person),
         "plate": samples.plate,
         "facePercentile": FACE_PERCENTILE,
         "personPercentile": AUTO_EXPOSURE_PERCENTILE,
@@ -116,12 +116,16 @@ def _exposure(samples: LightSamples) -> dict[str, Any]:
     }
 
 
-def _roots(values: np.ndarray) -> dict[str, Any]:
-    """Linear values [L, N, 3] as bytes of their square roots, each light by its own scale."""
-    values = np.maximum(values.astype(np.float32), 0)
-    scales = np.maximum(values.reshape(len(values), -1).max(1, initial=0), 1e-9)
-    steps = np.round(255 * np.sqrt(values / scales[:, None, None])).astype(np.uint8)
-    return {"scales": scales.tolist(), "count": values.shape[1], "bytes": _bytes(steps.tobytes())}
+def _brightest(some: Brightest) -> dict[str, Any]:
+    """Luminances as an image of their square roots, a row a light, each by its own scale."""
+    values = np.pad(some.luminances.clip(min=0), ((0, 0), (0, not some.luminances.size)))  # none is no image
+    scales = np.maximum(values.max(1), 1e-9)
+    return {
+        "roots": _webp(np.round(255 * np.sqrt(values / scales[:, None])).astype(np.uint8)),
+        "scales": scales.tolist(),
+        "shares": _floats(some.shares),
+        "total": some.total,
+    }
 
 
 def page(title: str, photo: str, document: Mapping[str, Any], strip: str) -> str:

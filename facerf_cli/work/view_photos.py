@@ -1,5 +1,6 @@
 """The pages of photos, and the list of them."""
 
+import glob
 import shlex
 from collections.abc import Sequence
 from functools import cache
@@ -82,12 +83,13 @@ def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plat
 def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:
     """Write the page of an OLAT stack, shown with `size_px` pixels at most; facts for the report."""
     header = read_olat_header(item.input_path)
-    basis = basis_of_stack(header.directions, lambda: stream_olats(item.input_path), header.seen, size_px)
-    size = basis.guide.shape[:2]
-    head = (0.5, 0.5, 0.5)
+    head, face = (0.5, 0.5, 0.5), None
     if header.kind == "photo":
         head, face = _face_of_stack(item, header, options)
-        basis = basis.anchored(header.source, face * header.seen, header.seen)
+    basis = basis_of_stack(
+        header.directions, stream_olats(item.input_path), header.seen, size_px, face, header.source
+    )
+    size = basis.guide.shape[:2]
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
     _write(path, item, "", basis, plate, head)
     return {"lights": len(header.directions)}
@@ -103,7 +105,7 @@ def _face_of_stack(
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
     vertices = fit.vertices_camera(face_model(options))
     view = view_face(vertices, photo_camera(fit.crop, *header.seen.shape), fit.crop.side_px)
-    return head_place(fit.crop, header.seen), view.full(view.mask)
+    return head_place(fit.crop, header.seen), view.full(view.mask) * header.seen
 
 
 def head_place(crop: Crop, matte: np.ndarray) -> tuple[float, float, float]:
@@ -126,7 +128,7 @@ def write_index(path: Path, items: Sequence[Item], options: PhotoOptions) -> Non
     """Write the list of all pages that exist, and print its path."""
     entries = []
     for item in items:
-        for made in sorted(item.output_base.parent.glob(f"{_escaped(item.output_base.name)}*.html")):
+        for made in sorted(item.output_base.parent.glob(f"{glob.escape(item.output_base.name)}*.html")):
             tag = made.stem.removeprefix(item.output_base.name)
             if tag == "" if options.face != "all" else tag.startswith("_face"):
                 address = made.relative_to(path.parent).as_posix()
@@ -160,8 +162,3 @@ def _strip(basis: Basis, plate: Plate) -> str:
         exposed = image * np.float32(2.0 ** auto_exposure_ev(image, seen))
         images.append(resized(exposed.clip(0, 1), *size))
     return strip_jpeg([linear_to_srgb(image) for image in images])
-
-
-def _escaped(name: str) -> str:
-    """A name in a pattern of files."""
-    return "".join(f"[{letter}]" if letter in "*?[" else letter for letter in name)
