@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.face.head import Head, shrunk_photo
+from facerf_cli.face.head import shrunk_photo
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import MOST_OVER_FRONT_EV, SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.image.strips import resized
@@ -30,8 +30,6 @@ MEAN_BETWEEN, PERCENTILE_95 = 3.0, 10.0  # between its lights
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    head: Head
-    field: PortraitField
     whole: Composition
     text: str
 
@@ -61,7 +59,7 @@ def shown() -> Shown:
     sun = [one for one in page_maps() if one.name == "sun"]
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), sun)
     whole = Person(models, photo, head, field).composed()
-    return Shown(head, field, whole, page("me", "me.jpg", document, ""))
+    return Shown(whole, page("me", "me.jpg", document, ""))
 
 
 def towards(*lights: tuple[float, float]) -> torch.Tensor:

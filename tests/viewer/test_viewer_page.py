@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import golden_spiral, rig_directions
-from facerf_cli.viewer.basis import Basis, basis_of_stack, evenly_spread
+from facerf_cli.viewer.basis import Basis, Brightest, basis_of_stack, evenly_spread
 from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_jpeg, strip_of
 
 
@@ -62,6 +63,27 @@ def test_a_stack_becomes_a_basis_and_evenly_spread_lights_are_kept() -> None:
     assert evenly_spread(directions) == list(range(40))
     kept = evenly_spread(golden_spiral(900), 100)
     assert 90 <= len(kept) <= 100 and len(set(kept)) == len(kept)
+
+
+def test_the_brightest_pixels_have_the_percentiles_of_all_under_every_light() -> None:
+    random = np.random.default_rng(4)
+    lobes = np.clip(random.normal(size=(12, 3)) @ random.normal(size=(3, 40 * 30)), 0.01, None) ** 3
+    images = (lobes.reshape(12, 40, 30, 1) * [0.8, 0.6, 0.5]).astype(np.float32)
+    mask = np.ones((40, 30), bool)
+    mask[:9] = False
+    found = Brightest.of(images, mask, 90.0)
+    assert 150 < found.luminances.shape[1] < mask.sum() == found.total
+    np.testing.assert_allclose(found.shares.sum(1), 1, rtol=1e-5)
+    red = luminance(images * np.array([1, 0, 0], np.float32))
+    for light, image in enumerate(images):
+        for values, all_values in (
+            (found.luminances[light], luminance(image)[mask]),
+            (found.luminances[light] * found.shares[:, 0], red[light][mask]),
+        ):
+            rank = len(values) - 1 - (found.total - 1) * 0.1
+            mine = np.interp(rank, np.arange(len(values)), np.sort(values))
+            np.testing.assert_allclose(mine, np.percentile(all_values, 90), rtol=1e-4)
+    assert Brightest.of(images, mask & False, 90.0).luminances.shape == (12, 0)
 
 
 def test_the_page_loads_nothing_and_names_are_escaped() -> None:
