@@ -37,7 +37,7 @@ _LIGHTS_AT_ONCE = 10
 _DARK = 5e-3  # added to the guide, as a share of its mean over the person: no ratio divides by 0
 _PERSON = 0.02  # share of the person from which on a pixel has a ratio
 _SURE = 0.5  # share from which on a pixel is skin, or the person's
-_SAMPLES = 2500  # pixels of the face, and of the person, at most, by which a page chooses its exposure
+_SAMPLES = 5000  # pixels of the face, and of the person, at most, by which a page chooses its exposure
 _WHITE_PERCENTILE = 99.9  # of a guide and of a ratio: the white of their bytes
 
 
