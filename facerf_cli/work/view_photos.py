@@ -83,7 +83,8 @@ def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plat
 def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:
     """Write the page of an OLAT stack, shown with `size_px` pixels at most; facts for the report."""
     header = read_olat_header(item.input_path)
-    head, face = (0.5, 0.5, 0.5), None
+    face: np.ndarray | None = None
+    head = (0.5, 0.5, 0.5)
     if header.kind == "photo":
         head, face = _face_of_stack(item, header, options)
     basis = basis_of_stack(
