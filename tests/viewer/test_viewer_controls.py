@@ -14,6 +14,8 @@ _FIRST_LOOK = """
     }
     seen.most = command();
     const box = byId("view").getBoundingClientRect();
+    seen.size = [box.width, box.height];
+    seen.room = document.querySelector("aside").getBoundingClientRect().left - box.right;
     const press = { bubbles: true, pointerId: 1, clientX: box.right - 1, clientY: box.top + box.height / 2 };
     byId("view").setPointerCapture = () => {};
     byId("view").dispatchEvent(new PointerEvent("pointerdown", press));
@@ -37,6 +39,8 @@ def test_a_page_begins_with_a_light_and_takes_nine(tmp_path: Path) -> None:
     assert "--light '40,25'" in seen["first"] and seen["message"] == ""
     lights = seen["most"].split("'")[1].split(";")
     assert len(lights) == 9 == len(set(lights))  # none on another
+    width, height = seen["size"]
+    assert seen["room"] >= 0 and abs(width - height) < 1  # the photo is square, and nothing lies over the panel
     azimuth, elevation = seen["dragged"]
     assert azimuth > 60 and abs(elevation) < 40  # the picture's right side
     assert seen["dark"].startswith("# add a light")
