@@ -40,7 +40,7 @@ def test_a_page_begins_with_a_light_and_takes_nine(tmp_path: Path) -> None:
     lights = seen["most"].split("'")[1].split(";")
     assert len(lights) == 9 == len(set(lights))  # none on another
     width, height = seen["size"]
-    assert seen["room"] >= 0 and abs(width - height) < 1  # the photo is square, and nothing lies over the panel
+    assert seen["room"] >= 0 and abs(width - height) < 1  # square, and not over the panel
     azimuth, elevation = seen["dragged"]
     assert azimuth > 60 and abs(elevation) < 40  # the picture's right side
     assert seen["dark"].startswith("# add a light")
