@@ -21,7 +21,7 @@ from facerf_cli.synth.bank.heads import HeadBakeSettings, draw_coefficients
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.head.shell import EYEBALL_RADIUS_MM, shell_head
 
-FACES = ("mean", "jaw_open", "blink", "half_blink", *range(4))
+FACES = ("mean", "jaw_open", "blink", "half_blink", *range(2))
 AWAY_FROM_CUTS_MM = 2.5
 
 
