@@ -34,7 +34,9 @@ from typing import Any
 import numpy as np
 
 HERE = Path(__file__).resolve().parents[1]
-TIMES = re.compile(r"seconds|time|_s$|version|sha256|digest|memory|bytes|per_second|date", re.IGNORECASE)
+TIMES = re.compile(
+    r"seconds|time|waiting|^files$|_s$|version|sha256|digest|memory|bytes|per_second|date", re.IGNORECASE
+)
 NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])", re.IGNORECASE)
 
 TABLE = tomllib.loads(Path(__file__).with_suffix(".toml").read_text())
@@ -251,11 +253,9 @@ def files_of(folder: Path, only: str) -> set[str]:
     """Paths of results in a folder of `make`: of chosen runs, or of all."""
     wanted = chosen(only) if only else None
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    shown = {name for name in names if not name.startswith(".") and "/." not in name}
+    left_out = re.compile(r"^\.|/\.|log\.txt$|/events\.out")
     return {
-        name
-        for name in shown
-        if not name.endswith("log.txt") and (not wanted or name.split("/")[0] in wanted)
+        name for name in names if not left_out.search(name) and (not wanted or name.split("/")[0] in wanted)
     }
 
 
