@@ -2,6 +2,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -235,17 +236,24 @@ def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, t
     assert metadata["provenance"]["fitted_with"].startswith("builtin-mean")
 
 
-def require_served(tmp_path: Path, name: str) -> None:
-    """Relight a photo with the network that a run trained; the shipped ones give another image."""
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], np.ndarray]:
+    """Words that relight a photo, and the image that the shipped networks give."""
+    folder = tmp_path_factory.mktemp("shipped")
     landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0].landmarks_px
-    points = tmp_path / "points.json"
+    points = folder / "points.json"
     points.write_text(json.dumps(landmarks_px.tolist()))
     line = ["relight", str(PHOTO), "--landmarks", str(points), "--light", "40,20", "--exposure", "0"]
-    images = []
-    for folder, checkpoint in (("shipped", []), ("trained", ["--checkpoint", str(tmp_path / "run")])):
-        assert main([*line, *checkpoint, "-o", str(tmp_path / folder)]) == 0
-        images.append(read_image(tmp_path / folder / "astronaut_light_40_20.exr").pixels)
-    assert abs(images[0] - images[1]).max() > 0.01
+    assert main([*line, "-o", str(folder)]) == 0
+    return line, read_image(folder / "astronaut_light_40_20.exr").pixels
+
+
+def require_served(tmp_path: Path, name: str, shipped: tuple[list[str], np.ndarray]) -> None:
+    """Relight a photo with the network that a run trained; the shipped ones give another image."""
+    line, image = shipped
+    assert main([*line, "--checkpoint", str(tmp_path / "run"), "-o", str(tmp_path / "trained")]) == 0
+    relit = read_image(tmp_path / "trained/astronaut_light_40_20.exr").pixels
+    assert abs(relit - image).max() > 0.01
     (row,) = map(json.loads, (tmp_path / "trained/report.jsonl").read_text().splitlines())
     path = tmp_path / "run/best.safetensors"
     assert row["networks"].pop(name) == {"file": str(path), "sha256": file_sha256(path)}
@@ -253,7 +261,9 @@ def require_served(tmp_path: Path, name: str) -> None:
     assert all(served["file"] == SHIPPED[other].name for other, served in row["networks"].items())
 
 
-def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> None:
+def test_the_parsing_network_trains_on_a_bank_of_portraits(
+    tmp_path: Path, shipped: tuple[list[str], np.ndarray]
+) -> None:
     """Its people are made up here; `tests/synth/bank/test_portraits.py` has a real one."""
     bank = tmp_path / "bank"
     (bank / "portraits").mkdir(parents=True)
@@ -271,10 +281,12 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(tmp_path: Path) -> No
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["parsing"] and "CC0" in metadata["licence"]
     assert metadata["provenance"]["heads"].startswith("synthetic people drawn from builtin")
-    require_served(tmp_path, "parsing")
+    require_served(tmp_path, "parsing", shipped)
 
 
-def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> None:
+def test_the_portrait_network_trains_on_a_bank_of_transport(
+    tmp_path: Path, shipped: tuple[list[str], np.ndarray]
+) -> None:
     """One person, baked and seen, stands for five."""
     bank, backgrounds = tmp_path / "bank", torch.full((2, 3, 16, 16), 90).byte()
     (bank / "transport").mkdir(parents=True)
@@ -291,7 +303,7 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(tmp_path: Path) -> N
     assert main([*line, "--bank", str(bank), "--steps", "1", "--workers", "0"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["portrait"] and "CC0" in metadata["licence"]
-    require_served(tmp_path, "portrait")
+    require_served(tmp_path, "portrait", shipped)
 
 
 def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path) -> None:
