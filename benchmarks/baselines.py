@@ -27,13 +27,12 @@ from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import explain_texture
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, load_pairs
-from facerf_cli.evaluation.people import CropView, Person
+from facerf_cli.evaluation.people import CropView, DatasetPerson
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import mean_interval, si_mse
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import Person as FittedPerson
-from facerf_cli.pipeline import explain
+from facerf_cli.pipeline import Person, explain
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
@@ -76,7 +75,7 @@ def main() -> None:
     models = load_models()
     errors: dict[str, list[tuple[str, list[float], float]]] = defaultdict(list)
     for subject in dataset.splits[given.split]:
-        person = Person(models.face, dataset, subject)
+        person = DatasetPerson(dataset, subject, None, models.sides(), models.networks.parsing)
         for case in cases(dataset, subject, given.per_person):
             for method in given.reflectance:
                 errors[method].append((subject, *measure(models, person, case, method)))
@@ -99,11 +98,13 @@ def cases(dataset: Dataset, subject: str, per_person: int) -> Iterator[BaselineC
         yield BaselineCase(pairs[first], pairs[second].source_camera, own, other)
 
 
-def measure(models: Models, person: Person, case: BaselineCase, method: str) -> tuple[list[float], float]:
+def measure(
+    models: Models, person: DatasetPerson, case: BaselineCase, method: str
+) -> tuple[list[float], float]:
     """Si-MSE of each of STEPS, and the processor's seconds to explain the photo."""
-    source, target = (captured(person, camera) for camera in (case.pair.source_camera, case.other_camera))
-    photo = source.truth(case.own)
-    head = person.head(case.pair, photo)
+    cameras = case.pair.source_camera, case.other_camera
+    source, target = (captured(models, person, camera) for camera in cameras)
+    photo, head = source.truth(case.own), person.portrait(case.pair).by(models).head
     started_s = time.process_time()
     explained = explain_by(models, head, method)
     seconds = time.process_time() - started_s
@@ -116,16 +117,16 @@ def measure(models: Models, person: Person, case: BaselineCase, method: str) -> 
     errors = []
     for view, light, truth in steps:
         shown = Target(view.view.fit, "face")
-        image = FittedPerson(models, None, head, explained.reflectance).image(light, shown).pixels
+        image = Person(models, None, head, explained.reflectance).image(light, shown).pixels
         errors.append(si_mse(image, truth, view.view.mask))
     return errors, seconds
 
 
-def captured(person: Person, camera: str) -> CapturedView:
+def captured(models: Models, person: DatasetPerson, camera: str) -> CapturedView:
     """Read a camera's stack of a person."""
-    crop = person.crop(camera)
+    view, directions = person.lit(camera).by(models).view, person.header(camera).directions
     olats = read_olats(person.dataset.stack_path(person.name, camera)).float()
-    return CapturedView(crop.view, torch.from_numpy(crop.header.directions).float(), olats)
+    return CapturedView(view, torch.from_numpy(directions).float(), olats)
 
 
 def explain_by(models: Models, head: Head, method: str) -> Explained:

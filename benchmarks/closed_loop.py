@@ -117,10 +117,8 @@ def estimates(
         face = replace(head.face, texture=relit.texture)
         for method, found in by_both(models, replace(head, face=face), features):
             yield light, ("texture", method, found)
-        rig_light = RigLight(RIG, light.weights)
-        ev = composition.auto_exposure_ev(relit.texture)
-        image = composition.image(rig_light, relit)
-        relit_photo = through_png(composition.exposed(rig_light, relit, image, ev))
+        ev = composition.exposure_ev(relit, "auto")
+        relit_photo = through_png(composition.image(relit, ev).pixels * np.float32(2.0**ev))
         seen_px = find_faces(SHIPPED_NETWORKS.parsing, relit_photo, light.name)[0].landmarks_px
         if np.linalg.norm(seen_px.mean(0) - landmarks_px.mean(0)) > _MOVED_PX:
             print(f"PNG {path.stem} {light.name}: left out, another face was detected")

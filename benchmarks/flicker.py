@@ -70,7 +70,7 @@ def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 
 def shot_view(models: Models, frames: list[np.ndarray]) -> ShotView:
     """The view of a shot, its face followed."""
-    follower = Follower("largest")
+    follower = Follower(models.networks.parsing, "largest")
     sightings = [follower.see(to_display(frame)) for frame in frames]
     return ShotView(models, models.sides(), frames.__getitem__, sightings)
 

@@ -66,14 +66,14 @@ def write_inputs(out: Path, checkout: Path) -> None:
         stream: Any = container.add_stream("prores_ks", rate=25)
         stream.width, stream.height, stream.pix_fmt = 224, 192, "yuv422p10le"
         for frame in frames:
-            container.mux(stream.encode(av.VideoFrame.from_image(frame)))
+            container.mux(stream.encode(av.VideoFrame.from_image(frame)))  # type: ignore[no-untyped-call]
         container.mux(stream.encode(None))
     from OpenImageIO import FLOAT, ImageOutput, ImageSpec
 
     for number, frame in enumerate(frames[:2]):
-        path = str(out / f"plates/plate.{1001 + number}.exr")
-        stream = ImageOutput.create(path)
-        stream.open(path, ImageSpec(224, 192, 3, FLOAT))
+        plate = str(out / f"plates/plate.{1001 + number}.exr")
+        stream = ImageOutput.create(plate)
+        stream.open(plate, ImageSpec(224, 192, 3, FLOAT))
         stream.write_image((np.asarray(frame) / np.float32(255)) ** np.float32(2.2))
         stream.close()
     face = np.asarray(whole.crop((140, 20, 308, 212)).convert("L"), np.float32)
@@ -190,7 +190,7 @@ def mesh_values(path: Path) -> Values:
     """Vertices and triangles of a mesh."""
     import trimesh
 
-    scene = trimesh.load(path, process=False, force="mesh")
+    scene: Any = trimesh.load(path, process=False, force="mesh")
     return {"vertices": np.asarray(scene.vertices), "faces": np.asarray(scene.faces)}
 
 
