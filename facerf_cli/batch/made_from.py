@@ -1,4 +1,4 @@
-"""What each output was made from, so that only stale ones are made again: recipes, and a folder's index.
+"""Recipes of outputs, and a folder's index of them, so that only stale ones are made again.
 
 A recipe is all that shapes an output, apart from its input.
 

@@ -1,4 +1,4 @@
-"""What networks share: settings in checkpoints, precision, and the steps between a texture and their layers.
+"""Parts that networks share: settings in checkpoints, precision, steps between a texture and their layers.
 
 These are exposure, colour cast, roots, resizing and head pose.
 """

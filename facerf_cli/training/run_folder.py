@@ -239,7 +239,7 @@ def load_state(path: Path, state: State, settings: TrainSettings) -> None:
 
 
 def _recipe(settings: TrainSettings) -> Recipe:
-    """What makes a run, by the names of options."""
+    """The recipe of a run, by the names of options."""
     recipe = recipe_of(settings, file_sha256)
     del recipe["results"]  # of verbs that write images
     return {"optimizer": type(settings.optimizer).__name__, **recipe}

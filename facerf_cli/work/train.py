@@ -119,7 +119,7 @@ def run_training(options: TrainOptions) -> None:
         with first_process_first():
             if first and not options.resume:
                 refuse_another_run(options.output)  # before hours of baking
-            stage = _Stage(options, trained, networks)
+            stage = _TrainedStage(options, trained, networks)
             objective: Objective = getattr(stage, options.stage.replace("-", "_"))()
         with TrainProgress(training.steps, training.max_seconds, options.settings, first) as progress:
             checkpoint = train(
@@ -149,7 +149,7 @@ def _load_start(options: TrainOptions) -> tuple[dict[str, Any], Start]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stage:
+class _TrainedStage:
     """Makes the objective of each stage; bakes, unwraps or detects its data where that is missing."""
 
     options: TrainOptions

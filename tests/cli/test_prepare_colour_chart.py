@@ -96,7 +96,10 @@ def test_jobs_corners_and_a_second_run(wrong: Path, corrected: Path, tmp_path: P
     corners = " ".join(f"{x:g},{y:g}" for x, y in CORNERS)
     for line in ([], [*chart, "--chart-corners", corners]):
         assert prepare(wrong, corrected, *SPLIT, *line) == 2
-        assert "or colour chart; give --overwrite" in capsys.readouterr().err and tree(corrected) == before
+        assert (
+            "or --colour-chart of the capture changed; give --overwrite" in capsys.readouterr().err
+            and tree(corrected) == before
+        )
 
 
 def test_an_older_charts_image_does_not_outlive_its_dataset(
