@@ -75,7 +75,7 @@ def main() -> None:
     models = load_models()
     errors: dict[str, list[tuple[str, list[float], float]]] = defaultdict(list)
     for subject in dataset.splits[given.split]:
-        person = DatasetPerson(dataset, subject, None, models.sides(), models.networks.parsing)
+        person = DatasetPerson(dataset, subject, None, models.sides(), models.networks.people)
         for case in cases(dataset, subject, given.per_person):
             for method in given.reflectance:
                 errors[method].append((subject, *measure(models, person, case, method)))

@@ -165,13 +165,13 @@ def measured(subject: Subject, index: int) -> tuple[dict[str, float], np.ndarray
     photo = photograph(baked, subject.appearance, weights)
     image = photo.image / photo.image.mean((1, 2)).mean() * 0.18 + 0.25 * (1 - photo.alpha)
     display = to_display(image.permute(1, 2, 0).contiguous().numpy())
-    faces = detect_faces(SHIPPED_NETWORKS.parsing, display)
+    faces = detect_faces(SHIPPED_NETWORKS.people, display)
     shown = [display, display]
     scores = {"found": float(bool(faces))}
     if faces:
         face = max(faces, key=lambda one: one.area_px)
         everything, inner = distances(face.landmarks_px, baked.landmarks_px[:68].numpy())
-        found = segment(SHIPPED_NETWORKS.parsing, display, face.landmarks_px)
+        found = segment(SHIPPED_NETWORKS.people, display, face.landmarks_px)
         scores |= {"landmarks, all %": everything, "inner %": inner}
         scores["IoU matte"] = overlap(found.matte, photo.alpha.numpy())
         for name in ("skin", "hair", "ears"):

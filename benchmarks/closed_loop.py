@@ -108,7 +108,7 @@ def estimates(
 ) -> Iterator[tuple[KnownLight, _Estimate]]:
     """Relight a photo by each light and yield what is estimated back, from the texture and from a PNG."""
     photo = read_image(path).pixels
-    landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px
+    landmarks_px = find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px
     head = fit_photo(models, photo, landmarks_px)
     composition = Composition(models.face, photo, head, reflectance=reflectance_of(models, head))
     weights = torch.stack([light.weights for light in lights])
@@ -119,7 +119,7 @@ def estimates(
             yield light, ("texture", method, found)
         ev = composition.exposure_ev(relit, "auto")
         relit_photo = through_png(composition.image(relit, ev).pixels * np.float32(2.0**ev))
-        seen_px = find_faces(SHIPPED_NETWORKS.parsing, relit_photo, light.name)[0].landmarks_px
+        seen_px = find_faces(SHIPPED_NETWORKS.people, relit_photo, light.name)[0].landmarks_px
         if np.linalg.norm(seen_px.mean(0) - landmarks_px.mean(0)) > _MOVED_PX:
             print(f"PNG {path.stem} {light.name}: left out, another face was detected")
             continue

@@ -40,7 +40,7 @@ def main() -> None:
     places, moves, errors = [], [], []
     for name, photo in images(photos(given.photos), given.dataset):
         try:
-            faces = find_faces(SHIPPED_NETWORKS.parsing, photo, name, "all")
+            faces = find_faces(SHIPPED_NETWORKS.people, photo, name, "all")
         except InputError as error:
             print(error)
             continue

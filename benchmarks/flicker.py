@@ -57,7 +57,7 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
     """Relight each frame as a photo."""
     results = []
     for frame in frames:
-        face = pipeline.find_for(models.networks.parsing, "landmarks", frame, "frame")[0]
+        face = pipeline.find_for(models.networks.people, "landmarks", frame, "frame")[0]
         results.append(relit(models, frame, pipeline.head_of(models, frame, face)))
     return results
 
@@ -70,7 +70,7 @@ def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 
 def shot_view(models: Models, frames: list[np.ndarray]) -> ShotView:
     """The view of a shot, its face followed."""
-    follower = Follower(models.networks.parsing, "largest")
+    follower = Follower(models.networks.people, "largest")
     sightings = [follower.see(to_display(frame)) for frame in frames]
     return ShotView(models, models.sides(), frames.__getitem__, sightings)
 

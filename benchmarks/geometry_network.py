@@ -118,7 +118,7 @@ def of_photos(paths: list[Path]) -> tuple[Tensor, Tensor]:
     crops, landmarks = [], []
     for path in paths:
         photo = read_image(path).pixels
-        landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px
+        landmarks_px = find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px
         crop = from_landmarks(landmarks_px, CROP_PX)
         crops.append(torch.from_numpy(crop.apply(photo)).permute(2, 0, 1))
         landmarks.append(torch.from_numpy(crop.to_crop(landmarks_px)).float())

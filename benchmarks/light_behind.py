@@ -52,7 +52,7 @@ def main() -> None:
 def evidence_of(models: Models, path: Path) -> LightEvidence:
     """Fit the largest face of a photo and predict it under the single lights of the rig."""
     photo = read_image(path).pixels
-    head = fit_photo(models, photo, find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px)
+    head = fit_photo(models, photo, find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px)
     return estimate_light(models, head).evidence
 
 

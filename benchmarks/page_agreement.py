@@ -54,7 +54,7 @@ def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
     """Print the table of one photo."""
     models = load_models()
     photo = read_image(path).pixels
-    face = find_for(models.networks.parsing, models.default_geometry, photo, str(path))[0]
+    face = find_for(models.networks.people, models.default_geometry, photo, str(path))[0]
     photo, head = shrunk_photo(photo, head_of(models, photo, face), size_px)
     basis, plate = of_photo(models, photo, head)
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), page_maps())

@@ -180,12 +180,12 @@ def measure_regions(folder: Path, regions: dict[str, dict[str, list[list[list[fl
         for path in sorted(folder.glob(f"{subject}_P00*{drawn['reference']}*")):
             grey = np.asarray(Image.open(path).convert("L"), np.float32) / 255
             image = _displayed(grey)
-            faces = detect_faces(SHIPPED_NETWORKS.parsing, image)
+            faces = detect_faces(SHIPPED_NETWORKS.people, image)
             if not faces:
                 print(f"{path.name}: no face found")
                 continue
             found = segment(
-                SHIPPED_NETWORKS.parsing, image, max(faces, key=lambda face: face.area_px).landmarks_px
+                SHIPPED_NETWORKS.people, image, max(faces, key=lambda face: face.area_px).landmarks_px
             )
             shares = {name: sum(found.layer(of) for of in classes) for name, classes in REGIONS.items()}
             for name, mask in outlines(drawn, (image.shape[1], image.shape[0])):
@@ -258,9 +258,7 @@ def measure_segment(folder: Path) -> None:
             if not (crop.present[0] and crop.known[0, :68].all()):
                 continue
             image = (255 * crop.crops[0].permute(1, 2, 0)).round().byte().numpy()
-            found = segment(
-                SHIPPED_NETWORKS.parsing, image, SEGMENT_PX * crop.landmarks[0, :68].numpy()
-            ).matte
+            found = segment(SHIPPED_NETWORKS.people, image, SEGMENT_PX * crop.landmarks[0, :68].numpy()).matte
             errors.append(_matte_errors(found, crop))
     sad, gradient = np.mean(errors, 0) * (256 / SEGMENT_PX) ** 2
     print(f"held-out matte of segment: SAD {sad:.3f}, gradient {gradient:.4f} ({len(errors)} photos)")
@@ -270,11 +268,11 @@ def measure_speed() -> None:
     """Print seconds of one core at 1024 x 1024."""
     photo = (255 * resize(skimage.data.astronaut(), (1024, 1024))).astype(np.uint8)
     steps = {
-        "facerf, boxes and landmarks": lambda: detect_faces(SHIPPED_NETWORKS.parsing, photo),
+        "facerf, boxes and landmarks": lambda: detect_faces(SHIPPED_NETWORKS.people, photo),
         "facerf, classes and matte": lambda: segment(
-            SHIPPED_NETWORKS.parsing, photo, detect_faces(SHIPPED_NETWORKS.parsing, photo)[0].landmarks_px
+            SHIPPED_NETWORKS.people, photo, detect_faces(SHIPPED_NETWORKS.people, photo)[0].landmarks_px
         ),
-        "dlib, boxes and landmarks": lambda: detect_faces(SHIPPED_NETWORKS.parsing, photo, "dlib"),
+        "dlib, boxes and landmarks": lambda: detect_faces(SHIPPED_NETWORKS.people, photo, "dlib"),
     }
     for name, step in steps.items():
         step()

@@ -78,7 +78,7 @@ def measure(models: Models, paths: list[Path], sheet: Path | None) -> None:
         wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
         photo = (source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
         try:
-            head = head_of(models, photo, find_for(models.networks.parsing, "landmarks", photo, path.name)[0])
+            head = head_of(models, photo, find_for(models.networks.people, "landmarks", photo, path.name)[0])
         except InputError:
             lost += 1
             continue
@@ -129,7 +129,7 @@ def _ssim(image: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> float:
 def print_speed(models: Models) -> None:
     """Print times in forward passes, and how well a photo comes back under its own light."""
     photo = read_image(ASTRONAUT).pixels
-    found = fit(models, photo, find_for(models.networks.parsing, "landmarks", photo, "astronaut")[0])
+    found = fit(models, photo, find_for(models.networks.people, "landmarks", photo, "astronaut")[0])
     field = found.reflectance
     assert isinstance(field, PortraitField)
     rig = rig_directions(150)

@@ -89,7 +89,7 @@ def measured(
     wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
-    person = fit(models, photo, find_for(models.networks.parsing, "landmarks", photo, "the photo")[0])
+    person = fit(models, photo, find_for(models.networks.people, "landmarks", photo, "the photo")[0])
     composition = person.composed(Target(background="none"))
     shown = {}
     lit = composition.relit(Lights(rig, torch.cat([lamp, natural[1:]])))

@@ -83,9 +83,9 @@ def astronaut_person() -> SeenPerson:
     """The person of the example photo."""
     models, photo = load_models(), read_image(ASTRONAUT).pixels
     head = head_of(
-        models, photo, find_for(models.networks.parsing, models.default_geometry, photo, "the example")[0]
+        models, photo, find_for(models.networks.people, models.default_geometry, photo, "the example")[0]
     )
-    return look_at_person(SHIPPED_NETWORKS.parsing, models.face, photo, head.fit)
+    return look_at_person(SHIPPED_NETWORKS.people, models.face, photo, head.fit)
 
 
 def shadows(person: SeenPerson, rig: torch.Tensor, at_once: int) -> None:

@@ -130,10 +130,10 @@ def segment(
     to it. Raises InputError where no face is found.
     """
     photo = _checked(photo)
-    parsing = (models.networks if models else SHIPPED_NETWORKS).parsing
+    people = (models.networks if models else SHIPPED_NETWORKS).people
     if landmarks_px is None:
-        landmarks_px = find_faces(parsing, photo, "photo")[0].landmarks_px
-    found = segment_image(parsing, to_display(photo), check_landmarks(landmarks_px))
+        landmarks_px = find_faces(people, photo, "photo")[0].landmarks_px
+    found = segment_image(people, to_display(photo), check_landmarks(landmarks_px))
     return {"person.A": found.matte, **filled(found.layers(), *found.matte.shape)}
 
 
@@ -156,7 +156,7 @@ def fit_photo(
         if geometry == "network":
             raise UsageError("geometry: 'network' uses no landmarks; leave one out")
         return pipeline.fit_photo(models, photo, landmarks_px, sides)
-    face = pipeline.find_for(models.networks.parsing, geometry or models.default_geometry, photo, "photo")[0]
+    face = pipeline.find_for(models.networks.people, geometry or models.default_geometry, photo, "photo")[0]
     return pipeline.head_of(models, photo, face, sides)
 
 

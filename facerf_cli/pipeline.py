@@ -31,7 +31,7 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
-from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered
 from facerf_cli.portrait.person import look_at_person
@@ -79,7 +79,7 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
 
 
 def find_for(
-    parsing: ParsingNetwork,
+    people: PeopleNetworks,
     geometry: Geometry,
     photo: np.ndarray,
     name: str,
@@ -90,7 +90,7 @@ def find_for(
 
     `which` is largest, all or an index. Raises InputError, with the photo's name, where no face is found.
     """
-    faces = find_faces(parsing, photo, name, which, landmarks_from)
+    faces = find_faces(people, photo, name, which, landmarks_from)
     return [face.box for face in faces] if geometry == "network" else faces
 
 
@@ -141,7 +141,7 @@ def reflectance_of(
         return field
     if steady and steady.portrait:
         return PortraitField.of(models.face, head, field, own, *steady.portrait)
-    person = look_at_person(models.networks.parsing, models.face, photo, head.fit)
+    person = look_at_person(models.networks.people, models.face, photo, head.fit)
     return PortraitField.of(models.face, head, field, own, person, maps_of(models.networks.portrait, person))
 
 
@@ -164,7 +164,7 @@ class Person:
         if isinstance(self.reflectance, PortraitField):
             return self.reflectance.person.segmentation.matte
         landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        return segment(self.models.networks.parsing, to_display(self.photo), landmarks_px).matte
+        return segment(self.models.networks.people, to_display(self.photo), landmarks_px).matte
 
     def composed(self, target: Target = AS_IN_PHOTO) -> Composition:
         """Prepare images of the person in a pose, before a background, that differ by their light alone."""

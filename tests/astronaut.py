@@ -28,7 +28,7 @@ def photo() -> np.ndarray:
 
 @cache
 def face() -> Face:
-    return find_faces(SHIPPED_NETWORKS.parsing, photo(), "astronaut")[0]
+    return find_faces(SHIPPED_NETWORKS.people, photo(), "astronaut")[0]
 
 
 @cache

@@ -73,7 +73,7 @@ def test_the_wheel_has_man_pages_completion_and_documents(wheel: zipfile.ZipFile
 def test_the_metadata_describe_it(metadata: Message, wheel: zipfile.ZipFile) -> None:
     assert metadata["Description-Content-Type"] == "text/markdown"
     assert str(metadata.get_payload()).strip() == (ROOT / "README.md").read_text().strip()
-    assert metadata["License-Expression"] == "MIT AND CC0-1.0"
+    assert metadata["License-Expression"] == "MIT AND CC0-1.0 AND Apache-2.0"
     for name in ("LICENSE", "facerf_cli/assets/NOTICE"):
         held = wheel.read(f"facerf-{__version__}.dist-info/licenses/{name}")
         assert name in metadata.get_all("License-File", []) and held == (ROOT / name).read_bytes()

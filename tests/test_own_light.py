@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from facerf_cli.face.head import FaceTexture
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.pipeline import fit_photo
+from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.own_light import light_of_frames, own_light
@@ -26,7 +28,10 @@ def models() -> Models:
 
 @pytest.fixture(scope="module")
 def face() -> FaceTexture:
-    head = fit_photo(astronaut.models(), astronaut.photo(), astronaut.face().landmarks_px)
+    """The face as the Parsing Network's landmarks fit it; there the field explains its own images best."""
+    photo, around = to_display(astronaut.photo()), Square.around(astronaut.face().landmarks_px, 1.7)
+    view = look(astronaut.models().networks.parsing, photo, [around], mirrored=True)[0]
+    head = fit_photo(astronaut.models(), astronaut.photo(), view.landmarks_px[:68])
     small = shrunk(head.face)
     return replace(small, visible=torch.ones_like(small.visible))
 

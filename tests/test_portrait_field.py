@@ -75,7 +75,7 @@ def test_under_its_own_light_the_photo_comes_back(
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
-    face = find_faces(SHIPPED_NETWORKS.parsing, grey, "grey")[0]
+    face = find_faces(SHIPPED_NETWORKS.people, grey, "grey")[0]
     image = fit(models, grey, face, sides=models.sides(64)).image(lamp(60), Target(background="none")).pixels
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
 

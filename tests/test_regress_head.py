@@ -110,8 +110,8 @@ def test_another_face_model_gets_the_same_surface(models: Models) -> None:
 
 def test_a_box_gives_about_the_crop_of_its_landmarks() -> None:
     photo = read_image(ASTRONAUT).pixels
-    whole = find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0]
-    box = find_for(SHIPPED_NETWORKS.parsing, "network", photo, "astronaut")[0]
+    whole = find_faces(SHIPPED_NETWORKS.people, photo, "astronaut")[0]
+    box = find_for(SHIPPED_NETWORKS.people, "network", photo, "astronaut")[0]
     assert not isinstance(box, Face) and box.box_px == whole.box_px and box.score == whole.score
     by_box, by_landmarks = from_box(box.box_px, 64), from_landmarks(whole.landmarks_px, 64)
     assert by_box.side_px == pytest.approx(by_landmarks.side_px, rel=0.15)

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
 from facerf_cli.image.strips import enlarged, filled, strips, whole
-from facerf_cli.portrait.matte import PersonColours, refine_matte, shrunk
+from facerf_cli.portrait.matte import PersonColours, lifted, shrunk
 from tests.oracles.person_colours import slow_person_colours
 
 HEIGHT, WIDTH = 150, 70
@@ -118,9 +118,9 @@ def test_colours_of_a_person_are_those_of_the_whole_image(
     assert (colours[33:40] == colours[:][33:40]).all()
 
 
-def test_a_matte_is_refined_by_strips_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_matte_is_enlarged_by_strips_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     photo = DRAW.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     rough, guide = DRAW.random((30, 14), np.float32), DRAW.random((30, 14, 3), np.float32)
-    found = refine_matte(rough, guide, photo)
+    found = lifted(rough, guide, photo)
     monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
-    np.testing.assert_allclose(found, refine_matte(rough, guide, photo), atol=1e-6)
+    np.testing.assert_allclose(found, lifted(rough, guide, photo), atol=1e-6)

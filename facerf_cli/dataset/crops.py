@@ -306,7 +306,7 @@ def _detect(cache: Path, networks: Networks, photos: list[Path]) -> None:
         landmarks_px = None
         try:
             pixels = read_image(photo).pixels
-            face = find_faces(networks.parsing, pixels, str(photo))[0]
+            face = find_faces(networks.people, pixels, str(photo))[0]
             crop = from_landmarks(face.landmarks_px, CACHED_SIDE_PX)
             write_display(record.with_suffix(".jpg"), crop.apply(pixels), "auto")
             landmarks_px = crop.to_crop(face.landmarks_px).round(3).tolist()

@@ -140,7 +140,7 @@ def _make_missing(dataset: Dataset, networks: Networks, jobs: int) -> None:
 
 
 def _made_from(dataset: Dataset, networks: Networks, subject: str, camera: str) -> str:
-    """What a portrait is made from: a stack, and the network that looks at the person."""
+    """The stamp of a portrait: of its stack, and of the network that looks at the person."""
     return f"{stamp(dataset, subject, camera)}-{networks.sha256('parsing')}"
 
 
@@ -163,7 +163,7 @@ def _portrait_of(networks: Networks, stack: Path) -> dict[str, Tensor]:
     """
     header = read_olat_header(stack)
     directions, around = torch.from_numpy(header.directions).float(), rig_directions(_AROUND)
-    person = person_in(networks.parsing, header.source)
+    person = person_in(networks.people, header.source)
     squared = [
         _in_square(person.square.apply(olat.permute(1, 2, 0).float().numpy())) for olat in read_olats(stack)
     ]

@@ -198,7 +198,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
     for light, weight in zip(person.lights, weights, strict=True):
         lit += weight * person.capture.frame(person.name, camera, light)
-    faces = detect_faces(person.networks.parsing, to_display(lit))
+    faces = detect_faces(person.networks.people, to_display(lit))
     return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
 
 

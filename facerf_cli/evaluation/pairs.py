@@ -20,7 +20,7 @@ from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.texts import read_text, require_regular
-from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces
 
 SUFFIXES = frozenset(
@@ -81,7 +81,7 @@ def collect_pairs(
     return pairs
 
 
-def compare_pair(pair: ImagePair, finder: ParsingNetwork | None = None) -> Comparison:
+def compare_pair(pair: ImagePair, finder: PeopleNetworks | None = None) -> Comparison:
     """Read a pair. EXR, HDR and .npy are scene-linear, other images are decoded by their colour space.
 
     The mask is the mask's image (its values as they are, the mean of its channels), else the truth's alpha,

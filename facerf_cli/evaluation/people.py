@@ -26,7 +26,7 @@ from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.image.metrics import tone_of
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.pipeline import (
     DEFAULT_ESTIMATOR,
     Estimator,
@@ -221,7 +221,7 @@ class DatasetPerson:
     name: str
     geometry: Geometry | None
     sides: Sides
-    parsing: ParsingNetwork
+    people: PeopleNetworks
     keep_eyes: bool = False
     landmarks_from: LandmarksFrom = "facerf"
     _lit: dict[str, Portrait] = field(default_factory=dict)
@@ -255,7 +255,7 @@ class DatasetPerson:
             face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
         else:
             try:
-                face = find_for(self.parsing, self.geometry, image, name, landmarks_from=self.landmarks_from)[
+                face = find_for(self.people, self.geometry, image, name, landmarks_from=self.landmarks_from)[
                     0
                 ]
             except InputError as error:

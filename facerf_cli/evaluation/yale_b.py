@@ -24,7 +24,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import far_samples
-from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import FaceBox, LandmarksFrom
 from facerf_cli.relighting.composition import Target
@@ -259,7 +259,7 @@ def compare_subject(
     database: YaleB,
     name: str,
     methods: Sequence[Method],
-    parsing: ParsingNetwork,
+    people: PeopleNetworks,
     network_alone: bool = False,
     geometry: Geometry = "landmarks",
     landmarks_from: LandmarksFrom = "facerf",
@@ -274,7 +274,7 @@ def compare_subject(
         database: The images.
         name: The subject's.
         methods: What is compared, at least one.
-        parsing: Finds the face.
+        people: Finds the face.
         network_alone: True to leave the photo's correction out of the field.
         geometry: Whether heads are fitted to landmarks or regressed.
         landmarks_from: Where landmarks come from.
@@ -284,7 +284,7 @@ def compare_subject(
     relightings = list(subject.relightings())
     frontal = _rgb(subject.image("frontal"))
     where = str(database.folder / name)
-    face = find_for(parsing, geometry, frontal, where, landmarks_from=landmarks_from)[0]
+    face = find_for(people, geometry, frontal, where, landmarks_from=landmarks_from)[0]
     for source in dict.fromkeys(one.source for one in relightings):
         of_source = [one for one in relightings if one.source == source]
         photo = subject.image(source)

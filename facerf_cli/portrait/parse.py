@@ -57,8 +57,11 @@ class Square:
         cos, sin = math.cos(self.turn_rad), math.sin(self.turn_rad)
         return self.side_px * np.array([[cos, sin], [-sin, cos]])
 
-    def cut(self, image_srgb: np.ndarray, size_px: int) -> Tensor:
-        """Resample an sRGB uint8 image [H, W, 3] to [3, size, size] in 0..1; its border goes on outside."""
+    def cut(self, image_srgb: np.ndarray, size_px: int, outside: float | None = None) -> Tensor:
+        """Resample an sRGB uint8 image [H, W, 3] to [3, size, size] in 0..1.
+
+        Beyond the image its border goes on, or there is `outside`.
+        """
         height, width = image_srgb.shape[:2]
         corners = self.to_photo(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
         step = max(1, int(self.side_px / size_px))  # photo pixels that are averaged first
@@ -73,7 +76,17 @@ class Square:
         place = self.to_photo(np.stack(np.meshgrid(at, at), -1))
         size = np.array(small.shape[:1:-1])
         grid = torch.from_numpy(2 * (place - low) / step / size - 1).float()[None]
-        return F.grid_sample(small, grid, padding_mode="border", align_corners=False)[0]
+        cut = F.grid_sample(small, grid, padding_mode="border", align_corners=False)[0]
+        if outside is None:
+            return cut
+        within = ((place >= 0) & (place <= (width, height))).all(-1)
+        return torch.where(torch.from_numpy(within), cut, outside)
+
+
+def whole_photo(image_srgb: np.ndarray, turn_rad: float = 0.0) -> Square:
+    """The square that shows a whole image [H, W, 3], turned."""
+    height, width = image_srgb.shape[:2]
+    return Square(width / 2, height / 2, float(max(height, width)), turn_rad)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,8 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.proxy import (
     Proxy,
@@ -88,7 +88,7 @@ def portrait_square(landmarks_px: np.ndarray, size_px: int = SIDE_PX) -> Crop:
 
 
 def look_at_person(
-    parsing: ParsingNetwork,
+    people: PeopleNetworks,
     model: MorphableModel,
     photo: np.ndarray,
     fit: FaceFit,
@@ -102,7 +102,7 @@ def look_at_person(
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = square or portrait_square(landmarks_px)
-    segmentation = segmentation or segment(parsing, to_display(photo), landmarks_px)
+    segmentation = segmentation or segment(people, to_display(photo), landmarks_px)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or give --reflectance field")

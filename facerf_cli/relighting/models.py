@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from facerf_cli.network.inputs import SourceColours
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork
+from facerf_cli.network.stored_graph import ASSET, PeopleNetworks, mediapipe_networks
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.parse import LANDMARKS
 
@@ -75,6 +76,11 @@ class Networks:
             self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
         return self._loaded[name]
 
+    @cached_property
+    def people(self) -> PeopleNetworks:
+        """The networks that find people and cut them out."""
+        return PeopleNetworks(self.parsing, *mediapipe_networks(self.device))
+
     def load(self, names: Iterable[str]) -> None:
         """Load networks by name; raises InputError for a file that is damaged or of another version."""
         for name in names:
@@ -91,7 +97,10 @@ class Networks:
     def served(self) -> dict[str, dict[str, str]]:
         """File and SHA-256 of each network that was needed so far, for reports."""
         names = [name for name in SHIPPED if name in self._loaded]
-        return {name: described_file(self.files[name]) for name in names}
+        files = {name: self.files[name] for name in names}
+        if "people" in self.__dict__:
+            files["mediapipe"] = ASSET
+        return {name: described_file(path) for name, path in files.items()}
 
 
 @cache
@@ -199,4 +208,7 @@ _CHECKS: dict[str, Callable[[Path, Any], None]] = {
 @cache
 def described_file(path: Path) -> dict[str, str]:
     """Path and SHA-256 of a checkpoint, for reports; of a shipped one the name alone."""
-    return {"file": path.name if path in SHIPPED.values() else str(path), "sha256": file_sha256(path)}
+    return {
+        "file": path.name if path in (*SHIPPED.values(), ASSET) else str(path),
+        "sha256": file_sha256(path),
+    }

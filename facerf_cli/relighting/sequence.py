@@ -24,8 +24,8 @@ from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitMaps
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, LandmarksFrom, choose_face, detect_faces, face_near
 from facerf_cli.portrait.parse import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
@@ -149,12 +149,12 @@ class Follower:
 
     def __init__(
         self,
-        parsing: ParsingNetwork,
+        people: PeopleNetworks,
         which: str,
         landmarks_from: LandmarksFrom = "facerf",
         last: np.ndarray | None = None,
     ) -> None:
-        self._parsing = parsing
+        self._people = people
         self._which, self._from, self._last = which, landmarks_from, last
 
     def see(self, image_srgb: np.ndarray) -> Sighting | None:
@@ -165,7 +165,7 @@ class Follower:
         """
         face: Face | None = None
         if self._last is not None and self._from == "facerf":
-            face = face_near(self._parsing, image_srgb, self._last)
+            face = face_near(self._people, image_srgb, self._last)
             if face is not None and not _may_be(face, self._last):
                 face = None
         if face is None:
@@ -179,7 +179,7 @@ class Follower:
     def _searched(self, image_srgb: np.ndarray) -> Face | None:
         last = self._last
         everyone = last is not None or self._which != "largest"
-        faces = detect_faces(self._parsing, image_srgb, self._from, everyone)
+        faces = detect_faces(self._people, image_srgb, self._from, everyone)
         if last is None:
             few = self._which.isdecimal() and int(self._which) >= len(faces)
             return None if few or not faces else choose_face(faces, self._which, "frame")[0]
@@ -368,19 +368,20 @@ class ShotView:
         """Classes of a frame alone, and the small image that they were seen in."""
         image = self._display(frame)
         small = small_image(image)
-        return seen_classes(self._models.networks.parsing, image, self.landmarks_px(frame), small), small
+        return seen_classes(self._models.networks.people, image, self.landmarks_px(frame), small), small
 
     def _segmentation(self, frame: int) -> Segmentation:
         around = self._around(frame)
         classes, images = zip(*(self._classes(one) for one in around), strict=True)
         own = around.index(frame)
         mean = steadied(classes, images, own)
-        return segmentation_of(mean / mean.sum(0).clamp_min(1e-6), self._display(frame), images[own])
+        mean = mean / mean.sum(0).clamp_min(1e-6)
+        return segmentation_of(mean, self._display(frame), self.landmarks_px(frame))
 
     def _seen_person(self, frame: int) -> SeenPerson:
         fit, segmentation = self._fit(frame), self.segmentation(frame)
-        parsing, model, photo = self._models.networks.parsing, self._models.face, self._read(frame)
-        return look_at_person(parsing, model, photo, fit, segmentation=segmentation)
+        people, model, photo = self._models.networks.people, self._models.face, self._read(frame)
+        return look_at_person(people, model, photo, fit, segmentation=segmentation)
 
     def _steady_maps(self, frame: int) -> PortraitMaps:
         """Maps of a frame, averaged with its neighbours' in the square, which follows the head."""

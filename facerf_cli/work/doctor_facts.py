@@ -13,7 +13,6 @@ import torch
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.dlib_landmarks import (
-    DETECTOR_LICENCE,
     PREDICTOR_LICENCE,
     RECOGNITION_LICENCE,
     predictor_path,
@@ -21,6 +20,8 @@ from facerf_cli.face.dlib_landmarks import (
 from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.files import SHIPPED, serving_files
+from facerf_cli.network.stored_graph import ASSET
+from facerf_cli.network.stored_graph import LICENCE as MEDIAPIPE_LICENCE
 from facerf_cli.relighting.models import described_file
 from facerf_cli.work.installed import MISSING
 
@@ -37,7 +38,7 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
         "assets": {
             "face model": _face_model(BUILTIN_PATH),
             **_checkpoints(serving),
-            "detector": {"licence": DETECTOR_LICENCE},
+            "mediapipe": {"licence": MEDIAPIPE_LICENCE, "size": _size(ASSET)},
             "dlib": _extra_models(),
         },
         "networks": networks,

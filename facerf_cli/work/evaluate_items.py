@@ -219,8 +219,8 @@ class FaceWork:
         models, photo = self.settings.methods()[0].models, self.settings.photo
         geometry = None if self.settings.data.joint_fit else photo.geometry or models.default_geometry
         sides = models.sides(photo.texture_side)
-        parsing, keep_eyes = models.networks.parsing, self.settings.options.keep_eyes
-        return DatasetPerson(dataset, name, geometry, sides, parsing, keep_eyes, photo.landmarks_from)
+        people, keep_eyes = models.networks.people, self.settings.options.keep_eyes
+        return DatasetPerson(dataset, name, geometry, sides, people, keep_eyes, photo.landmarks_from)
 
 
 def faces_of(item: Item, settings: FaceSettings) -> Iterator[SourceFace]:
@@ -487,7 +487,7 @@ class YaleWork:
             self.database,
             item.name,
             methods,
-            models.networks.parsing,
+            models.networks.people,
             self.settings.network_alone,
             photo.geometry or models.default_geometry,
             photo.landmarks_from,
@@ -528,4 +528,4 @@ class PairsWork:
         """Yield the comparisons of a part of the pairs."""
         models = load_models_once(PhotoOptions(self.settings)) if self.compared.face_distance else None
         for pair in self.parts[item.name]:
-            yield compare_pair(pair, models.networks.parsing if models else None)
+            yield compare_pair(pair, models.networks.people if models else None)

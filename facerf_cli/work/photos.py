@@ -159,8 +159,8 @@ def _find(
     if options.landmarks is not None:
         faces = [_given(item, image, options.landmarks)]
     else:
-        parsing, path = load_models_once(options).networks.parsing, str(item.input_path)
-        faces = find_for(parsing, geometry, image.pixels, path, options.face, options.landmarks_from)
+        networks, path = load_models_once(options).networks.people, str(item.input_path)
+        faces = find_for(networks, geometry, image.pixels, path, options.face, options.landmarks_from)
     found = []
     for number, face in enumerate(faces):
         name, (left, top, right, bottom) = str(item.input_path), face.box_px

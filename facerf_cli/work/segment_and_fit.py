@@ -62,9 +62,9 @@ def write_segments(
     image = read_photo(item, options, KEPT_OF_SEGMENTS_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
-    parsing = load_models_once(options).networks.parsing
+    networks = load_models_once(options).networks.people
     for tag, face in reversed(people):
-        _write_segment(item, tag, image, display, face, segment(parsing, display, face.landmarks_px))
+        _write_segment(item, tag, image, display, face, segment(networks, display, face.landmarks_px))
     return [tag for tag, _ in people], facts_of_found([face for _, face in people], options)
 
 

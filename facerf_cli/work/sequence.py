@@ -95,15 +95,15 @@ def _followed(
     """Rows of the frames that follow those of some rows; after a cut the face is chosen as in a new film."""
     take = rows[[0, *_cuts(rows)][-1] :]
     last = next((seen.landmarks_px for seen in map(_sighting, reversed(take)) if seen), None)
-    parsing = load_models_once(options).networks.parsing
-    follower = Follower(parsing, options.face, options.landmarks_from, last)
+    networks = load_models_once(options).networks.people
+    follower = Follower(networks, options.face, options.landmarks_from, last)
     frames = ShotFrames(shot, options)
     show = lru_cache(_AHEAD)(lambda number: to_display(frames.image(number).pixels))
     finder = CutFinder(len(shot.frames), show)
     for number in _with_progress(range(len(rows), len(shot.frames)), shot, settings):
         cut = shot.cuts and finder.is_cut(number)
         if cut:
-            follower = Follower(parsing, options.face, options.landmarks_from)
+            follower = Follower(networks, options.face, options.landmarks_from)
         yield _row(number, _sight(shot, number, show, follower, options), cut)
 
 

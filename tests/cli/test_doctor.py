@@ -33,7 +33,7 @@ def test_one_screen_with_versions_licences_and_configuration(
     assert len(out.splitlines()) <= 30 and max(map(len, out.splitlines())) <= 100
     words = " ".join(out.split())
     assert f"facerf {__version__}, Python" in words and "device cpu" in words and "ocio://default" in words
-    assert "Boost Software License" in words and "mine: MIT; 240 heads" in words
+    assert "Apache-2.0" in words and "mine: MIT; 240 heads" in words
     assert "pytest" not in words and "nbclient" not in words  # developers' tools
     assert "{" not in words and "None" not in words
 

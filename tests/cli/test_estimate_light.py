@@ -55,7 +55,7 @@ def test_a_light_is_a_map_numbers_and_a_image(
 
 
 def test_the_plain_form_fits_better_and_is_signed(given: Path, estimated: Path, tmp_path: Path) -> None:
-    assert estimate(given, tmp_path, "--signed", "--lights", "60") == 0
+    assert estimate(given, tmp_path, "--signed", "--lights", "120") == 0
     plain = row_of(tmp_path)
     assert plain["residual"] < row_of(estimated)["residual"] and not plain["non_negative"]
     assert (read_light(tmp_path / "astronaut_light.json").weights < 0).any()

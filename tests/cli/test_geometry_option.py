@@ -38,7 +38,7 @@ def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
     assert fit(tmp_path, "--geometry", "network") == 0
     found = load_fit(tmp_path / "astronaut_fit.npz")
     photo = read_image(PHOTO).pixels
-    assert found.crop == from_box(find_faces(SHIPPED_NETWORKS.parsing, photo, "astronaut")[0].box_px, 512)
+    assert found.crop == from_box(find_faces(SHIPPED_NETWORKS.people, photo, "astronaut")[0].box_px, 512)
     models = load_models()
     crop = torch.from_numpy(found.crop.apply(photo)).permute(2, 0, 1)[None]
     with torch.no_grad():

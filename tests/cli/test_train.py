@@ -240,7 +240,7 @@ def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, t
 def shipped(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[str], np.ndarray]:
     """Words that relight a photo, and the image that the shipped networks give."""
     folder = tmp_path_factory.mktemp("shipped")
-    landmarks_px = find_faces(SHIPPED_NETWORKS.parsing, read_image(PHOTO).pixels, "astronaut")[0].landmarks_px
+    landmarks_px = find_faces(SHIPPED_NETWORKS.people, read_image(PHOTO).pixels, "astronaut")[0].landmarks_px
     points = folder / "points.json"
     points.write_text(json.dumps(landmarks_px.tolist()))
     line = ["relight", str(PHOTO), "--landmarks", str(points), "--light", "40,20", "--exposure", "0"]

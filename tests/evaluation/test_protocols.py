@@ -54,7 +54,7 @@ def person(dataset: Dataset) -> DatasetPerson:
 
 def person_of(dataset: Dataset, geometry: Geometry | None = None) -> PersonOfAlbedo:
     """Of the joint fit, which is the true one here, unless another geometry is given."""
-    return PersonOfAlbedo(dataset, "0000", geometry, Sides(128, 96), SHIPPED_NETWORKS.parsing)
+    return PersonOfAlbedo(dataset, "0000", geometry, Sides(128, 96), SHIPPED_NETWORKS.people)
 
 
 def pair(index: int, source: str, target: str, light: int, envmap: str = "a") -> Pair:
@@ -328,7 +328,7 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     from facerf_cli.dataset.pairs import image_path, read_pairs, weights_path
 
     person, (first, second) = (
-        DatasetPerson(dataset, "0000", None, Sides(128, 32), SHIPPED_NETWORKS.parsing),
+        DatasetPerson(dataset, "0000", None, Sides(128, 32), SHIPPED_NETWORKS.people),
         read_pairs(dataset),
     )
     directions, weights = person.light(second)
@@ -350,7 +350,7 @@ def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, t
             del content["subjects"]["0000"]["traits"]
         (folder / "dataset.json").write_text(json.dumps(content))
         assert (
-            DatasetPerson(read_dataset(folder), "0000", None, Sides(128, 96), SHIPPED_NETWORKS.parsing).facts[
+            DatasetPerson(read_dataset(folder), "0000", None, Sides(128, 96), SHIPPED_NETWORKS.people).facts[
                 "tone"
             ]
             == tone

@@ -40,7 +40,7 @@ from tests.evaluation.method_doubles import FaceModelOnly
 from tests.evaluation.toy_subjects import Lambert, someone
 
 BENCH = SHARED / "bench" / "yale_b"
-PARSING = SHIPPED_NETWORKS.parsing
+PARSING = SHIPPED_NETWORKS.people
 
 
 @pytest.fixture(scope="module")

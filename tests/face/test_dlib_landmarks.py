@@ -21,7 +21,7 @@ PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
 
 @pytest.fixture(scope="module")
 def landmarks_px() -> np.ndarray:
-    return find_faces(SHIPPED_NETWORKS.parsing, (PHOTO**2.2).astype(np.float32), "astronaut")[0].landmarks_px
+    return find_faces(SHIPPED_NETWORKS.people, (PHOTO**2.2).astype(np.float32), "astronaut")[0].landmarks_px
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> Non
     found = []
     for name in ("obama.jpg", "obama2.jpg"):
         pixels = read_image(shared_data / "photos" / name).pixels
-        face = find_faces(SHIPPED_NETWORKS.parsing, pixels, name)[0]
+        face = find_faces(SHIPPED_NETWORKS.people, pixels, name)[0]
         found.append(face_descriptor(to_display(pixels) / 255.0, face.landmarks_px))
     assert (
         np.linalg.norm(found[0] - found[1]) < 0.6 < min(np.linalg.norm(each - descriptor) for each in found)

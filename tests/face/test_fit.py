@@ -258,7 +258,7 @@ def test_jaw_points_at_the_border_of_a_tight_crop_are_dropped():
 
 
 def test_a_smile_is_followed(model):
-    face = detect_faces(SHIPPED_NETWORKS.parsing, skimage.data.astronaut())[0]
+    face = detect_faces(SHIPPED_NETWORKS.people, skimage.data.astronaut())[0]
     crop = from_landmarks(face.landmarks_px, 256)
     fit = fit_landmarks(model, crop.to_crop(face.landmarks_px), crop)
     assert fit.error_iod <= 0.045

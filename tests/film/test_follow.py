@@ -35,7 +35,7 @@ def watch(
 
     monkeypatch.setattr(follow, "face_near", nearest)
     monkeypatch.setattr(follow, "detect_faces", lambda *_, **__: now[-1])
-    follower, found = Follower(SHIPPED_NETWORKS.parsing, which), []
+    follower, found = Follower(SHIPPED_NETWORKS.people, which), []
     for faces in shown:
         now.append([face_at(px) for px in faces])
         seen = follower.see(BLANK)

@@ -1,8 +1,11 @@
 """Views of squares as a network could give them, made up for tests."""
 
+from typing import Any
+
 import numpy as np
 import torch
 
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
 
@@ -30,3 +33,26 @@ def seen_of(square: Square, regions: dict[str, torch.Tensor], presence: float = 
         np.full(LANDMARKS, 0.01 * square.side_px),
         presence,
     )
+
+
+class _White(torch.nn.Module):
+    """In place of MediaPipe's person network: what is white is a person."""
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {"share": ((images.mean(1, keepdim=True) - 0.6) * 10).clamp(0, 1)}
+
+
+class _Nobody(torch.nn.Module):
+    """In place of MediaPipe's body network: nobody is seen."""
+
+    def forward(self, images: torch.Tensor) -> dict[str, torch.Tensor]:
+        zeros = torch.zeros(1, 1, 256, 256)
+        return {"score": torch.zeros(1, 1), "points": torch.zeros(1, 195), "mask": zeros}
+
+
+def white_people() -> PeopleNetworks:
+    """Networks that take what is white for a person; there are none that find faces."""
+    none: Any = None
+    person: Any = _White()
+    body: Any = _Nobody()
+    return PeopleNetworks(none, none, none, none, person, body)

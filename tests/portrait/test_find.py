@@ -15,7 +15,7 @@ from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
-from facerf_cli.portrait.find import Confidence, averaged, confidence_in, detect_faces, find_faces
+from facerf_cli.portrait.find import Confidence, confidence_in, detect_faces, find_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
@@ -34,7 +34,7 @@ def source(request):
 
 @pytest.fixture(scope="module")
 def landmarks_px(source):
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO, source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO, source)
     return face.landmarks_px
 
 
@@ -54,7 +54,7 @@ def resized(image, scale):
 
 @BOTH
 def test_a_mirrored_photo_has_mirrored_landmarks(source, landmarks_px):
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO[:, ::-1], source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[:, ::-1], source)
     back = face.landmarks_px[MIRROR_68] * [-1, 1] + [PHOTO.shape[1], 0]
     assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.25)
     assert error_iod(back, landmarks_px) < 0.02
@@ -66,7 +66,7 @@ def test_turned_photos(source, landmarks_px, turns):
     height, width = PHOTO.shape[:2]
     x, y = landmarks_px.T
     expected = {1: (y, width - x), 2: (width - x, height - y)}[turns]
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, np.rot90(PHOTO, turns), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.rot90(PHOTO, turns), source)
     # dlib looks at the photo turned back; facerf's network finds an upright square of its own
     assert error_iod(face.landmarks_px, np.stack(expected, -1)) < (0.02 if source == "dlib" else 0.05)
     left, top, right, bottom = face.box_px
@@ -76,34 +76,34 @@ def test_turned_photos(source, landmarks_px, turns):
 def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(source, landmarks_px):
     buffer = io.BytesIO()
     Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, np.array(Image.open(buffer)), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.array(Image.open(buffer)), source)
     assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
 
 
 def test_a_small_face(source, landmarks_px):
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, resized(PHOTO, 0.4), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, resized(PHOTO, 0.4), source)
     assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
 
 
 def test_a_large_image(source, landmarks_px):
     large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, large, source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, large, source)
     assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
 
 
 @BOTH
 def test_a_tight_crop(source, landmarks_px):
     low, high = landmarks_px[17:].min(0).astype(int) - 8, landmarks_px[17:].max(0).astype(int) + 10
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO[low[1] : high[1], low[0] : high[0]], source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[low[1] : high[1], low[0] : high[0]], source)
     assert error_iod(face.landmarks_px[17:] + low, landmarks_px[17:]) < 0.06
 
 
 @BOTH
 def test_a_dark_photo(source, landmarks_px):
     linear = srgb_to_linear(PHOTO.astype(np.float32) / 255)
-    (face,) = detect_faces(SHIPPED_NETWORKS.parsing, np.round(PHOTO * 0.03).astype(np.uint8), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.round(PHOTO * 0.03).astype(np.uint8), source)
     assert error_iod(face.landmarks_px, landmarks_px) < 0.08
-    (face,) = find_faces(SHIPPED_NETWORKS.parsing, linear * 1e-3, "dark.exr", landmarks_from=source)
+    (face,) = find_faces(SHIPPED_NETWORKS.people, linear * 1e-3, "dark.exr", landmarks_from=source)
     assert error_iod(face.landmarks_px, landmarks_px) < 0.02
 
 
@@ -111,27 +111,25 @@ def test_several_faces_from_left_to_right(source, landmarks_px):
     small = np.zeros_like(PHOTO)
     small[100:300, 90:270] = resized(PHOTO, 0.5)
     pair = np.concatenate([small, PHOTO], 1)
-    faces = detect_faces(SHIPPED_NETWORKS.parsing, pair, source)
+    faces = detect_faces(SHIPPED_NETWORKS.people, pair, source)
     assert len(faces) == 2 and faces[0].area_px < faces[1].area_px
-    assert len(detect_faces(SHIPPED_NETWORKS.parsing, pair, source, everyone=True)) == 2
+    assert len(detect_faces(SHIPPED_NETWORKS.people, pair, source, everyone=True)) == 2
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5000, 3), (200, 300, 3)])
 def test_no_face_names_the_image_and_a_way_out(shape):
     with pytest.raises(InputError, match=r"holiday\.png: no face found.*--landmarks"):
-        find_faces(
-            SHIPPED_NETWORKS.parsing, np.random.default_rng(0).random(shape, np.float32), "holiday.png"
-        )
+        find_faces(SHIPPED_NETWORKS.people, np.random.default_rng(0).random(shape, np.float32), "holiday.png")
 
 
 def test_only_display_images_are_searched():
     with pytest.raises(ValueError, match="uint8"):
-        detect_faces(SHIPPED_NETWORKS.parsing, np.zeros((5, 5, 3), np.float32))
+        detect_faces(SHIPPED_NETWORKS.people, np.zeros((5, 5, 3), np.float32))
 
 
 def test_both_find_the_same_landmarks():
     own, other = (
-        detect_faces(SHIPPED_NETWORKS.parsing, PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib")
+        detect_faces(SHIPPED_NETWORKS.people, PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib")
     )
     off = np.linalg.norm(own - other, axis=1) / iod_px(other)
     assert off[INNER].mean() < 0.06 and off.mean() < 0.08
@@ -140,33 +138,40 @@ def test_both_find_the_same_landmarks():
 def test_without_the_extra_only_its_option_fails(monkeypatch):
     monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
     dlib_landmarks._predictor.cache_clear()
-    assert detect_faces(SHIPPED_NETWORKS.parsing, PHOTO)
+    assert detect_faces(SHIPPED_NETWORKS.people, PHOTO)
     with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
-        detect_faces(SHIPPED_NETWORKS.parsing, PHOTO, "dlib")
-
-
-def test_views_are_weighed_by_what_is_expected_of_them():
-    first = seen_of(Square(50, 50, 100), {})
-    sure = replace(
-        first, landmarks_px=first.landmarks_px + np.array([3, 0]), error_px=np.full(LANDMARKS, 1.0)
-    )
-    unsure = replace(first, error_px=np.full(LANDMARKS, 2.0))
-    found = averaged([unsure, sure])
-    assert np.allclose(found.landmarks_px - first.landmarks_px, [2.4, 0])  # weights 1/4 and 1
-    assert found.square == first.square and np.allclose(found.error_px, 2)
+        detect_faces(SHIPPED_NETWORKS.people, PHOTO, "dlib")
 
 
 def test_a_face_that_is_larger_than_the_photo():
-    """From the eyes to the mouth; the photo looked at as a whole alone is seen upside down."""
-    (whole,) = detect_faces(SHIPPED_NETWORKS.parsing, PHOTO)
+    """From the eyes to the mouth."""
+    (whole,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO)
     face = whole.landmarks_px
     x0, x1 = (int(face[corner, 0]) for corner in (37, 44))
     y0, y1 = int(face[37, 1]) - 4, int(face[57, 1])
     (near,) = detect_faces(
-        SHIPPED_NETWORKS.parsing, np.kron(PHOTO[y0:y1, x0:x1], np.ones((3, 3, 1), np.uint8))
+        SHIPPED_NETWORKS.people, np.kron(PHOTO[y0:y1, x0:x1], np.ones((3, 3, 1), np.uint8))
     )
     off = np.linalg.norm(near.landmarks_px / 3 + [x0, y0] - face, axis=1)
     assert off[INNER].mean() < 0.12 * iod_px(face)
+
+
+@pytest.mark.parametrize("turn", [40, 90, 180, 250])
+def test_heads_in_any_turn_are_found_among_others(landmarks_px, turn):
+    lying = skimage.transform.rotate(PHOTO, turn, resize=True)
+    lying = resized(np.round(255 * lying).astype(np.uint8), 0.7)
+    height = max(len(lying), len(PHOTO))
+    pair = [np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in (PHOTO, lying)]
+    assert len(detect_faces(SHIPPED_NETWORKS.people, np.concatenate(pair, 1), everyone=True)) == 2
+
+
+def test_a_face_of_24_pixels_in_a_photo_of_12_megapixels(landmarks_px):
+    scale = 24 / np.ptp(landmarks_px[:, 1])
+    wide = np.full((3000, 4000, 3), 128, np.uint8)
+    small = resized(PHOTO, scale)
+    wide[1900 : 1900 + len(small), 3100 : 3100 + small.shape[1]] = small
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, wide, everyone=True)
+    assert error_iod(face.landmarks_px - [3100, 1900], scale * landmarks_px) < 0.15
 
 
 def view_of_face(
@@ -220,11 +225,11 @@ def test_the_words_follow_the_score() -> None:
 
 def test_a_blurred_photo_is_doubtful_and_says_why() -> None:
     photo = skimage.data.astronaut()[:300, 60:360].astype(np.float32)
-    (sharp,) = detect_faces(SHIPPED_NETWORKS.parsing, photo.astype(np.uint8))
+    (sharp,) = detect_faces(SHIPPED_NETWORKS.people, photo.astype(np.uint8))
     assert sharp.view is not None and confidence_in(sharp.view).factors["blurred"] == 1
     blurs = [0.01 * sharp.view.extent_px, 0.02 * sharp.view.extent_px]
     found = [
-        detect_faces(SHIPPED_NETWORKS.parsing, gaussian_filter(photo, (blur, blur, 0)).astype(np.uint8))[0]
+        detect_faces(SHIPPED_NETWORKS.people, gaussian_filter(photo, (blur, blur, 0)).astype(np.uint8))[0]
         for blur in blurs
     ]
     little, much = (confidence_in(one.view) for one in found if one.view)

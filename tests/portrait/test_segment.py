@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from facerf_cli.image.strips import filled
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait import segment as module
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
-from facerf_cli.portrait.segment import Segmentation, segment, with_ears, with_outline
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from tests.portrait.seen import places, seen_of
+from facerf_cli.portrait.segment import Segmentation, segment, with_ears
+from tests.portrait.seen import places, seen_of, white_people
 
 HEIGHT, WIDTH = 240, 320
 FACE = np.random.default_rng(0).uniform([135, 45], [185, 95], (68, 2))  # around (160, 70), 50 pixels large
@@ -38,7 +37,7 @@ def squares(monkeypatch: pytest.MonkeyPatch) -> list[Square]:
         for square in wanted:
             x, y = photo_share(square)
             head = (x - 160).square() + (y - 70).square() < 30**2
-            body = ((x - 160).abs() < 50) & (y > 110)
+            body = ((x - 160).abs() < 50) & (y > 98)
             other = (x - 30).square() + (y - 120).square() < 20**2
             found.append(
                 seen_of(square, {"garment": body, "skin": head, "hair": head & (y < 55), "hand": other})
@@ -49,15 +48,22 @@ def squares(monkeypatch: pytest.MonkeyPatch) -> list[Square]:
     return looked
 
 
+@pytest.fixture
+def people(monkeypatch: pytest.MonkeyPatch) -> PeopleNetworks:
+    """Networks that take what is white for a person, and see no further face and no body."""
+    monkeypatch.setattr(module, "find_meshes", lambda *_: [])
+    return white_people()
+
+
 def photo() -> np.ndarray:
     """Grey, with the person white, so that the matte's edges are the photo's."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    person = ((x - 160) ** 2 + (y - 70) ** 2 < 30**2) | ((abs(x - 160) < 50) & (y > 110))
+    person = ((x - 160) ** 2 + (y - 70) ** 2 < 30**2) | ((abs(x - 160) < 50) & (y > 98))
     return np.repeat(np.where(person, 220, 90)[..., None], 3, -1).astype(np.uint8)
 
 
-def test_layers_lie_where_the_network_saw_them(squares: list[Square]) -> None:
-    found = segment(SHIPPED_NETWORKS.parsing, photo(), FACE)
+def test_layers_lie_where_the_network_saw_them(squares: list[Square], people: PeopleNetworks) -> None:
+    found = segment(people, photo(), FACE)
     assert found.matte.shape == (HEIGHT, WIDTH)
     assert found.layer("hair")[45, 160] > 0.9 and found.layer("skin")[85, 160] > 0.9
     assert found.layer("garment")[200, 160] > 0.9 and found.matte[200, 230] < 0.1
@@ -66,13 +72,10 @@ def test_layers_lie_where_the_network_saw_them(squares: list[Square]) -> None:
     assert np.abs(total - found.matte).max() < 1e-5
 
 
-def test_another_person_is_left_out(squares: list[Square]) -> None:
-    found = segment(SHIPPED_NETWORKS.parsing, photo(), FACE)
-    assert found.matte[120, 30] < 0.05 and found.layer("hand").max() < 0.05
-
-
-def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(squares: list[Square]) -> None:
-    segment(SHIPPED_NETWORKS.parsing, photo(), FACE)
+def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(
+    squares: list[Square], people: PeopleNetworks
+) -> None:
+    segment(people, photo(), FACE)
     body, *_, near = squares
     assert near.side_px < body.side_px <= WIDTH
     for square in (body, near):
@@ -91,29 +94,7 @@ def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
     assert np.allclose(total, 0.5, atol=1e-6) and found.layer("hair").min() > 0.4
 
 
-def test_what_a_thin_bridge_joins_is_left_out_and_hair_off_the_body_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
-        found = []
-        for square in wanted:
-            x, y = photo_share(square)
-            head = (x - 160).square() + (y - 70).square() < 40**2
-            body = ((x - 160).abs() < 50) & (y > 105)
-            flag = (x < 70) & (y > 150)
-            bridge = (x < 160) & ((y - 180).abs() < 2.6)
-            strand = ((x - 210).square() + (y - 70).square()) < 4**2
-            found.append(seen_of(square, {"garment": body | flag | bridge, "skin": head, "hair": strand}))
-        return found
-
-    monkeypatch.setattr(module, "look", look)
-    classes = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))
-    matte = 1 - classes[0]
-    assert matte[200, 30] < 0.05 and matte[70, 160] > 0.9 and matte[220, 160] > 0.9
-    assert matte[70, 209] > 0.5
-
-
-def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch, people: PeopleNetworks) -> None:
     def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         smallest = min(square.side_px for square in wanted)
         everywhere = torch.ones_like(places()[0], dtype=torch.bool)
@@ -123,34 +104,20 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch) -> None:
         ]
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[
-        :, 70, 160
-    ]
+    at_face = module.seen_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[CLASSES.index("skin")] == pytest.approx(0.745, abs=0.01)  # 1.6^-4 over the sum
     assert at_face[CLASSES.index("neck")] > 0.2
 
 
-def test_a_badge_on_the_chest_is_no_hole_and_gaps_beside_the_neck_and_an_arm_stay(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
-        found = []
-        for square in wanted:
-            x, y = photo_share(square)
-            person = ((x - 160).abs() < 90) & (y > 40)
-            holes = [
-                (x - at_x).square() + (y - at_y).square() < 8**2
-                for at_x, at_y in ((150, 180), (190, 80), (235, 180))
-            ]
-            found.append(seen_of(square, {"garment": person & ~torch.stack(holes).any(0)}))
-        return found
-
-    monkeypatch.setattr(module, "look", look)
-    matte = 1 - module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[0]
-    assert matte[180, 150] > 0.99 and matte[80, 190] < 0.5 and matte[180, 235] < 0.5
+def test_no_pixel_of_the_person_is_without_a_class(squares: list[Square], people: PeopleNetworks) -> None:
+    """A hat that the Parsing Network does not see has the class of the nearest pixel that it sees."""
+    image = photo()
+    image[10:40, 140:180] = 220
+    found = segment(people, image, FACE)
+    assert found.matte[20, 160] > 0.9 and found.layer("hair")[20, 160] > 0.9
 
 
-def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hair_is_likelier_than_seen(monkeypatch: pytest.MonkeyPatch, people: PeopleNetworks) -> None:
     def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
         everywhere = torch.ones_like(places()[0], dtype=torch.bool)
         found = [seen_of(square, {"hair": everywhere}) for square in wanted]
@@ -160,36 +127,8 @@ def test_hair_is_likelier_than_seen_and_the_matte_is_not(monkeypatch: pytest.Mon
         return found
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[
-        :, 70, 160
-    ]
-    assert at_face[0] == pytest.approx(0.5, abs=1e-3)
+    at_face = module.seen_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    "name, share, matte",
-    [
-        ("hair", 0.4, 0.0), ("hair", 0.65, 0.5), ("hair", 0.9, 1.0),
-        ("garment", 0.2, 0.0), ("garment", 0.5, 0.5), ("garment", 0.75, 1.0),
-    ],
-)  # fmt: skip
-def test_a_person_is_whole_or_absent_where_it_is_fairly_sure(
-    monkeypatch: pytest.MonkeyPatch, name: str, share: float, matte: float
-) -> None:
-    def look(network: object, image: np.ndarray, wanted: Sequence[Square]) -> list[SquareView]:
-        found = [seen_of(square, {}) for square in wanted]
-        for seen in found:
-            seen.classes[0], seen.classes[CLASSES.index(name)] = 1 - share, share
-        return found
-
-    monkeypatch.setattr(module, "look", look)
-    monkeypatch.setattr(module, "_of_one_person", lambda classes, *_: classes)
-    at_chest = module.seen_classes(SHIPPED_NETWORKS.parsing, photo(), FACE, module.small_image(photo()))[
-        :, 150, 160
-    ]
-    assert 1 - at_chest[0] == pytest.approx(matte, abs=1e-3)
-    assert at_chest[CLASSES.index(name)] == pytest.approx(matte, abs=1e-3)
 
 
 EARS, HAIR, SKIN, GLASSES = (class_index(name) for name in ("ears", "hair", "skin", "glasses"))
@@ -240,68 +179,3 @@ def test_sure_hair_and_glasses_stay() -> None:
 
 _SIDE, _BORDER, _EXTENT_PX = 64, 40, 50.0
 _UNSURE = slice(_BORDER - 6, _BORDER + 6)  # columns of which the network is unsure
-
-
-def _two_colours() -> Tensor:
-    """A person of one colour on the left, a background of another on the right."""
-    image = torch.tensor([0.7, 0.4, 0.3]).view(3, 1, 1).repeat(1, _SIDE, _SIDE)
-    image[:, :, _BORDER:] = torch.tensor([0.3, 0.5, 0.3]).view(3, 1, 1)
-    return image
-
-
-def _classes_of(person: Tensor) -> Tensor:
-    """Classes of a person of hair and skin in equal parts, of which a share [h, w] is seen."""
-    classes = torch.zeros(len(CLASSES), _SIDE, _SIDE)
-    classes[0] = 1 - person
-    classes[[class_index("hair"), class_index("skin")]] = person / 2
-    return classes
-
-
-def _seen_to_border(share: float) -> Tensor:
-    person = torch.zeros(_SIDE, _SIDE)
-    person[:, :_BORDER], person[:, _UNSURE] = 1, share
-    return _classes_of(person)
-
-
-def test_what_the_network_is_unsure_of_goes_to_the_side_of_its_colours() -> None:
-    for share in (0.3, 0.7):
-        found = 1 - with_outline(_seen_to_border(share), _two_colours(), _EXTENT_PX)[0]
-        assert found[:, :_BORDER].min() > 0.85
-        assert found[:, _BORDER:].max() < 0.15
-
-
-def test_what_the_network_is_sure_of_stays() -> None:
-    classes = _classes_of((torch.arange(_SIDE) < _BORDER + 10).float().expand(_SIDE, -1))
-    torch.testing.assert_close(with_outline(classes, _two_colours(), _EXTENT_PX)[..., 50:], classes[..., 50:])
-
-
-def test_colours_that_both_sides_share_leave_it_to_the_network() -> None:
-    seen = _seen_to_border(0.3)
-    even = torch.full((3, _SIDE, _SIDE), 0.5)
-    middle = with_outline(seen, even, _EXTENT_PX)[0, :, _BORDER - 1 : _BORDER + 1]
-    torch.testing.assert_close(middle, seen[0, :, _BORDER - 1 : _BORDER + 1], atol=0.02, rtol=0)
-
-
-def test_classes_sum_to_1_and_share_the_person_as_before() -> None:
-    found = with_outline(_seen_to_border(0.7), _two_colours(), _EXTENT_PX)
-    torch.testing.assert_close(found.sum(0), torch.ones(_SIDE, _SIDE))
-    torch.testing.assert_close(found[class_index("hair")], found[class_index("skin")])
-
-
-def test_without_sure_pixels_of_both_sides_nothing_changes() -> None:
-    for share in (0.0, 0.5, 1.0):
-        classes = _classes_of(torch.full((_SIDE, _SIDE), share))
-        torch.testing.assert_close(with_outline(classes, _two_colours(), _EXTENT_PX), classes)
-
-
-def test_colours_add_no_islands() -> None:
-    classes, image = _seen_to_border(0.3), _two_colours()
-    island = slice(28, 32), slice(56, 60)
-    image[:, *island] = image[:, 0, 0].view(3, 1, 1)
-    classes[:, *island] = _classes_of(torch.full((_SIDE, _SIDE), 0.3))[:, *island]
-    found = 1 - with_outline(classes, image, _EXTENT_PX)[0]
-    assert found[island].max() <= 0.3
-    image[:, 28:32, :60] = image[:, 0, 0].view(3, 1, 1)
-    classes[:, 28:32, _BORDER:60] = _classes_of(torch.full((_SIDE, _SIDE), 0.3))[:, 28:32, _BORDER:60]
-    found = 1 - with_outline(classes, image, _EXTENT_PX)[0]
-    assert found[island].min() > 0.85  # a strand of hair

@@ -50,7 +50,7 @@ class Shown:
 def shown() -> Shown:
     models = load_models()
     photo = read_image(ASTRONAUT).pixels
-    face = find_for(models.networks.parsing, models.default_geometry, photo, "astronaut")[0]
+    face = find_for(models.networks.people, models.default_geometry, photo, "astronaut")[0]
     photo, head = shrunk_photo(photo, head_of(models, photo, face), 384)
     photo = np.clip(photo, 0, 1)
     basis, plate = of_photo(models, photo, head)

@@ -27,8 +27,8 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
-from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_harmonics, mirrored_x, reached_by
+from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SIDE_PX, SIDES, SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.proxy import own_shading
@@ -161,13 +161,13 @@ def look_at_views(backgrounds: Tensor, networks: Networks, seed: int, paths: lis
     with one_thread():
         for path in paths:
             number = int(path.stem.replace("_", ""))
-            seen = seen_in(load_view(path), backgrounds, networks.parsing, seed + number)
+            seen = seen_in(load_view(path), backgrounds, networks.people, seed + number)
             with atomic_path(seen_path(path)) as temporary:
                 save_file(seen, temporary, made_from)
 
 
 @torch.no_grad()
-def seen_in(view: "StoredView", backgrounds: Tensor, parsing: ParsingNetwork, seed: int) -> dict[str, Tensor]:
+def seen_in(view: "StoredView", backgrounds: Tensor, people: PeopleNetworks, seed: int) -> dict[str, Tensor]:
     """Fit and segment a photo of a view as those of users are; empty where no face is found in it.
 
     All is seen in the view's own frame, so that it lies on the view's images; see `layers_of`.
@@ -182,19 +182,19 @@ def seen_in(view: "StoredView", backgrounds: Tensor, parsing: ParsingNetwork, se
         image = image / image.mean().clamp_min(1e-6) * 0.1 + (1 - view.alpha) * background
         exposed = (image / image.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
         with suppress(InputError):
-            return layers_of(person_in(parsing, exposed, frame), portrait.directions)
+            return layers_of(person_in(people, exposed, frame), portrait.directions)
     return {}
 
 
-def person_in(parsing: ParsingNetwork, photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
+def person_in(people: PeopleNetworks, photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
     """Find the largest face of a scene-linear photo [H, W, 3], fit it, and look at the person.
 
     All is seen in the square around the landmarks, or in a given one. Raises InputError without a face.
     """
-    face = find_faces(parsing, photo, "portrait")[0]
+    face = find_faces(people, photo, "portrait")[0]
     crop = from_landmarks(face.landmarks_px, _CROP_PX)
     fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
-    return look_at_person(parsing, _builtin(), photo, fit, square)
+    return look_at_person(people, _builtin(), photo, fit, square)
 
 
 def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:

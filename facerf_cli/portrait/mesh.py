@@ -1,0 +1,216 @@
+"""Faces in a photo by MediaPipe's detectors (Bazarevsky et al., *BlazeFace*, 2019), and a mesh of each.
+
+Two detectors look at squares of the photo, which may be turned. Around each face that they propose, a network
+finds a mesh (Grishchenko et al., *Attention Mesh*, 2020), twice; it also says if a face is there.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
+from facerf_cli.portrait.parse import Square, whole_photo
+
+POINTS = 478  # of a mesh: 468 of MediaPipe's face, and 5 of each iris
+_MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
+_MESH_PX = 192
+_OVERLAP = 1.5  # how many parts along a side cover the photo, over those that just would
+_LEAST_MESH_SCORE, _LEAST_PX = 0.5, 8.0  # of a face; noise has smaller ones
+_SAME = 0.5  # distance of the middles of two boxes below which they hold one face, in sides of the larger
+_EYES = (33, 263)  # outer corners, the picture's left one first
+# MediaPipe's 468 points that stand for the 68 landmarks (Multi-PIE order).
+_OF_68 = np.array(
+    [
+        *(127, 234, 93, 132, 58, 136, 150, 176, 152, 400, 379, 365, 288, 361, 323, 454, 356),  # jaw
+        *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),  # brows
+        *(168, 197, 5, 4, 75, 97, 2, 326, 305),  # nose
+        *(33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380),  # eyes
+        *(61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181),  # outer lips
+        *(78, 82, 13, 312, 308, 317, 14, 87),  # inner lips
+    ]
+)
+
+
+@dataclass(frozen=True)
+class _Detector:
+    """A detector: the side of its input, cells a side and anchors a cell of its scales, least score."""
+
+    side_px: int
+    scales: tuple[tuple[int, int], ...]
+    least_score: float
+
+    def anchors(self) -> np.ndarray:
+        """Middles [N, 2] of the anchors, in sides of the input."""
+        middles = []
+        for cells, each in self.scales:
+            at = (np.arange(cells) + 0.5) / cells
+            middles.append(np.repeat(np.stack(np.meshgrid(at, at), -1).reshape(-1, 2), each, 0))
+        return np.concatenate(middles)
+
+
+_NEAR = _Detector(128, ((16, 2), (8, 6)), 0.5)
+_FAR = _Detector(192, ((48, 1),), 0.6)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceMesh:
+    """A face: points [478, 3] in the photo's pixels (z on the same scale, smaller toward the camera).
+
+    `score` in 0..1 says how surely a face is there, `square` where its mesh was found.
+    """
+
+    points_px: np.ndarray
+    score: float
+    square: Square
+
+    @property
+    def landmarks_px(self) -> np.ndarray:
+        """The 68 landmarks [68, 2]."""
+        return self.points_px[_OF_68, :2]
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """A proposed face: its square, level with the eyes, and score."""
+
+    square: Square
+    score: float
+
+
+_Proposed = TypeVar("_Proposed", _Box, FaceMesh)
+
+
+def first_squares(image_srgb: np.ndarray) -> list[Square]:
+    """The whole of an image [H, W, 3] and its parts of two thirds, where faces are searched first."""
+    return [whole_photo(image_srgb), *parts_of(image_srgb, max(image_srgb.shape[:2]) / 1.5)]
+
+
+def parts_of(image: np.ndarray, side_px: float) -> list[Square]:
+    """Overlapping squares that cover the photo."""
+    rows, columns = (
+        np.linspace(
+            min(side_px, length) / 2,
+            length - min(side_px, length) / 2,
+            max(1, math.ceil(_OVERLAP * length / side_px - 0.5)) if length > side_px else 1,
+        )
+        for length in image.shape[:2]
+    )
+    return [Square(float(x), float(y), side_px) for y in rows for x in columns]
+
+
+def find_meshes(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[FaceMesh]:
+    """Find faces in squares of an sRGB uint8 image [H, W, 3], the surest first."""
+    found: list[FaceMesh] = []
+    for box in distinct(detected(people, image_srgb, squares)):
+        if mesh := mesh_near(people, image_srgb, box.square):
+            found.append(mesh)
+    return distinct(found)
+
+
+def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) -> FaceMesh | None:
+    """The mesh of a face that is expected in a square; None where there is none."""
+    mesh = mesh_in(people.face_mesh, image_srgb, square)
+    if mesh.score > _LEAST_MESH_SCORE:
+        mesh = mesh_in(people.face_mesh, image_srgb, face_square(mesh.points_px))
+    extent_px = float(np.ptp(mesh.landmarks_px, axis=0).max())
+    return mesh if mesh.score > _LEAST_MESH_SCORE and extent_px > _LEAST_PX else None
+
+
+def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[_Box]:
+    """Boxes that the detectors propose in squares; one face has many."""
+    boxes: list[_Box] = []
+    for network, detector in ((people.near_faces, _NEAR), (people.far_faces, _FAR)):
+        anchors = detector.anchors()
+        for square in squares:
+            image = square.cut(image_srgb, detector.side_px, outside=0.0)
+            out = network(image[None] * 2 - 1)
+            score = out["scores"][0, :, 0].sigmoid().numpy()
+            values = out["boxes"].reshape(-1, 8, 2).numpy() / detector.side_px
+            likely = score > detector.least_score
+            for middle, size, eyes, its_score in zip(
+                values[likely, 0] + anchors[likely],
+                values[likely, 1],
+                values[likely, 2:4] + anchors[likely, None],
+                score[likely],
+                strict=True,
+            ):
+                boxes.append(_Box(_level(square, middle, float(size.max()), eyes), float(its_score)))
+    return boxes
+
+
+def mesh_in(network: StoredGraph, image_srgb: np.ndarray, square: Square) -> FaceMesh:
+    """The mesh of a face in a square around it."""
+    out = {
+        name: value.reshape(-1).numpy()
+        for name, value in network(square.cut(image_srgb, _MESH_PX, outside=0.0)[None]).items()
+    }
+    points = np.concatenate([out["mesh"].reshape(-1, 3), np.zeros((10, 3), np.float32)])
+    for name, numbers in _REFINED.items():
+        points[numbers, :2] = out[name].reshape(-1, 2)
+    for name, first in (("left_iris", 468), ("right_iris", 473)):
+        points[first : first + 5, :2] = out[name].reshape(-1, 2)
+        points[first : first + 5, 2] = points[_REFINED[f"{name[:-5]}_eye"][:16], 2].mean()
+    depth_px = points[:, 2:] * (square.side_px / _MESH_PX)
+    placed = np.concatenate([square.to_photo(points[:, :2] / _MESH_PX), depth_px], 1)
+    return FaceMesh(placed, float(1 / (1 + np.exp(-out["score"][0]))), square)
+
+
+def face_square(points_px: np.ndarray) -> Square:
+    """The square, level with the eyes, in which a mesh is found again from its points [478, 3]."""
+    left, right = points_px[list(_EYES), :2]
+    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    level = Square(0.0, 0.0, 1.0, turn_rad)
+    along = level.to_share(points_px[:468, :2])
+    low, high = along.min(0), along.max(0)
+    x_px, y_px = level.to_photo((low + high) / 2)
+    return Square(float(x_px), float(y_px), _MESH_SIDES * float((high - low).max()), turn_rad)
+
+
+def _level(square: Square, middle: np.ndarray, size: float, eyes: np.ndarray) -> Square:
+    """The square for the mesh of a face; its middle and eyes [2, 2] are in sides of a square around it."""
+    left, right = square.to_photo(eyes)
+    x_px, y_px = square.to_photo(middle)
+    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    return Square(float(x_px), float(y_px), _MESH_SIDES * size * square.side_px, turn_rad)
+
+
+def distinct(found: list[_Proposed]) -> list[_Proposed]:
+    """The surest of what lies on each other."""
+    kept: list[_Proposed] = []
+    for one in sorted(found, key=lambda one: -one.score):
+        if all(_apart(one.square, other.square) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _apart(first: Square, second: Square) -> bool:
+    side_px = max(first.side_px, second.side_px) / _MESH_SIDES
+    return math.hypot(first.x_px - second.x_px, first.y_px - second.y_px) > _SAME * side_px
+
+
+# Numbers of the mesh's points that the network finds again, finer, in a crop around lips and eyes.
+_REFINED = {
+    "lips": [
+        *(61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 185, 40, 39, 37, 0, 267, 269, 270, 409),
+        *(78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 191, 80, 81, 82, 13, 312, 311, 310, 415),
+        *(76, 77, 90, 180, 85, 16, 315, 404, 320, 307, 306, 184, 74, 73, 72, 11, 302, 303, 304, 408),
+        *(62, 96, 89, 179, 86, 15, 316, 403, 319, 325, 292, 183, 42, 41, 38, 12, 268, 271, 272, 407),
+    ],
+    "left_eye": [
+        *(33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173),
+        *(130, 25, 110, 24, 23, 22, 26, 112, 243, 247, 30, 29, 27, 28, 56, 190),
+        *(226, 31, 228, 229, 230, 231, 232, 233, 244, 113, 225, 224, 223, 222, 221, 189),
+        *(35, 124, 46, 53, 52, 65, 143, 111, 117, 118, 119, 120, 121, 128, 245),
+        *(156, 70, 63, 105, 66, 107, 55, 193),
+    ],
+    "right_eye": [
+        *(263, 249, 390, 373, 374, 380, 381, 382, 362, 466, 388, 387, 386, 385, 384, 398),
+        *(359, 255, 339, 254, 253, 252, 256, 341, 463, 467, 260, 259, 257, 258, 286, 414),
+        *(446, 261, 448, 449, 450, 451, 452, 453, 464, 342, 445, 444, 443, 442, 441, 413),
+        *(265, 353, 276, 283, 282, 295, 372, 340, 346, 347, 348, 349, 350, 357, 465),
+        *(383, 300, 293, 334, 296, 336, 285, 417),
+    ],
+}

@@ -1,0 +1,85 @@
+"""Mattes of people: views of a photo agree with the photo, and one person is told from the next."""
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.portrait.parse import Square
+from facerf_cli.portrait.people import (
+    HeadPlace,
+    cut,
+    matte_of,
+    outline,
+    part_of_first,
+    person_among,
+    placed_back,
+)
+from tests.portrait.seen import white_people
+
+FACE = np.random.default_rng(0).uniform([135, 45], [185, 95], (68, 2))  # around (160, 70)
+HEAD = HeadPlace(160, 70, 60, 95)
+
+
+def disc(x: float, y: float, radius: float, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
+    down, right = np.mgrid[: shape[0], : shape[1]] + 0.5
+    return (right - x) ** 2 + (down - y) ** 2 < radius**2
+
+
+def test_a_view_is_placed_back_where_it_was_cut() -> None:
+    y, x = np.mgrid[:120, :160] / 160
+    photo = torch.from_numpy(np.stack([x, y, x * y]).astype(np.float32))
+    square = Square(70, 60, 80)
+    placed, weight = placed_back(cut(photo, square)[None, :1], square, (120, 160))
+    inside = weight > 0.5
+    assert inside.sum() > 60**2 and (weight[:, 115:] == 0).all()
+    assert torch.allclose(placed[0, 0][inside], photo[0][inside], atol=2e-3)
+
+
+def test_a_border_beyond_the_photo_weighs_fully() -> None:
+    _, weight = placed_back(torch.ones(1, 1, 256, 256), Square(10, 60, 100), (120, 160))
+    assert weight[60, 0] == 1 and weight[60, 59] < 0.1
+
+
+def test_two_people_are_divided_where_they_touch() -> None:
+    first, second = disc(110, 120, 60), disc(210, 120, 60)
+    image = np.where(first[..., None], [0.9, 0.2, 0.2], 0.5) * ~second[..., None] + second[..., None] * [
+        0,
+        0.3,
+        0.9,
+    ]
+    heads = [HeadPlace(110, 100, 40, 120), HeadPlace(210, 100, 40, 120)]
+    bodies = [disc(100, 120, 40).astype(float), disc(220, 120, 40).astype(float)]
+    part = part_of_first(bodies, heads, (first | second).astype(float), image)
+    assert part[120, 60] > 0.9 and part[120, 150] > 0.9 and part[120, 175] < 0.1 and part[120, 260] < 0.1
+
+
+def test_the_parsing_network_takes_away_below_the_eyes_alone() -> None:
+    image = np.where(disc(160, 70, 55)[..., None], 1.0, 0.3).repeat(3, -1).astype(np.float32)
+    share = person_among(white_people(), image, [HEAD], np.zeros(image.shape[:2]))
+    assert share[30, 160] > 0.9 and share[100, 160] < 0.3
+
+
+def test_what_is_not_joined_to_the_face_is_nobody_and_small_holes_are_filled() -> None:
+    share = (disc(160, 70, 50) | disc(30, 200, 25)).astype(float)
+    share[disc(160, 80, 3)] = 0
+    expected, unknown = outline(share, HEAD)
+    assert expected[200, 30] == 0 and expected[80, 160] == 1
+    assert unknown[70, 110] and not unknown[70, 160] and not unknown[70, 90]
+
+
+@pytest.mark.parametrize("scale", [1, 6])
+def test_a_matte_follows_the_edge_of_the_photo_at_its_size(scale: int) -> None:
+    shape = (240 * scale, 320 * scale)
+    truth = disc(160 * scale, 70 * scale, 45 * scale, shape)
+    photo = np.where(truth[..., None], [220, 180, 160], [40, 60, 90]).astype(np.uint8)
+    blurred = disc(160, 70, 44).astype(np.float32)  # a pixel too small
+    matte = matte_of(blurred, photo, FACE * scale)
+    off = np.abs(matte - truth).mean() / truth.mean()
+    before = 1 - (44 / 45) ** 2
+    assert matte.shape == shape and off < before / 2
+
+
+def test_heads_scale_with_the_photo() -> None:
+    head = HeadPlace.of(FACE)
+    half, small = head.scaled(0.5), HeadPlace.of(FACE * 0.5)
+    assert vars(half) == pytest.approx(vars(small))
