@@ -19,7 +19,7 @@ from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.mesh import FaceMesh, distinct, find_meshes, first_squares, mesh_near, parts_of
-from facerf_cli.portrait.parse import Square, SquareView, look, whole_photo
+from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
 
 LandmarksFrom = Literal["facerf", "dlib"]
 Word = Literal["sure", "unsure", "doubtful"]
@@ -128,7 +128,7 @@ def detect_faces(
         meshes = distinct([*meshes, *find_meshes(people, image_srgb, squares)])
         if meshes and not everyone:
             break
-    faces = [_as_face(people, image_srgb, mesh) for mesh in meshes]
+    faces = [face for mesh in meshes if (face := _as_face(people, image_srgb, mesh))]
     return sorted(faces, key=lambda face: face.box_px[0])
 
 
@@ -159,9 +159,12 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
         yield parts_of(image, _FINEST_PX)
 
 
-def _as_face(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face:
+def _as_face(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face | None:
+    """The face of a mesh; None where the Parsing Network sees no head there."""
     landmarks_px = mesh.landmarks_px.astype(np.float64)
     (view,) = look(people.parsing, image, [_around(landmarks_px)])
+    if view.presence < LEAST_PRESENCE:
+        return None
     apart_px = np.linalg.norm(view.landmarks_px[:68] - landmarks_px, axis=-1)
     view = replace(
         view,

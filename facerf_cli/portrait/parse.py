@@ -18,6 +18,7 @@ from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landma
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 LANDMARKS = 68 + len(MORE_LANDMARKS)
+LEAST_PRESENCE = 0.5  # from which on a head is there
 _POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
 _SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered

@@ -73,11 +73,9 @@ def person_among(
 ) -> np.ndarray:
     """Share [h, w] of the person with the first of several heads in a small image [h, w, 3] in 0..1.
 
-    `parsed` [h, w] is the share that the Parsing Network sees. Other heads that lie on the first one are its
-    own, found again.
+    `parsed` [h, w] is the share that the Parsing Network sees.
     """
     head, *others = heads
-    others = [one for one in others if _apart(one, head)]
     share, body = person_share(people.person, image, head), body_share(people.body, image, head)
     share = np.maximum(share, body * (1 - _below_eyes(share, head)) * _near(share, head))  # hats
     if others:
@@ -247,11 +245,6 @@ def _one_piece(person: np.ndarray, head: HeadPlace) -> np.ndarray:
     small = np.bincount(holes.ravel()) < (_HOLE * head.height_px) ** 2
     small[0] = False
     return np.asarray(mine | small[holes])
-
-
-def _apart(first: HeadPlace, second: HeadPlace) -> bool:
-    distance_px = math.hypot(first.x_px - second.x_px, first.y_px - second.y_px)
-    return distance_px > 0.5 * max(first.height_px, second.height_px)
 
 
 def _filled(square: Square, shape: tuple[int, ...]) -> float:

@@ -4,6 +4,7 @@ The matte is that of `people.py`; the Parsing Network says what its pixels are. 
 and, for detail, at head and chest and at squares of several sizes around the head.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -20,7 +21,7 @@ from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.portrait.mesh import find_meshes, first_squares
-from facerf_cli.portrait.parse import Square, SquareView, look
+from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look
 from facerf_cli.portrait.people import HeadPlace, matte_of, person_among
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -91,10 +92,22 @@ def seen_classes(
     """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
     classes = _parsed(people.parsing, image_srgb, landmarks_px, small)
     scale = small.shape[2] / image_srgb.shape[1]
-    others = [mesh.landmarks_px for mesh in find_meshes(people, image_srgb, first_squares(image_srgb))]
-    heads = [HeadPlace.of(landmarks_px * scale), *(HeadPlace.of(points * scale) for points in others)]
+    everyone = [landmarks_px, *_neighbours(people, image_srgb, landmarks_px)]
+    heads = [HeadPlace.of(points * scale) for points in everyone]
     share = person_among(people, small.permute(1, 2, 0).numpy(), heads, 1 - classes[0].numpy())
     return _within_share(classes, torch.from_numpy(share).float())
+
+
+def _neighbours(
+    people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Landmarks [68, 2] of the other heads in an image, those that the Parsing Network sees, too."""
+    middle, extent_px = landmarks_px.mean(0), np.ptp(landmarks_px, axis=0).max()
+    for mesh in find_meshes(people, image_srgb, first_squares(image_srgb)):
+        if np.linalg.norm(mesh.landmarks_px.mean(0) - middle) > extent_px / 2:
+            (view,) = look(people.parsing, image_srgb, [mesh.square])
+            if view.presence >= LEAST_PRESENCE:
+                yield mesh.landmarks_px
 
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:

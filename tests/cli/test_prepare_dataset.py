@@ -22,9 +22,12 @@ from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.prepare import _Subject
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
+from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.dataset.capture import Truth, write_capture
@@ -262,6 +265,18 @@ def test_black_images_have_no_face(given: Given, tmp_path: Path, capsys: Said) -
     assert prepare(capture, tmp_path / "out") == 1
     assert "0000: no camera shows a face" in capsys.readouterr().err
     assert not (tmp_path / "out/dataset.json").exists()
+
+
+def test_the_network_of_a_checkpoint_looks_for_faces(given: Given, tmp_path: Path, capsys: Said) -> None:
+    networks, _ = load_networks(SHIPPED["parsing"], LAYOUT_VERSION)
+    with torch.no_grad():
+        networks["parsing"].judge[-1].bias[0] = -100  # nobody is there
+    blind = tmp_path / "blind.safetensors"
+    save_networks(blind, networks, {"layout_version": LAYOUT_VERSION})
+    cameras = json.loads((given[0] / "stage.json").read_text())["cameras"][:1]
+    capture = changed(given, tmp_path / "capture", subjects={"0000": {}}, cameras=cameras)
+    assert prepare(capture, tmp_path / "out", "--checkpoint", str(blind)) == 1
+    assert "0000: no camera shows a face" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
