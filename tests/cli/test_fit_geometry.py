@@ -91,10 +91,14 @@ def test_the_overlay_is_the_photo_but_for_the_face(fitted: Path) -> None:
     assert np.percentile(corner, 90) < 1.1 * np.percentile(corner, 10)  # the same but for its exposure
 
 
-def test_two_faces_each_get_their_files(tmp_path: Path) -> None:
+def test_two_faces_each_get_their_files_and_are_named_by_number_and_place(
+    tmp_path: Path, capsys: Capture
+) -> None:
     photo = read_image(PHOTO).pixels
     write_display(tmp_path / "two.png", np.concatenate([photo[:300, 60:400]] * 2, 1))
     assert main(["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o"), "--face", "all"]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "face 0 from the left, at x 1" in said and "face 1 from the left, at x 5" in said
     row = json.loads((tmp_path / "o" / "report.jsonl").read_text())
     assert set(row["outputs"]) == {f"two_face{n}{ending}" for n in (0, 1) for ending in ENDINGS}
     left, right = (load_fit(tmp_path / "o" / f"two_face{n}_fit.npz").crop.x0_px for n in (0, 1))
