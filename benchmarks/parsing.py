@@ -93,8 +93,8 @@ def distances(differences: np.ndarray) -> tuple[float, float]:
 
 def found_by_both(image: np.ndarray) -> tuple[list[Face], list[Face]]:
     """Faces in an sRGB uint8 image [H, W, 3] by facerf and by dlib."""
-    parsing = SHIPPED_NETWORKS.parsing
-    return detect_faces(parsing, image), detect_faces(parsing, image, "dlib")
+    people = SHIPPED_NETWORKS.people
+    return detect_faces(people, image), detect_faces(people, image, "dlib")
 
 
 def measure_yale_b(folder: Path, every: int) -> None:
