@@ -14,7 +14,6 @@ import numpy as np
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.parse import Square, whole_photo
 
-POINTS = 478  # of a mesh: 468 of MediaPipe's face, and 5 of each iris
 _MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
 _MESH_PX = 192
 _OVERLAP = 1.5  # how many parts along a side cover the photo, over those that just would
