@@ -120,7 +120,7 @@ def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Band:
     return lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1).reshape(-1, *rest)
 
 
-def fitted(height: int, width: int, most_px: int) -> tuple[int, int]:
+def fitted(height: int, width: int, most_px: float) -> tuple[int, int]:
     """The size of a frame whose longer side is `most_px` at most."""
     scale = min(1.0, most_px / max(height, width))
     return max(1, round(height * scale)), max(1, round(width * scale))

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
 
-from facerf_cli.image.strips import between, enlarged, strips
+from facerf_cli.image.strips import between, enlarged, fitted, strips
 
 _REACH_PX = 2  # of the linear functions of colour by which a matte is enlarged
 _SMOOTHNESS = 1e-5  # variance of colours, sRGB in 0..1, below which the matte is smoothed
@@ -68,9 +68,7 @@ class PersonColours:
     def __init__(self, photo: np.ndarray, matte: np.ndarray) -> None:
         self.shape = photo.shape
         self._photo, self._matte = photo, matte
-        height, width = matte.shape
-        scale = min(1.0, _COLOURS_PX / max(matte.shape))
-        size = max(1, round(height * scale)), max(1, round(width * scale))
+        size = fitted(matte.shape[0], matte.shape[1], _COLOURS_PX)
         mixture, share = shrunk(photo, size), shrunk(matte, size)
         person = own = background = mixture
         for reach in _COLOUR_REACH:

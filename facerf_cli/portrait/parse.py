@@ -59,7 +59,7 @@ class Square:
         return self.side_px * np.array([[cos, sin], [-sin, cos]])
 
     def cut(self, image_srgb: np.ndarray, size_px: int, outside: float | None = None) -> Tensor:
-        """Resample an sRGB uint8 image [H, W, 3] to [3, size, size] in 0..1.
+        """Resample an sRGB image [H, W, 3], uint8 or in 0..1, to [3, size, size] in 0..1.
 
         Beyond the image its border goes on, or there is `outside`.
         """
@@ -72,7 +72,7 @@ class Square:
         count = np.maximum(1, (high - low) // step)
         region = image_srgb[low[1] : low[1] + count[1] * step, low[0] : low[0] + count[0] * step]
         means = block_means(region, step if min(region.shape[:2]) >= step else 1)
-        small = torch.from_numpy(means).permute(2, 0, 1)[None] / 255
+        small = torch.from_numpy(means).permute(2, 0, 1)[None] / (255 if image_srgb.dtype == np.uint8 else 1)
         at = (np.arange(size_px) + PIXEL_CENTRE) / size_px
         place = self.to_photo(np.stack(np.meshgrid(at, at), -1))
         size = np.array(small.shape[:1:-1])
@@ -82,6 +82,28 @@ class Square:
             return cut
         within = ((place >= 0) & (place <= (width, height))).all(-1)
         return torch.where(torch.from_numpy(within), cut, outside)
+
+    def laid_over(
+        self, seen: Tensor, size: tuple[int, int], photo_px: tuple[int, ...], rim: float
+    ) -> tuple[Tensor, Tensor]:
+        """A view [C, S, S] of an upright square on a map [C, h, w] of a photo of H x W pixels.
+
+        Also its weight [h, w]: 1 well inside the square, falling to 0 at its border over `rim` sides; it
+        stays 1 where the border lies beyond the photo.
+        """
+        axes, weights = [], []
+        for count, length, middle_px in zip(size, photo_px, (self.y_px, self.x_px), strict=False):
+            at = ((torch.arange(count) + PIXEL_CENTRE) * length / count - middle_px) / self.side_px + 0.5
+            low, high = (at / rim).clamp(0, 1), ((1 - at) / rim).clamp(0, 1)
+            if middle_px < self.side_px / 2:
+                low = (at >= 0).float()
+            if middle_px > length - self.side_px / 2:
+                high = (at <= 1).float()
+            axes.append(2 * at - 1)
+            weights.append(low * high)
+        grid = torch.stack(torch.meshgrid(axes[1], axes[0], indexing="xy"), -1)[None]
+        placed = F.grid_sample(seen[None], grid, padding_mode="border", align_corners=False)[0]
+        return placed, weights[0][:, None] * weights[1]
 
 
 def whole_photo(image_srgb: np.ndarray, turn_rad: float = 0.0) -> Square:

@@ -18,14 +18,12 @@ from scipy.ndimage import (
     label,
     watershed_ift,
 )
-from torch import Tensor
 
-from facerf_cli.image.strips import enlarged
+from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.closed_form import solve_matte
 from facerf_cli.portrait.matte import lifted, shrunk
 from facerf_cli.portrait.parse import Square
-from facerf_cli.raster.camera import PIXEL_CENTRE
 
 _SOLVED_PX, _SOLVED_HEAD_PX = 768, 320  # longest side, and height of the head, at which the outline is solved
 _NETWORK_PX = 256
@@ -89,10 +87,12 @@ def matte_of(share: np.ndarray, image_srgb: np.ndarray, landmarks_px: np.ndarray
     """The matte [H, W] of a person with a share [h, w] and landmarks [68, 2] in an image [H, W, 3] uint8."""
     height, width = image_srgb.shape[:2]
     head = HeadPlace.of(landmarks_px)
-    scale = min(1.0, _SOLVED_PX / max(height, width), _SOLVED_HEAD_PX / head.height_px)
-    size = (max(1, round(height * scale)), max(1, round(width * scale)))
+    longest_px = max(height, width)
+    most_px = min(_SOLVED_PX, _SOLVED_HEAD_PX / head.height_px * longest_px)
+    size = fitted(height, width, most_px)
     image = shrunk(image_srgb, size) / np.float32(255)
-    expected, unknown = outline(np.asarray(enlarged(share[None], size)[0]).clip(0, 1), head.scaled(scale))
+    scaled = head.scaled(max(size) / longest_px)
+    expected, unknown = outline(np.asarray(enlarged(share[None], size)[0]).clip(0, 1), scaled)
     alpha = solve_matte(image, expected, unknown)
     return alpha if size == (height, width) else lifted(alpha, image, image_srgb)
 
@@ -109,16 +109,16 @@ def person_share(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np
     ]
     squares = [square for square in squares if _filled(square, image.shape) >= _FILLED]
     photo = torch.from_numpy(image).permute(2, 0, 1)
-    whole = F.interpolate(photo[None], (_NETWORK_PX, _NETWORK_PX), mode="area")
-    views = torch.cat([whole, *(cut(photo, square)[None] for square in squares)])
+    whole = F.interpolate(photo[None], (_NETWORK_PX, _NETWORK_PX), mode="area")[0]
+    views = torch.stack([whole, *(square.cut(image, _NETWORK_PX) for square in squares)])
     seen = network(torch.cat([views, views.flip(3)]))["share"]
     seen = (seen[: len(views)] + seen[len(views) :].flip(3)) / 2
     total = F.interpolate(seen[:1], (height, width), mode="bilinear", align_corners=False)[0, 0]
     weights = torch.ones(height, width)
     for square, one in zip(squares, seen[1:], strict=True):
-        placed, weight = placed_back(one[None], square, (height, width))
+        placed, weight = square.laid_over(one, (height, width), (height, width), _RIM)
         weight = weight * (_WEIGHT * head.height_px / square.side_px)
-        total, weights = total + placed[0, 0] * weight, weights + weight
+        total, weights = total + placed[0] * weight, weights + weight
     return np.asarray((total / weights).numpy())
 
 
@@ -128,21 +128,20 @@ def body_share(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np.n
     The first square follows from the head, the second from the hips and the circle around the body that the
     network finds there.
     """
-    shape = image.shape[:2]
+    shape = image.shape[0], image.shape[1]
     side_px = _BODY_SIDES * head.height_px
     square = Square(head.x_px, head.y_px + _BODY_BELOW * head.height_px, side_px)
     total, weights, best = torch.zeros(shape), torch.zeros(shape), 0.0
-    photo = torch.from_numpy(image).permute(2, 0, 1)
     for _ in range(2):
-        out = network(cut(photo, square)[None])
+        out = network(square.cut(image, _NETWORK_PX)[None])
         score = float(out["score"])
         places = out["points"].reshape(39, 5)[:, :2].numpy() / _NETWORK_PX
         nose, hips, rim = square.to_photo(places[[0, 33, 34]])
         if math.hypot(nose[0] - head.x_px, nose[1] - head.y_px) > 0.8 * head.height_px or score < 0.3:
             break  # nobody, or somebody else
         best = max(best, score)
-        placed, weight = placed_back(out["mask"].sigmoid(), square, shape)
-        total, weights = total + placed[0, 0] * weight, weights + weight
+        placed, weight = square.laid_over(out["mask"][0].sigmoid(), shape, shape, _RIM)
+        total, weights = total + placed[0] * weight, weights + weight
         radius = min(max(1.25 * math.hypot(*(rim - hips)), side_px / 2), 5 * head.height_px)
         square = Square(float(hips[0]), float(hips[1]), 2 * radius)
     return np.asarray((best * total / weights.clamp_min(1)).numpy())
@@ -181,39 +180,6 @@ def outline(share: np.ndarray, head: HeadPlace) -> tuple[np.ndarray, np.ndarray]
     inside, outside = distance_transform_edt(person), distance_transform_edt(~person)
     unknown = np.where(person, inside, outside) <= band_px
     return np.where(unknown, share, person), unknown
-
-
-def cut(photo: Tensor, square: Square) -> Tensor:
-    """A square of a photo [3, h, w] at the networks' size; its border goes on outside."""
-    height, width = photo.shape[1:]
-    shrink = square.side_px / _NETWORK_PX
-    if shrink > 1.5:  # average first, or thin things vanish between the samples
-        size = max(1, round(height / shrink)), max(1, round(width / shrink))
-        photo = F.interpolate(photo[None], size, mode="area")[0]
-    at = (np.arange(_NETWORK_PX) + PIXEL_CENTRE) / _NETWORK_PX
-    place = square.to_photo(np.stack(np.meshgrid(at, at), -1)) / (width, height) * 2 - 1
-    grid = torch.from_numpy(place).float()[None]
-    return F.grid_sample(photo[None], grid, padding_mode="border", align_corners=False)[0]
-
-
-def placed_back(seen: Tensor, square: Square, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """A view [1, 1, S, S] of a square on a photo [1, 1, h, w], and its weight [h, w] there.
-
-    The weight is 0 outside and rises from the square's border, but where that is beyond the photo.
-    """
-    axes = []
-    for length, middle_px in zip(size, (square.y_px, square.x_px), strict=True):
-        at = (torch.arange(length) + PIXEL_CENTRE - middle_px) / square.side_px + 0.5
-        low, high = (at / _RIM).clamp(0, 1), ((1 - at) / _RIM).clamp(0, 1)
-        if middle_px < square.side_px / 2:
-            low = (at >= 0).float()
-        if middle_px > length - square.side_px / 2:
-            high = (at <= 1).float()
-        axes.append((at, low * high))
-    (down, rows), (right, columns) = axes
-    grid = torch.stack(torch.meshgrid(2 * right - 1, 2 * down - 1, indexing="xy"), -1)[None]
-    placed = F.grid_sample(seen, grid, padding_mode="border", align_corners=False)
-    return placed, rows[:, None] * columns
 
 
 def _vetoed(share: np.ndarray, seen: np.ndarray, head: HeadPlace) -> np.ndarray:

@@ -11,11 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from facerf_cli.image.strips import Band, enlarged
+from facerf_cli.image.strips import Band, enlarged, fitted
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
@@ -125,7 +124,9 @@ def _parsed(
     near = [Square.around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
     views = look(parsing, image_srgb, [body, chest, *near])
-    (wide, inside), (middle, feather), *close = (_over_photo(one, size, image_srgb.shape) for one in views)
+    (wide, inside), (middle, feather), *close = (
+        one.square.laid_over(one.classes, size, image_srgb.shape, _FEATHER) for one in views
+    )
     classes = torch.lerp(torch.where(inside > 0, wide, _only_background()), middle, feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
     for (one, feather), sides in zip(close, _NEAR_SIDES, strict=True):
@@ -153,13 +154,9 @@ def _within_share(classes: Tensor, share: Tensor) -> Tensor:
 
 def small_image(image_srgb: np.ndarray) -> Tensor:
     """An sRGB uint8 image at the size of its classes [3, h, w], in 0..1."""
-    small = shrunk(image_srgb, _small_size(*image_srgb.shape[:2])) / np.float32(255)
+    size = fitted(image_srgb.shape[0], image_srgb.shape[1], _SMALL_PX)
+    small = shrunk(image_srgb, size) / np.float32(255)
     return torch.from_numpy(small).permute(2, 0, 1)
-
-
-def _small_size(height: int, width: int) -> tuple[int, int]:
-    scale = min(1.0, _SMALL_PX / max(height, width))
-    return max(1, round(height * scale)), max(1, round(width * scale))
 
 
 def _within(square: Square, height: int, width: int) -> Square:
@@ -177,21 +174,6 @@ def _places(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
     y = (np.arange(size[0]) + PIXEL_CENTRE) * shape[0] / size[0]
     x = (np.arange(size[1]) + PIXEL_CENTRE) * shape[1] / size[1]
     return np.stack(np.meshgrid(x, y), -1)
-
-
-def _over_photo(view: SquareView, size: tuple[int, int], shape: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """Classes [C, h, w] of an upright square over a small image of the whole photo, and their weight [h, w].
-
-    The weight is 1 well inside the square and falls to 0 at its border.
-    """
-    down, right = (
-        ((torch.arange(count) + PIXEL_CENTRE) * length / count - middle) / view.square.side_px + 0.5
-        for count, length, middle in zip(size, shape, (view.square.y_px, view.square.x_px), strict=False)
-    )
-    grid = torch.stack(torch.meshgrid(2 * right - 1, 2 * down - 1, indexing="xy"), -1)[None]
-    classes = F.grid_sample(view.classes[None], grid, padding_mode="border", align_corners=False)[0]
-    fall = [(torch.minimum(at, 1 - at) / _FEATHER).clamp(0, 1) for at in (down, right)]
-    return classes, torch.minimum(fall[0][:, None], fall[1])
 
 
 def _with_likelier_hair(classes: Tensor) -> Tensor:

@@ -7,12 +7,10 @@ import torch
 from facerf_cli.portrait.parse import Square
 from facerf_cli.portrait.people import (
     HeadPlace,
-    cut,
     matte_of,
     outline,
     part_of_first,
     person_among,
-    placed_back,
 )
 from tests.portrait.seen import white_people
 
@@ -25,18 +23,18 @@ def disc(x: float, y: float, radius: float, shape: tuple[int, int] = (240, 320))
     return (right - x) ** 2 + (down - y) ** 2 < radius**2
 
 
-def test_a_view_is_placed_back_where_it_was_cut() -> None:
+def test_a_view_is_laid_over_where_it_was_cut() -> None:
     y, x = np.mgrid[:120, :160] / 160
-    photo = torch.from_numpy(np.stack([x, y, x * y]).astype(np.float32))
+    photo = np.stack([x, y, x * y], -1).astype(np.float32)
     square = Square(70, 60, 80)
-    placed, weight = placed_back(cut(photo, square)[None, :1], square, (120, 160))
+    placed, weight = square.laid_over(square.cut(photo, 256), (120, 160), photo.shape, 0.12)
     inside = weight > 0.5
     assert inside.sum() > 60**2 and (weight[:, 115:] == 0).all()
-    assert torch.allclose(placed[0, 0][inside], photo[0][inside], atol=2e-3)
+    assert np.allclose(placed.numpy()[:, inside], photo[inside].T, atol=2e-3)
 
 
 def test_a_border_beyond_the_photo_weighs_fully() -> None:
-    _, weight = placed_back(torch.ones(1, 1, 256, 256), Square(10, 60, 100), (120, 160))
+    _, weight = Square(10, 60, 100).laid_over(torch.ones(1, 256, 256), (120, 160), (120, 160), 0.12)
     assert weight[60, 0] == 1 and weight[60, 59] < 0.1
 
 
