@@ -1,25 +1,28 @@
 """What tests share. The data of `../shared` is not in the repository; tests that need it skip without it."""
 
-import hashlib
 import os
 import signal
 import tarfile
-from collections import OrderedDict
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import typer
 
+from facerf_cli import pipeline
+from facerf_cli.face import head
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
+from facerf_cli.network.stored_graph import StoredGraph
 from facerf_cli.run import memory
+from tests.once import outside_training, remembered
 
 # A shell that starts the tests in the background ignores SIGINT, and children inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -68,30 +71,22 @@ def ict_model(ict_source: SourceModel) -> MorphableModel:
 
 @pytest.fixture(scope="session", autouse=True)
 def _the_same_photo_costs_once() -> None:
-    """The two large shipped networks give what they gave to the same input: most tests show one photo."""
+    """Steps of the method give what they gave to the same input: most tests show one photo."""
     for kind in (ParsingNetwork, PortraitNetwork):
-        kind.forward = remembered(kind.forward)
+        kind.forward = remembered(kind.forward, applies=outside_training)
+    StoredGraph.forward = remembered(StoredGraph.forward)
+    head.unwrap = remembered(head.unwrap)
+    pipeline.own_light = remembered(
+        pipeline.own_light,
+        lambda models, *rest: (models.networks.reflectance, models.source_colours, rest),
+        lambda models, *_: type(models.networks.reflectance).__module__.startswith("facerf_cli."),
+    )
 
 
-def remembered(forward: Callable[..., Any], most: int = 24) -> Callable[..., Any]:
-    """Keep the last results of a network's `forward` outside training, by its weights and its input."""
-    kept: OrderedDict[str, Any] = OrderedDict()
-
-    def again(network: torch.nn.Module, given: Any) -> Any:
-        if network.training or torch.is_grad_enabled():
-            return forward(network, given)
-        inputs = [given] if isinstance(given, torch.Tensor) else list(vars(given).values())
-        digest = hashlib.sha1(repr([tuple(tensor.shape) for tensor in inputs]).encode())
-        for tensor in (*inputs, *network.state_dict().values()):
-            digest.update(tensor.contiguous().cpu().numpy().tobytes())
-        if (key := digest.hexdigest()) not in kept:
-            kept[key] = forward(network, given)
-        kept.move_to_end(key)
-        while len(kept) > most:
-            kept.popitem(last=False)
-        return type(kept[key])(*(tensor.clone() for tensor in kept[key]))
-
-    return again
+@pytest.fixture(scope="session", autouse=True)
+def _the_command_line_is_built_once() -> None:
+    """Otherwise each call of `main` builds all verbs."""
+    typer.main.get_command = cache(typer.main.get_command)
 
 
 @pytest.fixture(autouse=True)
