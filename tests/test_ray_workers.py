@@ -27,6 +27,12 @@ needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="
 NAMES = tuple(f"{letter}.png" for letter in "abcdefgh")
 # Workers import tests.cli.toy_batch.
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+IMPATIENT = {  # Ray waits half a minute by our own settings
+    "RAY_NUM_REDIS_GET_RETRIES": "1",
+    "RAY_py_gcs_connect_timeout_s": "1",
+    "RAY_gcs_server_request_timeout_seconds": "1",
+    "RAY_gcs_rpc_server_connect_timeout_s": "1",
+}
 ITEMS = [f"x/{letter}" for letter in "abcdefgh"]
 
 
@@ -191,9 +197,10 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
 @needs_ray
 def test_what_answers_need_not_be_ray(tmp_path: Path) -> None:
     code = "from facerf_cli.run.ray_workers import connect\nimport sys\nconnect(sys.argv[1])"
+    environment = os.environ | IMPATIENT
     with socket.create_server(("127.0.0.1", 0)) as server:
         command = [sys.executable, "-c", code, f"127.0.0.1:{server.getsockname()[1]}"]
-        result = subprocess.run(command, capture_output=True, text=True)
+        result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert "UsageError: --ray 127.0.0.1:" in result.stderr.splitlines()[-1]
 
 

@@ -1,4 +1,4 @@
-"""A page agrees with `facerf relight`: at lights from all sides. Skipped without Chromium."""
+"""A page agrees with `facerf relight` at lights from all sides; its controls. Skipped without Chromium."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +21,7 @@ from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.view_photos import head_place, of_photo, page_maps
-from tests.viewer.browser import Drawn, chromium, drawn
+from tests.viewer.browser import Drawn, chromium, drawn, driven
 
 ASTRONAUT = Path(__file__).parents[2] / "examples" / "astronaut.jpg"
 MEAN, PERCENTILE_99 = 2.0, 8.0  # of 255, on the rig
@@ -51,7 +51,7 @@ def shown() -> Shown:
     models = load_models()
     photo = read_image(ASTRONAUT).pixels
     face = find_for(models.networks.people, models.default_geometry, photo, "astronaut")[0]
-    photo, head = shrunk_photo(photo, head_of(models, photo, face), 384)
+    photo, head = shrunk_photo(photo, head_of(models, photo, face, models.sides(128)), 384)
     photo = np.clip(photo, 0, 1)
     basis, plate = of_photo(models, photo, head)
     field = reflectance_of(models, head, "portrait", photo=photo)
@@ -150,3 +150,45 @@ def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path)
     relit = shown().relit(towards((40, 10)), torch.ones(1, 3))
     error = np.abs(resized(shown().truth(relit, 0.0), *size) - image.pixels[..., :3])
     assert error[resized(shown().whole.matte, *size) > 0.99].mean() < MEAN_BETWEEN
+
+
+_FIRST_LOOK = """
+    const command = () => byId("command").textContent;
+    const seen = { first: command(), message: byId("message").textContent };
+    for (let i = 0; i < 12; i++) {
+      byId("add").click();
+      await frames(3);
+    }
+    seen.most = command();
+    const box = byId("view").getBoundingClientRect();
+    seen.size = [box.width, box.height];
+    seen.room = document.querySelector("aside").getBoundingClientRect().left - box.right;
+    const press = { bubbles: true, pointerId: 1, clientX: box.right - 1, clientY: box.top + box.height / 2 };
+    byId("view").setPointerCapture = () => {};
+    byId("view").dispatchEvent(new PointerEvent("pointerdown", press));
+    await frames(3);
+    seen.dragged = [Number(byId("azimuth").value), Number(byId("elevation").value)];
+    for (let i = 0; i < 10; i++) {
+      byId("remove").click();
+      await frames(3);
+    }
+    seen.dark = command();
+    byId("compare").click();
+    await frames(3);
+    seen.before = [byId("before").hidden, byId("before").naturalWidth];
+    return seen;
+"""
+
+
+def test_a_page_begins_with_a_light_and_takes_nine(tmp_path: Path) -> None:
+    chromium()
+    seen = driven(shown().text, _FIRST_LOOK, tmp_path)
+    assert "--light '40,25'" in seen["first"] and seen["message"] == ""
+    lights = seen["most"].split("'")[1].split(";")
+    assert len(lights) == 9 == len(set(lights))  # none on another
+    width, height = seen["size"]
+    assert seen["room"] >= 0 and abs(width - height) < 1  # square, and not over the panel
+    azimuth, elevation = seen["dragged"]
+    assert azimuth > 60 and abs(elevation) < 40  # the picture's right side
+    assert seen["dark"].startswith("# add a light")
+    assert seen["before"] == [False, 384]
