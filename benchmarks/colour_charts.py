@@ -30,7 +30,8 @@ from facerf_cli.capture.chart import (
     sample,
     squares_px,
 )
-from facerf_cli.capture.chart_photo import find_chart, outline_patches
+from facerf_cli.capture.chart_photo import outline_patches
+from facerf_cli.capture.chart_search import find_chart
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.sheets import contact_sheet
 

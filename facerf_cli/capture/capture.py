@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera
@@ -22,53 +23,32 @@ FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in a light's plac
 _AMBIENT_WORDS = ("ambient", "dark", "black", "room", "background")  # there, too: a frame without lights
 _RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that file names cannot have everywhere
 _LONGEST = 500
-Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
 class ChartCorrection:
-    """Colour matrix of some cameras, and how it was found; plain values that processes can share."""
+    """Colour correction of some cameras by a chart's image."""
 
     image: Path
-    image_sha256: str
-    cameras: tuple[str, ...]
-    corners_px: Rows  # [4, 2] of the patches' area, clockwise from the dark skin patch
-    matrix: Rows  # [3, 3] on linear Rec.709 under a light of rgb 1; keeps the luminance of neutral colours
-    delta_e_before: tuple[float, float]  # CIE 2000, mean and largest of the 24 patches
-    delta_e_after: tuple[float, float]
-    light_span: float  # brightest over darkest light on the chart; the fit removes this falloff
-    overlay: str  # file name of the control image in a dataset
-
-    def record(self) -> dict[str, Any]:
-        """Entry of the correction in `dataset.json`."""
-        return {
-            "picture": self.image.name,
-            "picture_sha256": self.image_sha256,
-            "cameras": list(self.cameras),
-            "corners_px": [list(corner) for corner in self.corners_px],
-            "matrix": [list(row) for row in self.matrix],
-            "delta_e_2000": {
-                "before": dict(zip(("mean", "max"), self.delta_e_before, strict=True)),
-                "after": dict(zip(("mean", "max"), self.delta_e_after, strict=True)),
-            },
-            "light_span": self.light_span,
-            "overlay": self.overlay,
-        }
+    # Its entry in `dataset.json`: cameras; matrix [3, 3] on linear Rec.709 under a light of rgb 1, which
+    # keeps the luminance of neutral colours; corners of the patches' area, clockwise from the dark skin
+    # patch; CIE delta E 2000 of the 24 patches; span of the light on the chart; name of the control image.
+    record: Mapping[str, Any]
 
     def in_words(self) -> str:
         """Log line with the colour errors before and after."""
-        (mean_before, max_before), (mean, most) = self.delta_e_before, self.delta_e_after
+        before, after = (self.record["delta_e_2000"][when] for when in ("before", "after"))
         return (
-            f"{self.image}: colour chart of {', '.join(self.cameras)}: CIE delta E 2000 mean {mean:.1f}, "
-            f"max {most:.1f} (before: {mean_before:.1f}, {max_before:.1f})"
+            f"{self.image}: colour chart of {', '.join(self.record['cameras'])}: CIE delta E 2000 mean "
+            f"{after['mean']:.1f}, max {after['max']:.1f} (before: {before['mean']:.1f}, {before['max']:.1f})"
         )
 
 
 def correct_colours(charts: Iterable[ChartCorrection], camera: str, linear: np.ndarray) -> np.ndarray:
     """Apply the matrix of a camera's chart to a frame [H, W, 3], linear Rec.709, float32; if it has one."""
     for chart in charts:
-        if camera in chart.cameras:
-            return linear @ np.array(chart.matrix, np.float32).T
+        if camera in chart.record["cameras"]:
+            return linear @ np.array(chart.record["matrix"], np.float32).T
     return linear
 
 
@@ -147,35 +127,19 @@ _read_ambient = lru_cache(maxsize=2)(read_frame)  # every frame of a camera need
 
 
 def shift_image(image: np.ndarray, down_px: float, right_px: float) -> np.ndarray:
-    """Shift an image [H, W, C] down and right; the border is repeated, and whole-pixel shifts are exact.
+    """Shift an image [H, W, ...] down and right; the border is repeated, and whole-pixel shifts are exact.
 
     Values between pixels come from cubic convolution (R. Keys, *Cubic convolution interpolation for digital
-    image processing*, ASSP 1981), which keeps detail that linear interpolation blurs.
+    image processing*, ASSP 1981, equation 15), which keeps detail that linear interpolation blurs.
     """
-    return _shift_along(_shift_along(image, 0, down_px), 1, right_px)
-
-
-def _shift_along(image: np.ndarray, axis: int, by_px: float) -> np.ndarray:
-    if by_px == 0:
-        return image
-    first = int(np.floor(-by_px))
-    places = np.arange(image.shape[axis]) + first
-    summed = np.zeros_like(image)
-    for tap, weight in enumerate(_keys_weights(-by_px - first), start=-1):
-        if weight:
-            at = np.clip(places + tap, 0, image.shape[axis] - 1)
-            summed += image.dtype.type(weight) * image.take(at, axis)
-    return summed
-
-
-def _keys_weights(t: float) -> tuple[float, float, float, float]:
-    """Weights of the pixels at -1, 0, 1 and 2 for a place t in 0..1 (Keys, equation 15)."""
-    return (
-        -t * (1 - t) ** 2 / 2,
-        1 - (5 - 3 * t) * t**2 / 2,
-        t * (1 + 4 * t - 3 * t**2) / 2,
-        -(t**2) * (1 - t) / 2,
-    )
+    for axis, by_px in enumerate((down_px, right_px)):
+        if by_px:
+            reach = int(abs(by_px)) + 2
+            far = np.abs(np.arange(-reach, reach + 1) + by_px)
+            inner, outer = 1.5 * far**3 - 2.5 * far**2 + 1, -0.5 * far**3 + 2.5 * far**2 - 4 * far + 2
+            kernel = np.where(far < 1, inner, np.where(far < 2, outer, 0))
+            image = ndimage.correlate1d(image, kernel, axis, mode="nearest")
+    return image
 
 
 def require_pattern(

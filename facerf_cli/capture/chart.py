@@ -8,12 +8,12 @@ in alternation with it, as a plane in the logarithm of brightness, after Finlays
 alternating least squares technique for nonuniform intensity color correction'.
 """
 
-import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from skimage.draw import polygon
+from skimage.transform import estimate_transform
 
 from facerf_cli.image.colour import colour_science, lab_d65, luminance
 
@@ -26,8 +26,13 @@ PATCHES = ROWS * COLUMNS
 GREYS = slice(18, 24)  # white to black, the last row
 PATCH_SIDE = 0.87  # of the grid's pitch; the rest is the chart's black frame
 MIDDLE_SIDE = 0.45  # of the pitch: the sampled square, away from edges and from inaccurate corners
+LARGEST_DELTA_E = 8.0  # mean of the 24 patches; good photographs of a chart have 1 to 4
 _SIGMA_OF_MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _AT_WHITE = 1e-4  # from 1, within which a value counts as the largest of an integer format
+
+homography = partial(
+    estimate_transform, "projective"
+)  # from points [N, 2] to points [N, 2], by least squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,40 +111,15 @@ def centres() -> np.ndarray:
 
 def area_corners() -> np.ndarray:
     """Corners [4, 2] of the patches' area on that grid, clockwise from the dark skin patch."""
-    half, right, bottom = PATCH_SIDE / 2, COLUMNS - 1, ROWS - 1
-    return np.array(
-        [[-half, -half], [right + half, -half], [right + half, bottom + half], [-half, bottom + half]]
-    )
-
-
-def homography(points: np.ndarray, images: np.ndarray) -> np.ndarray:
-    """Fit the matrix [3, 3] that maps points [N, 2] to images [N, 2] by least squares; N is 4 or more.
-
-    Hartley and Zisserman, 'Multiple View Geometry', algorithm 4.2: images are centred and scaled first.
-    """
-    middle, scale = images.mean(0), max(float(images.std()), 1e-9)
-    x, y = points.T
-    u, v = ((images - middle) / scale).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
-    rows = [
-        np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], -1),
-        np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], -1),
-    ]
-    matrix = np.linalg.svd(np.concatenate(rows))[2][-1].reshape(3, 3)
-    back = np.array([[scale, 0, middle[0]], [0, scale, middle[1]], [0, 0, 1]])
-    return back @ matrix
-
-
-def project(grid_to_px: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Map points [..., 2] by a homography [3, 3]."""
-    mapped = points @ grid_to_px[:, :2].T + grid_to_px[:, 2]
-    return mapped[..., :2] / mapped[..., 2:]
+    size = np.array([COLUMNS, ROWS]) - 1 + PATCH_SIDE
+    return np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - PATCH_SIDE / 2
 
 
 def squares_px(corners_px: np.ndarray, side: float = MIDDLE_SIDE) -> np.ndarray:
     """Middle of each patch as a quadrilateral [24, 4, 2], from the corners [4, 2] of the patches' area."""
     square = side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    return project(homography(area_corners(), corners_px), centres()[:, None] + square)
+    grid_to_px = homography(area_corners(), corners_px)
+    return grid_to_px((centres()[:, None] + square).reshape(-1, 2)).reshape(-1, 4, 2)
 
 
 def sample(pixels: np.ndarray, corners_px: np.ndarray) -> Patches:
@@ -154,17 +134,6 @@ def sample(pixels: np.ndarray, corners_px: np.ndarray) -> Patches:
         noise[place] = _SIGMA_OF_MAD * np.median(np.abs(inside[:, 1] - colours[place, 1]))
         at_white[place] = (np.abs(inside - 1) < _AT_WHITE).any(-1).mean()
     return Patches(colours, counts, noise, at_white)
-
-
-def shrunk(pixels: np.ndarray, side_px: int) -> tuple[np.ndarray, int]:
-    """Shrink an image [H, W, 3] to `side_px` or less by averaging square blocks; return it and their side.
-
-    A block is never larger than the image's shorter side, so a thin image may stay longer than `side_px`.
-    """
-    scale = min(math.ceil(max(pixels.shape[:2]) / side_px), *pixels.shape[:2])
-    height, width = (side // scale for side in pixels.shape[:2])
-    blocks = pixels[: height * scale, : width * scale].reshape(height, scale, width, scale, 3)
-    return blocks.mean((1, 3), dtype=np.float32), scale
 
 
 def four_turns(corners_px: np.ndarray) -> list[np.ndarray]:

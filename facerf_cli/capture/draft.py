@@ -57,6 +57,7 @@ _DIGITS = 6
 
 Direction = list[float]  # unit vector toward the light
 ListedLight = tuple[str, Direction]  # name of an image, empty in a list without names; direction of its light
+Headers = dict[str, Header | None]  # by the paths of images
 Key = tuple[str, str, str]  # subject, camera and light; empty where the pattern does not name them
 
 
@@ -78,15 +79,6 @@ class Frames:
         return len(self.ids("subject")) * len(self.ids("camera")) * len(self.ids("light"))
 
 
-@dataclass(frozen=True)
-class CameraHeaders:
-    """Counts of what the headers of a camera's images say."""
-
-    sizes: Counter[tuple[int, int]]  # width and height
-    spaces: Counter[str | None]  # None where the header does not name the colour space
-    unread: int
-
-
 def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> dict[str, Any]:
     """Draft the content of `stage.json`, with notes under "draft".
 
@@ -100,13 +92,13 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> d
         raise UsageError(f"{folder}: no images found (looked for {' '.join(sorted(suffixes))})")
     try:
         frames, chosen = frames_by_pattern(images, pattern) if pattern else frames_by_depth(images)
-        headers = {camera: _read_headers(folder, frames, camera) for camera in frames.ids("camera")}
         if len(lights := frames.ids("light")) < _LEAST_LIGHTS:
             names = f"{counted(len(lights), 'light')} ({', '.join(lights)})"
             raise UsageError(
                 f"{names}, but a capture has {_LEAST_LIGHTS} or more; give its folder or --pattern"
             )
-        if not any(header.sizes for header in headers.values()):
+        headers = {camera: _read_headers(folder, frames, camera) for camera in frames.ids("camera")}
+        if not any(any(of_camera.values()) for of_camera in headers.values()):
             raise UsageError("the images cannot be read; check the files")
     except UsageError as error:
         raise UsageError(f"{folder}: {error}") from None
@@ -137,21 +129,24 @@ def as_text(stage: Mapping[str, Any]) -> str:
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def _read_headers(folder: Path, frames: Frames, camera: str) -> CameraHeaders:
-    paths = [folder / path for (_, of_camera, _), path in frames.paths.items() if of_camera == camera]
+def _read_headers(folder: Path, frames: Frames, camera: str) -> Headers:
+    """Headers of some of a camera's images, by their paths; None for what cannot be read."""
+    paths = [path for (_, of_camera, _), path in frames.paths.items() if of_camera == camera]
     step = max(len(paths) // _HEADERS, 1)
-    headers = [(path, read_header(path)) for path in paths[::step][:_HEADERS]]
-    read = [(path, header) for path, header in headers if header is not None]
-    return CameraHeaders(
-        Counter((header.width_px, header.height_px) for _, header in read),
-        Counter(_space_name(path, header) for path, header in read),
-        len(headers) - len(read),
-    )
+    return {path: read_header(folder / path) for path in paths[::step][:_HEADERS]}
 
 
-def _space_name(path: Path, header: Header) -> str | None:
+def _sizes(headers: Headers) -> list[tuple[int, int]]:
+    """Widths and heights in headers, the most frequent one first."""
+    sizes = Counter((header.width_px, header.height_px) for header in headers.values() if header)
+    return [size for size, _ in sizes.most_common()]
+
+
+def _space_name(path: str, header: Header) -> str | None:
     """Colour space of a header as `stage.json` names it; None where it has no name or would be a guess."""
-    if not header.is_floating and (header.bits > 8 or path.suffix.lower() not in _DISPLAY_SUFFIXES):
+    if not header.is_floating and (
+        header.bits > 8 or PurePosixPath(path).suffix.lower() not in _DISPLAY_SUFFIXES
+    ):
         return None
     if header.space == LINEAR:
         return "lin_rec709"
@@ -181,10 +176,11 @@ def _content(
     folder: Path,
     pattern: str,
     frames: Frames,
-    headers: Mapping[str, CameraHeaders],
+    headers: Mapping[str, Headers],
     directions: Mapping[str, list[float]],
 ) -> dict[str, Any]:
-    spaces = {space for header in headers.values() for space in header.spaces}
+    read = ((path, header) for of_camera in headers.values() for path, header in of_camera.items() if header)
+    spaces = {_space_name(path, header) for path, header in read}
     ambient = frames.ambient.most_common(1)
     subject = name if is_name(name := folder.resolve().name) else _LONE_SUBJECT
     return {
@@ -198,20 +194,20 @@ def _content(
             {"id": light, "direction": directions.get(light), "intensity": [1.0, 1.0, 1.0]}
             for light in frames.ids("light")
         ],
-        "cameras": [_camera(name, header, len(headers) == 1) for name, header in headers.items()],
+        "cameras": [_camera(name, _sizes(of), len(headers) == 1) for name, of in headers.items()],
         **({} if "{subject}" in pattern else {"subjects": {subject: {}}}),
     }
 
 
-def _camera(name: str, headers: CameraHeaders, alone: bool) -> dict[str, object]:
+def _camera(name: str, sizes: list[tuple[int, int]], alone: bool) -> dict[str, object]:
     """Entry of a camera with a guessed K; the space of a camera `alone` is the world."""
-    width, height = headers.sizes.most_common(1)[0][0] if headers.sizes else (None, None)
-    k = None
-    if width and height:
+    entry: dict[str, object] = {"id": name or _LONE_CAMERA, "width": None, "height": None, "K": None}
+    if sizes:
+        width, height = sizes[0]
         focal = float(_FOCAL * max(width, height))
         k = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
-    pose = _FACING if alone else None
-    return {"id": name or _LONE_CAMERA, "width": width, "height": height, "K": k, "world_to_camera": pose}
+        entry |= {"width": width, "height": height, "K": k}
+    return entry | {"world_to_camera": _FACING if alone else None}
 
 
 def _summary(pattern: str, frames: Frames) -> str:
@@ -235,15 +231,15 @@ def _gaps(content: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _assumptions(headers: Mapping[str, CameraHeaders], content: Mapping[str, Any]) -> Iterator[str]:
+def _assumptions(headers: Mapping[str, Headers], content: Mapping[str, Any]) -> Iterator[str]:
     yield "lights: the intensity 1 1 1 is assumed of each"
-    for camera, header in headers.items():
-        if len(header.sizes) > 1:
-            sizes = ", ".join(f"{width} x {height}" for (width, height), _ in header.sizes.most_common())
-            yield f"cameras: images{f' of {camera}' * bool(camera)} have several sizes: {sizes}"
-    if unread := sum(header.unread for header in headers.values()):
-        sampled = unread + sum(header.sizes.total() for header in headers.values())
-        yield f"cameras: {unread} of {counted(sampled, 'image')} sampled cannot be read"
+    for camera, of_camera in headers.items():
+        if len(sizes := _sizes(of_camera)) > 1:
+            words = ", ".join(f"{width} x {height}" for width, height in sizes)
+            yield f"cameras: images{f' of {camera}' * bool(camera)} have several sizes: {words}"
+    sampled = [header for of_camera in headers.values() for header in of_camera.values()]
+    if unread := sampled.count(None):
+        yield f"cameras: {unread} of {counted(len(sampled), 'image')} sampled cannot be read"
     yield "cameras: K is a guess, with a focal length of 4 times the longer side; calibrate them"
     if len(headers) == 1:
         yield "cameras: the space of the one camera is the world: x right, y up, z toward the camera"
@@ -300,20 +296,17 @@ def sort_frames(paths: Iterable[str], pattern: str) -> Frames:
     return frames
 
 
-def _natural_order(text: str) -> tuple[object, str]:
-    pieces = re.split("([0-9]+)", text)
-    is_number = [piece.isascii() and piece.isdigit() and len(piece) < 19 for piece in pieces]
-    key = [(0, int(p), "") if number else (1, 0, p) for p, number in zip(pieces, is_number, strict=True)]
-    return key, text
+def _natural_order(text: str) -> list[str | int]:
+    pieces = re.split("([0-9]+)", text)  # every second one is a number
+    return [int(piece) if place % 2 else piece for place, piece in enumerate(pieces)] + [text]
 
 
 def frames_by_pattern(images: Sequence[str], pattern: str) -> tuple[Frames, str]:
     """Sort images by the pattern of --pattern; UsageError for a wrong one, or one that no image matches."""
     try:
-        require_pattern(pattern, "--pattern", ["light"])
+        frames = sort_frames(images, require_pattern(pattern, "--pattern", ["light"]))
     except InputError as error:
         raise UsageError(str(error)) from None
-    frames = sort_frames(images, pattern)
     if not frames.paths:
         raise UsageError(f"--pattern {pattern}: no image matches, not even {images[0]}; correct the pattern")
     return frames, pattern
@@ -327,41 +320,37 @@ def frames_by_depth(images: Sequence[str]) -> tuple[Frames, str]:
     depths = sorted({path.count("/") for path in images})
     suffixes = sorted({PurePosixPath(path).suffix for path in images})
     if len(depths) > 1 or depths[0] >= len(_LAYOUTS):
-        raise _unknown_layout(f"images lie in {' and '.join(map(str, depths))} folders")
-    if len(suffixes) > 1:
-        raise _unknown_layout(f"images end in {' and '.join(suffixes)}")
-    pattern = _LAYOUTS[depths[0]] + suffixes[0]
-    frames = sort_frames(images, pattern)
-    if len(frames.paths) < max(_LEAST_SHARE * frames.expected, 1):
-        raise _unknown_layout(f"by {pattern}, {len(frames.paths)} of {frames.expected} frames exist")
-    return frames, pattern
-
-
-def _unknown_layout(reason: str) -> UsageError:
-    return UsageError(f"the layout of the images is unknown ({reason}); give --pattern, such as '{_EXAMPLE}'")
+        reason = f"images lie in {' and '.join(map(str, depths))} folders"
+    elif len(suffixes) > 1:
+        reason = f"images end in {' and '.join(suffixes)}"
+    else:
+        pattern = _LAYOUTS[depths[0]] + suffixes[0]
+        frames = sort_frames(images, pattern)
+        if len(frames.paths) >= max(_LEAST_SHARE * frames.expected, 1):
+            return frames, pattern
+        reason = f"by {pattern}, {len(frames.paths)} of {frames.expected} frames exist"
+    raise UsageError(f"the layout of the images is unknown ({reason}); give --pattern, such as '{_EXAMPLE}'")
 
 
 def read_light_list(path: Path) -> list[ListedLight]:
     """Read a list of lights; InputError names the first wrong line."""
     text = read_text(path, _LIST_LIMIT_BYTES, "give lines `name x y z`")
-    rows = (line.split("#")[0].replace(",", " ").strip() for line in text.splitlines())
-    lines = [(number, row) for number, row in enumerate(rows, 1) if row]
-    if lines and lines[0][1].isdecimal():
-        lines = lines[1:]  # the number of lines
-    return [_parse_line(path, number, row) for number, row in lines]
-
-
-def _parse_line(path: Path, number: int, row: str) -> ListedLight:
-    *name, x, y, z = fields if len(fields := row.rsplit(maxsplit=3)) > 2 else [""] * 3
-    try:
-        vector = np.array([float(x), float(y), float(z)])
-    except ValueError:
-        raise InputError(f"{path}: line {number} is wrong; give `name x y z`") from None
-    length = float(np.linalg.norm(vector))
-    if not 0 < length < math.inf:
-        raise InputError(f"{path}: line {number} has no direction; give a finite vector other than 0")
-    rounded = [round(float(value), _DIGITS) + 0.0 for value in vector / length]  # + 0.0 turns -0.0 into 0.0
-    return "".join(name), rounded
+    lights: list[ListedLight] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = line.split("#")[0].replace(",", " ").rsplit(maxsplit=3)
+        if not fields or (not lights and len(fields) == 1 and fields[0].isdecimal()):
+            continue  # empty, or the number of lines
+        try:
+            *name, x, y, z = fields
+            vector = np.array([float(x), float(y), float(z)])
+        except ValueError:
+            raise InputError(f"{path}: line {number} is wrong; give `name x y z`") from None
+        length = float(np.linalg.norm(vector))
+        if not 0 < length < math.inf:
+            raise InputError(f"{path}: line {number} has no direction; give a finite vector other than 0")
+        direction = (vector / length).round(_DIGITS) + 0.0  # turns -0.0 into 0.0
+        lights.append(("".join(name).strip(), direction.tolist()))
+    return lights
 
 
 def match_lights(

@@ -19,6 +19,7 @@ from facerf_cli.run.logs import counted
 Severity = Literal["error", "warning"]
 LEAST_LIGHTS, LEAST_SHARE = 10, 0.5  # lights, and share of the rig's, that a usable OLAT stack has
 MISSING, MARKED = "missing", "marked as damaged"
+CONSEQUENCES = ("subject stopped", "frame left out", "warning")
 _LISTED = 6  # entries of a log line; the rest are counted
 
 
@@ -47,6 +48,12 @@ class Finding:
         """Place of the fault, `subject/camera/light` as far as given."""
         return "/".join(name for name in (self.subject, self.camera, self.light) if name)
 
+    def consequence(self, strict: bool = False) -> str:
+        """Return one of `CONSEQUENCES`; with `strict` a finding always stops its subject."""
+        if self.leaves_out and not strict:
+            return "frame left out"
+        return "subject stopped" if strict or self.severity == "error" else "warning"
+
     def row(self) -> dict[str, Any]:
         """Row of findings.jsonl."""
         return {
@@ -60,10 +67,23 @@ class Finding:
             "figures": dict(self.figures),
         }
 
+    @staticmethod
+    def of_row(row: Mapping[str, Any]) -> "Finding":
+        """Read a row of findings.jsonl."""
+        return Finding(
+            row["severity"],
+            row["check"],
+            row["subject"],
+            row["words"],
+            row["camera"] or "",
+            row["light"] or "",
+            row["figures"],
+        )
+
 
 def stopping(findings: Iterable[Finding], strict: bool = False) -> list[Finding]:
     """Select the findings that stop their subject; with `strict` all do."""
-    return [found for found in findings if strict or (found.severity == "error" and not found.leaves_out)]
+    return [found for found in findings if found.consequence(strict) == "subject stopped"]
 
 
 def frames_left_out(findings: Iterable[Finding]) -> dict[str, set[str]]:
@@ -103,9 +123,9 @@ def select_frames(
     With `strict`, a missing frame that is not marked as damaged is an InputError too.
     """
     broken = {camera: _absent(capture, subject, camera) for camera in capture.cameras}
-    missing = [(camera, light) for camera, lights in broken.items() for light in lights]
-    if strict and (unmarked := [name for name in missing if broken[name[0]][name[1]] == MISSING]):
-        first = "/".join((subject, *unmarked[0]))
+    missing = {f"{camera}/{light}": why for camera, lights in broken.items() for light, why in lights.items()}
+    if strict and (unmarked := [name for name, why in missing.items() if why == MISSING]):
+        first = f"{subject}/{unmarked[0]}"
         raise InputError(f"{first}: missing ({len(unmarked)} such frames); without --strict it is left out")
     for found in findings:
         if found.leaves_out and found.camera in broken:
@@ -119,14 +139,18 @@ def select_frames(
     cameras = tuple(camera for camera in capture.cameras if camera not in dropped)
     if not cameras:
         raise InputError(f"{subject}: no camera has enough frames ({_list(dropped)}); add the frames")
-    left_out = _reasons(capture, {camera: broken[camera] for camera in cameras})
+    left_out = {
+        light: ", ".join(f"{camera}: {broken[camera][light]}" for camera in lacking)
+        for light in capture.light_ids
+        if (lacking := [camera for camera in cameras if light in broken[camera]])
+    }
     kept = tuple(place for place, light in enumerate(capture.light_ids) if light not in left_out)
     if left_out and len(kept) < max(LEAST_SHARE * rig, min(LEAST_LIGHTS, rig)):
         raise InputError(
             f"{subject}: {len(kept)} of {rig} lights have a sound frame in every camera, which is too few "
             f"({_list(left_out)}); add the frames, or take a camera out of the capture"
         )
-    return Selection(kept, cameras, left_out, dropped, tuple(map("/".join, missing)))
+    return Selection(kept, cameras, left_out, dropped, tuple(missing))
 
 
 def _absent(capture: Capture, subject: str, camera: str) -> dict[str, str]:
@@ -136,15 +160,6 @@ def _absent(capture: Capture, subject: str, camera: str) -> dict[str, str]:
         light: MARKED if light in marked else MISSING
         for light in capture.light_ids
         if not capture.frame_path(subject, camera, light).is_file()
-    }
-
-
-def _reasons(capture: Capture, broken: Mapping[str, Mapping[str, str]]) -> dict[str, str]:
-    """Reasons by light in the capture's order, from reasons by camera and light."""
-    return {
-        light: ", ".join(f"{camera}: {lights[light]}" for camera, lights in broken.items() if light in lights)
-        for light in capture.light_ids
-        if any(light in lights for lights in broken.values())
     }
 
 

@@ -34,7 +34,6 @@ from facerf_cli.capture.yale_b import read_yale_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three, distinct, read_document
-from facerf_cli.files.images import PHOTO_LIMIT_PX
 from facerf_cli.image.colour import named_space
 
 StageFormat = Literal["facerf-stage-1"]
@@ -106,12 +105,6 @@ class CameraEntry(Document):
     height: Side
     K: Annotated[Matrix3, AfterValidator(_intrinsics)]
     world_to_camera: Annotated[tuple[np.ndarray, np.ndarray], PlainValidator(_pose)]
-
-    @model_validator(mode="after")
-    def _is_readable(self) -> "CameraEntry":
-        if self.width * self.height > PHOTO_LIMIT_PX:
-            raise ValueError(f"images of at most {PHOTO_LIMIT_PX // 1_000_000} megapixels are read")
-        return self
 
     def posed(self) -> PosedCamera:
         """The camera with the axes of the package."""

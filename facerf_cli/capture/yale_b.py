@@ -96,7 +96,7 @@ class YaleB:
 
     folder: Path
     files: Mapping[str, Mapping[Flash, Path]]  # by subject, sorted
-    marked_damaged: Sequence[str]  # file names that end in .bad
+    marked: Mapping[str, frozenset[Flash]]  # by subject, of the files that end in .bad
     left_out: Sequence[str]  # stems of the files that exist and are excluded as damaged
     shifts: Shifts
 
@@ -119,7 +119,7 @@ class YaleB:
                 f"{self.folder / subject}: no sound image under {flash.name}; copy the folder again"
             )
         path = self.files[subject][flash]
-        image = _read_grey(path)
+        image = read_image(path, "linear").pixels[..., 0]
         if image.shape != (HEIGHT_PX, WIDTH_PX):
             raise InputError(
                 f"{path}: {image.shape[1]} x {image.shape[0]} pixels, not {WIDTH_PX} x {HEIGHT_PX}; use the "
@@ -148,29 +148,24 @@ def read_yale_b(
     )
     if not subjects:
         raise InputError(f"{folder}: no folders yaleB01 to yaleB39; give the folder that holds them")
-    files, marked, dropped = {}, [], []
+    files, marked, dropped = {}, {}, []
     for subject in subjects:
-        found = _images_of(folder / subject)
-        unwanted = set(leave_out.get(subject, ()))
+        found, unwanted = _images_of(folder / subject, ".pgm"), leave_out.get(subject, ())
+        if not found:
+            example = f"{subject}_{CAMERA}A+000E+00.pgm"
+            raise InputError(f"{folder / subject}: no images {example} and so on; copy the folder again")
         files[subject] = {flash: path for flash, path in found.items() if flash not in unwanted}
         dropped += [path.stem for flash, path in found.items() if flash in unwanted]
-        marked += sorted(path.name for path in (folder / subject).glob("*.pgm.bad"))
+        marked[subject] = frozenset(_images_of(folder / subject, ".pgm.bad"))
     return YaleB(folder, files, marked, dropped, shifts or {})
 
 
-def _images_of(folder: Path) -> dict[Flash, Path]:
+def _images_of(folder: Path, suffix: str) -> dict[Flash, Path]:
     """Images of a subject in the order of their flashes."""
-    prefix = f"{folder.name}_P00"
-    named = {path: Flash.named(path.stem.removeprefix(prefix)) for path in folder.glob(f"{prefix}A*.pgm")}
-    found = {flash: path for path, flash in named.items() if flash is not None}
-    if not found:
-        raise InputError(f"{folder}: no images {prefix}A+000E+00.pgm and so on; copy the folder again")
+    paths = folder.glob(f"{folder.name}_{CAMERA}A*{suffix}")
+    named = {path: path.name.removeprefix(f"{folder.name}_{CAMERA}").removesuffix(suffix) for path in paths}
+    found = {flash: path for path, name in named.items() if (flash := Flash.named(name))}
     return dict(sorted(found.items()))
-
-
-def _read_grey(path: Path) -> np.ndarray:
-    """Read a grey image [H, W] in 0..1."""
-    return read_image(path, "linear").pixels[..., 0]
 
 
 def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
@@ -201,7 +196,7 @@ def read_shifts(path: Path) -> dict[tuple[str, Flash], tuple[int, int]]:
 def read_yale_capture(folder: Path) -> Capture:
     """Read the database in a folder as a capture; no images are decoded yet."""
     database = read_yale_b(folder, leave_out={})
-    marked = {subject: _marked(database, subject) for subject in database.subjects}
+    marked = {subject: database.marked[subject] - set(of) for subject, of in database.files.items()}
     flashes = sorted({flash for found in (*database.files.values(), *marked.values()) for flash in found})
     return Capture(
         folder=folder,
@@ -236,11 +231,3 @@ def guess_camera() -> PosedCamera:
         rotation=torch.eye(3, dtype=torch.float64),
         translation_m=torch.zeros(3, dtype=torch.float64),
     )
-
-
-def _marked(database: YaleB, subject: str) -> set[Flash]:
-    """Flashes of which a subject has an image that ends in .bad and no sound one."""
-    prefix, suffix = f"{subject}_{CAMERA}", ".pgm.bad"
-    names = (name for name in database.marked_damaged if name.startswith(prefix))
-    found = {Flash.named(name.removeprefix(prefix).removesuffix(suffix)) for name in names}
-    return {flash for flash in found if flash is not None} - set(database.files[subject])

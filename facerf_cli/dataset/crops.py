@@ -23,15 +23,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.batch.made_from import Recipe, key_of, text_of_state
+from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, read_stack
 from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, read_pairs
 from facerf_cli.dataset.weights import relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import fit_from_arrays, load_fit
-from facerf_cli.files.documents import Document, Points68, digest, read_document, write_document
+from facerf_cli.face.fit import load_fit
+from facerf_cli.files.documents import Document, Points68, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
-from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, resize
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Networks
@@ -191,7 +192,7 @@ def mean_translation_m(dataset: Dataset) -> tuple[float, float, float]:
     subjects = dataset.splits["train"][:_SUBJECTS_AVERAGED] or dataset.subjects[:_SUBJECTS_AVERAGED]
     paths = [dataset.fit_path(subject, camera) for subject in subjects for camera in dataset.cameras[subject]]
     if not paths:
-        raise InputError(f"{dataset.folder}: no subject has a fit; run prepare-dataset again")
+        raise InputError(f"{dataset.folder}: no subject has a fit; {PREPARE_AGAIN}")
     x, y, z = torch.stack([load_fit(path).translation_m for path in paths]).mean(0).tolist()
     return x, y, z
 
@@ -215,19 +216,14 @@ class _StackInfo:
 
 @lru_cache(maxsize=_STACKS_CACHED)
 def _stack_info(path: Path) -> _StackInfo:
-    header = read_olat_header(path)
-    try:
-        fit = fit_from_arrays(header.fit)
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path}: invalid fit ({error}); run prepare-dataset again") from None
+    header, fit = read_stack(path)
     face = header.seen > 0.5
-    side_px = fit.crop.size_px
-    if header.kind != "image" or face.shape != (side_px, side_px) or not face.any():
-        raise InputError(f"{path}: not a stack of face crops; run prepare-dataset again")
+    if not face.any():
+        raise InputError(f"{path}: does not show the face; {PREPARE_AGAIN}")
     return _StackInfo(
         directions=torch.from_numpy(header.directions).float(),
         landmarks_px=fit.landmarks_px,
-        side_px=side_px,
+        side_px=fit.crop.size_px,
         lit_mean=max(float(header.source[face].mean()), _DARKEST),
         face_bits=np.packbits(face),
     )
@@ -273,36 +269,36 @@ def open_photos(
 
     Raises InputError where no photo has a face.
     """
-    known = {path: _record_path(path, cache) for path in sorted(paths)}
-    missing = [path for path, record in known.items() if not record.is_file()]
+    records = {path: cache / f"{key_of(_made_from(path, networks))}.json" for path in sorted(paths)}
+    missing = [item for item in records.items() if not item[1].is_file()]
     if missing:
         log.info("%s: detecting faces in %d photos (done once)", cache, len(missing))
-        work = partial(_detect, cache, networks)
+        work = partial(_detect, networks)
         if jobs > 1 and len(missing) > 1:
             in_shards(work, missing, jobs)
         else:
             work(missing)
-    found, landmarks = [], []
-    for record in known.values():
-        landmarks_px = read_document(record, _PhotoRecord, "delete the folder").landmarks_px
-        if landmarks_px is not None:
-            found.append(record.with_suffix(".jpg"))
-            landmarks.append(landmarks_px)
+    landmarks_px = {
+        record.with_suffix(".jpg"): read_document(record, _PhotoRecord, "delete the folder").landmarks_px
+        for record in records.values()
+    }
+    found = {path: points for path, points in landmarks_px.items() if points is not None}
     if not found:
-        raise InputError(f"--photos: no face in any of {len(known)} photos; give a folder of photos of faces")
-    return Photos(tuple(found), torch.from_numpy(np.stack(landmarks)).float(), side_px)
+        raise InputError(
+            f"--photos: no face in any of {len(records)} photos; give a folder of photos of faces"
+        )
+    return Photos(tuple(found), torch.from_numpy(np.stack(list(found.values()))).float(), side_px)
 
 
-def _record_path(photo: Path, cache: Path) -> Path:
-    facts = photo.stat()
-    return cache / f"{digest(f'{photo.absolute()} {facts.st_size} {facts.st_mtime_ns}'.encode())}.json"
+def _made_from(photo: Path, networks: Networks) -> Recipe:
+    """List all that the crop of a photo's face depends on."""
+    read = [str(photo.absolute()), text_of_state(photo)]
+    return {"photo": read, "parsing": networks.sha256("parsing"), "side": CACHED_SIDE_PX}
 
 
-def _detect(cache: Path, networks: Networks, photos: list[Path]) -> None:
+def _detect(networks: Networks, records: list[tuple[Path, Path]]) -> None:
     """Write the crop and the record of each photo."""
-    cache.mkdir(parents=True, exist_ok=True)
-    for photo in photos:
-        record = _record_path(photo, cache)
+    for photo, record in records:
         landmarks_px = None
         try:
             pixels = read_image(photo).pixels

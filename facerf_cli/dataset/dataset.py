@@ -1,7 +1,7 @@
 """The prepared dataset on disk (DESIGN, 'Files'): its paths, and reading and writing `dataset.json`.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
-    findings.jsonl             findings of the capture's checks (`capture/checks/findings.py`)
+    findings.jsonl             findings of the capture's checks (`capture/findings.py`)
     olat/SUBJECT/CAMERA.exr    OLAT stack of the face's crop (`files/olat_stack.py`, kind 'image')
     fits/SUBJECT/CAMERA.npz    its fit (`face/fit.py`)
     fits/SUBJECT.json          record of the subject; written last of the subject's files
@@ -30,33 +30,56 @@ from facerf_cli.batch.made_from import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.stage_json import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.fit import FaceFit, fit_from_arrays
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.documents import Direction, Document, Name, digest, distinct, read_document
+from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 
 Format = Literal["facerf-dataset-1"]
 FORMAT: Format = "facerf-dataset-1"
 DATASET_FILE = "dataset.json"
 SPLITS = ("train", "validation", "test")
 LARGEST_CROP_PX = 4096
+PREPARE_AGAIN = "run prepare-dataset with --overwrite always"
 _COLOUR_SPACE = "lin_rec709"
 
 
 @dataclass(frozen=True, eq=False)
-class Dataset:
-    """The content of `dataset.json`, without failed subjects."""
+class DatasetFolder:
+    """Paths of a dataset."""
 
     folder: Path
+
+    def stack_path(self, subject: str, camera: str) -> Path:
+        """Path of the OLAT stack of a subject and camera."""
+        return self.folder / "olat" / subject / f"{camera}.exr"
+
+    def fit_path(self, subject: str, camera: str) -> Path:
+        """Path of the fit of a subject in a camera's crop."""
+        return self.folder / "fits" / subject / f"{camera}.npz"
+
+    def record_path(self, subject: str) -> Path:
+        """Path of a subject's record; it exists once the subject is finished."""
+        return self.folder / "fits" / f"{subject}.json"
+
+    def sheet_path(self, subject: str) -> Path:
+        """Path of a subject's contact sheet."""
+        return self.folder / "sheets" / f"{subject}.jpg"
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset(DatasetFolder):
+    """The content of `dataset.json`, without failed subjects."""
+
     face_model: str  # name of the fitted model
     crop_px: int  # side of the largest crop
     light_ids: tuple[str, ...]
     directions_world: np.ndarray  # [L, 3] unit, toward the lights
     splits: dict[str, tuple[str, ...]]  # by 'train', 'validation' and 'test'
     cameras: dict[str, tuple[str, ...]]  # of each subject, in a split or not
-    normalisation: dict[str, Any]  # colour space from and to, black level, gain of each light
     provenance: dict[str, Any]
-    traits: dict[str, dict[str, Any]] = field(
-        default_factory=dict
-    )  # of each subject; {} where the capture has none
+    traits: dict[str, dict[str, Any]] = field(default_factory=dict)  # by subject; {} where there are none
     # Lights of subjects that lack some: indices into light_ids, ascending, of the parts of their stacks.
     fewer_lights: dict[str, tuple[int, ...]] = field(default_factory=dict)
 
@@ -67,11 +90,7 @@ class Dataset:
 
     def lights_of(self, subject: str) -> tuple[int, ...]:
         """Lights of a subject's stacks, in the order of the parts, as indices into `light_ids`."""
-        return self.fewer_lights.get(subject) or self._all_lights
-
-    @cached_property
-    def _all_lights(self) -> tuple[int, ...]:
-        return tuple(range(len(self.light_ids)))
+        return self.fewer_lights.get(subject) or tuple(range(len(self.light_ids)))
 
     def split_of(self, subject: str) -> str:
         """Split of a subject: 'train', 'validation', 'test', or '' for none."""
@@ -81,45 +100,13 @@ class Dataset:
     def _split_by_subject(self) -> dict[str, str]:
         return {subject: split for split, members in self.splits.items() for subject in members}
 
-    def stack_path(self, subject: str, camera: str) -> Path:
-        """Path of the OLAT stack of a subject and camera."""
-        return stack_path(self.folder, subject, camera)
-
-    def fit_path(self, subject: str, camera: str) -> Path:
-        """Path of the fit of a subject in a camera's crop."""
-        return fit_path(self.folder, subject, camera)
-
-
-def stack_path(folder: Path, subject: str, camera: str) -> Path:
-    """Path of a stack."""
-    return folder / "olat" / subject / f"{camera}.exr"
-
-
-def fit_path(folder: Path, subject: str, camera: str) -> Path:
-    """Path of a fit."""
-    return folder / "fits" / subject / f"{camera}.npz"
-
-
-def record_path(folder: Path, subject: str) -> Path:
-    """Path of a subject's record; it exists once the subject is finished."""
-    return folder / "fits" / f"{subject}.json"
-
-
-def sheet_path(folder: Path, subject: str) -> Path:
-    """Path of a subject's contact sheet."""
-    return folder / "sheets" / f"{subject}.jpg"
-
 
 class _RigLight(Document):
     id: Name
     direction_world: Direction
 
 
-class _CameraId(Document):
-    id: Name
-
-
-class _RigDocument(Document):
+class _Rig(Document):
     lights: Annotated[list[_RigLight], Field(min_length=1, max_length=MOST_LIGHTS)]
 
 
@@ -143,11 +130,9 @@ class _DatasetDocument(Document):
     format: Format
     face_model: str
     crop_px: Annotated[int, Field(ge=1, le=LARGEST_CROP_PX)]
-    rig: _RigDocument
-    cameras: Annotated[list[_CameraId], Field(max_length=MOST_CAMERAS)]
+    rig: _Rig
     subjects: Annotated[dict[Name, _SubjectEntry], Field(max_length=MOST_SUBJECTS)]
     splits: _SplitLists
-    normalisation: dict[str, Any]
     provenance: dict[str, Any]
 
     @property
@@ -158,11 +143,9 @@ class _DatasetDocument(Document):
     @model_validator(mode="after")
     def _is_consistent(self) -> "_DatasetDocument":
         light_ids = distinct([light.id for light in self.rig.lights], "the light")
-        known = set(distinct([camera.id for camera in self.cameras], "the camera"))
         for name, subject in self.done.items():
-            unknown = set(distinct(subject.cameras, f"in {name}, the camera")) - known
-            if unknown or not subject.cameras:
-                raise ValueError(f"subject {name} needs at least one camera, each of the dataset")
+            if not distinct(subject.cameras, f"in {name}, the camera"):
+                raise ValueError(f"subject {name} needs at least one camera")
             lights = light_ids if subject.lights is None else subject.lights
             if not lights or [light for light in light_ids if light in set(lights)] != lights:
                 raise ValueError(f"subject {name} needs some of the rig's lights, in the rig's order")
@@ -187,7 +170,6 @@ def read_dataset(folder: Path) -> Dataset:
         directions_world=np.array([light.direction_world for light in content.rig.lights]),
         splits={split: tuple(getattr(content.splits, split)) for split in SPLITS},
         cameras={name: tuple(subject.cameras) for name, subject in content.done.items()},
-        normalisation=content.normalisation,
         provenance=content.provenance,
         traits={name: subject.traits for name, subject in content.done.items()},
         fewer_lights={
@@ -204,6 +186,20 @@ def read_dataset(folder: Path) -> Dataset:
     return dataset
 
 
+def read_stack(path: Path) -> tuple[StackHeader, FaceFit]:
+    """Read the header and the fit of a stack; raise InputError where they are no face crop's."""
+    header = read_olat_header(path)
+    try:
+        if header.layout_version != LAYOUT_VERSION or header.kind != "image":
+            raise ValueError("another UV layout, or not a stack of images")
+        fit = fit_from_arrays(header.fit)
+        if header.seen.shape != (fit.crop.size_px, fit.crop.size_px):
+            raise ValueError("the images have another size")
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path}: invalid fit ({error}); {PREPARE_AGAIN}") from None
+    return header, fit
+
+
 @dataclass(frozen=True)
 class Split:
     """Sizes of training, validation and test: counts of subjects, or shares of all that sum to 1."""
@@ -216,25 +212,22 @@ class Split:
         """Parse `300/10/40` or `0.8/0.1/0.1`; raise UsageError for anything else."""
         words = text.split("/")
         advice = f"--split {text!r}: give counts of subjects such as 300/10/40, or shares such as 0.8/0.1/0.1"
-        if len(words) == 3 and all(word.isascii() and word.isdecimal() for word in words):
-            train, validation, test = (float(word) for word in words)
-            return Split((train, validation, test), are_shares=False)
         try:
             train, validation, test = (float(word) for word in words)
         except ValueError:
             raise UsageError(advice) from None
-        if not (min(train, validation, test) >= 0 and abs(train + validation + test - 1) < 1e-6):
+        parts, are_shares = (train, validation, test), not all(map(str.isdecimal, words))
+        if are_shares and not (min(parts) >= 0 and abs(sum(parts) - 1) < 1e-6):
             raise UsageError(f"{advice} (shares are not negative and sum to 1)")
-        return Split((train, validation, test), are_shares=True)
+        return Split(parts, are_shares)
 
     def counts(self, subjects: int) -> tuple[int, int, int]:
         """Split a number of subjects; where it is large enough, every share above 0 gets at least one."""
         if not self.are_shares:
             train, validation, test = (int(part) for part in self.parts)
-            if train + validation + test > subjects:
-                wanted = "/".join(str(int(part)) for part in self.parts)
+            if (wanted := train + validation + test) > subjects:
                 raise UsageError(
-                    f"--split {wanted}: {train + validation + test} subjects, but the capture has "
+                    f"--split {train}/{validation}/{test}: {wanted} subjects, but the capture has "
                     f"{subjects}; give shares such as 0.8/0.1/0.1"
                 )
             return train, validation, test
@@ -312,9 +305,8 @@ def _status(record: Mapping[str, Any] | None) -> dict[str, Any]:
     if record is None:
         return {"status": "failed"}
     known = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-    less = {
-        name: record[name] for name in ("lights", "left_out", "dropped", "ambient_kept") if name in record
-    }
+    optional = ("lights", "left_out", "dropped", "ambient_kept")
+    less = {name: record[name] for name in optional if name in record}
     return {"status": "done", **known, "cameras": list(record["cameras"]), **less}
 
 
@@ -345,7 +337,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
             **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),
-            **({"colour_charts": [chart.record() for chart in capture.charts]} if capture.charts else {}),
+            **({"colour_charts": [chart.record for chart in capture.charts]} if capture.charts else {}),
             "non_finite": "set to 0",
             "negative": "set to 0 after the crop",
         },

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from facerf_cli.batch.made_from import Recipe
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.findings import Selection
-from facerf_cli.dataset.dataset import fit_path, record_path, sheet_path, stack_path
+from facerf_cli.capture.findings import Finding, Selection
+from facerf_cli.dataset.dataset import DatasetFolder
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
@@ -46,101 +46,92 @@ _SHEET_AZEL_DEG = ((0.0, 15.0), (-60.0, 20.0), (60.0, 20.0))  # front, left and 
 _DIMMEST = 1e-3  # largest radiance under a constant map of 1 below which half floats lose precision
 log = logging.getLogger(LOGGER_NAME)
 
-FindingRows = Sequence[Mapping[str, Any]]
-
 
 class _SubjectRecord(Document):
     cameras: dict[Name, Any]
 
 
-def subject_outputs(capture: Capture, subject: str, folder: Path) -> list[Path]:
+def subject_outputs(capture: Capture, subject: str, dataset: DatasetFolder) -> list[Path]:
     """All files of a subject, from its record if it has one; the last one is written last."""
-    record = record_path(folder, subject)
+    record = dataset.record_path(subject)
     cameras = read_document(record, _SubjectRecord, "").cameras if record.exists() else capture.cameras
-    paths = [place(folder, subject, camera) for camera in cameras for place in (stack_path, fit_path)]
-    return [*paths, sheet_path(folder, subject), record]
+    paths = [of(subject, camera) for camera in cameras for of in (dataset.stack_path, dataset.fit_path)]
+    return [*paths, dataset.sheet_path(subject), record]
 
 
-def prepare_subject(
-    capture: Capture,
-    subject: str,
-    chosen: Selection,
-    model: MorphableModel,
-    networks: Networks,
-    folder: Path,
-    crop_px: int | None,
-    made_from: Recipe,
-    strict: bool = False,
-) -> dict[str, Any]:
-    """Write a subject's stacks, fits, sheet and record, and return the record.
+@dataclass(frozen=True, eq=False)
+class Preparation:
+    """All that subjects are prepared with; `networks` find the faces."""
 
-    `made_from` is that of `preparation`; `networks` find the faces. With `strict` a camera that does not see
-    the face is an error.
-    """
-    record_path(folder, subject).unlink(missing_ok=True)
-    person = _Subject(capture, subject, chosen.lights, model, networks)
+    model: MorphableModel
+    networks: Networks
+    dataset: DatasetFolder
+    crop_px: int | None  # None: by the pixels of the face
+    made_from: Recipe  # of `preparation`
+    strict: bool = False  # a camera that does not see the face is an error
+
+
+def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Preparation) -> dict[str, Any]:
+    """Write a subject's stacks, fits, sheet and record, and return the record."""
+    how.dataset.record_path(subject).unlink(missing_ok=True)
+    person = _Subject(capture, subject, chosen.lights, how)
     landmarks = [_find_landmarks(person, camera) for camera in chosen.cameras]
     try:
-        joint = fit_views(model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
+        joint = fit_views(how.model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
     except InputError as error:
         raise InputError(f"{subject}: {error}") from None
     cameras, rows, dropped = {}, [], dict(chosen.dropped)
     for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
         seen_px = None if error_iod is None else landmarks_px  # missing or rejected without an error
         error_iod = joint.mean_error_iod if error_iod is None else error_iod
+        posed = capture.cameras[camera]
         try:
-            fit, off_iod = fit_in_crop(model, joint, capture.cameras[camera], seen_px, error_iod, crop_px)
+            fit, off_iod = fit_in_crop(how.model, joint, posed, seen_px, error_iod, how.crop_px)
             header = _header(person, camera, joint, fit)
         except InputError as error:
             dropped[camera] = str(error)
             continue
-        rows.append(_write_camera(person, camera, fit, header, folder))
-        cameras[camera] = _camera_record(fit, seen_px is not None, off_iod)
+        rows.append(_write_camera(person, camera, fit, header))
+        cameras[camera] = {
+            "face_found": seen_px is not None,
+            "error_iod": round(fit.error_iod, 5),
+            "quality": fit.quality,
+            "crop_px": fit.crop.size_px,
+            "crop_off_iod": round(off_iod, 5),
+        }
     chosen = replace(chosen, dropped=dropped)
-    _remove_dropped(subject, chosen, folder, bool(cameras), strict)
+    _remove_dropped(subject, chosen, how, bool(cameras))
     sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
-    write_display(sheet_path(folder, subject), sheet, metadata=person.provenance())
+    write_display(how.dataset.sheet_path(subject), sheet, metadata=person.provenance())
     record = {
-        "prepared": made_from,
+        "prepared": how.made_from,
         "error_iod": round(joint.mean_error_iod, 5),
         "quality": quality_of(joint.mean_error_iod),
         "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
         "cameras": cameras,
         **_optional_entries(person, chosen),
     }
-    write_document(record_path(folder, subject), record)
+    write_document(how.dataset.record_path(subject), record)
     return record
 
 
-def prepared_subjects(capture: Capture, folder: Path) -> dict[str, dict[str, Any]]:
+def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, dict[str, Any]]:
     """Records of the finished subjects, by subject; 'prepared' is what they were made from."""
     return {
-        subject: read_document(record_path(folder, subject), dict[str, Any], "")
+        subject: read_document(dataset.record_path(subject), dict[str, Any], "")
         for subject in capture.subjects
-        if all(path.exists() for path in subject_outputs(capture, subject, folder))
-    }
-
-
-def _camera_record(fit: FaceFit, face_found: bool, off_iod: float) -> dict[str, Any]:
-    """Entry of a camera in a record."""
-    return {
-        "face_found": face_found,
-        "error_iod": round(fit.error_iod, 5),
-        "quality": fit.quality,
-        "crop_px": fit.crop.size_px,
-        "crop_off_iod": round(off_iod, 5),
+        if all(path.exists() for path in subject_outputs(capture, subject, dataset))
     }
 
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
-    """A subject of a capture, the lights of their stacks (indices into the capture's) and the face model."""
+    """A subject of a capture, and the lights of their stacks (indices into the capture's)."""
 
     capture: Capture
     name: str
     lights: tuple[int, ...]
-    model: MorphableModel
-    networks: Networks
+    how: Preparation
 
     @property
     def directions_world(self) -> np.ndarray:
@@ -152,31 +143,33 @@ class _Subject:
         synthetic = self.capture.provenance.get("synthetic") is True
         source_type = COMPUTER_GRAPHICS_SOURCE_TYPE if synthetic else ""
         name = "/".join([self.name, *camera])
-        return Provenance(name, **self.model.stamp, source_type=source_type).attributes()
+        return Provenance(name, **self.how.model.stamp, source_type=source_type).attributes()
 
 
-def _remove_dropped(subject: str, chosen: Selection, folder: Path, any_left: bool, strict: bool) -> None:
+def _remove_dropped(subject: str, chosen: Selection, how: Preparation, any_left: bool) -> None:
     """Log what is left out and delete an earlier run's files of it; raise where that is not allowed."""
-    if chosen.dropped and (strict or not any_left):
+    if chosen.dropped and (how.strict or not any_left):
         reasons = "; ".join(f"{camera}: {why}" for camera, why in chosen.dropped.items())
         advice = "without --strict the other cameras are used" if any_left else "no camera is left"
         raise InputError(f"{subject}: {reasons}; {advice}")
     if words := chosen.in_words():
         log.warning("%s: %s", subject, words)
     for camera in chosen.dropped:
-        stack_path(folder, subject, camera).unlink(missing_ok=True)
-        fit_path(folder, subject, camera).unlink(missing_ok=True)
+        how.dataset.stack_path(subject, camera).unlink(missing_ok=True)
+        how.dataset.fit_path(subject, camera).unlink(missing_ok=True)
 
 
 def _optional_entries(person: _Subject, chosen: Selection) -> dict[str, Any]:
     """Entries of a record that it has where they are not empty: missing, shifted and uncorrected frames."""
     capture = person.capture
-    entries: dict[str, Any] = {"dropped": chosen.dropped, "missing": list(chosen.missing)}
-    if chosen.left_out:
-        entries |= {"lights": [capture.light_ids[light] for light in chosen.lights]}
-        entries |= {"left_out": chosen.left_out}
-    entries |= {"shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()}}
-    entries |= {"ambient_kept": _ambient_kept(person, chosen.cameras)}
+    entries = {
+        "dropped": chosen.dropped,
+        "missing": list(chosen.missing),
+        "lights": [capture.light_ids[light] for light in chosen.lights] if chosen.left_out else [],
+        "left_out": chosen.left_out,
+        "shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()},
+        "ambient_kept": _ambient_kept(person, chosen.cameras),
+    }
     return {name: entry for name, entry in entries.items() if entry}
 
 
@@ -198,7 +191,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
     for light, weight in zip(person.lights, weights, strict=True):
         lit += weight * person.capture.frame(person.name, camera, light)
-    faces = detect_faces(person.networks.people, to_display(lit))
+    faces = detect_faces(person.how.networks.people, to_display(lit))
     return choose_face(faces, "largest", camera)[0].landmarks_px if faces else None
 
 
@@ -247,23 +240,21 @@ def _header(person: _Subject, camera: str, joint: JointFit, fit: FaceFit) -> Sta
     directions = person.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
     inside = fit.crop.valid(posed.height_px, posed.width_px)
-    header = stack_header(person.model, fit, directions, source, inside, person.provenance(camera))
+    header = stack_header(person.how.model, fit, directions, source, inside, person.provenance(camera))
     if not header.seen.any():
         raise InputError("the camera does not see the face")
     complete = len(person.lights) == len(person.capture.light_ids)
     return header if complete else replace(header, rig_lights=person.lights)
 
 
-def _write_camera(
-    person: _Subject, camera: str, fit: FaceFit, header: StackHeader, folder: Path
-) -> np.ndarray:
+def _write_camera(person: _Subject, camera: str, fit: FaceFit, header: StackHeader) -> np.ndarray:
     """Write a camera's stack and fit; return its tiles [6, h, w, 3] of the sheet."""
     sheet_images: dict[int, np.ndarray] = dict.fromkeys(sheet_lights(header.directions), header.source)
     crops = _crops(person, camera, fit.crop, header, sheet_images)
-    write_olat_stack(stack_path(folder, person.name, camera), header, crops)
-    with atomic_path(fit_path(folder, person.name, camera)) as temporary:
+    write_olat_stack(person.how.dataset.stack_path(person.name, camera), header, crops)
+    with atomic_path(person.how.dataset.fit_path(person.name, camera)) as temporary:
         save_fit(temporary, fit, header.metadata)
-    return sheet_tiles(header, fit, person.model, sheet_images)
+    return sheet_tiles(header, fit, person.how.model, sheet_images)
 
 
 def _crops(
@@ -296,7 +287,9 @@ def _warn_of_half_float_limits(name: str, clipped: int, lit: float) -> None:
 
 
 def index_page(
-    dataset: Mapping[str, Any], records: Mapping[str, Mapping[str, Any]], findings: Mapping[str, FindingRows]
+    dataset: Mapping[str, Any],
+    records: Mapping[str, Mapping[str, Any]],
+    findings: Mapping[str, Sequence[Finding]],
 ) -> str:
     """Make the page from the content of `dataset.json`, the records of finished subjects and the findings."""
     return filled_page(

@@ -13,7 +13,7 @@ for synthetic heads.
 """
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -26,16 +26,16 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from facerf_cli.batch.made_from import is_made_from, text_of_state
-from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
+from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, provenance_of, read_dataset, read_stack
 from facerf_cli.dataset.pairs import Pair, image_path, load_pairs
 from facerf_cli.errors import InputError
-from facerf_cli.face.fit import FaceFit, fit_from_arrays
+from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import digest
 from facerf_cli.files.images import HALF_MAX, read_image
-from facerf_cli.files.olat_stack import StackHeader, read_olat_header, read_olats
+from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import inpaint, normal_map, unwrap
@@ -65,10 +65,11 @@ def sources_path(dataset: Dataset, side: int, subject: str) -> Path:
 
 def build_textures(dataset: Dataset, face_model: str, side: int, subjects: Iterable[str], jobs: int) -> None:
     """Unwrap stacks and written sources of subjects fitted with `face_model`; skip finished ones."""
-    missing = [subject for subject in subjects if not _is_finished(dataset, side, subject)]
+    missing = [part for subject in subjects for part in _missing(dataset, side, subject)]
     if not missing:
         return
-    log.info("%s: unwrapping %d subjects (done once)", dataset.folder / f"textures-{side}", len(missing))
+    folder, count = dataset.folder / f"textures-{side}", len({subject for subject, _ in missing})
+    log.info("%s: unwrapping %d subjects (done once)", folder, count)
     work = partial(_build_shard, dataset, face_model, side)
     if jobs > 1 and len(missing) > 1:
         in_shards(work, missing, jobs)
@@ -76,14 +77,22 @@ def build_textures(dataset: Dataset, face_model: str, side: int, subjects: Itera
         work(missing)
 
 
-def _build_shard(dataset: Dataset, face_model: str, side: int, subjects: list[str]) -> None:
+def _missing(dataset: Dataset, side: int, subject: str) -> Iterator[tuple[str, str]]:
+    """Subject and camera of each stack to unwrap; "" in a camera's place means the subject's sources."""
+    for camera in dataset.cameras[subject]:
+        if not is_made_from(texture_path(dataset, side, subject, camera), stamp(dataset, subject, camera)):
+            yield subject, camera
+    if _has_sources(dataset, subject) and not sources_path(dataset, side, subject).exists():
+        yield subject, ""
+
+
+def _build_shard(dataset: Dataset, face_model: str, side: int, parts: list[tuple[str, str]]) -> None:
     model = load_face_model(face_model)
     with one_thread():
-        for subject in subjects:
-            for camera in dataset.cameras[subject]:
-                if not _is_unwrapped(dataset, side, subject, camera):
-                    _unwrap_stack(dataset, model, side, subject, camera)
-            if _has_sources(dataset, subject) and not sources_path(dataset, side, subject).exists():
+        for subject, camera in parts:
+            if camera:
+                _unwrap_stack(dataset, model, side, subject, camera)
+            else:
                 _unwrap_sources(dataset, model, side, subject)
 
 
@@ -101,15 +110,6 @@ def stamp(dataset: Dataset, subject: str, camera: str) -> str:
     return f"{LAYOUT_VERSION}-{text_of_state(dataset.stack_path(subject, camera))}"
 
 
-def _is_finished(dataset: Dataset, side: int, subject: str) -> bool:
-    stacks = all(_is_unwrapped(dataset, side, subject, camera) for camera in dataset.cameras[subject])
-    return stacks and (not _has_sources(dataset, subject) or sources_path(dataset, side, subject).exists())
-
-
-def _is_unwrapped(dataset: Dataset, side: int, subject: str, camera: str) -> bool:
-    return is_made_from(texture_path(dataset, side, subject, camera), stamp(dataset, subject, camera))
-
-
 def _has_sources(dataset: Dataset, subject: str) -> bool:
     """Tell whether all sources of a subject were written; otherwise they are summed as they are drawn."""
     pairs = _pairs(dataset, subject)
@@ -117,15 +117,15 @@ def _has_sources(dataset: Dataset, subject: str) -> bool:
 
 
 def _unwrap_stack(dataset: Dataset, model: MorphableModel, side: int, subject: str, camera: str) -> None:
-    """Write a stack's textures: olats [L, 3, T, T], and the fields of `samples.UnwrappedView`."""
+    """Write a stack's textures: olats [L, 3, T, T], and the fields of `UnwrappedView`."""
     path = dataset.stack_path(subject, camera)
-    header = read_olat_header(path)
-    fit, vertices = _read_fit(path, header, model)
+    header, fit = read_stack(path)
+    vertices = fit.vertices_camera(model)
     planes = torch.from_numpy(np.dstack([header.source, header.seen])).permute(2, 0, 1)
     texture, visible = unwrap(planes, vertices, grid_triangles(), fit.camera, side)
     visible = visible * (texture[3] > _LEAST_INSIDE)
     if visible.max() < 0.5:
-        raise InputError(f"{path}: the fit lies outside the visible face; run prepare-dataset again")
+        raise InputError(f"{path}: the fit lies outside the visible face; {PREPARE_AGAIN}")
     at_once = _at_once(side)
     olats = torch.empty(len(header.directions), 3, side, side, dtype=torch.float16)
     for first in range(0, len(olats), at_once):
@@ -142,19 +142,6 @@ def _unwrap_stack(dataset: Dataset, model: MorphableModel, side: int, subject: s
     with atomic_path(texture_path(dataset, side, subject, camera)) as temporary:
         contiguous = {name: tensor.contiguous() for name, tensor in tensors.items()}
         save_file(contiguous, temporary, {"of": stamp(dataset, subject, camera)})
-
-
-def _read_fit(path: Path, header: StackHeader, model: MorphableModel) -> tuple[FaceFit, Tensor]:
-    """Read a stack's fit, and its mesh in the crop's camera space [V, 3]."""
-    try:
-        if header.layout_version != LAYOUT_VERSION or header.kind != "image":
-            raise ValueError("another UV layout, or not a stack of images")
-        fit = fit_from_arrays(header.fit)
-        if header.seen.shape != (fit.crop.size_px, fit.crop.size_px):
-            raise ValueError("the images have another size")
-        return fit, fit.vertices_camera(model)
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{path}: invalid fit ({error}); run prepare-dataset again") from None
 
 
 def _at_once(side: int) -> int:
@@ -177,8 +164,8 @@ def _unwrap_sources(dataset: Dataset, model: MorphableModel, side: int, subject:
         shape = (len(pairs), 3, side, side)
         textures = np.lib.format.open_memmap(temporary, "w+", np.float16, shape)
         for camera in dataset.cameras[subject]:
-            stack = dataset.stack_path(subject, camera)
-            fit, vertices = _read_fit(stack, read_olat_header(stack), model)
+            _, fit = read_stack(dataset.stack_path(subject, camera))
+            vertices = fit.vertices_camera(model)
             rows = [row for row, pair in enumerate(pairs) if pair.source_camera == camera]
             for first in range(0, len(rows), at_once):
                 part = rows[first : first + at_once]
@@ -217,17 +204,15 @@ class DatasetTextures:
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
         """Heads of the split train, and at most `held_out` of the split validation."""
         places = {subject: place for place, subject in enumerate(self.dataset.subjects)}
+        for split in ("train", "validation"):
+            if not self.dataset.splits[split]:
+                advice = "run prepare-dataset with another --split"
+                raise InputError(f"{self.dataset.folder}: no subject in the split {split}; {advice}")
         train, validation = (
-            [places[subject] for subject in self.dataset.splits[split] if self.dataset.cameras[subject]]
+            torch.tensor([places[subject] for subject in self.dataset.splits[split]])
             for split in ("train", "validation")
         )
-        for split, found in (("train", train), ("validation", validation)):
-            if not found:
-                raise InputError(
-                    f"{self.dataset.folder}: no subject in the split {split}; "
-                    "run prepare-dataset with another --split"
-                )
-        return torch.tensor(train), torch.tensor(validation[:held_out])
+        return train, validation[:held_out]
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
         """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of the face model's mean."""
@@ -245,23 +230,12 @@ class DatasetTextures:
         subjects = [self.dataset.subjects[int(head)] for head in heads]
         lights = min(lights, *(len(self.dataset.lights_of(subject)) for subject in subjects))
         faces = [self._draw_face(subject, lights, generator) for subject in subjects]
-        visible = torch.stack([face.source.visible for face in faces])
-        source, target = simulate_camera(
-            torch.stack([face.texture for face in faces]),
-            torch.stack([face.target for face in faces]),
-            torch.stack([face.source.lit for face in faces]),
-            visible,
-            generator,
-        )
-        return Sample(
-            source=torch.stack([inpaint(s, v[0]) for s, v in zip(source, visible, strict=True)]),
-            visible=visible,
-            normals_source=torch.stack([face.source.normals for face in faces]),
-            normals_target=torch.stack([face.normals_target for face in faces]),
-            lights=torch.stack([face.lights for face in faces]),
-            target=target,
-            weight=torch.stack([face.weight for face in faces]),
-        )
+        names = _FaceTextures.__dataclass_fields__
+        of = {name: torch.stack([getattr(face, name) for face in faces]) for name in names}
+        lit = of.pop("lit")
+        source, of["target"] = simulate_camera(of.pop("texture"), of["target"], lit, of["visible"], generator)
+        filled = [inpaint(*pair) for pair in zip(source, of["visible"][:, 0], strict=True)]
+        return Sample(source=torch.stack(filled), **of)
 
     def _draw_face(self, subject: str, lights: int, generator: torch.Generator) -> "_FaceTextures":
         pairs, weights = load_pairs(self.dataset).get(subject, ([], None))
@@ -307,8 +281,10 @@ class DatasetTextures:
             images = torch.stack([olats[int(light)] for light in chosen]).float()
         source_to_target = target.rotation @ source.rotation.T
         return _FaceTextures(
-            source=source,
             texture=texture,
+            lit=source.lit,
+            visible=source.visible,
+            normals_source=source.normals,
             target=images,
             lights=target.directions[chosen],
             # The source's normals turned, as in `pipeline.predict_olat`.
@@ -350,8 +326,10 @@ class UnwrappedView:
 class _FaceTextures:
     """One face of a sample, before the simulated camera."""
 
-    source: UnwrappedView
     texture: Tensor  # [3, T, T] of the source
+    lit: Tensor  # [3, T, T] of the source under a constant map of radiance 1
+    visible: Tensor  # [1, T, T] of the source
+    normals_source: Tensor  # [3, T, T]
     target: Tensor  # [L, 3, T, T]
     lights: Tensor  # [L, 3] in the target's camera space
     normals_target: Tensor  # [3, T, T]

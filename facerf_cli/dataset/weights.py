@@ -24,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset
+from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.light_files import read_map_file
@@ -136,8 +136,7 @@ def _world_to_head(dataset: Dataset, subject: str, camera: str) -> np.ndarray:
     in_world = dataset.directions_world[list(dataset.lights_of(subject))]
     if len(header.directions) != len(in_world):
         raise InputError(
-            f"{path}: {len(header.directions)} lights, the dataset has {len(in_world)}; "
-            "run prepare-dataset again"
+            f"{path}: {len(header.directions)} lights, the dataset has {len(in_world)}; {PREPARE_AGAIN}"
         )
     in_head = header.directions @ header.rotation
     u, _, vt = np.linalg.svd(in_head.T @ in_world)
@@ -160,9 +159,7 @@ def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY
     header = read_olat_header(path)
     (height, width), lights = header.seen.shape, len(header.directions)
     if weights.shape[1] != lights:
-        raise InputError(
-            f"{path}: {lights} lights, the dataset has {weights.shape[1]}; run prepare-dataset again"
-        )
+        raise InputError(f"{path}: {lights} lights, the dataset has {weights.shape[1]}; {PREPARE_AGAIN}")
     rows = _strip_rows(lights, height, width, memory_bytes // 2)
     whole = read_olats(path) if rows >= height else None
     batch = max(1, memory_bytes // (4 * 6 * height * width))

@@ -230,7 +230,7 @@ def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool, room: 
         yield "Images are aligned to their subject's frontal one by the given shifts."
     else:
         yield "Images are not aligned (no --shifts); the published figures are of aligned ones."
-    marked, known = len(database.marked_damaged), len(database.left_out)
+    marked, known = sum(map(len, database.marked.values())), len(database.left_out)
     yield f"Left out of all subjects there: {marked} images marked as damaged, {known} known to be."
     yield (
         f"Published rows are of the same images, aligned, of {PUBLISHED_SUBJECTS} subjects, by the benchmark "

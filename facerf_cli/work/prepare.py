@@ -3,9 +3,9 @@
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rich.progress import track
@@ -14,23 +14,30 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.batch.made_from import Recipe, require_same
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings, torch_device
-from facerf_cli.capture.capture import Capture, ChartCorrection
+from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.draft import as_text, draft_stage
-from facerf_cli.capture.findings import Selection, frames_left_out, has_new_frames, select_frames
+from facerf_cli.capture.findings import (
+    Finding,
+    Selection,
+    frames_left_out,
+    has_new_frames,
+    select_frames,
+    stopping,
+)
 from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
 from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
     LARGEST_CROP_PX,
     Dataset,
+    DatasetFolder,
     Split,
     describe_dataset,
     preparation,
     read_dataset,
-    record_path,
 )
 from facerf_cli.dataset.pairs import (
     draw_pairs,
@@ -40,31 +47,39 @@ from facerf_cli.dataset.pairs import (
     relight_subject,
     write_pairs,
 )
-from facerf_cli.dataset.prepare import index_page, prepare_subject, prepared_subjects, subject_outputs
+from facerf_cli.dataset.prepare import (
+    Preparation,
+    index_page,
+    prepare_subject,
+    prepared_subjects,
+    subject_outputs,
+)
 from facerf_cli.dataset.settings import DatasetSettings, PairSettings
 from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import CROP_STEP_PX
-from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, MorphableModel, load_face_model
+from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import serving_files
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run import memory
-from facerf_cli.run.logs import LOGGER_NAME, STDERR
+from facerf_cli.run.logs import LOGGER_NAME, STDERR, counted
 from facerf_cli.run.workers import one_thread, process_died, spread
 from facerf_cli.synth.sky.skies import parse_envmaps
 from facerf_cli.work.capture_findings import (
-    CheckOnly,
-    check_all,
+    FINDINGS_FILE,
     collect_findings,
+    keep_findings,
     require_sound,
     show_findings,
     write_findings,
 )
 from facerf_cli.work.light_setups import MAP_SUFFIXES
 
+T = TypeVar("T")
+R = TypeVar("R")
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -104,63 +119,89 @@ def prepare_capture(
     split, overwrite, output = Split.parse(content.split), batch.overwrite == "always", batch.output
     if (px := content.crop) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
         raise UsageError(f"--crop {px}: give a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
-    source = _with_charts(CaptureSource(folder, reading), chart)
-    capture = source.opened()
+    capture = _open_capture(folder, reading, chart)
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
     if checking.checks == "only" and not batch.dry_run:
-        return check_all(CheckOnly(source.opened), items, batch, checking.strict, settings)
+        return check_all(partial(_check, capture), items, batch, checking.strict, settings)
     networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
-    model_sha256 = _model_digest(content.face_model)
+    model, is_builtin = load_face_model(content.face_model), content.face_model == BUILTIN
+    model_sha256 = file_sha256(BUILTIN_PATH if is_builtin else Path(content.face_model))
     made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
+    how = Preparation(model, networks, DatasetFolder(output), content.crop, made_from, checking.strict)
     if not overwrite:
-        _check_earlier(capture, output, made_from)
-    work = Prepare(source, checking, networks, content.face_model, content.crop, output, made_from)
-    if overwrite and not batch.dry_run:
-        (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
+        _judge_earlier(capture, output, made_from, batch.dry_run)
     elif not batch.dry_run:
-        _forget_completed(capture, output)
+        (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
+    work = Prepare(capture, how, checking.checks == "on")
     code = run_items("prepare-dataset", items, work, work.outputs_of, batch, settings)
     if not batch.dry_run and sums_up(items, work.outputs_of, batch):
-        _write_dataset(work, capture, split, settings.seed, model_sha256)
+        _write_dataset(capture, how, split, settings.seed, model_sha256)
     return code
 
 
-@dataclass(frozen=True)
-class CaptureSource:
-    """A capture's folder and the options to read it with."""
+def check_all(
+    work: Callable[[Item], list[Finding]],
+    items: Sequence[Item],
+    batch: BatchOptions,
+    strict: bool,
+    settings: Settings,
+) -> int:
+    """Check all subjects, print the table and write findings.jsonl; return 1 if a subject would be stopped.
 
-    folder: Path
-    reading: ReadSettings
-    charts: tuple[ChartCorrection, ...] = ()
+    UsageError with `--shard`, because the file covers all subjects.
+    """
+    if batch.shard.of > 1:
+        raise UsageError("--shard: --checks only checks all subjects; omit it, and give --jobs or --ray")
+    results = with_bar(work, items, "checks", batch, settings, _not_checked)
+    findings = [found for of_subject in results for found in of_subject]
+    write_findings(batch.output / FINDINGS_FILE, findings)
+    show_findings(findings, strict)
+    if not findings:
+        log.info("checked: %s, nothing found", counted(len(items), "subject"))
+    print(batch.output / FINDINGS_FILE)
+    return 1 if stopping(findings, strict) else 0
 
-    def opened(self) -> Capture:
-        """Read the capture's description once per process; UsageError where it is wrong."""
-        return replace(_read_capture(self.folder, self.reading), charts=self.charts)
+
+def with_bar(
+    work: Callable[[T], R],
+    items: Sequence[T],
+    title: str,
+    batch: BatchOptions,
+    settings: Settings,
+    died: Callable[[T, Exception], R],
+) -> Iterator[R]:
+    """Map items by the workers of --jobs or --ray, with a progress bar."""
+    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+    results = spread(work, items, batch.workers(settings), died)
+    return iter(track(results, title, len(items), console=STDERR, transient=True, disable=not shown))
 
 
-@cache
-def _read_capture(folder: Path, reading: ReadSettings) -> Capture:
+def _check(capture: Capture, item: Item) -> list[Finding]:
+    with one_thread():
+        return check_subject(capture, item.name)
+
+
+def _not_checked(item: Item, error: Exception) -> list[Finding]:
+    return [Finding("error", "unchecked", item.name, process_died(error))]
+
+
+def _open_capture(folder: Path, reading: ReadSettings, chart: ChartSettings) -> Capture:
+    """Read a capture's description and --colour-chart, and log the corrections; UsageError for wrong ones."""
+    image, corners = chart.colour_chart, chart.chart_corners
+    if corners and not image:
+        raise UsageError("--chart-corners: no image is given; give --colour-chart too")
     try:
-        return read_capture(folder, reading)
+        capture = read_capture(folder, reading)
     except InputError as error:
         raise UsageError(str(error)) from None
-
-
-def _with_charts(source: CaptureSource, given: ChartSettings) -> CaptureSource:
-    """Add the colour corrections of --colour-chart, and log each."""
-    image, corners = given.colour_chart, given.chart_corners
-    if not image:
-        if corners:
-            raise UsageError("--chart-corners: no image is given; give --colour-chart too")
-        return source
     try:
-        charts = tuple(read_charts(source.opened(), image, _parse_corners(corners) if corners else None))
+        charts = tuple(read_charts(capture, image, _parse_corners(corners) if corners else None))
     except InputError as error:
         raise UsageError(f"--colour-chart: {error}") from None
-    for chart in charts:
-        log.info("%s", chart.in_words())
-    return replace(source, charts=charts)
+    for correction in charts:
+        log.info("%s", correction.in_words())
+    return replace(capture, charts=charts)
 
 
 def _parse_corners(text: str) -> np.ndarray:
@@ -189,69 +230,40 @@ def _check_subjects(capture: Capture, output: Path, split: Split) -> None:
         log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
 
 
-def _model_digest(name: str) -> str:
-    _face_model(name)  # reports a wrong file before it is hashed
-    return file_sha256(BUILTIN_PATH if name == BUILTIN else Path(name))
+def _judge_earlier(capture: Capture, output: Path, made_from: Recipe, dry_run: bool) -> None:
+    """Raise UsageError where finished subjects were prepared with other options than this run has.
 
-
-@cache
-def _face_model(name: str) -> MorphableModel:
-    """Load the face model once per process."""
-    return load_face_model(name)
-
-
-def _check_earlier(capture: Capture, output: Path, made_from: Recipe) -> None:
-    """Raise UsageError where finished subjects were prepared with other options than this run has."""
-    for subject, record in prepared_subjects(capture, output).items():
-        before = record.get("prepared")
-        require_same(
-            before if isinstance(before, dict) else {},
-            made_from,
-            f"{output}: {subject} was prepared otherwise",
-            "give --overwrite always, or another folder",
-        )
-
-
-def _forget_completed(capture: Capture, output: Path) -> None:
-    """Remove the records of subjects whose missing frames exist by now, so that they are prepared again."""
-    for subject, record in prepared_subjects(capture, output).items():
+    Removes the records of subjects whose missing frames exist by now, so that they are prepared again.
+    """
+    dataset = DatasetFolder(output)
+    earlier = prepared_subjects(capture, dataset)
+    for subject, record in earlier.items():
+        before, said = record.get("prepared"), f"{output}: {subject} was prepared otherwise"
+        advice = "give --overwrite always to prepare all subjects again, or another folder with -o"
+        require_same(before if isinstance(before, dict) else {}, made_from, said, advice)
+    for subject, record in () if dry_run else earlier.items():
         if has_new_frames(capture, subject, record.get("missing", ())):
             log.info("%s: frames that were missing exist now; it is prepared again", subject)
-            record_path(output, subject).unlink()
+            dataset.record_path(subject).unlink()
 
 
 @dataclass(frozen=True)
 class Prepare:
     """Prepares one subject; settings only."""
 
-    source: CaptureSource
-    checking: CheckSettings
-    networks: Networks
-    face_model: str
-    crop_px: int | None
-    folder: Path
-    made_from: Recipe
+    capture: Capture
+    how: Preparation
+    with_checks: bool
 
     def outputs_of(self, item: Item) -> Sequence[Path]:
         """Files of a subject."""
-        return subject_outputs(self.source.opened(), item.name, self.folder)
+        return subject_outputs(self.capture, item.name, self.how.dataset)
 
     def __call__(self, item: Item) -> Outcome:
         """Prepare a subject on one thread, so that its bytes do not depend on the number of cores."""
-        model = _face_model(self.face_model)
         with one_thread():
             capture, chosen = self._choose(item.name)
-            record = prepare_subject(
-                capture,
-                item.name,
-                chosen,
-                model,
-                self.networks,
-                self.folder,
-                self.crop_px,
-                self.made_from,
-                self.checking.strict,
-            )
+            record = prepare_subject(capture, item.name, chosen, self.how)
         if record["quality"] == "poor":
             log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
         worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
@@ -262,39 +274,35 @@ class Prepare:
 
     def _choose(self, subject: str) -> tuple[Capture, Selection]:
         """Check a subject, select its sound frames, and align them on request; InputError for too few."""
-        capture = self.source.opened()
-        findings = check_subject(capture, subject) if self.checking.checks == "on" else []
-        write_findings(self.folder, subject, findings)
-        require_sound(subject, findings, self.checking.strict)
-        chosen = select_frames(capture, subject, findings, self.checking.strict)
+        capture, strict = self.capture, self.how.strict
+        findings = check_subject(capture, subject) if self.with_checks else []
+        keep_findings(self.how.dataset.folder, subject, findings)
+        require_sound(subject, findings, strict)
+        chosen = select_frames(capture, subject, findings, strict)
         if capture.align:
             capture = with_alignment(capture, subject, frames_left_out(findings))
         return capture, chosen
 
 
-def _write_dataset(work: Prepare, capture: Capture, split: Split, seed: int, model_sha256: str) -> None:
+def _write_dataset(
+    capture: Capture, how: Preparation, split: Split, seed: int, face_model_sha256: str
+) -> None:
     """Write findings.jsonl, the index page and dataset.json of the subjects prepared with these options."""
-    found = prepared_subjects(capture, work.folder).items()
-    records = {subject: record for subject, record in found if record.get("prepared") == work.made_from}
-    findings = collect_findings(work.folder, capture.subjects)
-    show_findings([row for rows in findings.values() for row in rows], work.checking.strict)
+    folder, found = how.dataset.folder, prepared_subjects(capture, how.dataset).items()
+    records = {subject: record for subject, record in found if record.get("prepared") == how.made_from}
+    findings = collect_findings(folder, capture.subjects)
+    show_findings([found for of_subject in findings.values() for found in of_subject], how.strict)
     if not records:
         return
-    _write_chart_overlays(capture, work.folder)
-    model = _face_model(work.face_model)
-    dataset = describe_dataset(capture, records, split, seed, model, model_sha256)
-    with atomic_path(work.folder / "index.html") as temporary:
+    for older in folder.glob("colour_chart*.png"):
+        older.unlink()
+    write_chart_overlays(capture, folder)
+    dataset = describe_dataset(capture, records, split, seed, how.model, face_model_sha256)
+    with atomic_path(folder / "index.html") as temporary:
         text = index_page(dataset, records, findings)
         temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
-    write_document(work.folder / DATASET_FILE, dataset)
-    print(work.folder / DATASET_FILE)
-
-
-def _write_chart_overlays(capture: Capture, output: Path) -> None:
-    """Replace the control images of colour charts."""
-    for older in output.glob("colour_chart*.png"):
-        older.unlink()
-    write_chart_overlays(capture, output)
+    write_document(folder / DATASET_FILE, dataset)
+    print(folder / DATASET_FILE)
 
 
 def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, settings: Settings) -> int:
@@ -305,7 +313,7 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     if not pairs:
         raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
     if not batch.dry_run:
-        write_pairs(dataset, pairs, overwrite, _Spread(batch, settings))
+        write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
     if wanted.lazy:
         print(pairs_path(dataset))
         return 0
@@ -342,22 +350,15 @@ class _Relight:
         return Outcome(self.outputs_of(item), {"pictures": len(pairs), "made": made})
 
 
-@dataclass(frozen=True)
-class _Spread:
-    """`map` over envmaps by the workers of --jobs or --ray, with a progress bar."""
-
-    batch: BatchOptions
-    settings: Settings
-
-    def __call__(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
-        if self.batch.shard.of > 1:  # shards would write the same pairs at the same time
-            raise UsageError(
-                "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
-            )
-        results = spread(work, items, self.batch.workers(self.settings), _died)
-        shown = STDERR.is_terminal and self.settings.verbosity >= 0 and not self.settings.log_json
-        return iter(track(results, "maps", len(items), console=STDERR, transient=True, disable=not shown))
+def _spread_maps(
+    batch: BatchOptions, settings: Settings, work: Callable[[T], R], maps: Sequence[T]
+) -> Iterator[R]:
+    if batch.shard.of > 1:  # shards would write the same pairs at the same time
+        raise UsageError(
+            "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
+        )
+    return with_bar(work, maps, "maps", batch, settings, _map_died)
 
 
-def _died(item: Any, error: Exception) -> str:
-    return f"{item.name}: {process_died(error)}"
+def _map_died(task: Any, error: Exception) -> Any:
+    return f"{task.name}: {process_died(error)}"

@@ -12,7 +12,6 @@ from facerf_cli.capture.chart import (
     ROWS,
     area_corners,
     homography,
-    project,
     published_colours,
 )
 
@@ -39,8 +38,8 @@ def chart_image(
     """
     draw = np.random.default_rng(seed)
     y, x = np.mgrid[: shape[0] * _SUPER, : shape[1] * _SUPER] + 0.5
-    to_grid = np.linalg.inv(homography(area_corners(), corners_px))
-    grid = project(to_grid, np.stack([x, y], -1) / _SUPER)
+    from_grid = homography(area_corners(), corners_px)
+    grid = from_grid.inverse(np.stack([x, y], -1).reshape(-1, 2) / _SUPER).reshape(*x.shape, 2)
     cell = np.rint(grid).astype(int)
     board = ((grid > -0.5 - _FRAME) & (grid < [COLUMNS - 0.5 + _FRAME, ROWS - 0.5 + _FRAME])).all(-1)
     inside = ((cell >= 0) & (cell < [COLUMNS, ROWS])).all(-1) & (np.abs(grid - cell) < PATCH_SIDE / 2).all(-1)

@@ -9,12 +9,9 @@ import pytest
 
 from facerf_cli.capture.chart import (
     GREYS,
-    area_corners,
     centres,
     fit_colours,
-    homography,
     neutral_matrix,
-    project,
     published_colours,
     sample,
 )
@@ -95,14 +92,6 @@ def test_importing_colour_science_changes_nothing_and_nothing_is_printed_at_the_
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_a_homography_meets_its_corners_and_many_points() -> None:
-    matrix = homography(area_corners(), CORNERS)
-    np.testing.assert_allclose(project(matrix, area_corners()), CORNERS)
-    images = project(matrix, centres())
-    again = homography(centres(), images + 0.01 * np.random.default_rng(0).standard_normal(images.shape))
-    assert np.abs(project(again, area_corners()) - CORNERS).max() < 0.1
 
 
 def test_the_middles_are_sampled() -> None:

@@ -15,7 +15,8 @@ from facerf_cli.capture.chart import (
     published_colours,
     squares_px,
 )
-from facerf_cli.capture.chart_photo import find_chart, read_charts, write_chart_overlays
+from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
+from facerf_cli.capture.chart_search import find_chart
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import read_image, write_display, write_exr
@@ -40,20 +41,27 @@ def correction(folder: Path, image: np.ndarray, corners_px: np.ndarray | None = 
     return next(read_charts(capture(folder), str(folder / "chart.exr"), corners_px))
 
 
+def delta_e(chart: ChartCorrection) -> float:
+    """The mean that the correction leaves."""
+    return float(chart.record["delta_e_2000"]["after"]["mean"])
+
+
 @pytest.mark.parametrize("found", [False, True])
 def test_a_camera_with_noise_and_uneven_light_is_undone(tmp_path: Path, found: bool) -> None:
     image = chart_image(matrix=CAMERA, light=(1.2, 0.8), noise=0.01)
     chart = correction(tmp_path, image, None if found else CORNERS)
-    np.testing.assert_allclose(chart.matrix, kept_luminance(CAMERA), atol=0.02)
-    assert chart.delta_e_after[0] < 0.5 and chart.delta_e_after[1] < 1.5 < 5 < chart.delta_e_before[0]
-    assert chart.light_span == pytest.approx(1.25, abs=0.05) and chart.cameras == ("C0", "C1")
+    before, after = (chart.record["delta_e_2000"][when] for when in ("before", "after"))
+    np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.02)
+    assert after["mean"] < 0.5 and after["max"] < 1.5 < 5 < before["mean"]
+    assert chart.record["light_span"] == pytest.approx(1.25, abs=0.05)
+    assert chart.record["cameras"] == ["C0", "C1"]
 
 
 @pytest.mark.parametrize("turn", [1, 2])
 def test_corners_begin_anywhere_and_go_either_way(tmp_path: Path, turn: int) -> None:
     corners = four_turns(CORNERS)[turn][:: -1 if turn % 2 else 1]
     chart = correction(tmp_path, chart_image(matrix=CAMERA), corners)
-    assert np.array(chart.corners_px).tolist() == CORNERS.tolist() and chart.delta_e_after[0] < 0.5
+    assert chart.record["corners_px"] == CORNERS.tolist() and delta_e(chart) < 0.5
 
 
 def test_lamps_of_one_colour_change_nothing(tmp_path: Path) -> None:
@@ -63,7 +71,7 @@ def test_lamps_of_one_colour_change_nothing(tmp_path: Path) -> None:
         stage = capture(tmp_path / name, lights=lights)
         write_exr(tmp_path / f"{name}.exr", chart_image(matrix=CAMERA, noise=0.0) * np.float32(tint) + LEVEL)
         chart = next(read_charts(stage, str(tmp_path / f"{name}.exr"), CORNERS))
-        np.testing.assert_allclose(chart.matrix, kept_luminance(CAMERA), atol=5e-3)
+        np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=5e-3)
 
 
 def test_a_chart_for_each_camera(tmp_path: Path) -> None:
@@ -72,11 +80,14 @@ def test_a_chart_for_each_camera(tmp_path: Path) -> None:
         write_exr(tmp_path / f"chart_C{number}.exr", chart_image(matrix=matrix) + LEVEL)
     name = str(tmp_path / "chart_{camera}.exr")
     charts = tuple(read_charts(stage, name, None))
-    assert [chart.cameras for chart in charts] == [("C0",), ("C1",)]
-    np.testing.assert_allclose(charts[1].matrix, np.eye(3), atol=0.01)
+    assert [chart.record["cameras"] for chart in charts] == [["C0"], ["C1"]]
+    np.testing.assert_allclose(charts[1].record["matrix"], np.eye(3), atol=0.01)
     seen = (np.array([[[0.3, 0.5, 0.2]]]) @ CAMERA.T).astype(np.float32)
     assert np.abs(correct_colours(charts, "C1", seen) - seen).max() < 0.01
-    assert np.abs(correct_colours(charts, "C0", seen) - seen @ np.array(charts[0].matrix).T).max() < 1e-6
+    assert (
+        np.abs(correct_colours(charts, "C0", seen) - seen @ np.array(charts[0].record["matrix"]).T).max()
+        < 1e-6
+    )
     assert correct_colours((), "C0", seen) is seen
     with pytest.raises(UsageError, match="names an image per camera"):
         next(read_charts(stage, name, CORNERS))
@@ -96,7 +107,7 @@ def test_the_overlay_shows_published_colours_in_corrected_ones(tmp_path: Path) -
     x, y = squares_px(CORNERS)[6].mean(0).astype(int)
     orange = shown[y - 6 : y + 6, x - 6 : x + 6]  # the published colour within what was sampled
     assert np.abs(orange - published_colours()[6]).max() < 0.05
-    assert json.dumps(chart.record()) and "max" in chart.in_words() and "\n" not in chart.in_words()
+    assert json.dumps(chart.record) and "max" in chart.in_words() and "\n" not in chart.in_words()
 
 
 DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
@@ -129,12 +140,17 @@ def test_a_white_of_eight_bits_is_clipped(tmp_path: Path) -> None:
         next(read_charts(stage, str(tmp_path / "chart.png"), CORNERS))
     write_display(tmp_path / "chart.png", chart_image(matrix=CAMERA, exposure=0.8))
     chart = next(read_charts(stage, str(tmp_path / "chart.png"), CORNERS))
-    np.testing.assert_allclose(chart.matrix, kept_luminance(CAMERA), atol=0.03)
+    np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.03)
 
 
 def test_a_white_of_floats_that_is_one_is_not_clipped(tmp_path: Path) -> None:
     image = chart_image(noise=0.0)
-    assert correction(tmp_path, image * np.float32((1 - LEVEL) / image.max())).delta_e_after[0] < 0.5
+    assert (
+        correction(tmp_path, image * np.float32((1 - LEVEL) / image.max())).record["delta_e_2000"]["after"][
+            "mean"
+        ]
+        < 0.5
+    )
 
 
 @pytest.mark.parametrize("turn", [0, 3])

@@ -17,7 +17,6 @@ from facerf_cli.capture.draft import (
     frames_by_pattern,
     match_lights,
     read_light_list,
-    sort_frames,
 )
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
@@ -279,19 +278,6 @@ def test_a_wrong_pattern_is_refused(pattern: str, said: str) -> None:
     with pytest.raises(UsageError, match=said) as raised:
         frames_by_pattern(crossed("{s}/{c}/{l}.exr"), pattern)
     assert str(raised.value).startswith("--pattern") and "\n" not in str(raised.value)
-
-
-def test_images_without_lights_and_with_all_are_no_frames() -> None:
-    extra = ["0001/C1/ambient.exr", "0002/C1/ambient.exr", "0001/C1/dark.exr", "0001/C2/all_on.exr"]
-    frames = sort_frames([*crossed("{s:04}/C{c}/L{l:03}.exr"), *extra], FOLDERS)
-    assert frames.ambient.most_common() == [("ambient", 2), ("dark", 1)]
-    assert len(frames.ids("light")) == len(LIGHTS) and not frames.strays
-
-
-def test_ids_that_no_file_could_bear_are_left_out() -> None:
-    paths = crossed("{s}/C{c}/L{l}.exr", ["ann\n", "b\udcff", "\u0627\u062d", "ok"])
-    frames = sort_frames(paths, FOLDERS)
-    assert frames.ids("subject") == ["ok"] and len(frames.strays) == 3 * len(paths) // 4
 
 
 def listed(folder: Path, text: str) -> Path:

@@ -1,7 +1,6 @@
 """Captures on disk: axes, lamps and values become DESIGN's; whatever is wrong is said in one line."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +111,6 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"lights": light(id="L1")}, "'L1' occurs twice"),
         ({"lights": light(id="../L0")}, "a name"),
         ({"cameras": camera(width=10**9)}, r"cameras\[0\]: width .*65536"),
-        ({"cameras": camera(width=60_000, height=60_000)}, "megapixels"),
         ({"cameras": camera(K=[[1, 0], [0, 1]])}, "3 x 3"),
         ({"cameras": camera(K=[[500, 3, 32], [0, 500, 30], [0, 0, 1]])}, "fx, 0, cx"),
         ({"cameras": camera(K=[[500, 0, 32], [0, 600, 30], [0, 0, 1]])}, "square"),
@@ -144,27 +142,6 @@ def test_nothing_is_guessed(tmp_path: Path, missing: str) -> None:
     capture_at(tmp_path)
     (tmp_path / "stage.json").write_text(json.dumps({k: v for k, v in GOOD.items() if k != missing}))
     with pytest.raises(InputError, match=f"has no '{missing}'"):
-        read_capture(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        '{"format": NaN}',
-        '{"a": ' + "9" * 5000 + "}",
-        '{"subjects": {"0000": {"age": 30}, "0000": {}}}',
-    ],
-)
-def test_broken_json(tmp_path: Path, text: str) -> None:
-    (tmp_path / "stage.json").write_text(text)
-    with pytest.raises(InputError, match="not JSON"):
-        read_capture(tmp_path)
-
-
-def test_a_description_that_is_no_file(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "stage.json")  # reading one would wait for ever
-    with pytest.raises(InputError, match="is no file"):
         read_capture(tmp_path)
 
 

@@ -56,7 +56,7 @@ def test_damaged_images_are_left_out_and_counted(folder: Path) -> None:
     for angles in ("A-035E+40", "A+035E+15"):
         write_pgm(folder / "yaleB05" / f"yaleB05_P00{angles}.pgm.bad", ramp(0))
     database = read_yale_b(folder)
-    assert database.marked_damaged == ["yaleB05_P00A+035E+15.pgm.bad", "yaleB05_P00A-035E+40.pgm.bad"]
+    assert database.marked == {"yaleB05": {Flash(-35, 40), Flash(35, 15)}, "yaleB07": frozenset()}
     assert database.left_out == ["yaleB05_P00A+035E+40"]  # known to be two fields in one
     assert Flash(35, 40) not in database.flashes("yaleB05") and Flash(35, 40) in database.flashes("yaleB07")
     assert Flash(35, 40) in read_yale_b(folder, leave_out={}).flashes("yaleB05")
@@ -112,7 +112,7 @@ def test_images_of_another_size(folder: Path, height: int, width: int, said: str
 
 def test_the_database_itself(shared_data: Path) -> None:
     database: YaleB = read_yale_b(shared_data / "extended_yale_b")
-    assert len(database.subjects) == 21 and len(database.marked_damaged) == 18
+    assert len(database.subjects) == 21 and sum(map(len, database.marked.values())) == 18
     assert len(database.left_out) == 10  # of the 16, whose other subjects are not in this copy
     assert [len(database.flashes(subject)) for subject in ("yaleB01", "yaleB05")] == [64, 62]
 

@@ -18,8 +18,8 @@ import pytest
 import torch
 
 from facerf_cli.capture.stage_json import read_capture
-from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.prepare import _Subject
+from facerf_cli.dataset.dataset import Dataset, DatasetFolder, read_dataset
+from facerf_cli.dataset.prepare import Preparation, _Subject
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -94,7 +94,8 @@ def test_what_is_made_names_the_face_model(prepared: Dataset) -> None:
 
 def test_what_comes_of_a_synthetic_capture_says_so(given: Given) -> None:
     capture = replace(read_capture(given[0]), provenance={"synthetic": True})
-    made = _Subject(capture, "0000", (), load_face_model(), SHIPPED_NETWORKS).provenance("C1")
+    how = Preparation(load_face_model(), SHIPPED_NETWORKS, DatasetFolder(given[0]), None, {})
+    made = _Subject(capture, "0000", (), how).provenance("C1")
     assert made["facerf:input"] == "0000/C1" and made["facerf:synthetic"] == 1
     assert made["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
 

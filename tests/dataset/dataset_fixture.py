@@ -12,9 +12,8 @@ from facerf_cli.dataset.dataset import (
     FORMAT,
     SPLITS,
     Dataset,
-    fit_path,
+    DatasetFolder,
     read_dataset,
-    stack_path,
 )
 from facerf_cli.dataset.prepare import constant_weights, stack_header
 from facerf_cli.face.crop import Crop
@@ -124,7 +123,7 @@ def _write_one(
     olats = skin * fragments.covered * cosine[:, None]  # [L, 3, H, W]
     weights = torch.from_numpy(constant_weights(directions.numpy()))
     source[:] = torch.einsum("l,lchw->hwc", weights, olats).numpy()
-    write_olat_stack(stack_path(folder, subject, camera), header, [olats])
-    path = fit_path(folder, subject, camera)
+    write_olat_stack(DatasetFolder(folder).stack_path(subject, camera), header, [olats])
+    path = DatasetFolder(folder).fit_path(subject, camera)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_fit(path, fit)

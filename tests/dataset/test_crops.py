@@ -30,7 +30,7 @@ from facerf_cli.files.images import write_display
 from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.portrait.find import Face
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 
@@ -198,7 +198,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked_at: list[str]
     return tmp_path
 
 
-def test_faces_are_found_once(folder: Path, looked_at: list[str], caplog: pytest.LogCaptureFixture) -> None:
+def test_faces_are_found_once(
+    folder: Path,
+    looked_at: list[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     paths, cache = sorted(folder.glob("*.png")), folder / "cache"
     with caplog.at_level(logging.WARNING):
         first = open_photos(paths, cache, SHIPPED_NETWORKS, 64)
@@ -209,6 +214,9 @@ def test_faces_are_found_once(folder: Path, looked_at: list[str], caplog: pytest
     os.utime(paths[0], (0, 0))
     open_photos(paths, cache, SHIPPED_NETWORKS, 64)
     assert len(looked_at) == 4  # the one that changed
+    monkeypatch.setattr(Networks, "sha256", lambda networks, name: "another")
+    open_photos(paths, cache, SHIPPED_NETWORKS, 64)
+    assert len(looked_at) == 7  # by another network
 
 
 def test_crops_hold_their_landmarks(folder: Path) -> None:

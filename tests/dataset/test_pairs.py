@@ -295,7 +295,6 @@ def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: 
         {"subject": "9999"},
         {"source_camera": "C7"},
         {"target_light": 20},
-        {"index": -1},
         {"index": 1},
     ],
 )

@@ -5,7 +5,7 @@ read once for all checks, and one full frame is in memory at a time.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,16 +35,17 @@ _BELOW = -0.7  # sine of the elevation: the body hides lights further below
 _ABOVE, _OVERHEAD = 0.85, 0.3  # sine above which hair or brows hide lights of a cosine below the second
 
 
-@dataclass(frozen=True)
-class FrameFigures:
-    """Measurements of a full-size frame with recorded values, not divided by the light's intensity."""
-
-    digest: str  # SHA-256 of the pixels
-    highest: float  # largest value
-    share_highest: float  # of the pixels with the largest value in some channel
-    spread: float  # largest less smallest value
-    comb: float  # relative difference between odd and even rows, see `comb`
-    comb_ratio: float  # that over the difference between odd and even columns
+# Measurements of a full-size frame with recorded values, not divided by the light's intensity.
+_MEASURED = np.dtype(
+    [
+        ("digest", "U64"),  # SHA-256 of the pixels
+        ("highest", float),  # largest value
+        ("share_highest", float),  # of the pixels with the largest value in some channel
+        ("spread", float),  # largest less smallest value
+        ("comb", float),  # relative difference between odd and even rows, see `comb`
+        ("comb_ratio", float),  # that over the difference between odd and even columns
+    ]
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,23 +54,21 @@ class CameraFrames:
 
     subject: str
     camera: str
-    light_ids: tuple[str, ...]  # of the frames
-    places: np.ndarray  # [L] indices into the capture's lights, ascending
+    light_ids: list[str]  # of the frames
     directions: np.ndarray  # [L, 3] unit, toward the lights, camera space
     grey: np.ndarray  # [L, h, w] float32 linear, under a light of rgb 1
-    figures: tuple[FrameFigures, ...]
+    measured: np.ndarray  # [L] of `_MEASURED`
     scale: float  # pixels of the camera per pixel of `grey`
 
-    def without(self, broken: set[str]) -> "CameraFrames":
+    def without(self, broken: Collection[str]) -> "CameraFrames":
         """Remove the frames under these lights."""
         kept = [row for row, light in enumerate(self.light_ids) if light not in broken]
         return replace(
             self,
-            light_ids=tuple(self.light_ids[row] for row in kept),
-            places=self.places[kept],
+            light_ids=[self.light_ids[row] for row in kept],
             directions=self.directions[kept],
             grey=self.grey[kept],
-            figures=tuple(self.figures[row] for row in kept),
+            measured=self.measured[kept],
         )
 
     def error(self, check: str, words: str, row: int | None = None, **figures: float) -> Finding:
@@ -82,71 +81,50 @@ class CameraFrames:
         return Finding("warning", check, self.subject, words, self.camera, figures=figures)
 
 
-@dataclass(frozen=True)
-class Unread:
-    """A frame that could not be read."""
-
-    light: str
-    reason: str
-    wrong_size: bool  # the file is sound, but not of the camera's size
-
-
 def read_frames(
     capture: Capture, subject: str, camera: str, side_px: int
-) -> tuple[CameraFrames, list[Unread]]:
-    """Read the frames of a camera that exist, shrunk to `side_px`; return unreadable ones separately."""
+) -> tuple[CameraFrames, dict[str, InputError]]:
+    """Read the frames of a camera that exist, shrunk to `side_px`; return the errors of others by light."""
     posed = capture.cameras[camera]
     scale = max(posed.width_px, posed.height_px, side_px) / side_px
     size = (max(round(posed.height_px / scale), 1), max(round(posed.width_px / scale), 1))
-    places, greys, figures, unread = [], [], [], []
+    places, greys, measured, unread = [], [], [], {}
     for place, light in enumerate(capture.light_ids):
         if not capture.frame_path(subject, camera, light).exists():
             continue
         try:
             pixels = capture.frame(subject, camera, place)
         except InputError as error:
-            unread.append(Unread(light, str(error), isinstance(error, FrameSizeError)))
+            unread[light] = error
             continue
         places.append(place)
-        figures.append(_measure(pixels * capture.intensities[place].astype(np.float32)))
-        greys.append(small(grey_of(pixels), size))
-    rows = np.array(places, int)
+        measured.append(_measure(pixels * capture.intensities[place].astype(np.float32)))
+        grey = torch.from_numpy(_grey_of(pixels))[None, None]
+        greys.append(F.interpolate(grey, size, mode="area")[0, 0].numpy())
     frames = CameraFrames(
         subject=subject,
         camera=camera,
-        light_ids=tuple(capture.light_ids[place] for place in places),
-        places=rows,
-        directions=capture.directions_world[rows] @ posed.rotation.double().numpy().T,
+        light_ids=[capture.light_ids[place] for place in places],
+        directions=capture.directions_world[places] @ posed.rotation.double().numpy().T,
         grey=np.stack(greys) if greys else np.zeros((0, *size), np.float32),
-        figures=tuple(figures),
+        measured=np.array(measured, _MEASURED),
         scale=scale,
     )
     return frames, unread
 
 
-def grey_of(pixels: np.ndarray) -> np.ndarray:
+def _grey_of(pixels: np.ndarray) -> np.ndarray:
     """Mean of the channels [H, W]; numpy's mean is many times slower over an axis of three."""
     return (pixels[..., 0] + pixels[..., 1] + pixels[..., 2]) / np.float32(3)
 
 
-def small(grey: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Shrink a plane [H, W] by area averaging."""
-    return F.interpolate(torch.from_numpy(grey)[None, None], size, mode="area")[0, 0].numpy()
-
-
-def _measure(pixels: np.ndarray) -> FrameFigures:
+def _measure(pixels: np.ndarray) -> tuple[str | float, ...]:
     """Measure a frame [H, W, 3] at full size."""
-    highest, grey = float(pixels.max()), grey_of(pixels)
+    highest, grey = float(pixels.max()), _grey_of(pixels)
     rows, columns = comb(grey), comb(grey.T)
     top = (pixels >= highest * _AT_THE_TOP).any(-1) if highest > 0 else np.zeros(1)
-    return FrameFigures(
-        digest=hashlib.sha256(pixels.tobytes()).hexdigest(),
-        highest=highest,
-        share_highest=float(top.mean()),
-        spread=highest - float(pixels.min()),
-        comb=rows,
-        comb_ratio=rows / max(columns, 1e-6),
-    )
+    digest = hashlib.sha256(pixels.tobytes()).hexdigest()
+    return digest, highest, top.mean(), highest - float(pixels.min()), rows, rows / max(columns, 1e-6)
 
 
 def comb(grey: np.ndarray) -> float:
@@ -180,13 +158,14 @@ def reaches_face(directions: np.ndarray) -> np.ndarray:
 def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Finding]:
     """Report each missing frame of a camera; a camera without frames, or extra files, as one warning."""
     paths = {light: capture.frame_path(subject, camera, light) for light in capture.light_ids}
+    marked = capture.marked.get(subject, frozenset())
     missing = [light for light, path in paths.items() if not path.is_file()]
     if len(missing) == len(paths):
         example = next(iter(paths.values()))
         words = f"has no frames ({example}, ...); copy them, or correct the pattern"
         yield Finding("warning", "missing", subject, words, camera)
         missing = []
-    for light in missing:
+    for light in (light for light in missing if light not in marked):
         yield Finding("error", "missing", subject, f"{paths[light]}: no such file; copy it", camera, light)
     if extra := extra_names(capture, subject, camera):
         names = ", ".join(extra[:_LISTED]) + (", ..." if len(extra) > _LISTED else "")
@@ -207,19 +186,20 @@ def extra_names(capture: Capture, subject: str, camera: str) -> list[str]:
     return sorted(name for name in names if not unlisted_kind(name))
 
 
-def check_readable(frames: CameraFrames, unread: Sequence[Unread]) -> Iterator[Finding]:
+def check_readable(frames: CameraFrames, unread: Mapping[str, InputError]) -> Iterator[Finding]:
     """Report each unreadable frame; or the camera, where most frames have another size."""
-    wrong = [frame for frame in unread if frame.wrong_size]
-    if len(wrong) > _MOST_OF_ANOTHER_SIZE * (len(unread) + len(frames.light_ids)):
+    sizes = {light: error for light, error in unread.items() if isinstance(error, FrameSizeError)}
+    camera_is_wrong = len(sizes) > _MOST_OF_ANOTHER_SIZE * (len(unread) + len(frames.light_ids))
+    if camera_is_wrong:
         words = (
-            f"{len(wrong)} frames have another size than the camera ({wrong[0].reason}); correct the "
-            "camera's width, height and K"
+            f"{len(sizes)} frames have another size than the camera ({next(iter(sizes.values()))}); correct "
+            "the camera's width, height and K"
         )
-        yield frames.error("resolution", words, frames=len(wrong))
-        unread = [frame for frame in unread if not frame.wrong_size]
-    for frame in unread:
-        check = "resolution" if frame.wrong_size else "unreadable"
-        yield Finding("error", check, frames.subject, frame.reason, frames.camera, frame.light)
+        yield frames.error("resolution", words, frames=len(sizes))
+    for light, error in unread.items():
+        if light not in sizes or not camera_is_wrong:
+            check = "resolution" if light in sizes else "unreadable"
+            yield Finding("error", check, frames.subject, str(error), frames.camera, light)
 
 
 def check_black(frames: CameraFrames) -> Iterator[Finding]:
@@ -228,15 +208,12 @@ def check_black(frames: CameraFrames) -> Iterator[Finding]:
     A light behind the head may reach nothing that the camera sees. So a dark frame counts as black only under
     a light that reaches the face; a frame of one value is broken under any light.
     """
-    if not frames.figures:
-        return
-    highest = np.array([figures.highest for figures in frames.figures])
-    usual = float(np.median(highest))
+    highest, spread = frames.measured["highest"], frames.measured["spread"]
+    usual = float(np.median(highest)) if len(highest) else 1.0
     if usual <= 0:
         yield frames.error("black", "most frames are black; check the lens cap and black_level")
         return
-    flat = np.array([figures.spread <= _FLAT * max(figures.highest, 0) for figures in frames.figures])
-    dark = highest < _BLACK * usual
+    flat, dark = spread <= _FLAT * highest.clip(0), highest < _BLACK * usual
     for row in np.flatnonzero(dark & reaches_face(frames.directions) | flat).tolist():
         words = "is black" if dark[row] else "has one value throughout"
         words += "; check the shutter, the light and the file"
@@ -249,11 +226,8 @@ def check_clipped(frames: CameraFrames) -> Iterator[Finding]:
     The ceiling is the largest value of all frames, if two or more frames reach it: noise and highlights
     differ from frame to frame, a clipped sensor does not. EXR files declare no ceiling.
     """
-    highest = np.array([figures.highest for figures in frames.figures])
-    if len(highest) < 2:
-        return
-    at_ceiling = highest >= highest.max() * (1 - _CEILING)
-    share = np.array([figures.share_highest for figures in frames.figures])
+    highest, share = frames.measured["highest"], frames.measured["share_highest"]
+    at_ceiling = highest >= highest.max(initial=0) * (1 - _CEILING)
     clipped = np.flatnonzero(at_ceiling & (share > _CLIPPED_SHARE))
     if not len(clipped) or at_ceiling.sum() < 2:
         return
@@ -268,21 +242,17 @@ def check_clipped(frames: CameraFrames) -> Iterator[Finding]:
 def same_frames(frames: CameraFrames) -> list[list[int]]:
     """Groups of rows with identical images, among frames that have more than one value."""
     groups: dict[str, list[int]] = {}
-    for row, figures in enumerate(frames.figures):
-        if figures.spread > 0:
-            groups.setdefault(figures.digest, []).append(row)
+    for row in np.flatnonzero(frames.measured["spread"] > 0).tolist():
+        groups.setdefault(frames.measured["digest"][row], []).append(row)
     return [rows for rows in groups.values() if len(rows) > 1]
 
 
 def check_other_cameras(frames: CameraFrames, earlier: Mapping[str, str]) -> Iterator[Finding]:
     """Report a camera with frames of another one; `earlier` has the others' camera/light by digest."""
-    again = [
-        (light, earlier[figures.digest])
-        for light, figures in zip(frames.light_ids, frames.figures, strict=True)
-        if figures.spread > 0 and figures.digest in earlier
-    ]
+    rows = np.flatnonzero(frames.measured["spread"] > 0)
+    again = [row for row in rows if frames.measured["digest"][row] in earlier]
     if again:
-        light, place = again[0]
+        light, place = frames.light_ids[again[0]], earlier[frames.measured["digest"][again[0]]]
         words = f"{len(again)} frames are another camera's ({light} is identical to {place}); copy them again"
         yield frames.error("duplicate", words, frames=len(again))
 
@@ -293,10 +263,9 @@ def check_fields(frames: CameraFrames) -> Iterator[Finding]:
     Hair alternates too, under lights from above; so the frames of neighbouring lights set what is usual.
     Lights behind the head light edges one row wide, and are not judged.
     """
-    if len(frames.figures) < 3:
+    ratios, combs = frames.measured["comb_ratio"], frames.measured["comb"]
+    if len(ratios) < 3:
         return
-    ratios = np.array([figures.comb_ratio for figures in frames.figures])
-    combs = np.array([figures.comb for figures in frames.figures])
     near = np.argsort(-frames.directions @ frames.directions.T, axis=1)[:, 1 : 1 + _NEIGHBOURS]
     usual = np.maximum(np.median(ratios[near], axis=1), max(float(np.median(ratios)), 1.0))
     broken = (ratios > _TIMES_USUAL * usual) & (combs > _COMB) & reaches_face(frames.directions)

@@ -21,7 +21,7 @@ highlights.
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -55,6 +55,7 @@ _MODEL_ERRORS_PX, _MODEL_WIDTH = (0.3, 0.6), 0.6  # of the shading model; its re
 _OWN_MOTIONS_PX = (0.15, 0.4, 1.0, 2.0)  # of a frame's own motion
 _SURE = 5.0  # least gain in log likelihood of a path; a lower one finds paths in Extended Yale B
 _MOST_FRAMES = 300  # by which the sizes are chosen, at a cost of their cube
+_PathModel = tuple[tuple[float, float], tuple[float, float]]  # bend and size; errors of shading, own motion
 # Prediction of a frame from the frames of neighbouring lights.
 _WIDTH = 0.6  # reach of a light's influence on the unit sphere
 _NOISE = 0.05
@@ -62,31 +63,25 @@ _MEAN = 1e-3  # variance of what all frames share
 _REWEIGHTINGS = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Offsets of frames from their predictions."""
-
-    moved_px: np.ndarray  # [L, 2] down and right, in pixels of the small frames
-    trusted: np.ndarray  # [L] bool; offsets of other frames are 0
-
-
 def check_motion(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
     """Warn once per camera with frames in which the head has moved."""
-    motion = measure_motion(frames, stereo)
-    far = np.hypot(*motion.moved_px.T)
+    moved_px, trusted = measure_motion(frames, stereo)
+    far = np.hypot(*moved_px.T)
     moved = far > _MOVED_PX
     if not moved.any():
         return
     worst = int(far.argmax())
     limit_px, worst_px = _MOVED_PX * frames.scale, far[worst] * frames.scale
     words = (
-        f"the head moves: of {motion.trusted.sum()} measurable frames, {moved.sum()} or more are off by over "
+        f"the head moves: of {trusted.sum()} measurable frames, {moved.sum()} or more are off by over "
         f"{limit_px:.1f} pixels ({frames.light_ids[worst]} by {worst_px:.1f}); --align shifts them back"
     )
     yield frames.warning("motion", words, frames=int(moved.sum()), worst_px=round(float(worst_px), 2))
 
 
-def measure_motion(frames: CameraFrames, stereo: Stereo, least_front: float = _IN_FRONT) -> Motion:
+def measure_motion(
+    frames: CameraFrames, stereo: Stereo, least_front: float = _IN_FRONT
+) -> tuple[np.ndarray, np.ndarray]:
     """Measure frames against predictions, for lights of a cosine to the camera's axis over `least_front`."""
     predicted = np.zeros(frames.grey.shape)
     predicted[:, stereo.lit] = stereo.predicted(frames.directions)
@@ -94,15 +89,20 @@ def measure_motion(frames: CameraFrames, stereo: Stereo, least_front: float = _I
     return motion_between(frames.grey, predicted, stereo.lit, front)
 
 
-def motion_between(seen: np.ndarray, predicted: np.ndarray, mask: np.ndarray, judged: np.ndarray) -> Motion:
-    """Measure frames [L, h, w] against predictions within `mask` [h, w], for the `judged` [L] ones."""
+def motion_between(
+    seen: np.ndarray, predicted: np.ndarray, mask: np.ndarray, judged: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measure frames [L, h, w] against predictions within `mask` [h, w], for the `judged` [L] ones.
+
+    Returns the offsets [L, 2], down and right, in pixels, and whether they can be trusted [L]; others are 0.
+    """
     moved, peaks, gain = np.zeros((len(judged), 2)), np.zeros(len(judged)), np.zeros(len(judged))
     for row in np.flatnonzero(judged):
         pair = (orientation(image) * mask for image in (seen[row], predicted[row]))
         moved[row], peaks[row], gain[row] = register(*pair)
     moved[(gain < _LEAST_GAIN) & (np.hypot(*moved.T) > _MOVED_PX)] = 0
     trusted = judged & (peaks > _LEAST_PEAK)
-    return Motion(np.where(trusted[:, None], moved, 0), trusted)
+    return np.where(trusted[:, None], moved, 0), trusted
 
 
 def orientation(image: np.ndarray) -> np.ndarray:
@@ -135,11 +135,12 @@ def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float, f
 
 def with_alignment(capture: Capture, subject: str, broken: Mapping[str, set[str]]) -> Capture:
     """Add the shifts of a subject's frames to a capture; `broken` is that of `frames_left_out`."""
-    shifts = dict(capture.shifts)
-    for camera in capture.cameras:
-        found = align_shifts(capture, subject, camera, broken.get(camera, set()))
-        shifts |= {(subject, camera, light): shift_px for light, shift_px in found.items()}
-    return replace(capture, shifts=shifts)
+    shifts = {
+        (subject, camera, light): shift_px
+        for camera in capture.cameras
+        for light, shift_px in align_shifts(capture, subject, camera, broken.get(camera, set())).items()
+    }
+    return replace(capture, shifts={**capture.shifts, **shifts})
 
 
 def align_shifts(
@@ -165,8 +166,8 @@ def head_motion(frames: CameraFrames) -> np.ndarray:
     for size in _OWN_LEVELS:
         grey = _coarser(_moved_back(frames, path + own), size).grey
         predicted = np.tensordot(weights.astype(np.float32), grey, 1)
-        found = motion_between(grey, predicted, lit_pixels(grey), judged)
-        more = own_motion(weights, found.moved_px, found.trusted, _SHRINK[size])
+        moved_px, trusted = motion_between(grey, predicted, lit_pixels(grey), judged)
+        more = own_motion(weights, moved_px, trusted, _SHRINK[size])
         own += size * np.where(judged[:, None], more, 0)
         own[judged] -= np.median(own[judged], axis=0)  # a common offset is not motion between frames
     return path + np.where((np.hypot(*own.T) > _LEAST_OWN_PX)[:, None], own, 0)
@@ -179,8 +180,8 @@ def _fit_path(frames: CameraFrames) -> np.ndarray:
         stereo = fit_stereo(view)
         if stereo is None:
             return path
-        found = measure_motion(view, stereo, _PATH_FRONT)
-        path = head_path(path + _COARSER * found.moved_px, found.trusted, frames.directions)
+        moved_px, trusted = measure_motion(view, stereo, _PATH_FRONT)
+        path = head_path(path + _COARSER * moved_px, trusted, frames.directions)
         if not path.any():
             return path
     return path
@@ -208,37 +209,30 @@ def head_path(moved_px: np.ndarray, trusted: np.ndarray, directions: np.ndarray)
     near = _model_correlation(directions[few])
 
     def likeliest(paths: Iterable[tuple[float, float]]) -> tuple[float, _PathModel]:
-        errors = list(product(_MODEL_ERRORS_PX, _OWN_MOTIONS_PX))
-        tries = [_PathModel(*path, *error) for path in paths for error in errors]
-        found = [_log_likelihood(model.covariance(few, near), moved_px[few]) for model in tries]
+        tries = list(product(paths, product(_MODEL_ERRORS_PX, _OWN_MOTIONS_PX)))
+        found = [_log_likelihood(_covariance(model, few, near), moved_px[few]) for model in tries]
         return max(found), tries[int(np.argmax(found))]
 
     still, _ = likeliest([_NO_PATH])
     best, model = likeliest(product(_BENDS, _PATHS_PX))
     if best <= still + _SURE:
         return np.zeros(moved_px.shape)
-    covariance = model.covariance(rows, _model_correlation(directions[rows]))
-    shared = model.path_covariance(np.arange(len(trusted))[:, None] - rows)
+    covariance = _covariance(model, rows, _model_correlation(directions[rows]))
+    shared = _path_covariance(model[0], np.arange(len(trusted))[:, None] - rows)
     return shared @ cho_solve(cho_factor(covariance), moved_px[rows])
 
 
-@dataclass(frozen=True)
-class _PathModel:
-    """Standard deviations in pixels of the parts of an offset, and the frames over which the path bends."""
+def _path_covariance(path: tuple[float, float], apart: np.ndarray) -> np.ndarray:
+    """Covariance of a path, (frames over which it bends, size), at frames `apart` in the order of lights."""
+    bend, size_px = path
+    return size_px**2 * np.exp(-(apart**2) / (2 * bend**2))
 
-    frames: float
-    path_px: float
-    model_px: float
-    own_px: float
 
-    def path_covariance(self, apart: np.ndarray) -> np.ndarray:
-        """Covariance of the path at frames that are `apart` in the order of the lights."""
-        return self.path_px**2 * np.exp(-(apart**2) / (2 * self.frames**2))
-
-    def covariance(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
-        """Covariance [N, N] of the offsets of frames [N]; `near` [N, N] correlates the model's errors."""
-        shared = self.path_covariance(rows[:, None] - rows)
-        return shared + self.model_px**2 * near + self.own_px**2 * np.eye(len(rows))
+def _covariance(model: _PathModel, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Covariance [N, N] of the offsets of frames [N]; `near` [N, N] correlates the shading's errors."""
+    path, (shading_px, own_px) = model
+    shared = _path_covariance(path, rows[:, None] - rows)
+    return shared + shading_px**2 * near + own_px**2 * np.eye(len(rows))
 
 
 def _model_correlation(directions: np.ndarray) -> np.ndarray:

@@ -139,21 +139,15 @@ def check_duplicates(frames: CameraFrames, stereo: Stereo | None) -> Iterator[Fi
     `stereo` is fitted without these frames; if it is None, whole groups are reported.
     """
     for rows in same_frames(frames):
-        own = None if stereo is None else _best_row(frames, stereo, rows)
-        names = ", ".join(frames.light_ids[row] for row in rows)
+        words = f"is identical to other frames ({', '.join(frames.light_ids[row] for row in rows)})"
+        own = None
+        if stereo is not None:
+            predicted, image = stereo.predicted(frames.directions[rows]), frames.grey[rows[0]][stereo.lit]
+            own = rows[int(np.argmax([np.corrcoef(image, guess)[0, 1] for guess in predicted]))]
+            words += f" and fits light {frames.light_ids[own]} best"
         for row in rows:
-            if row == own:
-                continue
-            words = f"is identical to other frames ({names})"
-            words += "" if own is None else f" and fits light {frames.light_ids[own]} best"
-            yield frames.error("duplicate", words + "; copy it again", row, frames=len(rows))
-
-
-def _best_row(frames: CameraFrames, stereo: Stereo, rows: list[int]) -> int:
-    """Row whose predicted frame correlates best with the image that the rows share."""
-    predicted = stereo.predicted(frames.directions[rows])
-    image = frames.grey[rows[0]][stereo.lit]
-    return rows[int(np.argmax([np.corrcoef(image, guess)[0, 1] for guess in predicted]))]
+            if row != own:
+                yield frames.error("duplicate", words + "; copy it again", row, frames=len(rows))
 
 
 def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
@@ -169,9 +163,8 @@ def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding
             f"{len(wrong)} of {len(rows)} frames are lit from elsewhere than declared (median "
             f"{np.median(off_deg):.0f} degrees off); correct the order of the lights"
         )
-        yield frames.error(
-            "order", words, frames=len(wrong), median_off_deg=round(float(np.median(off_deg)), 1)
-        )
+        off = round(float(np.median(off_deg)), 1)
+        yield frames.error("order", words, frames=len(wrong), median_off_deg=off)
         return
     for place in wrong.tolist():
         like = frames.light_ids[int(np.argmax(frames.directions @ found[place]))]
@@ -228,20 +221,12 @@ def measure_gains(frames: CameraFrames, stereo: Stereo) -> tuple[np.ndarray, np.
     return expected, bright / np.maximum(expected, 1e-12)
 
 
-@dataclass(frozen=True)
-class Curve:
-    """The exponent that linearises a camera's frames best."""
+def check_gamma(subject: str, curves: Sequence[tuple[float, float]]) -> Iterator[Finding]:
+    """Report one error for a subject whose cameras agree, in the median, that values are not linear.
 
-    exponent: float
-    times_worse: float  # error at exponent 1 over the smallest error
-
-
-def check_gamma(subject: str, curves: Sequence[Curve]) -> Iterator[Finding]:
-    """Report one error for a subject whose cameras agree, in the median, that values are not linear."""
-    if not curves:
-        return
-    exponent = float(np.median([curve.exponent for curve in curves]))
-    worse = float(np.median([curve.times_worse for curve in curves]))
+    `curves` are those of `fit_exponent`.
+    """
+    exponent, worse = np.median(curves, axis=0).tolist() if curves else (1.0, 1.0)
     if _LINEAR[0] < exponent < _LINEAR[1] or worse < _CLEAR:
         return
     words = (
@@ -252,8 +237,11 @@ def check_gamma(subject: str, curves: Sequence[Curve]) -> Iterator[Finding]:
     yield Finding("error", "gamma", subject, words, figures=figures)
 
 
-def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> Curve | None:
-    """Fit the exponent to a camera's lit pixels [h, w] by shading; None where too little is lit."""
+def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> tuple[float, float] | None:
+    """Fit the exponent that linearises a camera's lit pixels [h, w]; None where too little is lit.
+
+    Returns it, and the ratio of the error at exponent 1 to the smallest error.
+    """
     values = np.maximum(frames.grey[:, lit].astype(float), 0)
     step = max(values.shape[1] // _PIXELS, 1)
     values = values[:, ::step]
@@ -266,7 +254,7 @@ def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> Curve | None:
     place = int(errors.argmin())
     exponent = parabola_vertex(np.log(EXPONENTS), errors, place)
     at_one = float(errors[np.argmin(np.abs(EXPONENTS - 1))])
-    return Curve(float(np.exp(exponent)), at_one / max(float(errors[place]), 1e-9))
+    return float(np.exp(exponent)), at_one / max(float(errors[place]), 1e-9)
 
 
 def _shading_error(values: np.ndarray, used: np.ndarray, directions: np.ndarray, exponent: float) -> float:
@@ -297,12 +285,12 @@ class RigFit:
     @property
     def faults(self) -> list[str]:
         """Faults of the lights in words; empty for none."""
-        ways = ["mirrored left to right"] if self.mirrored else []
-        ways += (
-            [f"turned sideways by {self.right_deg:.0f} degrees"] if abs(self.right_deg) > _TURN_DEG else []
-        )
-        upright = _UP_DEG[0] < self.up_deg < _UP_DEG[1]
-        return ways + ([] if upright else [f"turned up or down by {self.up_deg:.0f} degrees"])
+        ways = {
+            "mirrored left to right": self.mirrored,
+            f"turned sideways by {self.right_deg:.0f} degrees": abs(self.right_deg) > _TURN_DEG,
+            f"turned up or down by {self.up_deg:.0f} degrees": not _UP_DEG[0] < self.up_deg < _UP_DEG[1],
+        }
+        return [way for way, is_fault in ways.items() if is_fault]
 
 
 def measure_rig(camera: str, stereo: Stereo) -> RigFit:
@@ -320,9 +308,7 @@ def check_rigs(subject: str, rigs: Sequence[RigFit]) -> Iterator[Finding]:
     if not off:
         return
     half = len(rigs) / 2
-    right_deg, up_deg = (
-        float(np.median([getattr(rig, name) for rig in rigs])) for name in ("right_deg", "up_deg")
-    )
+    right_deg, up_deg = np.median([(rig.right_deg, rig.up_deg) for rig in rigs], axis=0).tolist()
     of_most = RigFit("", sum(rig.mirrored for rig in rigs) > half, right_deg, up_deg)
     what, advice = "unlike in other cameras, the lights are", "its world_to_camera, or its frames"
     if of_most.faults:

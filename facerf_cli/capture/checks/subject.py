@@ -1,11 +1,10 @@
 """All checks of a subject's frames, before a dataset is prepared from them."""
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.frames import (
-    CameraFrames,
     check_black,
     check_clipped,
     check_fields,
@@ -17,9 +16,7 @@ from facerf_cli.capture.checks.frames import (
 )
 from facerf_cli.capture.checks.motion import check_motion
 from facerf_cli.capture.checks.shading import (
-    Curve,
     RigFit,
-    Stereo,
     check_duplicates,
     check_frames_order,
     check_gamma,
@@ -32,6 +29,15 @@ from facerf_cli.capture.checks.shading import (
 from facerf_cli.capture.findings import Finding
 
 
+@dataclass
+class _Cameras:
+    """Results of a subject's cameras, which are judged together at the end."""
+
+    curves: list[tuple[float, float]] = field(default_factory=list)
+    rigs: list[RigFit] = field(default_factory=list)
+    frame_of: dict[str, str] = field(default_factory=dict)  # camera/light by the digest of its pixels
+
+
 def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Finding]:
     """Check a subject's frames; findings are sorted, errors first.
 
@@ -39,67 +45,47 @@ def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Fin
     Unreadable frames are findings, not exceptions; a missing frame that the capture marks as damaged is none.
     The checks see the frames without a colour chart's matrix, which would hide clipped channels.
     """
-    checks = _Checks(replace(capture, charts=()), subject, side_px)
-    found = [finding for camera in capture.cameras for finding in checks.of_camera(camera)]
-    found += check_gamma(subject, checks.curves)
-    found += check_rigs(subject, checks.rigs)
-    marked = capture.marked.get(subject, frozenset())
-    found = [finding for finding in found if finding.check != "missing" or finding.light not in marked]
+    plain, cameras = replace(capture, charts=()), _Cameras()
+    found = [
+        one for camera in plain.cameras for one in _check_camera(plain, subject, camera, side_px, cameras)
+    ]
+    found += [*check_gamma(subject, cameras.curves), *check_rigs(subject, cameras.rigs)]
     return sorted(found, key=lambda finding: (finding.severity != "error", finding.leaves_out))
 
 
-class _Checks:
-    """Checks of a subject's cameras in turn, and the results that are judged at the end."""
-
-    def __init__(self, capture: Capture, subject: str, side_px: int) -> None:
-        self.capture, self.subject, self.side_px = capture, subject, side_px
-        self.curves: list[Curve] = []
-        self.rigs: list[RigFit] = []
-        self._digests: dict[str, str] = {}
-
-    def of_camera(self, camera: str) -> list[Finding]:
-        """Check the frames of a camera."""
-        found = list(check_missing(self.capture, self.subject, camera))
-        frames, unread = read_frames(self.capture, self.subject, camera, self.side_px)
-        found += check_readable(frames, unread)
-        for check in (check_black, check_clipped, check_fields):
-            found += check(frames)
-        found += check_other_cameras(frames, self._digests)
-        names = (f"{camera}/{light}" for light in frames.light_ids)
-        self._digests |= {of.digest: name for of, name in zip(frames.figures, names, strict=True)}
-        doubles = {frames.light_ids[row] for rows in same_frames(frames) for row in rows}
-        sound = frames.without(left_out(found) | doubles)
-        stereo, fitted_to = fit_stereo(sound), sound.light_ids
-        found += check_duplicates(frames, stereo)
-        sound = frames.without(left_out(found))
-        if stereo is None:
-            return found
-        found += check_unlit(sound, stereo)
-        whole = frames.without(left_out(found))
-        if whole.light_ids != fitted_to:
-            stereo = fit_stereo(whole)
-        of_shading = [] if stereo is None else self._check_shading(whole, stereo)
-        if is_disordered(of_shading):  # then the expected brightness of frames is unknown
-            found = [finding for finding in found if finding.check != "unlit"]
-        return found + of_shading
-
-    def _check_shading(self, frames: CameraFrames, stereo: Stereo) -> list[Finding]:
-        """Check frames that are sound and lit against their photometric stereo."""
-        found = list(check_frames_order(frames, stereo))
-        if is_disordered(found):
-            return found  # then the normals are wrong
-        self.rigs.append(measure_rig(frames.camera, stereo))
-        whole = frames.without(left_out(found))
-        curve = fit_exponent(whole, stereo.lit)
-        self.curves += [] if curve is None else [curve]
-        return [*found, *check_motion(whole, stereo)]
+def _check_camera(
+    capture: Capture, subject: str, camera: str, side_px: int, cameras: _Cameras
+) -> list[Finding]:
+    """Check the frames of a camera, first one by one, then those that are sound by their shading."""
+    frames, unread = read_frames(capture, subject, camera, side_px)
+    found = [*check_missing(capture, subject, camera), *check_readable(frames, unread)]
+    for check in (check_black, check_clipped, check_fields):
+        found += check(frames)
+    found += check_other_cameras(frames, cameras.frame_of)
+    places = (f"{camera}/{light}" for light in frames.light_ids)
+    cameras.frame_of |= zip(frames.measured["digest"], places, strict=True)
+    doubles = {frames.light_ids[row] for rows in same_frames(frames) for row in rows}
+    fitted = frames.without(_left_out(found) | doubles)
+    stereo = fit_stereo(fitted)
+    found += check_duplicates(frames, stereo)
+    if stereo is None:
+        return found
+    unlit = list(check_unlit(frames.without(_left_out(found)), stereo))
+    sound = frames.without(_left_out([*found, *unlit]))
+    if sound.light_ids != fitted.light_ids:
+        stereo = fit_stereo(sound)
+    if stereo is None:
+        return [*found, *unlit]
+    disorder = list(check_frames_order(sound, stereo))
+    if any(not one.leaves_out for one in disorder):  # then neither normals nor expected brightness are known
+        return [*found, *disorder]
+    cameras.rigs.append(measure_rig(camera, stereo))
+    ordered = sound.without(_left_out(disorder))
+    if curve := fit_exponent(ordered, stereo.lit):
+        cameras.curves.append(curve)
+    return [*found, *unlit, *disorder, *check_motion(ordered, stereo)]
 
 
-def is_disordered(findings: Iterable[Finding]) -> bool:
-    """Tell whether a camera's findings say that the list of lights is in another order."""
-    return any(found.check == "order" and not found.leaves_out for found in findings)
-
-
-def left_out(findings: Iterable[Finding]) -> set[str]:
+def _left_out(findings: Iterable[Finding]) -> set[str]:
     """Lights whose frames one camera's findings leave out."""
     return {found.light for found in findings if found.leaves_out}

@@ -14,7 +14,7 @@ UNLIT = [Finding("error", "unlit", "0000", f"has {k} % of the light", "C0", f"L{
 
 def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:
     console = Console(file=io.StringIO(), width=width)
-    show_findings([finding.row() for finding in findings], strict, console)
+    show_findings(findings, strict, console)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
@@ -44,5 +44,7 @@ def test_many_alike_are_counted() -> None:
 
 
 def test_the_summary_counts_what_follows() -> None:
-    rows = [finding.row() for finding in [WARNS, *UNLIT, STOPS]]
-    assert summary(rows) == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"
+    assert (
+        summary([WARNS, *UNLIT, STOPS])
+        == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"
+    )
