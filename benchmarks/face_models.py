@@ -30,9 +30,10 @@ from scipy.spatial import cKDTree
 
 from facerf_cli.face.importers.basel import _LANDMARKS_2017 as _LANDMARKS
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
+from facerf_cli.face.importers.find_landmarks import landmarks_of
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit
-from facerf_cli.face.importers.source import SourceModel, landmarks_of
+from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles
 

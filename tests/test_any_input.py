@@ -16,7 +16,6 @@ from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.icc import space_of_profile
-from facerf_cli.files.inert_pickle import read_inert_pickle
 from facerf_cli.files.light_files import (
     Harmonics,
     LightRecord,
@@ -129,7 +128,6 @@ READERS = {
     "a.txt": lambda path: read_numbers(path, (9, 27)),
     "a.lp": read_light_list,
     "a.toml": read_rig,
-    "a.pkl": read_inert_pickle,
 }
 
 

@@ -44,7 +44,7 @@ def send_pi(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_a_reader_in_its_own_process_imports_none(folder: Path) -> None:
-    assert arrays_apart(__name__, "send_pi", folder / "a.png")["pi"] == 3.14
+    assert arrays_apart(send_pi, folder / "a.png")["pi"] == 3.14
     assert not imported(folder)
 
 

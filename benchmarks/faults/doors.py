@@ -40,11 +40,11 @@ def _image(path: Path) -> None:
 
 
 def _stack(path: Path) -> None:
-    from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_olat_stack
+    from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_olats
 
     is_olat_stack(path)
     read_olat_header(path)
-    read_olat_stack(path)
+    read_olats(path)
 
 
 def _light(path: Path) -> None:
@@ -112,9 +112,8 @@ def _array(path: Path) -> None:
 
 
 def _face_model(path: Path) -> None:
-    from facerf_cli.face.morphable import load_face_model, read_model_facts
+    from facerf_cli.face.morphable import load_face_model
 
-    read_model_facts(path)
     load_face_model(str(path))
 
 

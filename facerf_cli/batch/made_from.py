@@ -14,6 +14,7 @@ import os
 import os.path
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
@@ -62,15 +63,9 @@ _INDEXES = ".facerf-index*.jsonl"
 Row = dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True)
-class OneRecipe:
+def one_recipe(settings: Any) -> RecipesOf:
     """The recipe of all outputs of a verb: the fields of its settings."""
-
-    settings: Any
-
-    def __call__(self, digest_of: DigestOf) -> list[Recipe]:
-        """Return the one recipe."""
-        return [recipe_of(self.settings, digest_of)]
+    return lambda digest_of: [recipe_of(settings, digest_of)]
 
 
 def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
@@ -187,6 +182,22 @@ def _listing_digest(folder: Path) -> str:
     return hashlib.sha256(json.dumps(facts).encode("utf-8", "backslashreplace")).hexdigest()
 
 
+def json_rows(path: Path) -> Iterator[Row]:
+    """The objects of a file of JSON lines; a missing file has none."""
+    if not is_regular(path):
+        return
+    for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
+        with suppress(ValueError):  # a run that was killed may leave half a line
+            row = parse_json(line)
+            if isinstance(row, dict):
+                yield row
+
+
+def lines_of(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Rows as JSON lines."""
+    return "".join(json_line(row) + "\n" for row in rows)
+
+
 class _Rows:
     """The rows of the indexes of a folder: files by path, recipes by key, outputs by path in the folder."""
 
@@ -194,17 +205,11 @@ class _Rows:
         self.files: dict[str, Row] = {}
         self.recipes: dict[str, Recipe] = {}
         self.outputs: dict[str, Row] = {}
-        for path in filter(is_regular, sorted(folder.glob(_INDEXES))):
-            for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
-                self._take(line)
+        for path in sorted(folder.glob(_INDEXES)):
+            for row in json_rows(path):
+                self._take(row)
 
-    def _take(self, line: str) -> None:
-        try:
-            row = parse_json(line)
-        except ValueError:  # a run that was killed may leave half a line
-            return
-        if not isinstance(row, dict):
-            return
+    def _take(self, row: Row) -> None:
         if isinstance(row.get("of"), dict):
             self.recipes[str(row.get("recipe"))] = row["of"]
         elif "output" in row:
@@ -259,8 +264,7 @@ class FolderIndex:
         self._rows = _Rows(folder)
         self._new: list[Row] = []  # files read since the rows were last written
         self.edited: list[Path] = []  # finished outputs that are not as they were written
-        name = "" if shard.of == 1 else f"-{shard.number}-of-{shard.of}"
-        self.path = folder / f".facerf-index{name}.jsonl"
+        self.path = folder / f".facerf-index{shard.suffix}.jsonl"
         self.want(recipes_of)
 
     def want(self, recipes_of: RecipesOf) -> None:
@@ -330,7 +334,7 @@ class FolderIndex:
         rows += [{"recipe": key, "of": recipe} for key, recipe in self._rows.recipes.items()]
         rows += self._rows.outputs.values()
         with atomic_path(self.path) as temporary:
-            temporary.write_text("".join(json_line(row) + "\n" for row in rows), encoding="utf-8")
+            temporary.write_text(lines_of(rows), encoding="utf-8")
 
     def add(self, made: Made, outputs: Sequence[Path]) -> None:
         """Add the rows of an item that was made; `outputs` are those that have a recipe, in their order."""
@@ -345,7 +349,7 @@ class FolderIndex:
         rows += self._new
         self._new.clear()
         with self.path.open("a", encoding="utf-8") as stream:
-            stream.write("".join(json_line(row) + "\n" for row in rows))
+            stream.write(lines_of(rows))
 
     def _wanted_of(self, number: int) -> tuple[str, Recipe]:
         """Key and recipe of an item's output, or those of all of them."""

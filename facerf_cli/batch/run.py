@@ -19,14 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.batch.inputs import Item, NamePattern, file_pattern
-from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, read_row
+from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, json_rows, lines_of, read_row
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
-from facerf_cli.files.texts import is_regular, parse_json, require_regular
+from facerf_cli.files.texts import is_regular, require_regular
 from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
-from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, json_line, printable_line, unexpected
+from facerf_cli.run.logs import LOGGER_NAME, escaped, printable_line, progress_bar, unexpected
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, process_died, spread
 
@@ -55,18 +55,13 @@ class ItemResult:
     stops_the_run: FacerfError | None = None
 
 
-def report_name(shard: Shard) -> str:
-    """The report's name; each shard has its own, since shards run at the same time."""
-    return REPORT_NAME if shard.of == 1 else f"report-{shard.number}-of-{shard.of}.jsonl"
-
-
 def open_report(
     path: Path,
     verb: str,
     todo: list[Item],
     finished: list[Item],
     outputs_of: Callable[[Item], Sequence[Path]],
-) -> Path:
+) -> None:
     """Start the report: older rows stay, except those of items that are about to be made again.
 
     A run without `--shard` takes over the rows of earlier shards.
@@ -85,16 +80,15 @@ def open_report(
             rows[verb, item.name] = _row(verb, skipped, path.parent) | {"status": "skipped"}
     try:
         with atomic_path(path) as temporary:
-            temporary.write_text("".join(json_line(row) + "\n" for row in rows.values()), encoding="utf-8")
+            temporary.write_text(lines_of(rows.values()), encoding="utf-8")
     except FacerfError as error:
         raise unusable(path.parent, error.__cause__ or error) from error
-    return path
 
 
 def add_row(report: Path, verb: str, result: ItemResult) -> None:
     """Write the row of an item that was processed."""
     with report.open("a", encoding="utf-8") as stream:
-        stream.write(json_line(_row(verb, result, report.parent)) + "\n")
+        stream.write(lines_of([_row(verb, result, report.parent)]))
 
 
 def unusable(folder: Path, error: BaseException) -> UsageError:
@@ -105,14 +99,8 @@ def unusable(folder: Path, error: BaseException) -> UsageError:
 
 def rows_of(path: Path) -> Iterator[dict[str, Any]]:
     """The rows of a report; what is no row is passed over, a missing file holds none."""
-    if not is_regular(path):
-        return
-    for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
-        try:
-            row = parse_json(line)
-        except ValueError:  # a run that was killed may leave half a line
-            continue
-        if isinstance(row, dict) and isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
+    for row in json_rows(path):
+        if isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
             yield row
 
 
@@ -248,11 +236,11 @@ def run_items(
         UsageError: The output folder cannot be used.
     """
     items = options.shard.share(items)
-    is_new = not options.output.exists()
+    is_new, lock_name = not options.output.exists(), f".facerf-lock{options.shard.suffix}"
     with ExitStack() as stack:
         if not options.dry_run:
             try:
-                stack.enter_context(alone_in(options.output, _lock_name(options.shard)))
+                stack.enter_context(alone_in(options.output, lock_name))
             except OSError as error:
                 raise unusable(options.output, error) from error
         if index is None and recipes_of:
@@ -266,7 +254,9 @@ def run_items(
         if options.dry_run:
             _log_made_again(again)
             return _list_what_would_be_done(todo, finished, outputs_of)
-        report = open_report(options.output / report_name(options.shard), verb, todo, finished, outputs_of)
+        report = open_report(
+            options.output / f"report{options.shard.suffix}.jsonl", verb, todo, finished, outputs_of
+        )
         if index and (todo or index.has_news):
             index.open()
         if finished:
@@ -287,8 +277,8 @@ def run_items(
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
         elif failures and is_new:
-            lock = options.output / _lock_name(options.shard)
-            _remove_what_is_empty(options.output, [report, lock, *([index.path] if index else [])])
+            records = [report, options.output / lock_name, *([index.path] if index else [])]
+            _remove_what_is_empty(options.output, records)
         return 1 if failures else 0
 
 
@@ -327,11 +317,6 @@ def all_finished(
     """True if this process's share of the items is finished, so that nothing needs to be loaded."""
     share = options.shard.share(items)
     return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
-
-
-def _lock_name(shard: Shard) -> str:
-    """The name of a run's lock; each shard has its own, since shards run at the same time."""
-    return ".facerf-lock" if shard.of == 1 else f".facerf-lock-{shard.number}-of-{shard.of}"
 
 
 def sums_up(
@@ -465,14 +450,10 @@ def _with_progress(
     results: Iterator[ItemResult], total: int, verb: str, settings: Settings
 ) -> Iterator[ItemResult]:
     """Pass the results through, with a progress bar on stderr if that is a terminal."""
-    # imported here, since --help does without it
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import MofNCompleteColumn  # --help does without it
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-    # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.
-    redirect = sys.stdout.isatty()
-    with Progress(*columns, console=STDERR, disable=not shown, redirect_stdout=redirect) as progress:
+    shown = settings.verbosity >= 0 and not settings.log_json
+    with progress_bar(MofNCompleteColumn(), shown=shown) as progress:
         task = progress.add_task(verb, total=total)
         for result in results:
             yield result

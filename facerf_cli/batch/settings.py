@@ -31,6 +31,11 @@ class Shard:
             raise UsageError(f"--shard {text}: not a share; give K/N with K from 1 to N, such as 3/8")
         return Shard(int(number), int(of))
 
+    @property
+    def suffix(self) -> str:
+        """The end of the names of its own files, since shards run at the same time; '' for the whole."""
+        return "" if self.of == 1 else f"-{self.number}-of-{self.of}"
+
     def share(self, items: Sequence[T]) -> Sequence[T]:
         """This process's items."""
         return items[self.number - 1 :: self.of]

@@ -130,9 +130,8 @@ def read_config(path: Path, group: Any) -> dict[str, Any]:
 
     Raises UsageError for a file that is no TOML, and for verbs and options that do not exist.
     """
-    too_long = f"larger than {_LIMIT_BYTES >> 20} MiB; give a TOML file"
     try:
-        tables = read_toml(path, _LIMIT_BYTES, too_long, "mend it")
+        tables = read_toml(path, _LIMIT_BYTES, "mend it")
     except InputError as error:
         raise UsageError(f"--config {error}") from None
     of_all = tables.pop(GLOBAL, {})

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.crop import Box, Crop
 from facerf_cli.face.topology import MIRROR_68
-from facerf_cli.image.strips import block_means
+from facerf_cli.image.strips import block_means, resized
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 PREDICTOR_LICENCE = (
@@ -129,9 +128,7 @@ def _reduced(image: np.ndarray, scale: float) -> np.ndarray:
     """Resize to uint8 by averaging (or smoothly enlarging) without a float copy of the whole image."""
     block = max(1, min(int(1 / scale), *image.shape[:2]))  # an image may be one pixel wide
     size = [max(1, round(length * scale)) for length in image.shape[:2]]
-    tensor = torch.from_numpy(block_means(image, block)).permute(2, 0, 1)[None]
-    resized = torch.nn.functional.interpolate(tensor, size, mode="bilinear", antialias=True)[0]
-    return resized.permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
+    return np.round(resized(block_means(image, block), *size)).clip(0, 255).astype(np.uint8)
 
 
 def _brightened(image: np.ndarray) -> np.ndarray:

@@ -5,13 +5,11 @@ mouth. A synthetic light stage also needs ears, a skull, eyeballs and teeth: a m
 its authors' topology, driven by the same coefficients.
 """
 
-import math
 import zipfile
-import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -26,10 +24,6 @@ BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # values of HeadModel.part, by index
 EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means, in imported models
-_NPZ_ERRORS = (  # that reading a damaged .npz can raise: numpy parses a header as a text of Python
-    *(ValueError, OSError, LookupError, EOFError, RuntimeError, TypeError, AttributeError, SyntaxError),
-    *(TokenError, OverflowError, MemoryError, SystemError, zlib.error, zipfile.BadZipFile),
-)
 # Types of a head's arrays in a face model's file, under names that begin with `_HEAD_PREFIX`.
 _HEAD_TYPES = {
     "mean": np.float32,
@@ -43,8 +37,7 @@ _HEAD_PREFIX = "head_"
 _MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000  # of a head
 _MAX_COEFFICIENTS = 500
 _MAX_LETTERS = 2000  # of a name or a licence
-MAX_ARRAYS = 64  # of a file
-_MAX_ARRAY_BYTES, _MAX_FILE_BYTES = 192 << 20, 1 << 30  # 500 shapes of a head in half precision; all arrays
+MAX_ARRAYS, _MAX_BYTES = 64, 1 << 30  # of a file
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,15 +140,19 @@ def _read(path: Path) -> MorphableModel:
             f"{path}: no such face model; give '{BUILTIN}' or a file of `facerf face-model import`"
         )
     try:
-        return _from_arrays(path, read_npz(path))
-    except (ValueError, TypeError, LookupError, OverflowError) as error:
-        reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))
+        _require_size(path, _MAX_BYTES)
+        with np.load(path, allow_pickle=False) as arrays:
+            return _from_arrays(path, arrays)
+    except InputError:
+        raise
+    except Exception as error:  # whatever damage makes zipfile and numpy raise
         raise InputError(
-            f"{path}: not a facerf face model ({reason}); import it with `facerf face-model import`"
+            f"{path}: not a facerf face model ({one_line(str(error))}); "
+            "import it with `facerf face-model import`"
         ) from None
 
 
-def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
+def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> MorphableModel:
     if int(arrays["layout_version"]) != LAYOUT_VERSION:
         raise InputError(
             f"{path}: it has another UV layout; import the face model again with this version of facerf"
@@ -167,20 +164,18 @@ def _from_arrays(path: Path, arrays: dict[str, np.ndarray]) -> MorphableModel:
     return MorphableModel(name, licence, mean, identity, expression, names, head)
 
 
-def _head(arrays: dict[str, np.ndarray], identities: int, expressions: int) -> HeadModel:
-    """The head of a face model's arrays; raises ValueError or KeyError for a damaged one."""
-    vertices, faces = (np.atleast_1d(arrays[_HEAD_PREFIX + key]).shape[0] for key in ("mean", "triangles"))
+def _head(arrays: Mapping[str, np.ndarray], identities: int, expressions: int) -> HeadModel:
+    vertices, faces = (len(arrays[_HEAD_PREFIX + key]) for key in ("mean", "triangles"))
     if not 3 <= vertices <= _MAX_VERTICES or not 1 <= faces <= _MAX_TRIANGLES:
         raise ValueError(f"its head has {vertices} vertices and {faces} triangles")
     mean, identity, expression = _shapes(arrays, _HEAD_PREFIX, vertices, identities, expressions)
-    triangles = _indices(arrays, "triangles", (faces, 3), vertices).astype(np.int64)
-    part = _indices(arrays, "part", (vertices,), len(HEAD_PARTS)).astype(np.uint8)
-    uv = _floats(arrays, _HEAD_PREFIX + "uv", (vertices, 2))
-    return HeadModel(mean, identity, expression, torch.from_numpy(triangles), torch.from_numpy(part), uv)
+    triangles = _indices(arrays, "triangles", (faces, 3), vertices).long()
+    part = _indices(arrays, "part", (vertices,), len(HEAD_PARTS)).byte()
+    return HeadModel(mean, identity, expression, triangles, part, _floats(arrays, "head_uv", (vertices, 2)))
 
 
 def _shapes(
-    arrays: dict[str, np.ndarray],
+    arrays: Mapping[str, np.ndarray],
     prefix: str,
     vertices: int,
     identities: int | None = None,
@@ -188,32 +183,28 @@ def _shapes(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean [N, 3] and shapes [Ki, N, 3] and [Ke, N, 3] of a file's arrays."""
     mean = _floats(arrays, prefix + "mean", (vertices, 3))
-    counts = {"identity": identities, "expression": expressions}
-    identity, expression = (_floats(arrays, prefix + key, (counts[key], vertices, 3)) for key in counts)
-    return mean, identity, expression
+    identity = _floats(arrays, prefix + "identity", (identities, vertices, 3))
+    return mean, identity, _floats(arrays, prefix + "expression", (expressions, vertices, 3))
 
 
-def _floats(arrays: dict[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
+def _floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
     """An array as float32; raises ValueError for another shape (None: any of a basis), NaN or infinity."""
     array = arrays[key]
-    expected = (len(array) if array.ndim else 0, *shape[1:]) if shape[0] is None else shape
+    expected = (len(array), *shape[1:]) if shape[0] is None else shape
     if array.shape != expected or (shape[0] is None and len(array) > _MAX_COEFFICIENTS):
-        wanted = ", ".join("K" if length is None else str(length) for length in shape)
-        raise ValueError(f"{key} has shape {array.shape}, not [{wanted}]")
+        raise ValueError(f"{key} has shape {array.shape}, not {shape}")
     tensor = torch.from_numpy(array.astype(np.float32))
     if not tensor.isfinite().all():
         raise ValueError(f"{key} holds values that are not finite")
     return tensor
 
 
-def _indices(arrays: dict[str, np.ndarray], key: str, shape: tuple[int, ...], count: int) -> np.ndarray:
+def _indices(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...], count: int) -> Tensor:
     """An array of a head's indices below `count`; raises ValueError for anything else."""
     array = arrays[_HEAD_PREFIX + key]
-    if array.shape != shape:
-        raise ValueError(f"{_HEAD_PREFIX}{key} has shape {array.shape}, not {list(shape)}")
-    if array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
-        raise ValueError(f"{_HEAD_PREFIX}{key} holds indices out of range")
-    return array
+    if array.shape != shape or array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
+        raise ValueError(f"{_HEAD_PREFIX}{key} is not of shape {shape}, or holds indices out of range")
+    return torch.from_numpy(array)
 
 
 def _printable(array: np.ndarray) -> str:
@@ -221,38 +212,27 @@ def _printable(array: np.ndarray) -> str:
     return "".join(letter for letter in one_line(str(array))[:_MAX_LETTERS] if letter.isprintable())
 
 
-def read_npz(path: Path, most_bytes: int = _MAX_ARRAY_BYTES) -> dict[str, np.ndarray]:
-    """Read the arrays of an .npz by name, without pickles; `most_bytes` bounds each of them.
+def read_npz(path: Path, most_bytes: int = _MAX_BYTES) -> dict[str, np.ndarray]:
+    """Read the arrays of an .npz by name, without pickles; `most_bytes` bounds them together.
 
     Raises ValueError with a reason in one line for any other file, and for too many or too large arrays.
     """
     try:
-        npz_shapes(path, most_bytes)
+        _require_size(path, most_bytes)
         with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
-    except _NPZ_ERRORS as error:
+            return dict(file)
+    except Exception as error:  # whatever damage makes zipfile and numpy raise
         raise ValueError(one_line(str(error))) from None
 
 
-def npz_shapes(path: Path, most_bytes: int = _MAX_ARRAY_BYTES) -> dict[str, tuple[int, ...]]:
-    """The shapes of the arrays in an .npz, from their headers alone; raises one of `_NPZ_ERRORS`."""
-    if not zipfile.is_zipfile(path):  # numpy would suggest to unpickle it
-        raise ValueError("it is not an .npz")
-    shapes, total = {}, 0
+def _require_size(path: Path, most_bytes: int) -> None:
+    """Raise ValueError for an .npz of too many or too large arrays, which a small file may be unpacked to."""
     with zipfile.ZipFile(path) as archive:
-        if len(archive.infolist()) > MAX_ARRAYS:
-            raise ValueError(f"it holds {len(archive.infolist())} arrays; at most {MAX_ARRAYS} are read")
-        for entry in archive.infolist():
-            with archive.open(entry) as file:
-                if np.lib.format.read_magic(file) != (1, 0):
-                    raise ValueError(f"{entry.filename} is not an array of version 1.0")
-                shape, _, dtype = np.lib.format.read_array_header_1_0(file)
-            size = max(entry.file_size, math.prod(shape) * dtype.itemsize)
-            total += size
-            if size > most_bytes or total > _MAX_FILE_BYTES:
-                raise ValueError(f"{entry.filename} is too large")
-            shapes[entry.filename.removesuffix(".npy")] = shape
-    return shapes
+        entries = archive.infolist()
+    if len(entries) > MAX_ARRAYS:
+        raise ValueError(f"it holds {len(entries)} arrays; at most {MAX_ARRAYS} are read")
+    if sum(entry.file_size for entry in entries) > most_bytes:
+        raise ValueError(f"its arrays are too large; {most_bytes} bytes are read at most")
 
 
 def save_face_model(path: Path, model: MorphableModel) -> None:
@@ -273,26 +253,3 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
             expression_names=np.array(model.expression_names, dtype=np.str_),
             **head,
         )
-
-
-@dataclass(frozen=True)
-class ModelFacts:
-    """A face model's name, licence and numbers of shapes."""
-
-    name: str
-    licence: str
-    identities: int
-    expressions: int
-
-
-def read_model_facts(path: Path) -> ModelFacts | None:
-    """Read the facts of a file of `facerf face-model import` without its shapes; None for any other file."""
-    try:
-        shapes = npz_shapes(path)
-        if "layout_version" not in shapes:
-            return None
-        with np.load(path, allow_pickle=False) as file:
-            name, licence = (_printable(file[key]) for key in ("name", "licence"))
-        return ModelFacts(name, licence, shapes["identity"][0], shapes["expression"][0])
-    except _NPZ_ERRORS:
-        return None

@@ -1,7 +1,7 @@
-"""Readers in a process of their own, for libraries that a damaged file can crash: scipy's .mat, HDF5.
+"""Readers in a process of their own, for libraries that a damaged file can crash: HEIC, .mat, HDF5, pickles.
 
 The child sends arrays as an .npz without pickles, so that even a child that a file has taken over can only
-send numbers. Its memory and time are limited; its death is an error in one line.
+send numbers. Its memory, its time and what it sends are limited; its death is an error in one line.
 """
 
 import importlib
@@ -12,13 +12,14 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from facerf_cli.run.logs import printable_line
 
-_MEMORY_BYTES = 6 << 30
+_MEMORY_BYTES, _SENT_BYTES = 6 << 30, 2 << 30
 _TIME_S = 300
 _REFUSED = 3  # exit code of a child that says why on stderr
 # -P, for the working directory may hold a json.py; the search path is then that of the parent.
@@ -27,14 +28,14 @@ _CHILD += "from facerf_cli.files.apart import serve; serve()"
 
 
 def arrays_apart(
-    module: str, reader: str, path: Path, *limits: int, time_s: float = _TIME_S
+    reader: Callable[..., dict[str, np.ndarray]], path: Path, *limits: int, time_s: float = _TIME_S
 ) -> dict[str, np.ndarray]:
-    """Call `reader(path, *limits)` of a module, which returns arrays by name, in a process of its own.
+    """Call `reader(path, *limits)`, a function of a module, in a process of its own.
 
     Raises ValueError with what the reader raised there, or how its process ended.
     """
-    command = [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), module, reader, os.fspath(path)]
-    command += map(str, limits)
+    command = [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), reader.__module__, reader.__name__]
+    command += [os.fspath(path), *map(str, limits)]
     with tempfile.TemporaryFile() as file:
         try:
             ended = subprocess.run(
@@ -42,15 +43,14 @@ def arrays_apart(
             )
         except subprocess.TimeoutExpired:
             raise ValueError(f"reading it takes longer than {time_s:.0f} s") from None
-        said = printable_line(ended.stderr.decode(errors="replace"))
         if ended.returncode == _REFUSED:
-            raise ValueError(said)
+            raise ValueError(printable_line(ended.stderr.decode(errors="replace")))
         if ended.returncode:
             raise ValueError(f"it makes its reader fail ({_death(ended.returncode)})")
         file.seek(0)
         try:
             with np.load(file, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
+                return dict(arrays)
         except (OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
             raise ValueError(f"its reader sent no arrays ({error})") from None
 
@@ -68,10 +68,10 @@ def serve() -> None:
     _limit()
     try:
         arrays = getattr(importlib.import_module(module), reader)(Path(path), *map(int, limits))
+        np.savez(sys.stdout.buffer, **arrays)
     except Exception as error:  # whatever a damaged file makes its library raise
         print(str(error) or type(error).__name__, file=sys.stderr)
         sys.exit(_REFUSED)
-    np.savez(sys.stdout.buffer, **arrays)
 
 
 def _limit() -> None:
@@ -79,6 +79,11 @@ def _limit() -> None:
         return
     import resource
 
-    for limit, value in ((resource.RLIMIT_AS, _MEMORY_BYTES), (resource.RLIMIT_CORE, 0)):
+    limits = {
+        resource.RLIMIT_AS: _MEMORY_BYTES,
+        resource.RLIMIT_FSIZE: _SENT_BYTES,
+        resource.RLIMIT_CORE: 0,
+    }
+    for limit, value in limits.items():
         most = resource.getrlimit(limit)[1]
         resource.setrlimit(limit, (value if most < 0 else min(value, most), most))

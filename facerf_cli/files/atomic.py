@@ -7,7 +7,7 @@ data is on the disk before the rename, and the rename before the next step (Pill
 Are Not Created Equal', OSDI 2014).
 
 A run holds the lock of its output folder; the next one waits, and then finds what the first has made. The
-lock is the system's (`flock`), so that it ends with its process, however that ends.
+lock ends with its process, however that ends.
 """
 
 import atexit
@@ -18,19 +18,19 @@ import os
 import platform
 import secrets
 import shutil
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by, end_again
 
-if sys.platform != "win32":
-    import fcntl
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 _ABANDONED_S = 24 * 3600  # without a write: then another machine's temporary folder counts as abandoned
 _MARK = ".part-"
@@ -197,55 +197,39 @@ def _sync_folder(folder: Path) -> None:
 def alone_in(folder: Path, name: str) -> Iterator[None]:
     """Hold the lock `name` of a folder, which is created; wait for a process that holds it, and say so.
 
-    Folders that were created and are empty in the end are removed. Where the file system has no locks, as on
-    Windows, nothing is held. Raises OSError where the folder cannot be written to.
+    Folders that were created and are empty in the end are removed. Raises OSError where the folder cannot be
+    written to.
     """
+    from filelock import FileLock  # --help does without it
+
     created = [path for path in (folder, *folder.parents) if not path.exists()]
-    lock = folder / name
-    descriptor = _taken(lock)
+    path = folder / name
+    lock = FileLock(path)
+    _acquire(lock, path)
     try:
+        path.write_text(str(os.getpid()))
         yield
     finally:
-        lock.unlink(missing_ok=True)  # first: who waits for it sees that it is another file
-        os.close(descriptor)
+        path.unlink(missing_ok=True)  # first: who waits for it sees that it is another file
+        lock.release()
         with suppress(OSError):
-            for path in created:
-                path.rmdir()
+            for empty in created:
+                empty.rmdir()
 
 
-def _taken(lock: Path) -> int:
-    """Open and lock the file; again where its last owner has removed it meanwhile."""
-    while True:
-        lock.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+def _acquire(lock: "FileLock", path: Path) -> None:
+    """Wait for a lock; its folder is made again where the last owner has removed it."""
+    from filelock import Timeout
+
+    waits = False
+    while not lock.is_locked:
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            _wait_for(descriptor, lock)
-            if _is_at(descriptor, lock):
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, str(os.getpid()).encode())
-                return descriptor
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
-
-
-def _wait_for(descriptor: int, lock: Path) -> None:
-    if sys.platform == "win32":
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        owner = printable_line(os.pread(descriptor, 20, 0).decode(errors="replace"))
-        wait = "%s: another facerf (process %s) writes there; waiting for it (--jobs and --shard share work)"
-        log.warning(wait, lock.parent, owner)
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
-    except OSError:  # this file system has no locks
-        pass
-
-
-def _is_at(descriptor: int, lock: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), os.stat(lock, follow_symlinks=False))
-    except FileNotFoundError:
-        return False
+            lock.acquire(blocking=waits)
+        except FileNotFoundError:
+            pass
+        except Timeout:
+            waits = True
+            owner = printable_line(path.read_text(errors="replace")[:20]) if path.is_file() else ""
+            said = "%s: another facerf (process %s) writes there; waiting (--jobs and --shard share work)"
+            log.warning(said, path.parent, owner)

@@ -1,16 +1,15 @@
 """Downloads of published files into the user's cache: resumed after a broken connection, then verified.
 
-By hand, since no small library resumes, bounds the size and locks against a second process.
+By hand, since no small library resumes and bounds the size.
 """
 
 import http.client
 import logging
 import os
 import ssl
-import sys
 import urllib.request
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -19,15 +18,13 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import unquote, urlsplit
 
 import platformdirs
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import DownloadColumn
 
 from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError
+from facerf_cli.files.atomic import alone_in
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.run.logs import LOGGER_NAME, STDERR, one_line
-
-if sys.platform != "win32":
-    import fcntl
+from facerf_cli.run.logs import LOGGER_NAME, one_line, progress_bar
 
 TIMEOUT_S = 30.0  # without any data on a connection
 _TRIES = 5  # connections to a server; each continues where the last one broke
@@ -72,13 +69,11 @@ def fetch(published: PublishedFile, option: str, cache: Path | None = None) -> P
     """
     path = (cache or cache_folder()) / published.name
     try:
-        if _is_whole(published, path):
-            return path
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with _alone(path):
-            if not _is_whole(published, path):  # another process may have fetched it by now
-                log.info("fetching %s to %s", published.url, path)
-                _fetch(published, path)
+        if not _is_whole(published, path):
+            with alone_in(path.parent, f".{path.name}.lock"):
+                if not _is_whole(published, path):  # another process may have fetched it by now
+                    log.info("fetching %s to %s", published.url, path)
+                    _fetch(published, path)
     except _Refused as error:
         raise FacerfError(
             f"{published.url}: {error}; put the right file at {path}, or give {option}"
@@ -132,9 +127,8 @@ def _download(published: PublishedFile, part: Path) -> None:
 def _one_connection(published: PublishedFile, part: Path) -> bool:
     """Append one connection's data to `part`; return whether the file is complete."""
     begin = _size(part)
-    headers = {"User-Agent": f"facerf/{__version__}"} | ({"Range": f"bytes={begin}-"} if begin else {})
     try:
-        response = _open(published.url, headers)
+        response = _open(published.url, begin)
     except HTTPError as error:
         error.close()
         if begin and error.code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
@@ -169,13 +163,14 @@ class _GuardedRedirects(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _open(url: str, headers: dict[str, str]) -> http.client.HTTPResponse:
+def _open(url: str, begin: int) -> http.client.HTTPResponse:
+    headers = {"User-Agent": f"facerf/{__version__}"} | ({"Range": f"bytes={begin}-"} if begin else {})
     handlers: list[urllib.request.BaseHandler] = [_GuardedRedirects()]
     if _check_address(url) in _THIS_MACHINE:
         handlers.append(urllib.request.ProxyHandler({}))  # this machine is reached without a proxy
-    request = urllib.request.Request(url, headers=headers)
-    response: http.client.HTTPResponse = urllib.request.build_opener(*handlers).open(
-        request, timeout=TIMEOUT_S
+    opener = urllib.request.build_opener(*handlers)
+    response: http.client.HTTPResponse = opener.open(
+        urllib.request.Request(url, headers=headers), None, TIMEOUT_S
     )
     return response
 
@@ -190,21 +185,9 @@ def _check_address(url: str) -> str:
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Make other processes that want `path` wait until it is downloaded; no effect on Windows."""
-    with path.with_name(f".{path.name}.lock").open("ab") as file:
-        if sys.platform != "win32":
-            with suppress(OSError):  # some file systems have no locks
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-@contextmanager
 def _progress(name: str, begin: int, total: int | None) -> Iterator[Callable[[int], None]]:
     """Show a progress bar if stderr is a terminal; yield a function that advances it by bytes."""
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
-    hidden, redirect = not STDERR.is_terminal, sys.stdout.isatty()
-    with Progress(*columns, console=STDERR, disable=hidden, redirect_stdout=redirect) as progress:
+    with progress_bar(DownloadColumn()) as progress:
         task = progress.add_task(name, total=total, completed=begin)
         yield lambda count: progress.advance(task, count)
 

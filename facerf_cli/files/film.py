@@ -6,11 +6,11 @@ The wheel of PyAV holds FFmpeg with x264 and x265, which are under the GPL; face
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -76,14 +76,6 @@ class Film:
         self._pts = self._presented()
         self._coming: Iterator[tuple[int, Any]] = iter(())
         self._next = -1  # number of the frame that is decoded next, without a seek
-
-    def __enter__(self) -> "Film":
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the file."""
@@ -164,7 +156,7 @@ class Film:
 
 def film_facts(path: Path) -> FilmFacts:
     """Read the facts of a film."""
-    with Film(path) as film:
+    with closing(Film(path)) as film:
         return film.facts()
 
 
@@ -257,7 +249,7 @@ def comment_of(path: Path) -> str:
 
 def film_timing(path: Path) -> Timing:
     """The times of a film's frames, with its sound."""
-    with Film(path) as film:
+    with closing(Film(path)) as film:
         facts, has_sound = film.facts(), film.has_sound
     return Timing(facts.times_s, facts.rate, path if has_sound else None)
 

@@ -60,7 +60,7 @@ def decode_heif(path: Path, limit_px: int, bytes_px: int = HEIF_BYTES) -> tuple[
             f"{path}: HEIC and HEIF need the package pi-heif; pip install 'facerf[heic]', or save it as JPEG"
         )
     try:
-        arrays = arrays_apart(__name__, "heif_arrays", path, limit_px, memory.left_bytes() // bytes_px)
+        arrays = arrays_apart(heif_arrays, path, limit_px, memory.left_bytes() // bytes_px)
     except ValueError as error:
         raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
     if SIZE in arrays:

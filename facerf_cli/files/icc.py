@@ -7,7 +7,6 @@ adapted to D50, so its space has that white.
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -53,7 +52,7 @@ def space_of_profile(profile: bytes, name: str) -> ColourSpace | None:
 def _space(profile: bytes, name: str) -> ColourSpace | None:
     tags, kind = _tags(profile), profile[16:20]
     if kind == b"GRAY" and b"kTRC" in tags:
-        return ColourSpace(name, REC709_CHROMATICITIES, _Curves((_curve(tags[b"kTRC"]),) * 3))
+        return ColourSpace(name, REC709_CHROMATICITIES, _by_channel(*[_curve(tags[b"kTRC"])] * 3))
     wanted = [letter + part for part in (b"XYZ", b"TRC") for letter in (b"r", b"g", b"b")]
     if kind != b"RGB " or not all(tag in tags for tag in wanted):
         return None
@@ -63,7 +62,7 @@ def _space(profile: bytes, name: str) -> ColourSpace | None:
     if (sums <= 0).any() or (white <= 0).any():
         return None
     xy = np.vstack([colorants / sums, white / white.sum()])[:, :2]
-    return ColourSpace(name, tuple(xy.ravel()), _Curves(tuple(_curve(tags[tag]) for tag in wanted[3:])))
+    return ColourSpace(name, tuple(xy.ravel()), _by_channel(*(_curve(tags[tag]) for tag in wanted[3:])))
 
 
 def _tags(profile: bytes) -> dict[bytes, bytes]:
@@ -75,16 +74,15 @@ def _tags(profile: bytes) -> dict[bytes, bytes]:
     return {signature: profile[offset : offset + size] for signature, offset, size in entries}
 
 
-@dataclass(frozen=True)
-class _Curves:
-    """Decodes each channel of [..., 3] by its curve; negative values are mirrored."""
+def _by_channel(*curves: Curve) -> Curve:
+    """Decode each channel of [..., 3] by its curve; negative values are mirrored."""
 
-    channels: tuple[Curve, ...]
-
-    def __call__(self, encoded: np.ndarray) -> np.ndarray:
+    def decode(encoded: np.ndarray) -> np.ndarray:
         size = np.abs(encoded)
-        decoded = [curve(size[..., index]) for index, curve in enumerate(self.channels)]
+        decoded = [curve(size[..., index]) for index, curve in enumerate(curves)]
         return np.copysign(np.stack(decoded, -1), encoded).astype(np.float32)
+
+    return decode
 
 
 def _curve(tag: bytes) -> Curve:
@@ -97,44 +95,38 @@ def _curve(tag: bytes) -> Curve:
         a, b = rest[:2] or (1.0, 0.0)
         if kind < 3:  # without a line: below d it is constant
             level = rest[2] if kind == 2 else 0.0
-            return _Parametric(g, a, b, 0.0, -b / a, level, level)
-        return _Parametric(g, *rest, *(0.0, 0.0)[: 6 - len(rest)])
+            return _parametric(g, a, b, 0.0, -b / a, level, level)
+        return _parametric(g, *rest, *(0.0, 0.0)[: 6 - len(rest)])
     (count,) = struct.unpack_from(">I", tag, 8)
     if tag[:4] != b"curv" or count > _MOST_ENTRIES:
         raise ValueError("not a curve")
     if count <= 1:
         gamma = struct.unpack_from(">H", tag, 12)[0] / 256 if count else 1.0
-        return _Parametric(gamma)
-    return _Table(tuple(value / 65535 for value in struct.unpack_from(f">{count}H", tag, 12)))
+        return _parametric(gamma)
+    return _table(np.array(struct.unpack_from(f">{count}H", tag, 12)) / 65535)
 
 
-@dataclass(frozen=True)
-class _Table:
+def _table(entries: np.ndarray) -> Curve:
     """A sampled curve, linear between its entries and beyond the last."""
+    places, slope = np.linspace(0, 1, len(entries)), (entries[-1] - entries[-2]) * (len(entries) - 1)
 
-    entries: tuple[float, ...]
+    def curve(encoded: np.ndarray) -> np.ndarray:
+        beyond = entries[-1] + slope * (encoded - 1)
+        return np.where(encoded > 1, beyond, np.interp(encoded, places, entries))
 
-    def __call__(self, encoded: np.ndarray) -> np.ndarray:
-        last, slope = self.entries[-1], (self.entries[-1] - self.entries[-2]) * (len(self.entries) - 1)
-        inside = np.interp(encoded, np.linspace(0, 1, len(self.entries)), self.entries)
-        return np.where(encoded > 1, last + slope * (encoded - 1), inside)
+    return curve
 
 
-@dataclass(frozen=True)
-class _Parametric:
+def _parametric(
+    g: float, a: float = 1, b: float = 0, c: float = 0, d: float = 0, e: float = 0, f: float = 0
+) -> Curve:
     """(a x + b)^g + e from x = d on, and c x + f below."""
 
-    g: float
-    a: float = 1.0
-    b: float = 0.0
-    c: float = 0.0
-    d: float = 0.0
-    e: float = 0.0
-    f: float = 0.0
+    def curve(encoded: np.ndarray) -> np.ndarray:
+        power = np.maximum(a * encoded + b, 0) ** g + e
+        return np.where(encoded >= d, power, c * encoded + f)
 
-    def __call__(self, encoded: np.ndarray) -> np.ndarray:
-        power = np.maximum(self.a * encoded + self.b, 0) ** self.g + self.e
-        return np.where(encoded >= self.d, power, self.c * encoded + self.f)
+    return curve
 
 
 def _is_sound(space: ColourSpace) -> bool:

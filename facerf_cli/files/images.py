@@ -6,8 +6,9 @@ that tools which want four channels find four.
 
 import logging
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,7 +49,7 @@ from facerf_cli.image.colour import (
     to_linear_rec709,
     unit_floats,
 )
-from facerf_cli.image.strips import rows_of, strips
+from facerf_cli.image.strips import Band, rows_of, strips
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
@@ -118,7 +119,8 @@ def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
         raise InputError(f"{path}: not a readable image; {advice}")
     try:
         spec = stream.spec()
-        _check_size(path, spec, limit_px)
+        if spec.deep:
+            raise InputError(f"{path}: a deep image is not read; flatten it, as by oiiotool --flatten")
         if stream.format_name() == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5:
             raise InputError(f"{path}: a DPX file that lies on its side is not read; save it upright")
         colour, alpha = pick_channels(list(spec.channelnames), spec.alpha_channel)
@@ -126,7 +128,7 @@ def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
         used = colour if alpha is None else [*colour, alpha]
         first, past = min(used), max(used) + 1
         kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
-        _ask_for(path, spec, (past - first) * kind.size(), kept_px)
+        _require_room(path, spec, limit_px, (past - first) * kind.size(), kept_px)
         values = stream.read_image(0, 0, first, past, kind)
         message = _reason(path, oiio_error(stream))
     finally:
@@ -140,22 +142,14 @@ def _decode_by_oiio(path: Path, limit_px: int, kept_px: int) -> Decoded:
     return Decoded(values, spec, shown, None if alpha is None else alpha - first)
 
 
-def _check_size(path: Path, spec: oiio.ImageSpec, limit_px: int) -> None:
-    if _pixels(spec) > limit_px:
-        raise InputError(
-            f"{path}: {spec.width} x {spec.height} pixels; at most {limit_px / 1e6:.0f} megapixels are "
-            "read, so make it smaller"
-        )
-
-
-def _pixels(spec: oiio.ImageSpec) -> int:
-    return int(max(spec.width * spec.height, spec.full_width * spec.full_height))
-
-
-def _ask_for(path: Path, spec: oiio.ImageSpec, stored_px: int, kept_px: int) -> None:
+def _require_room(path: Path, spec: oiio.ImageSpec, limit_px: int, stored_px: int, kept_px: int) -> None:
+    pixels = max(spec.width * spec.height, spec.full_width * spec.full_height)
+    image = f"{path}: {spec.width} x {spec.height} pixels"
+    if pixels > limit_px:
+        most = f"at most {limit_px / 1e6:.0f} megapixels are read"
+        raise InputError(f"{image}; {most}, so make it smaller")
     alpha = _ALPHA_BYTES * (spec.alpha_channel >= 0)
-    needed = _pixels(spec) * (_LINEAR_BYTES + alpha + max(stored_px, kept_px))
-    memory.require(f"{path}: {spec.width} x {spec.height} pixels", needed, "make it smaller")
+    memory.require(image, pixels * (_LINEAR_BYTES + alpha + max(stored_px, kept_px)), "make it smaller")
 
 
 def _reason(path: Path, message: str) -> str:
@@ -295,8 +289,7 @@ def write_exr(
     G, B in half. Each name before the dot is a part. Values beyond the range of half floats (65504) are
     clamped with a warning.
     """
-    parts = [_exr_image(pixels, alpha, space), *_exr_layers(layers or {}, space)]
-    specs, counts = [], [0] * len(parts)
+    parts, specs = [_exr_image(pixels, alpha, space), *_exr_layers(layers or {}, space)], []
     for part in parts:
         spec = _spec((*pixels.shape[:2], len(part.channels)), part.kind)
         spec.channelnames = tuple(part.channels)
@@ -310,14 +303,18 @@ def write_exr(
         else:  # the same in all parts, as OpenEXR requires
             spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
         specs.append(spec)
+    beyond: list[int] = []
 
-    def values(number: int, rows: slice) -> np.ndarray:
-        data, beyond = _exr_data(path, parts[number], rows)
-        counts[number] += beyond
+    def band(part: _ExrPart, rows: slice) -> np.ndarray:
+        values = np.dstack([of(rows) for of in part.of])
+        if part.kind == "float" and np.isfinite(values).all():
+            return values.astype(np.float32, copy=False)
+        data, count = half_floats(path, values)
+        beyond.append(count)
         return data
 
-    _write(path, specs, values, metadata)
-    if count := sum(counts):
+    write_parts(path, specs, [partial(band, part) for part in parts], metadata)
+    if count := sum(beyond):
         log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
     return count
 
@@ -332,7 +329,7 @@ class _ExrPart:
     name: str
     kind: str
     channels: list[str]
-    of: list[Callable[[slice], np.ndarray]]
+    of: list[Band]
     alpha_channel: int = -1
 
 
@@ -362,18 +359,17 @@ def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterato
     yield from grouped.values()
 
 
-def _in_space(values: np.ndarray, space: ColourSpace | None) -> Callable[[slice], np.ndarray]:
+def _in_space(values: np.ndarray, space: ColourSpace | None) -> Band:
     """Rows of colours in a space, or as they are."""
     if space is None:
         return lambda rows: rows_of(values, rows)
     return lambda rows: from_linear_rec709(rows_of(values, rows).astype(np.float32, copy=False), space)
 
 
-def _exr_data(path: Path, part: _ExrPart, rows: slice) -> tuple[np.ndarray, int]:
-    """Return values [h, W, C] of a part's rows, and how many were beyond the range of half floats."""
-    values = np.dstack([of(rows) for of in part.of])
+def half_floats(path: Path, values: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return finite values as half floats, and how many were beyond their range."""
     with np.errstate(over="ignore"):
-        data = values.astype(np.float16 if part.kind == "half" else np.float32, copy=False)
+        data = values.astype(np.float16, copy=False)
     if np.isfinite(data).all():
         return data, 0
     _require_finite(path, values)
@@ -397,7 +393,7 @@ def write_tiff(
     The colour must not be premultiplied, and is not in the file.
     """
 
-    def values(_: int, rows: slice) -> np.ndarray:
+    def values(rows: slice) -> np.ndarray:
         colour = from_linear_rec709(rows_of(pixels, rows), space)
         _require_finite(path, colour)
         return np.dstack([colour] if alpha is None else [colour, rows_of(alpha, rows)]).astype(
@@ -410,7 +406,7 @@ def write_tiff(
     if space.is_linear:
         profile = np.frombuffer(linear_profile(space), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
-    _write(path, [spec], values, metadata)
+    write_parts(path, [spec], [values], metadata)
 
 
 def write_display(
@@ -432,7 +428,7 @@ def write_display(
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
 
-    def values(_: int, rows: slice) -> np.ndarray:
+    def values(rows: slice) -> np.ndarray:
         seen, opaque = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
         _require_finite(path, seen)
         if opaque is not None and jpeg:
@@ -448,7 +444,7 @@ def write_display(
     spec.attribute("CompressionQuality", JPEG_QUALITY)
     spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
-    _write(path, [spec], values, {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
+    write_parts(path, [spec], [values], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
     return chosen_ev
 
 
@@ -458,15 +454,12 @@ def _spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
     return spec
 
 
-def _write(
-    path: Path,
-    specs: Sequence[oiio.ImageSpec],
-    values: Callable[[int, slice], np.ndarray],
-    metadata: Attributes | None,
+def write_parts(
+    path: Path, specs: Sequence[oiio.ImageSpec], bands: Iterable[Band], metadata: Attributes | None = None
 ) -> None:
     """Write the parts of an image atomically, with its metadata in the first one's header and as XMP.
 
-    `values` gives rows [h, W, C] of a part by its number; they are written in strips as they come.
+    A band gives rows [h, W, C] of its part; they are written in strips as they come.
     """
     for name, value in (metadata or {}).items():
         specs[0].attribute(name, value)
@@ -477,11 +470,12 @@ def _write(
             raise UsageError(f"{path}: not the suffix of an image format; use .exr, .png or .jpg")
         name = str(temporary)
         good = stream.open(name, tuple(specs)) if len(specs) > 1 else stream.open(name, specs[0])
-        for number, spec in enumerate(specs):
+        for number, (band, spec) in enumerate(zip(bands, specs, strict=True)):
             good = good and (number == 0 or stream.open(name, spec, "AppendSubimage"))
             for rows in strips((spec.height, spec.width)) if good else ():
-                part = np.ascontiguousarray(values(number, rows))
-                good = good and stream.write_scanlines(rows.start, rows.stop, 0, part)
+                good = good and stream.write_scanlines(
+                    rows.start, rows.stop, 0, np.ascontiguousarray(band(rows))
+                )
         message = oiio_error(stream)
         if not (stream.close() and good):
             raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")

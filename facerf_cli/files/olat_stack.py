@@ -11,20 +11,20 @@ import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import OpenImageIO as oiio
 import torch
-from pydantic import PlainValidator
+from pydantic import Field, PlainValidator
 from torch import Tensor
 
-from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.files.atomic import atomic_path
+from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.image_metadata import Attributes, oiio_error, utf8_path
-from facerf_cli.files.images import HALF_MAX
+from facerf_cli.files.images import half_floats, write_parts
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.run import memory
@@ -38,8 +38,7 @@ _SUM_BYTES = 30  # of a pixel of a light that is summed: half floats, floats, an
 _AT_ONCE = 16  # lights that are summed
 _OPEN = 256  # lights that are read before a stack is opened again
 _SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
-_MOST_PARTS = 4097  # 4096 lights and the source
-_MOST_HEADER_BYTES = 1 << 20  # of the JSON
+_MOST_LIGHTS = 4096
 _MOST_CHANNELS = 16  # of a part; other programs may add some
 _LENGTH_TOLERANCE = 0.01  # a direction's length may differ from 1 by this
 _SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
@@ -66,31 +65,14 @@ class StackHeader:
     rig_lights: tuple[int, ...] = ()  # numbers of the parts to write, in their rig; () counts from 0
 
 
-@dataclass(frozen=True, eq=False)
-class OlatStack:
-    """A stack in memory; olats [L, 3, H, W] float16, linear."""
-
-    header: StackHeader
-    olats: Tensor
-
-
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
     """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive."""
-    specs = _specs(header)
+    source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
     images = (image for batch in _apart(olats) for image in batch.permute(0, 2, 3, 1).cpu().numpy())
-    with atomic_path(path) as temporary, _one_thread():
-        stream = oiio.ImageOutput.create(str(temporary))
-        assert stream is not None, f"{path}: a stack is an .exr"
-        good = stream.open(str(temporary), tuple(specs))
-        for number, (image, spec) in enumerate(zip(images, specs[:-1], strict=True)):
-            good = good and (number == 0 or stream.open(str(temporary), spec, "AppendSubimage"))
-            good = good and stream.write_image(_as_half(path, image))
-        good = good and stream.open(str(temporary), specs[-1], "AppendSubimage")
-        source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
-        good = good and stream.write_image(_as_half(path, source))
-        message = oiio_error(stream)
-        if not (stream.close() and good):
-            raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
+    with _one_thread():
+        write_parts(
+            path, _specs(header), (half_floats(path, part)[0].__getitem__ for part in chain(images, [source]))
+        )
 
 
 def _apart(olats: Iterable[Tensor]) -> Iterator[Tensor]:
@@ -153,12 +135,6 @@ def _part(
     return spec
 
 
-def _as_half(path: Path, image: np.ndarray) -> np.ndarray:
-    if not np.isfinite(image).all():
-        raise InputError(f"{path}: not written: some values are NaN or infinite; check its photo")
-    return np.ascontiguousarray(image.clip(-HALF_MAX, HALF_MAX), np.float16)
-
-
 def is_olat_stack(path: Path) -> bool:
     """Return whether a file is an OLAT stack that facerf wrote; False if it cannot be opened as an image."""
     is_exr = path.suffix.lower() == ".exr" and is_regular(path)
@@ -179,30 +155,20 @@ def _text_of(spec: oiio.ImageSpec) -> str:
         return ""
 
 
-def read_olat_stack(path: Path) -> OlatStack:
-    """Read a stack; the budget of memory is asked for its lights and source before pixels are decoded."""
-    with _opened(path) as stream:
-        content = _header_of(path, stream.spec())
-        _ask_for(path, stream.spec(), content["lights"])
-        return OlatStack(_read_header(path, stream, content), _read_lights(path, stream, content))
-
-
 def read_olat_header(path: Path) -> StackHeader:
     """Read a stack without its OLATs, for which memory is not asked."""
-    with _opened(path) as stream:
-        content = _header_of(path, stream.spec())
-        _ask_for(path, stream.spec(), 0)
-        return _read_header(path, stream, content)
+    with _opened(path) as stack:
+        _ask_for(stack, 0)
+        return _read_header(stack)
 
 
 def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None)) -> Tensor:
     """Read some lights' OLATs [l, 3, h, W] float16, or some of their rows, from a stack of any size."""
-    with _opened(path) as stream:
-        content = _header_of(path, stream.spec())
-        height = content["shape"][0]
+    with _opened(path) as stack:
+        height = stack.shape[0]
         share = len(range(height)[rows]) / max(1, height)
-        _ask_for(path, stream.spec(), len(range(content["lights"])[lights]), share)
-        return _read_lights(path, stream, content, lights, rows)
+        _ask_for(stack, len(range(stack.document.lights)[lights]), share)
+        return _read_lights(stack, lights, rows)
 
 
 def stream_olats(path: Path) -> Iterator[Tensor]:
@@ -210,102 +176,17 @@ def stream_olats(path: Path) -> Iterator[Tensor]:
 
     A batch has as many lights as fit half of the budget of memory, which is asked for one and the source.
     """
-    with _opened(path) as stream:
-        spec, lights = stream.spec(), _header_of(path, stream.spec())["lights"]
-        size_px = spec.height * spec.width
-        what = f"{path}: lights of {spec.width} x {spec.height} pixels"
-        memory.require(what, size_px * (_SUM_BYTES + _SOURCE_BYTES), "a stack of fewer pixels")
-        fit = (memory.left_bytes() // 2 // size_px - _SOURCE_BYTES) // _SUM_BYTES
+    with _opened(path) as stack:
+        (height, width), lights = stack.shape, stack.document.lights
+        what = f"{path}: lights of {width} x {height} pixels"
+        memory.require(what, height * width * (_SUM_BYTES + _SOURCE_BYTES), "a stack of fewer pixels")
+        fit = (memory.left_bytes() // 2 // (height * width) - _SOURCE_BYTES) // _SUM_BYTES
         at_once = max(1, min(_AT_ONCE, fit))
     for first in range(0, lights, _OPEN):  # OpenEXR holds some memory for each part that was read
-        with _opened(path) as stream:
-            content, last = _header_of(path, stream.spec()), min(first + _OPEN, lights)
+        last = min(first + _OPEN, lights)
+        with _opened(path) as stack:
             for start in range(first, last, at_once):
-                some = slice(start, min(start + at_once, last))
-                yield _read_lights(path, stream, content, some).float()
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[oiio.ImageInput]:
-    require_regular(path, "give a stack that `facerf predict-olat` wrote")
-    stream = oiio.ImageInput.open(utf8_path(path))
-    if stream is None:
-        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio_error())}")
-    try:
-        yield stream
-    finally:
-        oiio_error(stream)
-        stream.close()
-
-
-def _read_header(path: Path, stream: oiio.ImageInput, content: dict[str, Any]) -> StackHeader:
-    lights = content["lights"]
-    attributes = stream.spec().extra_attribs
-    directions = np.empty((lights, 3))
-    for number in range(lights):
-        directions[number] = _direction(path, _part_at(path, stream, number))
-    source = _pixels(path, stream, lights, _SOURCE_CHANNELS, content["shape"]).astype(np.float32)
-    return StackHeader(
-        kind=content["kind"],
-        directions=directions,
-        rotation=content["rotation"],
-        source=source[..., :3],
-        seen=source[..., 3],
-        normals=source[..., 4:],
-        layout_version=content["layout_version"],
-        fit=content["fit"],
-        metadata={entry.name: entry.value for entry in attributes if _is_provenance(entry.name)},
-    )
-
-
-def _read_lights(
-    path: Path,
-    stream: oiio.ImageInput,
-    content: dict[str, Any],
-    lights: slice = slice(None),
-    rows: slice = slice(None),
-) -> Tensor:
-    height, width = content["shape"]
-    numbers = range(content["lights"])[lights]
-    olats = np.empty((len(numbers), len(range(height)[rows]), width, 3), np.float16)
-    for place, number in enumerate(numbers):
-        olats[place] = _pixels(path, stream, number, ("R", "G", "B"), content["shape"], rows)
-    return torch.from_numpy(olats).permute(0, 3, 1, 2)
-
-
-def _is_provenance(name: str) -> bool:
-    return name in ("Software", "IPTC:DigitalSourceType") or (
-        name.startswith("facerf:") and name not in (_HEADER, _DIRECTION, "facerf:light")
-    )
-
-
-def _ask_for(path: Path, spec: oiio.ImageSpec, lights: int, share: float = 1.0) -> None:
-    """Ask the budget for some lights, or a share of their rows, and for the source, decoded and as floats."""
-    needed = spec.height * spec.width * (share * lights * _LIGHT_BYTES + _SOURCE_BYTES)
-    what = f"{path}: {lights} lights of {spec.width} x {spec.height} pixels"
-    memory.require(what, int(needed), "a stack of fewer lights or pixels")
-
-
-def _header_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
-    """Return the first part's JSON with its types checked, and the parts' shape (H, W)."""
-    content = _json_of(path, spec)
-    if not 1 <= content["lights"] < _MOST_PARTS:
-        raise InputError(f"{path}: {content['lights']} lights; a stack has from 1 to {_MOST_PARTS - 1}")
-    return content | {"shape": (spec.height, spec.width)}
-
-
-def _json_of(path: Path, spec: oiio.ImageSpec) -> dict[str, Any]:
-    text = _text_of(spec)
-    if not text:
-        raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
-    try:
-        if len(text) > _MOST_HEADER_BYTES:
-            raise ValueError(f"its header is larger than {_MOST_HEADER_BYTES >> 20} MiB")
-        return dict(checked(_StackDocument, parse_json(text), _HEADER))
-    except (ValueError, InputError) as error:
-        raise InputError(
-            f"{path}: damaged OLAT stack, or written by another version of facerf ({error})"
-        ) from None
+                yield _read_lights(stack, slice(start, min(start + at_once, last))).float()
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
@@ -317,38 +198,107 @@ def _arrays(value: Any) -> dict[str, np.ndarray]:
 class _StackDocument(Document):
     format: Format
     kind: Literal["photo", "texture", "image"]
-    lights: int
+    lights: Annotated[int, Field(ge=1, le=_MOST_LIGHTS)]
     layout_version: int
     rotation: Matrix3
     fit: Annotated[dict[str, np.ndarray], PlainValidator(_arrays)]
 
 
-def _direction(path: Path, spec: oiio.ImageSpec) -> np.ndarray:
-    value = spec.getattribute(_DIRECTION)
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """An open file, its first part's JSON, and the shape (H, W) that all parts must have."""
+
+    path: Path
+    stream: oiio.ImageInput
+    document: _StackDocument
+    shape: tuple[int, int]
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Stack]:
+    require_regular(path, "give a stack that `facerf predict-olat` wrote")
+    stream = oiio.ImageInput.open(utf8_path(path))
+    if stream is None:
+        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio_error())}")
+    try:
+        spec = stream.spec()
+        yield _Stack(path, stream, _document(path, spec), (spec.height, spec.width))
+    finally:
+        oiio_error(stream)
+        stream.close()
+
+
+def _document(path: Path, spec: oiio.ImageSpec) -> _StackDocument:
+    text = _text_of(spec)
+    if not text:
+        raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
+    try:
+        return checked(_StackDocument, parse_json(text), _HEADER)
+    except (ValueError, InputError) as error:
+        raise InputError(
+            f"{path}: damaged OLAT stack, or written by another version of facerf ({error})"
+        ) from None
+
+
+def _ask_for(stack: _Stack, lights: int, share: float = 1.0) -> None:
+    """Ask the budget for some lights, or a share of their rows, and for the source, decoded and as floats."""
+    height, width = stack.shape
+    what = f"{stack.path}: {lights} lights of {width} x {height} pixels"
+    needed = height * width * (share * lights * _LIGHT_BYTES + _SOURCE_BYTES)
+    memory.require(what, int(needed), "a stack of fewer lights or pixels")
+
+
+def _read_header(stack: _Stack) -> StackHeader:
+    document, attributes = stack.document, stack.stream.spec().extra_attribs
+    directions = np.array([_direction(stack, number) for number in range(document.lights)])
+    source = _pixels(stack, document.lights, _SOURCE_CHANNELS).astype(np.float32)
+    return StackHeader(
+        kind=document.kind,
+        directions=directions,
+        rotation=document.rotation,
+        source=source[..., :3],
+        seen=source[..., 3],
+        normals=source[..., 4:],
+        layout_version=document.layout_version,
+        fit=document.fit,
+        metadata={entry.name: entry.value for entry in attributes if _is_provenance(entry.name)},
+    )
+
+
+def _read_lights(stack: _Stack, lights: slice, rows: slice = slice(None)) -> Tensor:
+    numbers, (height, width) = range(stack.document.lights)[lights], stack.shape
+    olats = np.empty((len(numbers), len(range(height)[rows]), width, 3), np.float16)
+    for place, number in enumerate(numbers):
+        olats[place] = _pixels(stack, number, ("R", "G", "B"), rows)
+    return torch.from_numpy(olats).permute(0, 3, 1, 2)
+
+
+def _is_provenance(name: str) -> bool:
+    return name in ("Software", "IPTC:DigitalSourceType") or (
+        name.startswith("facerf:") and name not in (_HEADER, _DIRECTION, "facerf:light")
+    )
+
+
+def _direction(stack: _Stack, number: int) -> np.ndarray:
+    value = _part_at(stack, number).getattribute(_DIRECTION)
     direction = np.array(value if isinstance(value, tuple) else (), np.float64)
     if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < _LENGTH_TOLERANCE:
-        raise InputError(f"{path}: a part of the OLAT stack has no direction; write the stack again")
+        raise InputError(f"{stack.path}: a part of the OLAT stack has no direction; write the stack again")
     return direction / np.linalg.norm(direction)
 
 
-def _part_at(path: Path, stream: oiio.ImageInput, number: int) -> oiio.ImageSpec:
-    if not stream.seek_subimage(number, 0):
-        raise InputError(f"{path}: damaged OLAT stack: part {number} is missing; write the stack again")
-    return stream.spec()
+def _part_at(stack: _Stack, number: int) -> oiio.ImageSpec:
+    if not stack.stream.seek_subimage(number, 0):
+        raise InputError(f"{stack.path}: damaged OLAT stack: part {number} is missing; write the stack again")
+    return stack.stream.spec()
 
 
-def _pixels(
-    path: Path,
-    stream: oiio.ImageInput,
-    number: int,
-    channels: tuple[str, ...],
-    shape: tuple[int, int],
-    rows: slice = slice(None),
-) -> np.ndarray:
+def _pixels(stack: _Stack, number: int, channels: tuple[str, ...], rows: slice = slice(None)) -> np.ndarray:
     """Read the named channels [h, W, C] of a part, or of some of its rows."""
-    spec = _part_at(path, stream, number)
+    path, stream, spec = stack.path, stack.stream, _part_at(stack, number)
     names = list(spec.channelnames)
-    if (spec.height, spec.width) != shape or not set(channels) <= set(names) or len(names) > _MOST_CHANNELS:
+    fits = (spec.height, spec.width) == stack.shape and set(channels) <= set(names)
+    if not fits or len(names) > _MOST_CHANNELS or spec.deep:
         raise InputError(f"{path}: damaged OLAT stack: part {number} has another size or other channels")
     first, past, _ = rows.indices(spec.height)
     if spec.tile_width:  # another program has rewritten the file in tiles

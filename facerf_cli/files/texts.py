@@ -58,8 +58,8 @@ def require_regular(path: Path, advice: str = "check the path") -> None:
         raise InputError(f"{path}: is a pipe or a device, not a regular file; {advice}")
 
 
-def read_text(path: Path, limit_bytes: int, advice: str) -> str:
-    """Read a regular text file of at most `limit_bytes`, in UTF-8; other bytes are replaced."""
+def read_bytes(path: Path, limit_bytes: int, advice: str) -> bytes:
+    """Read a regular file of at most `limit_bytes`; an InputError for any other gives the advice."""
     require_regular(path, advice)
     try:
         with path.open("rb") as stream:
@@ -67,8 +67,13 @@ def read_text(path: Path, limit_bytes: int, advice: str) -> str:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
     if len(content) > limit_bytes:
-        raise InputError(f"{path}: too large, over {limit_bytes >> 20} MiB; {advice}")
-    return content.decode(errors="replace")
+        raise InputError(f"{path}: larger than {limit_bytes / (1 << 20):.4g} MiB; {advice}")
+    return content
+
+
+def read_text(path: Path, limit_bytes: int, advice: str) -> str:
+    """Read a text file of at most `limit_bytes`, in UTF-8; other bytes are replaced."""
+    return read_bytes(path, limit_bytes, advice).decode(errors="replace")
 
 
 def file_sha256(path: Path) -> str:
@@ -92,17 +97,7 @@ def parse_json(text: str | bytes) -> Any:
 
 def read_json(path: Path, missing: str, limit_bytes: int = LIMIT_BYTES) -> Any:
     """Read a JSON file; `missing` says what to do if the file does not exist, or is none of ours."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise InputError(f"{path}: is no file; give a JSON file")
-        with path.open("rb") as stream:
-            content = stream.read(limit_bytes + 1)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; {missing}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if len(content) > limit_bytes:
-        raise InputError(f"{path}: larger than {limit_bytes >> 20} MiB; {missing}")
+    content = read_bytes(path, limit_bytes, missing)
     try:
         return parse_json(content)
     except ValueError as error:
@@ -142,20 +137,11 @@ def _not_finite(text: str) -> float:
     raise ValueError(f"{text} is not a finite number")
 
 
-def read_toml(path: Path, limit_bytes: int, too_long: str, advice: str) -> dict[str, Any]:
-    """Read the tables of a TOML file.
-
-    Raises InputError, which says `too_long` of a file over the limit, and `advice` of one that is no TOML.
-    """
-    require_regular(path)
+def read_toml(path: Path, limit_bytes: int, advice: str) -> dict[str, Any]:
+    """Read the tables of a TOML file; an InputError for any other gives the advice."""
+    content = read_bytes(path, limit_bytes, advice)
     try:
-        with path.open("rb") as stream:
-            data = stream.read(limit_bytes + 1)
-        if len(data) > limit_bytes:
-            raise InputError(f"{path}: {too_long}")
-        return tomllib.loads(data.decode())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path") from None
+        return tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:  # also of the decoding
         raise InputError(f"{path}: not TOML ({error}); {advice}") from None
 
@@ -165,8 +151,7 @@ def read_rig(path: Path) -> dict[str, Settings]:
 
     [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
     """
-    too_long = f"more than {_RIG_LIMIT_BYTES} bytes; a rig file holds lights alone"
-    tables = read_toml(path, _RIG_LIMIT_BYTES, too_long, "see docs/lights.md")
+    tables = read_toml(path, _RIG_LIMIT_BYTES, "see docs/lights.md")
     if not 1 <= len(tables) <= MOST_RIG_LIGHTS:
         raise InputError(f"{path}: {len(tables)} lights; give 1 to {MOST_RIG_LIGHTS}")
     return {name: _settings(table, f"{path}: {name}") for name, table in tables.items()}

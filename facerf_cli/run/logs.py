@@ -7,11 +7,14 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from facerf_cli._version import __version__
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn
 
 # IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
 COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
@@ -144,6 +147,19 @@ def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
     logger.handlers[:] = [handler]
     logger.propagate = False
     logger.setLevel({-1: logging.ERROR, 0: logging.INFO}.get(verbosity, logging.DEBUG))
+
+
+def progress_bar(*columns: "ProgressColumn", shown: bool = True) -> "Progress":
+    """A bar on stderr if that is a terminal: the task, a bar, more columns, the time that remains."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn  # --help does without it
+
+    # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.
+    return Progress(
+        *(TextColumn("{task.description}"), BarColumn(), *columns, TimeRemainingColumn()),
+        console=STDERR,
+        disable=not (shown and STDERR.is_terminal),
+        redirect_stdout=sys.stdout.isatty(),
+    )
 
 
 def log_to_queue(queue: Any, level: int) -> None:

@@ -1,9 +1,11 @@
 """Face models imported, listed, described and drawn for `facerf face-model`."""
 
 import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.importers.ict import PUBLISHED, cached_face_model
 from facerf_cli.face.importers.resample import import_face_model
 from facerf_cli.face.morphable import (
@@ -11,7 +13,6 @@ from facerf_cli.face.morphable import (
     BUILTIN_PATH,
     MorphableModel,
     load_face_model,
-    read_model_facts,
     save_face_model,
 )
 from facerf_cli.face.topology import GRID, OUTER_EYE_CORNERS, grid_triangles
@@ -37,9 +38,10 @@ def list_rows() -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     files = [(BUILTIN, BUILTIN_PATH), *((str(path), path) for path in sorted(Path().glob("*.npz")))]
     for model, path in files:
-        if facts := read_model_facts(path):
-            shapes = f"{facts.identities} + {facts.expressions}"
-            rows.append({"model": model, "name": facts.name, "shapes": shapes, "licence": facts.licence})
+        with suppress(InputError):
+            found = load_face_model(path)
+            shapes = f"{len(found.identity)} + {len(found.expression)}"
+            rows.append({"model": model, "name": found.name, "shapes": shapes, "licence": found.licence})
     for kind in PUBLISHED:
         cached = cached_face_model(kind)
         words = f"to import: {cached}" if cached else f"not here; facerf face-model fetch {kind}"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.made_from import DigestOf, OneRecipe, Recipe, recipe_of
+from facerf_cli.batch.made_from import DigestOf, Recipe, one_recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.errors import UsageError
@@ -119,7 +119,7 @@ class FitGeometry:
         """Fit the face model to the inputs; return the exit code."""
         self.photo.check()
         prepare = partial(_prepare, self.photo, FITTING, batch.dry_run)
-        recipe, settings = OneRecipe(self), self.photo.settings
+        recipe, settings = one_recipe(self), self.photo.settings
         items = collect_items(inputs, batch.output, PHOTO_SUFFIXES, batch.name, settings.null_separated)
         return run_items("fit-geometry", items, self, self.outputs_of, batch, settings, recipe, prepare)
 
@@ -273,7 +273,7 @@ class PredictOlat:
             )
         kinds = ["portrait" if work.page or work.frame == "photo" else "field"]
         prepare = partial(_prepare, self.photo, networks_of(kinds), batch.dry_run)
-        recipe, settings = OneRecipe(work), self.photo.settings
+        recipe, settings = one_recipe(work), self.photo.settings
         items = collect_items(inputs, batch.output, PHOTO_SUFFIXES, batch.name, settings.null_separated)
         predict = partial(process, work)
         return run_items("predict-olat", items, predict, work.outputs_of, batch, settings, recipe, prepare)
@@ -318,7 +318,7 @@ class MakePage:
             raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
         batch = replace(batch, output=folder)
         prepare = partial(_prepare, self.photo, networks_of(["portrait"]), batch.dry_run)
-        recipe = OneRecipe(self)
+        recipe = one_recipe(self)
         code = run_items("view", items, self, self.outputs_of, batch, settings, recipe, prepare)
         if not one and not batch.dry_run and sums_up(items, self.outputs_of, batch):
             from facerf_cli.work.view_photos import write_index
@@ -400,7 +400,7 @@ class ConvertLight:
             parse_lights(self.lights)  # a wrong one fails the call, not every item
         items = collect_items(inputs, batch.output, _LIGHT_SUFFIXES, null_separated=settings.null_separated)
         convert = partial(process, self)
-        return run_items("convert-light", items, convert, self.outputs_of, batch, settings, OneRecipe(self))
+        return run_items("convert-light", items, convert, self.outputs_of, batch, settings, one_recipe(self))
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file for each form."""

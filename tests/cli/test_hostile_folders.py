@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
-from facerf_cli.batch.run import _exist, print_path, report_name
-from facerf_cli.batch.settings import Shard
+from facerf_cli.batch.run import REPORT_NAME, _exist, print_path
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.pairs import read_array
@@ -18,10 +17,11 @@ from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.images import decode
 from facerf_cli.files.light_files import read_numbers
-from facerf_cli.files.olat_stack import is_olat_stack, read_olat_stack
+from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.files.texts import is_regular, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
 from tests.cli.toy_batch import run
+from tests.stacks import read_olat_stack
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 HOSTILE = (
@@ -43,7 +43,7 @@ def photos_of(folder: Path, *names: str) -> Path:
 
 
 def rows(out: Path) -> list[dict[str, object]]:
-    return [json.loads(line) for line in (out / report_name(Shard())).read_text().split("\n") if line]
+    return [json.loads(line) for line in (out / REPORT_NAME).read_text().split("\n") if line]
 
 
 def test_names_of_all_characters_have_a_row_and_an_output_each(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ OPENERS = {
     "landmarks": read_landmarks,
     "a list of lights": read_light_list,
     "numbers": lambda path: read_numbers(path, (9,)),
-    "TOML": lambda path: read_toml(path, 100, "", ""),
+    "TOML": lambda path: read_toml(path, 100, ""),
     "a fit": load_fit,
     "an array": read_array,
 }

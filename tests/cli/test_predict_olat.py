@@ -11,7 +11,6 @@ from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image, write_display
-from facerf_cli.files.olat_stack import OlatStack, read_olat_stack
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main
@@ -21,6 +20,7 @@ from facerf_cli.viewer.page import strip_of
 from tests.astronaut import PATH as PHOTO
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.files.test_relight_web import Decoder
+from tests.stacks import OlatStack, read_olat_stack
 
 SIDES = "70,0;-70,0;0,80"
 Capture = pytest.CaptureFixture[str]

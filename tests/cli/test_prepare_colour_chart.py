@@ -10,12 +10,12 @@ import pytest
 
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.files.images import read_image, write_exr
-from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
 from tests.capture.test_chart import kept_luminance
 from tests.cli.test_prepare_dataset import prepare, tree
 from tests.dataset.capture import BLACK_LEVEL, write_capture
+from tests.stacks import read_olat_stack
 
 LIGHTS = 10
 SPLIT = ("--split", "1/0/0")

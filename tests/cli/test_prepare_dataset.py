@@ -24,13 +24,13 @@ from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image, write_display, write_exr
-from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.dataset.capture import Truth, write_capture
+from tests.stacks import read_olat_stack
 
 LIGHTS = 12
 Given = tuple[Path, dict[str, Truth]]

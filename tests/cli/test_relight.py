@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.files.images import read_image, write_display, write_exr
-from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, write_olat_stack
+from facerf_cli.files.olat_stack import read_olat_header, write_olat_stack
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.relighting.composition import Composition, Relit
@@ -17,6 +17,7 @@ from facerf_cli.relighting.field import Field
 from facerf_cli.synth.sky.skies import kind_of
 from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
+from tests.stacks import read_olat_stack
 
 
 def relight(given: Path, output: Path, *line: str, photo: Path = PHOTO) -> int:

@@ -27,12 +27,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.files.images import write_display
-from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.stacks import read_olat_stack
 
 CROP_PX = 48
 

@@ -14,9 +14,9 @@ from facerf_cli.dataset.prepare import constant_weights, stack_header
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import fit_from_arrays, load_fit
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.raster.camera import pose_to_rotation
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.stacks import read_olat_stack
 
 
 @pytest.fixture(scope="module")

@@ -32,10 +32,11 @@ from facerf_cli.dataset.weights import (
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.images import read_image, write_exr
-from facerf_cli.files.olat_stack import read_olat_header, read_olat_stack, read_olats, write_olat_stack
+from facerf_cli.files.olat_stack import read_olat_header, read_olats, write_olat_stack
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.stacks import read_olat_stack
 
 MAPS = envmap_names(ProceduralMaps(4, 7, 32))
 

@@ -20,7 +20,6 @@ from facerf_cli.dataset.textures import DatasetTextures, UnwrappedView, open_dat
 from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles
-from facerf_cli.files.olat_stack import read_olat_stack
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
@@ -31,6 +30,7 @@ from facerf_cli.training.loop import train
 from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.stacks import read_olat_stack
 
 SIDE, LIGHTS = 32, 20
 NETWORK = DefaultReflectanceSettings(

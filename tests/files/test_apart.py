@@ -33,13 +33,17 @@ def greedy(path: Path) -> dict[str, np.ndarray]:
     return {"a": np.ones(1 << 40, np.uint8)}
 
 
+def endless_output(path: Path) -> dict[str, np.ndarray]:
+    return {str(number): np.zeros(1 << 29, np.uint8) for number in range(5)}
+
+
 def pickled(path: Path) -> dict[str, np.ndarray]:
     return {"a": np.array([print], dtype=object)}
 
 
 def test_arrays_come_back_by_name(tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"a \xff b")
-    arrays = arrays_apart(__name__, "numbers", path)
+    arrays = arrays_apart(numbers, path)
     assert arrays["a/b"].tolist() == [0, 1, 2] and bytes(arrays["name"]) == os.fsencode(path)
 
 
@@ -50,10 +54,11 @@ def test_arrays_come_back_by_name(tmp_path: Path) -> None:
         ("crashing", "SIGSEGV"),
         ("endless", "longer than 2 s"),
         ("greedy", "allocate"),
+        ("endless_output", "File too large|Errno 27"),
         ("pickled", "."),
     ],
 )
 def test_what_goes_wrong_there_is_an_error_here(reader: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=says) as refused:
-        arrays_apart(__name__, reader, tmp_path, time_s=2 if reader == "endless" else 60)
+        arrays_apart(globals()[reader], tmp_path, time_s=2 if reader == "endless" else 60)
     assert str(refused.value).isprintable()

@@ -198,7 +198,13 @@ def test_a_full_disk_is_named_and_what_came_is_kept(
 
     server.cuts = [5000]
     with monkeypatch.context() as small:
-        small.setattr(Path, "open", lambda path, mode: Full(path, mode.replace("b", "")))
+        usual = Path.open
+
+        def opened(path: Path, mode: str = "r", **how: Any) -> Any:
+            full = path.suffix == ".part"
+            return Full(path, mode.replace("b", "")) if full else usual(path, mode, **how)
+
+        small.setattr(Path, "open", opened)
         with pytest.raises(FacerfError, match=r"in the cache \(No space left on device\); make room"):
             fetch(server.published(), OPTION, tmp_path)
     assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT

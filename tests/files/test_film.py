@@ -1,6 +1,7 @@
 """Films read by frame, and written with times, sound and metadata."""
 
 import sys
+from contextlib import closing
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,7 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
     path = tmp_path / f"film{suffix}"
     write_film(path, images, Timing.steady(5, Fraction(30000, 1001)), "Synthetic: a test")
     assert comment_of(path) == "Synthetic: a test"
-    with Film(path) as film:
+    with closing(Film(path)) as film:
         facts = film.facts()
         assert (facts.width, facts.height, len(facts.times_s)) == (50, 36, 5)
         assert facts.rate == pytest.approx(30000 / 1001, rel=1e-4)

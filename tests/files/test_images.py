@@ -12,6 +12,7 @@ import tifffile
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.image_metadata import read_header, space_of_file
 from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr, write_tiff
+from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image import colour
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers
@@ -125,6 +126,21 @@ def test_a_fourth_channel_that_is_no_alpha_is_left_out(tmp_path: Path) -> None:
 def test_an_exr_with_layers_only_gives_its_first(tmp_path: Path) -> None:
     path = save(tmp_path / "a.exr", VALUES[..., [0, 1, 2]], channelnames=("skin.R", "skin.G", "skin.B"))
     np.testing.assert_array_equal(read_image(path).pixels, VALUES[..., :3])
+
+
+def test_a_deep_exr_is_refused(tmp_path: Path) -> None:
+    """Its pixels have several samples each, and OpenImageIO's flat readers return memory as it lies."""
+    path, spec, data = tmp_path / "a.exr", oiio.ImageSpec(5, 3, 4, "float"), oiio.DeepData()
+    spec.deep, spec.channelnames = True, ("R", "G", "B", "Z")
+    data.init(spec)
+    for pixel in range(15):
+        data.set_samples(pixel, 2)
+    stream = oiio.ImageOutput.create(str(path))
+    assert stream.open(str(path), spec) and stream.write_deep_image(data) and stream.close()
+    with pytest.raises(InputError, match=r"a\.exr: a deep image is not read; flatten it, as by oiiotool"):
+        read_image(path)
+    with pytest.raises(InputError, match="not an OLAT stack"):
+        read_olats(path)
 
 
 def test_orientation_6_turns_the_first_row_to_the_right_edge(tmp_path: Path) -> None:

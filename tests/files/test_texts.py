@@ -126,7 +126,7 @@ def test_values_become_the_text_of_an_option(tmp_path: Path) -> None:
     [
         (b"", "0 lights; give 1 to 32"),
         (b"\n".join(b"[l%d]\naz = 1" % k for k in range(MOST_RIG_LIGHTS + 1)), "33 lights"),
-        (b"# " + b"x" * 70000, "more than 65536 bytes"),
+        (b"# " + b"x" * 70000, "larger than 0.0625 MiB"),
         (b"key = 3", "key: not a light"),
         (b"[key]\naz = true", "key: az: not a number"),
         (b"[key]\naz = [1, 'a']", "az: not a number"),

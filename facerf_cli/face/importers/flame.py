@@ -14,7 +14,6 @@ of 51 or 68 points (FLAME's `flame_static_embedding.pkl`, and .npz files).
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,7 +21,9 @@ from scipy.spatial.transform import Rotation
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.source import SourceModel, require_mesh
 from facerf_cli.face.morphable import read_npz
-from facerf_cli.files.inert_pickle import array_of, read_inert_pickle, read_inert_stream
+from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.inert_pickle import pickled_arrays
+from facerf_cli.files.texts import require_regular
 from facerf_cli.run.logs import one_line
 
 IDENTITIES = 300  # the first shapes; the others are expressions
@@ -56,18 +57,19 @@ def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
     without an embedding are found later by shape. Raises InputError for any other file.
     """
     path = _model_file(path)
-    found = landmarks or path.with_name("landmark_embedding.npy")
+    embedding = landmarks or path.with_name("landmark_embedding.npy")
     try:
-        raw = read_npz(path) if path.suffix == ".npz" else read_inert_pickle(path)
-        if not isinstance(raw, dict):
-            raise ValueError(f"it holds a {type(raw).__name__}, not a table of arrays")
-        source = _source({key: value for key, value in raw.items() if isinstance(key, str)}, path.stem)
-    except (IndexError, AttributeError, OverflowError, KeyError, ValueError, TypeError) as error:
+        source = _source(_table(path), path.stem)
+    except (KeyError, ValueError, TypeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else one_line(str(error))[:160]
         raise InputError(f"{path}: not a FLAME model ({reason}); download it again") from None
-    if landmarks or found.is_file():
-        source.known.update(read_embedding(found, source.mean, source.triangles))
+    if landmarks or embedding.is_file():
+        source.known.update(read_embedding(embedding, source.mean, source.triangles))
     return source
+
+
+def _table(path: Path) -> dict[str, np.ndarray]:
+    return read_npz(path) if path.suffix == ".npz" else arrays_apart(pickled_arrays, path)
 
 
 def _model_file(path: Path) -> Path:
@@ -87,10 +89,10 @@ def _model_file(path: Path) -> Path:
     return models[0]
 
 
-def _source(raw: Mapping[str, Any], stem: str) -> SourceModel:
-    mean = array_of(raw["v_template"]).astype(np.float64)
-    triangles = array_of(raw["f"]).astype(np.int64)
-    shapes = array_of(raw["shapedirs"])
+def _source(raw: Mapping[str, np.ndarray], stem: str) -> SourceModel:
+    mean = raw["v_template"].astype(np.float64)
+    triangles = raw["f"].astype(np.int64)
+    shapes = raw["shapedirs"]
     require_mesh(mean, triangles)
     if shapes.ndim != 3 or shapes.shape[:2] != mean.shape or not 1 <= shapes.shape[2] <= _MAX_SHAPES:
         raise ValueError(f"shapedirs has shape {list(shapes.shape)}, not [{len(mean)}, 3, 400]")
@@ -110,7 +112,7 @@ def _source(raw: Mapping[str, Any], stem: str) -> SourceModel:
     )
 
 
-def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Jaw turns of one standard deviation [1, N, 3] by name (linear blend skinning, FLAME's equation 2).
 
     {} for a file without a skeleton. Raises ValueError for a skeleton that is not FLAME's.
@@ -118,7 +120,7 @@ def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarra
     keys = ("posedirs", "weights", "J_regressor")
     if not all(key in raw for key in keys):
         return {}
-    corrections, weights, regressor = (array_of(raw[key]).astype(np.float64) for key in keys)
+    corrections, weights, regressor = (raw[key].astype(np.float64) for key in keys)
     wanted = ((*mean.shape, 9 * (_JOINTS - 1)), (len(mean), _JOINTS), (_JOINTS, len(mean)))
     for key, array, shape in zip(keys, (corrections, weights, regressor), wanted, strict=True):
         if array.shape != shape or not np.isfinite(array).all():
@@ -137,48 +139,20 @@ def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, Any]) -> dict[str, np.ndarra
 def read_embedding(path: Path, mean: np.ndarray, triangles: np.ndarray) -> dict[int, np.ndarray]:
     """Read landmarks on the mean [N, 3] by number; raises InputError for a file without an embedding."""
     try:
-        table = _embedding_table(path)
-        faces, weights = next(
-            (array_of(table[first]), array_of(table[second]))
-            for first, second in _EMBEDDING_KEYS
-            if first in table and second in table
-        )
+        require_regular(path)
+        table = _table(path)
+        named = [keys for keys in _EMBEDDING_KEYS if table.keys() >= set(keys)]
+        if not named:
+            raise ValueError(f"none of {', '.join(key for keys in _EMBEDDING_KEYS for key in keys)}")
+        faces, weights = (table[key] for key in named[0])
         faces, weights = faces.astype(np.int64).ravel(), weights.astype(np.float64).reshape(-1, 3)
         if len(faces) not in (_INNER, 68) or len(weights) != len(faces):
             raise ValueError(f"it has {len(faces)} points and {len(weights)} weights")
         if not (0 <= faces.min() <= faces.max() < len(triangles)) or abs(weights.sum(-1) - 1).max() > 0.01:
             raise ValueError("it belongs to another mesh")
-    except StopIteration:
-        keys = ", ".join(key for pair in _EMBEDDING_KEYS for key in pair)
-        raise InputError(
-            f"{path}: no landmarks (none of {keys}); give an embedding of FLAME's landmarks"
-        ) from None
-    except (LookupError, AttributeError, TypeError, OverflowError, ValueError) as error:
+    except (ValueError, TypeError) as error:
         raise InputError(
             f"{path}: no landmarks ({one_line(str(error))[:160]}); give an embedding of FLAME's landmarks"
         ) from None
     points = np.einsum("nkc,nk->nc", mean[triangles[faces]], weights)
     return dict(zip(range(68 - len(points), 68), points, strict=True))
-
-
-def _embedding_table(path: Path) -> Mapping[str, Any]:
-    """Read the arrays of an embedding by name, without running pickles."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; give an embedding of FLAME's landmarks")
-    if path.suffix == ".npz":
-        return read_npz(path)
-    if path.suffix != ".npy":
-        table = read_inert_pickle(path)
-    else:
-        with path.open("rb") as file:
-            try:
-                np.lib.format.read_magic(file)
-                _, _, kind = np.lib.format.read_array_header_1_0(file)
-            except Exception as error:  # whatever damage does: numpy parses a header as a text of Python
-                raise ValueError(one_line(str(error))) from None
-            if not kind.hasobject:
-                raise ValueError("it holds plain numbers, not a table")
-            table = read_inert_stream(file, path)
-    if not isinstance(table, dict):
-        raise ValueError(f"it holds a {type(table).__name__}, not a table")
-    return table

@@ -5,11 +5,9 @@ needs no agreement.
 """
 
 import hashlib
-import lzma
 import re
 import tarfile
 import zipfile
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -38,25 +36,21 @@ _PARTS = {  # first and last vertex; an eyeball is its sclera, which covers the 
 }
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
-# Errors that reading a damaged archive can raise.
-_ZIP_ERRORS = (zlib.error, zipfile.BadZipFile, UnicodeDecodeError, MemoryError)
-_ARCHIVE_ERRORS = (OSError, EOFError, RuntimeError, lzma.LZMAError, tarfile.TarError, *_ZIP_ERRORS)
 _ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
 
 
 def read_ict_facekit(path: Path) -> SourceModel:
     """Read ICT-FaceKit's folder, .zip or .tar; raises InputError for anything else."""
-    raw = dict(_objs(path))
-    if "generic_neutral_mesh" not in raw:
-        raise InputError(
-            f"{path}: no FaceXModel/generic_neutral_mesh.obj; give ICT-FaceKit's folder or archive"
-        )
-    return ict_source(path, raw)
+    return ict_source(path, dict(_objs(path)))
 
 
 def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
     """The model of the .obj files' contents by stem; their centimetres become metres."""
-    neutral = raw.pop("generic_neutral_mesh")
+    neutral = raw.pop("generic_neutral_mesh", None)
+    if neutral is None:
+        raise InputError(
+            f"{path}: no FaceXModel/generic_neutral_mesh.obj; give ICT-FaceKit's folder or archive"
+        )
     mean = _obj_vertices(path, "generic_neutral_mesh", neutral)
     identities = sorted(stem for stem in raw if re.fullmatch(r"identity\d+", stem))
     expressions = sorted(set(raw) - set(identities))
@@ -133,7 +127,9 @@ def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
                 if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
                     raise InputError(f"{path}: {name} is too large; fetch ICT-FaceKit again")
                 yield found[1], text
-    except _ARCHIVE_ERRORS as error:
+    except InputError:
+        raise
+    except Exception as error:  # whatever damage makes a reader of archives raise
         reason = one_line(str(error) or type(error).__name__)
         raise InputError(f"{path}: cannot be read ({reason}); fetch ICT-FaceKit again") from None
 

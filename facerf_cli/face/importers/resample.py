@@ -16,15 +16,10 @@ from scipy.spatial.distance import cdist
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
+from facerf_cli.face.importers.find_landmarks import landmarks_of, nearest_on_mesh, rigid_alignment
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit
-from facerf_cli.face.importers.source import (
-    SourceHead,
-    SourceModel,
-    landmarks_of,
-    nearest_on_mesh,
-    rigid_alignment,
-)
+from facerf_cli.face.importers.source import SourceHead, SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel, load_face_model
 from facerf_cli.face.topology import (
     GRID,

@@ -1,14 +1,16 @@
 """A head around the built-in face, sampled with as many vertices as another model has."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.face.importers.source import nearest_on_mesh, rigid_alignment
+from facerf_cli.face.importers.find_landmarks import nearest_on_mesh, rigid_alignment
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV, grid_triangles, locate
 
@@ -68,3 +70,11 @@ def off_mm(model: MorphableModel, head: Head) -> np.ndarray:
     mesh = trimesh.Trimesh(model.mean.double().numpy(), grid_triangles().numpy(), process=False)
     nearest, _ = nearest_on_mesh(mesh, points)
     return 1000 * np.linalg.norm(nearest - points, axis=-1)
+
+
+def arrays_here(reader: Callable[[Path], dict[str, np.ndarray]], path: Path) -> dict[str, np.ndarray]:
+    """`arrays_apart` without its process."""
+    try:
+        return reader(path)
+    except Exception as error:
+        raise ValueError(str(error)) from None

@@ -12,13 +12,14 @@ import pytest
 import scipy.io
 
 from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.face.importers import basel, basel_arrays
+from facerf_cli.face.importers import basel
 from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
+from facerf_cli.face.importers.find_landmarks import landmarks_of, rigid_alignment
 from facerf_cli.face.importers.resample import import_face_model, resample_model
-from facerf_cli.face.importers.source import SourceModel, landmarks_of, rigid_alignment
+from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
-from tests.face.importers.heads import Head, head, off_mm
+from tests.face.importers.heads import Head, arrays_here, head, off_mm
 
 h5py = pytest.importorskip("h5py")
 
@@ -34,15 +35,7 @@ def face() -> Head:
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Read in this process: starting another takes a second."""
-
-    def arrays(module: str, reader: str, path: Path) -> dict[str, np.ndarray]:
-        try:
-            found: dict[str, np.ndarray] = getattr(basel_arrays, reader)(path)
-            return found
-        except Exception as error:
-            raise ValueError(str(error)) from None
-
-    monkeypatch.setattr(basel, "arrays_apart", arrays)
+    monkeypatch.setattr(basel, "arrays_apart", arrays_here)
 
 
 def orthonormal(shapes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -157,9 +150,15 @@ def test_a_file_that_crashes_its_reader_is_refused_in_one_line(face: Head, tmp_p
     assert "\n" not in str(refused.value)
 
 
-def test_the_published_mesh_of_2009_has_its_landmarks() -> None:
-    mean = np.arange(53490 * 3).reshape(-1, 3)
-    known = basel._known_2009(mean)
+def test_the_published_mesh_of_2009_has_its_landmarks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    column = 1e6 * np.arange(53490 * 3, dtype=np.float64)[:, None]
+    corners = np.array([[1, 2, 3]])
+    arrays = {"mean": column, "basis": np.eye(len(column), 1), "deviations": np.ones((1, 1)), "tl": corners}
+    monkeypatch.setattr(basel, "arrays_apart", lambda *_: arrays)
+    (tmp_path / "a.mat").touch()
+    known = read_basel_2009(tmp_path / "a.mat").known
     assert len(known) == 18 and set(known) <= set(range(17, 68))
     assert known[30][0] == 3 * 8319 and known[54][0] == 3 * 11714
 
@@ -241,7 +240,7 @@ WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
         lambda m: {**m, "shapePC": np.zeros((9, 199))},
         r"shapePC has shape \[9, 199",
     ),
-    "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "shapeEV is a struct"),
+    "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "not a Basel"),
     "triangles beyond": (lambda m: {**m, "tl": m["tl"] + 1}, "does not have"),
     "not finite": (lambda m: {**m, "shapeMU": m["shapeMU"] * np.nan}, "not finite"),
     "millimetres": (lambda m: {**m, "shapeMU": m["shapeMU"] / 1000}, "the unit of its"),
@@ -277,7 +276,7 @@ WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
         {f"expression/model/{name}": None for name in ("mean", "pcaBasis", "pcaVariance")},
         "it lacks expression/model",
     ),
-    "text for numbers": ({"shape/model/mean": "text"}, "shape/model/mean is object"),
+    "text for numbers": ({"shape/model/mean": "text"}, "shape/model/mean is "),
     "a basis of another mesh": ({"shape/model/pcaBasis": np.zeros((9, 199))}, r"pcaBasis has shape \[9"),
     "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "not of unit length"),
     "variance below zero": ({"shape/model/pcaVariance": -np.ones(199)}, "pcaVariance is negative"),
@@ -306,7 +305,7 @@ def test_a_huge_claim_takes_no_room(tmp_path: Path, face: Head, shift: np.ndarra
     path = h5(tmp_path / "a.h5", face, shift, **{"shape/model/pcaBasis": None})
     with h5py.File(path, "a") as file:
         file.create_dataset("shape/model/pcaBasis", (10**9, 199), "f4", chunks=(1000, 199))
-    with pytest.raises(InputError, match="pcaBasis is float32 of shape"):
+    with pytest.raises(InputError, match="allocate"):
         read_basel_2017(path)
     (tmp_path / "b.h5").write_bytes(path.read_bytes()[:5000])
     with pytest.raises(InputError, match="not a Basel Face Model 2017"):

@@ -5,8 +5,9 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers.basel import _LANDMARKS_2017 as _LANDMARKS
+from facerf_cli.face.importers.find_landmarks import _correction, find_landmarks
 from facerf_cli.face.importers.ict import LANDMARK_IDS
-from facerf_cli.face.importers.source import SourceModel, _correction, find_landmarks
+from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.topology import LANDMARKS_M, MIRROR_68
 from tests.face.importers.heads import head
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers import ict as ict_module
+from facerf_cli.face.importers.find_landmarks import landmarks_of, rigid_alignment
 from facerf_cli.face.importers.ict import (
     ICT_FACEKIT,
     LANDMARK_IDS,
@@ -23,7 +24,7 @@ from facerf_cli.face.importers.ict import (
     ict_content_sha256,
 )
 from facerf_cli.face.importers.resample import import_face_model
-from facerf_cli.face.importers.source import SourceModel, landmarks_of, rigid_alignment
+from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model, save_face_model
 from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, landmark_weights
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 import trimesh
 
+from facerf_cli.face.importers.find_landmarks import nearest_on_mesh
 from facerf_cli.face.importers.resample import skin_uv
-from facerf_cli.face.importers.source import nearest_on_mesh
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.raster.camera import Camera
