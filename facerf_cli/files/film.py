@@ -30,16 +30,17 @@ _CLOCK = 90_000  # ticks a second, in which the times of frames are written
 
 
 @dataclass(frozen=True)
-class FilmFacts:
-    """A film's upright size, the times of its frames in seconds, in order, and the mean frame rate."""
+class Timing:
+    """Times of a film's frames in seconds, and the film whose sound it has."""
 
-    width: int
-    height: int
     times_s: tuple[Fraction, ...]
     rate: Fraction
+    sound: Path | None = None
 
-    def __len__(self) -> int:
-        return len(self.times_s)
+    @staticmethod
+    def steady(count: int, rate: Fraction) -> "Timing":
+        """Frames at a constant rate, without sound."""
+        return Timing(tuple(number / rate for number in range(count)), rate)
 
 
 def require_av(path: Path) -> Any:
@@ -81,11 +82,6 @@ class Film:
         """Close the file."""
         self._container.close()
 
-    @property
-    def has_sound(self) -> bool:
-        """True if the film has a sound track."""
-        return bool(self._container.streams.audio)
-
     def _presented(self) -> list[int]:
         """Time stamps of all frames in the order of presentation; packets are read, not decoded."""
         try:
@@ -102,16 +98,15 @@ class Film:
             raise InputError(f"{self._path}: has {len(pts)} frames; give a film of 1 to {_MOST_FRAMES}")
         return sorted(pts)
 
-    def facts(self) -> FilmFacts:
-        """Size, times and rate; decodes the first frame, which knows how the film is turned."""
-        height, width = self.read(0).shape[:2]
+    def timing(self) -> Timing:
+        """The times of the frames in order, the mean frame rate, and the film where it has sound."""
         base = Fraction(self._stream.time_base)
         times_s = tuple(pts * base for pts in self._pts)
         rate = Fraction(self._stream.average_rate or 0)
         if rate <= 0:
             length_s = times_s[-1] - times_s[0]
             rate = (len(times_s) - 1) / length_s if length_s else Fraction(24)
-        return FilmFacts(width, height, times_s, rate)
+        return Timing(times_s, rate, self._path if self._container.streams.audio else None)
 
     def read(self, number: int) -> np.ndarray:
         """Frame `number` [H, W, 3], upright, display-encoded R'G'B', uint8 or, of deeper films, uint16."""
@@ -154,10 +149,11 @@ class Film:
         return np.ascontiguousarray(np.rot90(values, round(frame.rotation / 90) % 4))
 
 
-def film_facts(path: Path) -> FilmFacts:
-    """Read the facts of a film."""
+def film_timing(path: Path) -> Timing:
+    """Read the timing of a film; its first frame is decoded, so that an HDR film is refused here."""
     with closing(Film(path)) as film:
-        return film.facts()
+        film.read(0)
+        return film.timing()
 
 
 def _reason(error: Exception) -> str:
@@ -191,20 +187,6 @@ _FORMS = {
         ("aac", "mp3", "ac3", "alac", "pcm_s16le", "pcm_s24le"),
     ),
 }
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Times of a film's frames in seconds, and the film whose sound it has."""
-
-    times_s: tuple[Fraction, ...]
-    rate: Fraction
-    sound: Path | None = None
-
-    @staticmethod
-    def steady(count: int, rate: Fraction) -> "Timing":
-        """Frames at a constant rate, without sound."""
-        return Timing(tuple(number / rate for number in range(count)), rate)
 
 
 def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
@@ -245,13 +227,6 @@ def comment_of(path: Path) -> str:
             return str(container.metadata.get("comment", ""))
     except (av.error.FFmpegError, OSError, ValueError):
         return ""
-
-
-def film_timing(path: Path) -> Timing:
-    """The times of a film's frames, with its sound."""
-    with closing(Film(path)) as film:
-        facts, has_sound = film.facts(), film.has_sound
-    return Timing(facts.times_s, facts.rate, path if has_sound else None)
 
 
 def _timed(images: Sequence[Path], timing: Timing) -> Iterator[tuple[int, int, Path]]:

@@ -88,8 +88,8 @@ def read_header(path: Path) -> Header | None:
     width, height = spec.full_width, spec.full_height
     if spec.get_int_attribute("Orientation", 1) >= 5:  # rotated by 90 degrees
         width, height = height, width
-    floating, bits = is_floating(spec), 8 * spec.format.size()
-    return Header(width, height, floating, bits, space_of_file(path, spec), metadata_of(spec))
+    space = stated_space(path, spec) or default_space(spec)
+    return Header(width, height, is_floating(spec), 8 * spec.format.size(), space, metadata_of(spec))
 
 
 def _spec_of(path: Path) -> oiio.ImageSpec | None:
@@ -130,24 +130,30 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
     return attributes
 
 
-def space_of_file(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
-    """Return the colour space that the file states; by default floats are linear Rec.709, integers sRGB."""
+def default_space(spec: oiio.ImageSpec) -> ColourSpace:
+    """Return the colour space of a file that states none: linear Rec.709 for floats, sRGB for integers."""
+    return LINEAR if is_floating(spec) else SRGB
+
+
+def stated_space(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
+    """Return the colour space that the file states; None where it says nothing."""
     if is_ultra_hdr(path, spec):
         return _space_of_ultra_hdr(path, spec)
-    default = LINEAR if is_floating(spec) else SRGB
+    default = default_space(spec)
     description = spec.get_string_attribute("ICCProfile:profile_description")
     profile = spec.getattribute("ICCProfile")
     if profile is not None or description:
         return _space_of_icc(path, b"" if profile is None else bytes(profile), description, default)
     name = spec.get_string_attribute("oiio:ColorSpace") or spec.get_string_attribute(OCIO_SPACE)
+    chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
     if name == "" and spec.get_string_attribute("dpx:Transfer") == "Printing density":
-        named: ColourSpace | None = CINEON
-    else:
-        named = default if name in _SAYS_NOTHING else find_space(name)
+        return CINEON
+    if name in _SAYS_NOTHING and not chromaticities:
+        return None
+    named = default if name in _SAYS_NOTHING else find_space(name)
     if named is None:
         log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
         named = default
-    chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
     if not chromaticities or not named.is_linear:
         return named
     by_primaries = linear_space(chromaticities)
@@ -201,13 +207,6 @@ def _jpeg_segments(content: bytes, start: int) -> Iterator[bytes]:
         length = int.from_bytes(content[at + 2 : at + 4], "big")
         yield content[at + 4 : at + 2 + length]
         at += 2 + max(length, 2)
-
-
-def states_space(spec: oiio.ImageSpec) -> bool:
-    """Return whether a file says anything about its colour space."""
-    names = (OCIO_SPACE, "ICCProfile", "ICCProfile:profile_description", "chromaticities")
-    says = spec.get_string_attribute("oiio:ColorSpace") not in _SAYS_NOTHING
-    return says or any(spec.getattribute(name) is not None for name in names)
 
 
 def is_floating(spec: oiio.ImageSpec) -> bool:

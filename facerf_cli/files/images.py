@@ -22,14 +22,14 @@ from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import (
     OCIO_SPACE,
     Attributes,
+    default_space,
     embed_xmp,
     is_floating,
     is_ultra_hdr,
     metadata_of,
     oiio_error,
     require_whole_png,
-    space_of_file,
-    states_space,
+    stated_space,
     utf8_path,
 )
 from facerf_cli.files.texts import require_regular
@@ -249,10 +249,10 @@ def _space(path: Path, colourspace: str | ColourSpace | None, spec: oiio.ImageSp
     """Return the space in which the caller wants a file read, or that the file states."""
     if colourspace:
         return named_space(colourspace) if isinstance(colourspace, str) else colourspace
-    found = space_of_file(path, spec)
-    if is_floating(spec) and not states_space(spec):
-        log.info("%s: does not say its colour space; read as %s", path, found.name)
-    return found
+    found, default = stated_space(path, spec), default_space(spec)
+    if found is None and is_floating(spec):
+        log.info("%s: does not say its colour space; read as %s", path, default.name)
+    return found or default
 
 
 def _finite(colour: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, int]:

@@ -8,7 +8,6 @@ by Gaussians of the distance of directions. Lights come from in front: the viewe
 
 import io
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
 
 _INFO = "info.json"
+_PLANES = 18  # of weights, a multiple of three
 _QUALITY = 95
 _BYTES, _ZERO = 255, 127  # of the basis: steps, and the byte of 0
 _SPACING = 0.5  # sigma of the Gaussians, as a share of the distance between lights
@@ -26,23 +26,15 @@ _CLIPPED = 0.1  # percent of a plane's weights beyond the range of its bytes, on
 _VALUES_AT_ONCE = 1 << 23
 
 
-@dataclass(frozen=True)
-class RelightWebSettings:
-    """Planes of weights, a multiple of three."""
-
-    planes: int = 18
-
-
 def write_relight_web(
     folder: Path,
     images: np.ndarray,
     directions: np.ndarray,
     metadata: dict[str, Any] | None = None,
-    settings: RelightWebSettings = RelightWebSettings(),
 ) -> None:
     """Write display images [L, H, W, 3] in 0..255 of lights from unit directions [L, 3] to a folder."""
     lights, height, width, _ = images.shape
-    planes = min(settings.planes, 3 * lights)
+    planes = min(_PLANES, 3 * lights)
     mean, components = _principal(images, planes)
     low, high = _ranges(images, mean, components)
     spread = np.maximum(high - low, 1e-6)

@@ -91,9 +91,9 @@ def collect_frames(
 
 
 def _of_film(item: Item, pattern: NamePattern | None) -> Shot:
-    from facerf_cli.files.film import film_facts
+    from facerf_cli.files.film import film_timing
 
-    count = len(film_facts(item.input_path).times_s)
+    count = len(film_timing(item.input_path).times_s)
     digits = max(_DIGITS, len(str(count - 1)))
     mirrored = item.mirrored or PurePosixPath(item.input_path.name)
     folder = item.output_base.parents[len(PurePosixPath(item.name).parts) - 1]

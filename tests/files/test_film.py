@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.film import Film, Timing, comment_of, film_facts, film_timing, write_film
+from facerf_cli.files.film import Film, Timing, comment_of, film_timing, write_film
 from facerf_cli.files.images import write_display
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
@@ -58,9 +58,9 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
     write_film(path, images, Timing.steady(5, Fraction(30000, 1001)), "Synthetic: a test")
     assert comment_of(path) == "Synthetic: a test"
     with closing(Film(path)) as film:
-        facts = film.facts()
-        assert (facts.width, facts.height, len(facts.times_s)) == (50, 36, 5)
-        assert facts.rate == pytest.approx(30000 / 1001, rel=1e-4)
+        timing = film.timing()
+        assert film.read(0).shape == (36, 50, 3) and len(timing.times_s) == 5 and timing.sound is None
+        assert timing.rate == pytest.approx(30000 / 1001, rel=1e-4)
         for number in (3, 0, 4, 1, 2, 2):  # in any order
             frame = film.read(number)
             assert frame.dtype == kind
@@ -72,15 +72,15 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
 def test_an_odd_size_is_made_even(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     write_film(path, images_of(tmp_path, (35, 49)), Timing.steady(5, Fraction(24)), "")
-    facts = film_facts(path)
-    assert (facts.width, facts.height) == (50, 36)
+    with closing(Film(path)) as film:
+        assert film.read(0).shape == (36, 50, 3)
 
 
 def test_times_of_a_film_with_an_uneven_rate_are_kept(tmp_path: Path) -> None:
     times_s = tuple(map(Fraction, ("0", "1/30", "1/10", "1/5", "1/2")))
     path = tmp_path / "film.mp4"
     write_film(path, images_of(tmp_path), Timing(times_s, Fraction(20)), "")
-    assert [float(time_s) for time_s in film_facts(path).times_s] == pytest.approx(list(map(float, times_s)))
+    assert [float(time_s) for time_s in film_timing(path).times_s] == pytest.approx(list(map(float, times_s)))
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_film_that_cannot_be_finished_is_not_there(tmp_path: Path) -> None:
 def test_what_is_no_film_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("no film at all\n" * 50)
     with pytest.raises(InputError, match=r"text\.mp4: not a readable film"):
-        film_facts(tmp_path / "text.mp4")
+        film_timing(tmp_path / "text.mp4")
     with av.open(str(tmp_path / "tone.mp4"), "w") as container:
         tone = container.add_stream("aac", rate=48000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
@@ -127,7 +127,7 @@ def test_what_is_no_film_is_said_in_one_line(tmp_path: Path) -> None:
         container.mux(tone.encode(frame))
         container.mux(tone.encode(None))
     with pytest.raises(InputError, match=r"tone\.mp4: holds no pictures"):
-        film_facts(tmp_path / "tone.mp4")
+        film_timing(tmp_path / "tone.mp4")
     assert comment_of(tmp_path / "text.mp4") == ""
 
 
@@ -141,10 +141,10 @@ def test_a_film_in_hdr_is_refused(tmp_path: Path) -> None:
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     with pytest.raises(InputError, match="is an HDR film"):
-        film_facts(path)
+        film_timing(path)
 
 
 def test_without_av_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UsageError, match=r"pip install 'facerf\[video\]'"):
-        film_facts(tmp_path / "a.mp4")
+        film_timing(tmp_path / "a.mp4")

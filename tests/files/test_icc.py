@@ -4,7 +4,6 @@ import io
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from PIL import Image, ImageCms
 
@@ -130,9 +129,3 @@ def test_the_profile_of_a_linear_space(space: colour.ColourSpace) -> None:
         ramp = np.arange(0, 256, 5, np.uint8)[None, :, None].repeat(3, -1)
         encoded = 255 * colour.linear_to_srgb(ramp / np.float32(255))
         assert np.abs(by_littlecms(ramp, made) - encoded).max() < 1
-
-
-def test_openimageio_hands_the_profile_over(tmp_path: Path) -> None:
-    Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=icc_profiles.DISPLAY_P3)
-    found = oiio.ImageBuf(str(tmp_path / "a.png")).spec().getattribute("ICCProfile")
-    assert bytes(found) == icc_profiles.DISPLAY_P3

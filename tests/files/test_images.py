@@ -10,7 +10,7 @@ import pytest
 import tifffile
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.image_metadata import read_header, space_of_file
+from facerf_cli.files.image_metadata import read_header, stated_space
 from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr, write_tiff
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image import colour
@@ -143,13 +143,6 @@ def test_a_deep_exr_is_refused(tmp_path: Path) -> None:
         read_olats(path)
 
 
-def test_orientation_6_turns_the_first_row_to_the_right_edge(tmp_path: Path) -> None:
-    values = np.zeros((4, 6, 3), np.float32)
-    values[0, :, 0] = 1
-    turned = read_image(save(tmp_path / "a.png", values, "uint8", Orientation=6)).pixels
-    assert turned.shape == (6, 4, 3) and turned[:, 3, 0].min() == 1 and turned[:, :3].max() == 0
-
-
 def test_chromaticities_of_an_exr(tmp_path: Path) -> None:
     rgb = VALUES[..., :3]
     path = save(tmp_path / "a.exr", rgb, chromaticities=colour.ACESCG.chromaticities)
@@ -171,9 +164,9 @@ def test_colour_space_that_an_exr_names(tmp_path: Path, name: str, space: colour
 def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
     spec = oiio.ImageSpec(4, 4, 3, "uint8")
     spec.attribute("ICCProfile:profile_description", "Display P3")
-    assert space_of_file(tmp_path, spec) is colour.DISPLAY_P3
+    assert stated_space(tmp_path, spec) is colour.DISPLAY_P3
     spec.attribute("ICCProfile:profile_description", "Scanner 7")
-    assert space_of_file(tmp_path, spec) is colour.SRGB
+    assert stated_space(tmp_path, spec) is colour.SRGB
     assert "the embedded profile 'Scanner 7' is not understood; taken for sRGB" in warned.text
 
 
