@@ -314,7 +314,7 @@ DOORS: dict[str, Door] = {
     "fits": Door(samples.fits, _fit, _FITS, 2),
     "npy images": Door(_npy_pixels, _array, (mutations.npy, mutations.bytes_), 1),
     "face models": Door(samples.face_models, _face_model, _FITS, 0.1),
-    "FLAME": Door(samples.flame, _flame, (mutations.bytes_, mutations.bytes_, mutations.zip_), 2),
+    "FLAME": Door(samples.flame, _flame, (mutations.bytes_, mutations.bytes_, mutations.zip_), 0.2),
     "Basel 2009": Door(samples.basel_2009, _basel_2009, weight=0.02),
     "Basel 2017": Door(samples.basel_2017, _basel_2017, weight=0.02),
     "ICT-FaceKit": Door(samples.ict, _ict, (mutations.zip_, mutations.bytes_), 0.2),

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -295,7 +296,7 @@ def _results(
     memory.collect_as_usual()
     workers = options.workers(settings)
     at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
-    work = _Work(process, indexed, settings.job_bytes(at_once))
+    work = partial(_run_one, process, indexed, settings.job_bytes(at_once))
     try:
         with closing(spread(work, todo, workers, _broken)) as results:
             for result in _with_progress(results, len(todo), verb, settings):
@@ -341,39 +342,32 @@ def sums_up(
     return not left
 
 
-@dataclass(frozen=True)
-class _Work:
-    """Runs `process` on an item and returns an `ItemResult`, whatever happens."""
+def _run_one(process: Callable[[Item], Outcome], indexed: bool, memory_bytes: int, item: Item) -> ItemResult:
+    """Run `process` on an item and return an `ItemResult`, whatever happens."""
+    start_s = time.perf_counter()
+    memory.set_limit(memory_bytes)
 
-    process: Callable[[Item], Outcome]
-    indexed: bool
-    memory_bytes: int
+    def result(**ends: Any) -> ItemResult:
+        return ItemResult(item, round(time.perf_counter() - start_s, 3), **ends)
 
-    def __call__(self, item: Item) -> ItemResult:
-        start_s = time.perf_counter()
-        memory.set_limit(self.memory_bytes)
-
-        def result(**ends: Any) -> ItemResult:
-            return ItemResult(item, round(time.perf_counter() - start_s, 3), **ends)
-
-        try:
-            can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
-            read = read_row(item.input_path) if self.indexed and can_be_read else None
-            if item.is_file:
-                require_regular(item.input_path)
-            with all_or_none() if item.is_file else nullcontext():
-                outcome = self.process(item)
-            made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
-            return result(outcome=outcome, made=made)
-        except InputError as error:
-            return result(error=str(error), trace=traceback.format_exc())
-        except FacerfError as error:
-            return result(stops_the_run=error)
-        except Exception as error:  # a bug must not cost the other items
-            return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
-        finally:
-            memory.give_back()
-            end_again()
+    try:
+        can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
+        read = read_row(item.input_path) if indexed and can_be_read else None
+        if item.is_file:
+            require_regular(item.input_path)
+        with all_or_none() if item.is_file else nullcontext():
+            outcome = process(item)
+        made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
+        return result(outcome=outcome, made=made)
+    except InputError as error:
+        return result(error=str(error), trace=traceback.format_exc())
+    except FacerfError as error:
+        return result(stops_the_run=error)
+    except Exception as error:  # a bug must not cost the other items
+        return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
+    finally:
+        memory.give_back()
+        end_again()
 
 
 def _broken(item: Item, error: Exception) -> ItemResult:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import Outcome, _Work
+from facerf_cli.batch.run import Outcome, _run_one
 from facerf_cli.batch.settings import Settings
 from facerf_cli.main import global_options_first, main
 from facerf_cli.run import memory
@@ -34,8 +34,8 @@ def test_jobs_have_a_share_each_unless_one_is_given(monkeypatch: pytest.MonkeyPa
     assert Settings().job_bytes(4) == memory.default_limit(4)
     assert Settings(memory_bytes=7).job_bytes(4) == 7
     seen = []
-    work = _Work(lambda item: seen.append(memory.limit_bytes()), False, 12345)  # type: ignore[arg-type]
-    work(Item(Path("a"), Path("a"), "a"))
+    item = Item(Path("a"), Path("a"), "a")
+    _run_one(lambda item: seen.append(memory.limit_bytes()), False, 12345, item)  # type: ignore[arg-type]
     assert seen == [12345]
 
 
@@ -43,7 +43,7 @@ def test_an_item_gives_its_memory_back_however_it_ends(monkeypatch: pytest.Monke
     given: list[str] = []
     monkeypatch.setattr(memory, "give_back", lambda: given.append("back"))
     for process in (lambda item: Outcome([]), lambda item: 1 / 0):
-        _Work(process, False, 1 << 30)(Item(Path("a"), Path("a"), "a"))
+        _run_one(process, False, 1 << 30, Item(Path("a"), Path("a"), "a"))
     assert given == ["back", "back"]
 
 

@@ -34,7 +34,8 @@ def greedy(path: Path) -> dict[str, np.ndarray]:
 
 
 def endless_output(path: Path) -> dict[str, np.ndarray]:
-    return {str(number): np.zeros(1 << 29, np.uint8) for number in range(5)}
+    os.ftruncate(1, 3 << 30)
+    return {}
 
 
 def pickled(path: Path) -> dict[str, np.ndarray]:
