@@ -207,10 +207,12 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
     lock = FileLock(path)
     _acquire(lock, path)
     try:
-        path.write_text(str(os.getpid()))
+        with suppress(PermissionError):  # Windows keeps a locked file shut
+            path.write_text(str(os.getpid()))
         yield
     finally:
-        path.unlink(missing_ok=True)  # first: who waits for it sees that it is another file
+        with suppress(PermissionError):
+            path.unlink(missing_ok=True)  # first: who waits for it sees that it is another file
         lock.release()
         with suppress(OSError):
             for empty in created:
@@ -221,6 +223,7 @@ def _acquire(lock: "FileLock", path: Path) -> None:
     """Wait for a lock; its folder is made again where the last owner has removed it."""
     from filelock import Timeout
 
+    wait = "%s: another facerf (process %s) writes there; waiting for it (--jobs and --shard share work)"
     waits = False
     while not lock.is_locked:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -229,7 +232,12 @@ def _acquire(lock: "FileLock", path: Path) -> None:
         except FileNotFoundError:
             pass
         except Timeout:
+            log.warning(wait, path.parent, _owner(path))
             waits = True
-            owner = printable_line(path.read_text(errors="replace")[:20]) if path.is_file() else ""
-            said = "%s: another facerf (process %s) writes there; waiting (--jobs and --shard share work)"
-            log.warning(said, path.parent, owner)
+
+
+def _owner(path: Path) -> str:
+    """The process that wrote a lock."""
+    with suppress(OSError):  # it has just ended
+        return printable_line(path.read_text(errors="replace")[:20])
+    return "unknown"
