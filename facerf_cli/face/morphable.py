@@ -220,7 +220,10 @@ def read_npz(path: Path, most_bytes: int = _MAX_BYTES) -> dict[str, np.ndarray]:
     try:
         _require_size(path, most_bytes)
         with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+            arrays = dict(file)
+        if not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("it holds a file that is not an array")
+        return arrays
     except Exception as error:  # whatever damage makes zipfile and numpy raise
         raise ValueError(one_line(str(error))) from None
 
