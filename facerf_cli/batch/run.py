@@ -255,9 +255,8 @@ def run_items(
         if options.dry_run:
             _log_made_again(again)
             return _list_what_would_be_done(todo, finished, outputs_of)
-        report = open_report(
-            options.output / f"report{options.shard.suffix}.jsonl", verb, todo, finished, outputs_of
-        )
+        report = options.output / f"report{options.shard.suffix}.jsonl"
+        open_report(report, verb, todo, finished, outputs_of)
         if index and (todo or index.has_news):
             index.open()
         if finished:
