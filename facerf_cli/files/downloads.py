@@ -8,12 +8,10 @@ import logging
 import os
 import ssl
 import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import IO, Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import unquote, urlsplit
 
@@ -140,11 +138,12 @@ def _one_connection(published: PublishedFile, part: Path) -> bool:
         length = response.headers.get("Content-Length", "")
         total = begin + int(length) if length.isdecimal() else None
         _refuse_beyond(published, total or 0)
-        with part.open("ab" if begin else "wb") as file, _progress(published.name, begin, total) as advance:
+        with part.open("ab" if begin else "wb") as file, progress_bar(DownloadColumn()) as progress:
+            task = progress.add_task(published.name, total=total, completed=begin)
             while block := response.read1(_BLOCK):
                 _refuse_beyond(published, file.tell() + len(block))
                 file.write(block)
-                advance(len(block))
+                progress.advance(task, len(block))
             return total is None or file.tell() >= total
 
 
@@ -153,43 +152,27 @@ def _refuse_beyond(published: PublishedFile, size: int) -> None:
         raise _Refused(f"larger than the published file can be ({published.size_limit / 2**20:.0f} MiB)")
 
 
-class _GuardedRedirects(urllib.request.HTTPRedirectHandler):
-    """Refuse a redirection to an address that `_check_address` refuses."""
-
-    def redirect_request(
-        self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: Any, newurl: str
-    ) -> urllib.request.Request | None:
-        _check_address(newurl)
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
-
-
 def _open(url: str, begin: int) -> http.client.HTTPResponse:
     headers = {"User-Agent": f"facerf/{__version__}"} | ({"Range": f"bytes={begin}-"} if begin else {})
-    handlers: list[urllib.request.BaseHandler] = [_GuardedRedirects()]
-    if _check_address(url) in _THIS_MACHINE:
-        handlers.append(urllib.request.ProxyHandler({}))  # this machine is reached without a proxy
-    opener = urllib.request.build_opener(*handlers)
-    response: http.client.HTTPResponse = opener.open(
-        urllib.request.Request(url, headers=headers), None, TIMEOUT_S
-    )
+    request = urllib.request.Request(url, headers=headers)
+    response: http.client.HTTPResponse = opener_of(url).open(request, None, TIMEOUT_S)
     return response
 
 
-def _check_address(url: str) -> str:
-    """Return the host of an allowed address; refuse any other."""
-    parts = urlsplit(url)
-    host = parts.hostname or ""
-    if not (parts.scheme == "https" or (parts.scheme == "http" and host in _THIS_MACHINE)):
-        raise _Refused(f"the address {parts.scheme}://{host} is not https; only https is allowed")
-    return host
-
-
-@contextmanager
-def _progress(name: str, begin: int, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar if stderr is a terminal; yield a function that advances it by bytes."""
-    with progress_bar(DownloadColumn()) as progress:
-        task = progress.add_task(name, total=total, completed=begin)
-        yield lambda count: progress.advance(task, count)
+def opener_of(url: str) -> urllib.request.OpenerDirector:
+    """Return an opener of https alone, redirections too; on this machine of http, without a proxy."""
+    here = urlsplit(url).hostname in _THIS_MACHINE
+    opener = urllib.request.OpenerDirector()
+    for handler in (
+        urllib.request.HTTPHandler if here else urllib.request.ProxyHandler,
+        urllib.request.HTTPSHandler,
+        urllib.request.HTTPRedirectHandler,
+        urllib.request.HTTPDefaultErrorHandler,
+        urllib.request.HTTPErrorProcessor,
+        urllib.request.UnknownHandler,
+    ):
+        opener.add_handler(handler())
+    return opener
 
 
 def _is_whole(published: PublishedFile, path: Path) -> bool:

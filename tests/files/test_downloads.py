@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.error import URLError
 
 import pytest
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.files import downloads
-from facerf_cli.files.downloads import PublishedFile, fetch
+from facerf_cli.files.downloads import PublishedFile, fetch, opener_of
 
 CONTENT = bytes(range(256)) * 2000
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -174,10 +175,12 @@ def test_a_silent_server_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("url", ["http://example.org/a.pth", "file:///etc/passwd", "ftp://example.org/a.pth"])
 def test_only_https_is_fetched_from(server: Server, tmp_path: Path, url: str) -> None:
-    with pytest.raises(FacerfError, match="only https"):
+    with pytest.raises(FacerfError, match="unknown url type"):
         fetch(PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
-    server.location = url
-    with pytest.raises(FacerfError, match=r"only https|not allowed"):
+    with pytest.raises(URLError, match="unknown url type"):  # as after a redirection
+        opener_of("https://example.org/a.pth").open(url)
+    server.location = url.replace("http:", "gopher:")
+    with pytest.raises(FacerfError, match=r"unknown url type|not allowed"):
         fetch(server.published(), OPTION, tmp_path)
 
 
