@@ -1,10 +1,9 @@
 """Atomic writes, and one run at a time in an output folder.
 
-An output is written into a hidden folder next to it, made durable, and renamed.
-The hidden folder belongs to this process alone: its name is random and `mkdir` refuses a name that exists, so
-no link that another user has put there is followed. A power cut leaves the old output or the new one: the
-data is on the disk before the rename, and the rename before the next step (Pillai et al., 'All File Systems
-Are Not Created Equal', OSDI 2014).
+An output is written into a hidden folder next to it, made durable, and renamed. The hidden folder belongs to
+this process alone, and no link that another user has put there is followed (`tempfile.mkdtemp`). A power cut
+leaves the old output or the new one: the data is on the disk before the rename, and the rename before the
+next step (Pillai et al., 'All File Systems Are Not Created Equal', OSDI 2014).
 
 A run holds the lock of its output folder; the next one waits, and then finds what the first has made. The
 lock ends with its process, however that ends.
@@ -16,8 +15,8 @@ import hashlib
 import logging
 import os
 import platform
-import secrets
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -70,12 +69,12 @@ def atomic_path(path: Path) -> Iterator[Path]:
 @contextmanager
 def hidden_folder(path: Path) -> Iterator[Path]:
     """Yield a hidden folder next to an output, of this process alone, which goes with the block."""
-    room = path.with_name(_room_name(path.stem))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep_once(path.parent)
+    start = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-"
+    room = Path(tempfile.mkdtemp(prefix=start, dir=path.parent))
+    _open.add(room)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep_once(path.parent)
-        room.mkdir(mode=0o700)
-        _open.add(room)
         yield room
     finally:
         shutil.rmtree(room, ignore_errors=True)
@@ -115,10 +114,6 @@ clean_by(_remove_own)
 atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
 
 
-def _room_name(stem: str) -> str:
-    return f".{stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(8)}"
-
-
 @cache
 def _machine() -> str:
     """An id of this machine, since machines that share a folder may use the same process ids."""
@@ -135,7 +130,7 @@ def _sweep_once(folder: Path) -> None:
 
 def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
     machine, _, rest = leftover.name.rpartition(_MARK)[2].partition("-")
-    owner = rest.partition("-")[0].partition(".")[0]
+    owner = rest.partition("-")[0]
     if len(machine) != len(_machine()) or not owner.isdecimal():
         return False
     if machine == _machine():
