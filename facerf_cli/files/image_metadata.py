@@ -9,7 +9,7 @@ import os
 import shutil
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +43,6 @@ _HEIF_LIMIT_PX = 100_000_000  # of a photo that is decoded for its header alone
 OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
 _SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
-_GAIN_MAP_NAMES = (b"urn:iso:std:iso:ts:21496:-1", b"hdr-gain-map")  # ISO's metadata, or Adobe's XMP
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
 _JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
 _XMP_NAMESPACES = {
@@ -185,28 +184,21 @@ def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
 def _space_of_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     """Return the linear space of a JPEG with a gain map, with the primaries of the map, else of the image."""
     stored = spec.getattribute("ICCProfile")
-    profile = _gain_map_profile(path.read_bytes()) or (b"" if stored is None else bytes(stored))
+    profile = _gain_map_profile(path) or (b"" if stored is None else bytes(stored))
     space = space_of_profile(profile, "") or SRGB
     return (space.chromaticities and linear_space(space.chromaticities)) or LINEAR
 
 
-def _gain_map_profile(content: bytes) -> bytes:
-    """Return the ICC profile of the gain map (ISO 21496-1), a JPEG after the first one; empty without one."""
-    start = 0
-    while (start := content.find(_JPEG_START + b"\xff", start + 1)) > 0:
-        segments = list(_jpeg_segments(content, start))
-        if any(name in segment for segment in segments for name in _GAIN_MAP_NAMES):
-            return b"".join(part[14:] for part in segments if part.startswith(b"ICC_PROFILE\0"))
-    return b""
+def _gain_map_profile(path: Path) -> bytes:
+    """Return the ICC profile of the gain map (ISO 21496-1), the file's second image; empty without one."""
+    from PIL import Image  # few files need it
 
-
-def _jpeg_segments(content: bytes, start: int) -> Iterator[bytes]:
-    """Yield the segments of a JPEG's header, without their markers."""
-    at = start + len(_JPEG_START)
-    while content[at : at + 1] == b"\xff" and content[at + 1 : at + 2] not in (b"\xda", b"\xd9", b""):
-        length = int.from_bytes(content[at + 2 : at + 4], "big")
-        yield content[at + 4 : at + 2 + length]
-        at += 2 + max(length, 2)
+    try:
+        with Image.open(path, formats=["JPEG"]) as image:
+            image.seek(1)
+            return bytes(image.info.get("icc_profile", b""))
+    except Exception:  # whatever damage makes Pillow raise
+        return b""
 
 
 def is_floating(spec: oiio.ImageSpec) -> bool:
