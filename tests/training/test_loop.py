@@ -100,46 +100,62 @@ def test_an_interrupted_run_goes_on_to_the_last_digit(tmp_path: Path, whole: Pat
     assert_same_run(tmp_path, whole)
 
 
-@pytest.mark.parametrize("moment", ["save", "state", "begin"])
-def test_a_killed_run_goes_on_to_the_last_digit(
-    tmp_path: Path, whole: Path, moment: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Killed between the log and the state, while the state is written, before there was any state."""
-    body = f"""
-import os, signal, sys, torch
+MOMENTS = ("save", "state", "begin")
+KILLED = """
+import multiprocessing, os, signal, sys, torch
 sys.modules["tensorboard"] = None
 from facerf_cli.training import loop as training
-from facerf_cli.training import run_folder
-from tests.training.test_loop import TINY, toy_objective
+from tests.training.test_loop import MOMENTS, TINY, toy_objective
 from pathlib import Path
-calls = 0
+
 def dies(function, at):
+    calls = 0
     def wrapped(*arguments, **named):
-        global calls
+        nonlocal calls
         calls += 1
         if calls == at:
             os.kill(os.getpid(), signal.SIGKILL)
         return function(*arguments, **named)
     return wrapped
-moment = {moment!r}
-if moment == "save":
-    training.save_state = dies(training.save_state, 2)
-elif moment == "state":
-    def torn(content, path, save=torch.save):
-        save(content, path)
-        os.truncate(path, 1000)
-        dies(lambda: None, 2)()
-        save(content, path)
-    torch.save = torn
-else:
-    training.save_networks = dies(training.save_networks, 1)
-training.train(toy_objective(), Path({str(tmp_path)!r}), TINY)
+
+def run(moment, folder):
+    if moment == "save":
+        training.save_state = dies(training.save_state, 2)
+    elif moment == "state":
+        end = dies(lambda: None, 2)
+        def torn(content, path, save=torch.save):
+            save(content, path)
+            os.truncate(path, 1000)
+            end()
+            save(content, path)
+        torch.save = torn
+    else:
+        training.save_networks = dies(training.save_networks, 1)
+    training.train(toy_objective(), Path(folder), TINY)
+
+for moment in MOMENTS:
+    child = multiprocessing.get_context("fork").Process(target=run, args=(moment, sys.argv[1] + "/" + moment))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL, moment
 """
-    done = subprocess.run([sys.executable, "-c", body], cwd=Path(__file__).parents[2], capture_output=True)
-    assert done.returncode == -signal.SIGKILL, done.stderr.decode()
-    train(toy_objective(), tmp_path, TINY, resume=True)
-    assert_same_run(tmp_path, whole)
-    assert not list(tmp_path.glob(".*part*"))
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Runs killed between the log and the state, while the state is written, before there was any state."""
+    folder = tmp_path_factory.mktemp("killed")
+    command = [sys.executable, "-c", KILLED, str(folder)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True)
+    assert done.returncode == 0, done.stderr.decode()
+    return folder
+
+
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_killed_run_goes_on_to_the_last_digit(killed: Path, whole: Path, moment: str) -> None:
+    train(toy_objective(), killed / moment, TINY, resume=True)
+    assert_same_run(killed / moment, whole)
+    assert not list((killed / moment).glob(".*part*"))
 
 
 def test_more_steps_go_on_from_a_finished_run(tmp_path: Path) -> None:
@@ -220,19 +236,28 @@ def first_draws(count: int) -> list[Any]:
     return [next(draws) for _ in range(count)]
 
 
-def _one_of_two(rank: int, folder: Path, port: int, settings: TrainSettings) -> None:
-    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    os.environ |= {"WORLD_SIZE": "2", "RANK": str(rank), "LOCAL_RANK": str(rank)}
+def _one_of_two(rank: int, folder: Path, settings: TrainSettings) -> None:
+    os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     torch.set_num_threads(1)
     with joined_processes():
         train(toy_objective(), folder, settings)
 
 
-def test_two_processes_learn_what_one_does(tmp_path: Path) -> None:
+def test_two_processes_learn_what_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Not AdamW, which makes steps of the rounding where a gradient is nothing else.
     settings = replace(TINY, batch=4, steps=10, optimizer=Adadelta(learning_rate=2.0))
     train(toy_objective(), tmp_path / "one", settings)
-    mp.spawn(_one_of_two, (tmp_path / "two", _free_port(), settings), nprocs=2)
+    for name, value in (("MASTER_ADDR", "127.0.0.1"), ("MASTER_PORT", _free_port()), ("WORLD_SIZE", 2)):
+        monkeypatch.setenv(name, str(value))
+    other = mp.get_context("spawn").Process(target=_one_of_two, args=(1, tmp_path / "two", settings))
+    other.start()
+    threads = torch.get_num_threads()
+    for name in ("RANK", "LOCAL_RANK"):
+        monkeypatch.setenv(name, "0")  # taken back afterwards
+    _one_of_two(0, tmp_path / "two", settings)
+    torch.set_num_threads(threads)
+    other.join()
+    assert other.exitcode == 0
     assert losses_of(tmp_path / "two") == pytest.approx(losses_of(tmp_path / "one"), rel=1e-5)
     assert losses_of(tmp_path / "two")[-1] < 0.9 * losses_of(tmp_path / "two")[0]
     one, two = (state_of(tmp_path / name)["networks"] for name in ("one", "two"))
