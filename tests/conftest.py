@@ -1,5 +1,6 @@
 """What tests share. The data of `../shared` is not in the repository; tests that need it skip without it."""
 
+import multiprocessing
 import os
 import signal
 import tarfile
@@ -28,6 +29,22 @@ from tests.once import outside_training, remembered
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "shared"))
+
+# Files that take 10 s or more, the longest first: where they come first, both processes end together.
+LONG = """
+cli/test_train.py cli/test_film.py cli/test_prepare_dataset.py cli/test_relight.py
+cli/test_output_options.py viewer/test_viewer_agreement.py cli/test_evaluate_protocols.py
+test_ray_workers.py portrait/test_find.py cli/test_prepare_checks.py test_stopping.py
+cli/test_predict_olat.py test_python_api.py cli/test_synth_stage.py cli/test_estimate_light.py
+training/test_loop.py tools/test_builtin_face.py cli/test_evaluate_yale_b.py cli/test_relight_dataset.py
+cli/test_shards_sum_up.py test_foreign_modules.py test_distribution.py test_near_lights.py
+synth/test_path_tracer.py synth/head/test_hair.py test_portrait_field.py
+"""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    places = {Path(__file__).parent / name: place for place, name in enumerate(LONG.split())}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
 
 
 @pytest.hookimpl(wrapper=True)
@@ -74,7 +91,7 @@ def _the_same_photo_costs_once() -> None:
     """Steps of the method give what they gave to the same input: most tests show one photo."""
     for kind in (ParsingNetwork, PortraitNetwork):
         kind.forward = remembered(kind.forward, applies=outside_training)
-    StoredGraph.forward = remembered(StoredGraph.forward)
+    StoredGraph.forward = remembered(StoredGraph.forward, most=200)
     head.unwrap = remembered(head.unwrap)
     pipeline.own_light = remembered(
         pipeline.own_light,
@@ -87,6 +104,19 @@ def _the_same_photo_costs_once() -> None:
 def _the_command_line_is_built_once() -> None:
     """Otherwise each call of `main` builds all verbs."""
     typer.main.get_command = cache(typer.main.get_command)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _processes_have_torch() -> None:
+    """Processes of `--jobs` are forked from one that has imported it: each spawned one would import it again.
+
+    What goes to them is pickled either way.
+    """
+    context_of = multiprocessing.get_context
+    multiprocessing.set_forkserver_preload(["torch", "scipy.spatial", "trimesh", "OpenImageIO"])
+    multiprocessing.get_context = lambda method=None: context_of(
+        "forkserver" if method == "spawn" else method
+    )
 
 
 @pytest.fixture(autouse=True)

@@ -1,37 +1,51 @@
 """The notebook of the examples runs from top to bottom, and is kept without outputs."""
 
-import base64
+import contextlib
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import nbformat
 import numpy as np
 import pytest
-from nbclient import NotebookClient
 from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOK = ROOT / "examples/facerf.ipynb"
 
 
+@dataclass(frozen=True)
+class Run:
+    """What the cells show, images [H, W, C] of 0 to 255, and what they print."""
+
+    images: list[np.ndarray]
+    text: str
+
+
+def cells() -> list[Any]:
+    return [cell for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
+
+
 @pytest.fixture(scope="module")
-def run() -> Any:
-    """The notebook after a run of all cells, in a kernel that starts at the root."""
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    client = NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(ROOT)}})
-    return client.execute()
+def run() -> Run:
+    """A run of all cells from the root, in this process."""
+    images: list[np.ndarray] = []
+
+    def show(image: Any) -> None:
+        images.append(np.asarray(Image.open(io.BytesIO(image.data)), np.float32))
+
+    names: dict[str, Any] = {}
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as said:
+        patch.chdir(ROOT)
+        patch.setattr("IPython.display.display", show)
+        for cell in cells():
+            exec(compile(cell.source, NOTEBOOK.name, "exec"), names)
+    return Run(images, said.getvalue())
 
 
-def images(notebook: Any) -> list[np.ndarray]:
-    """What the cells show [H, W, C], 0 to 255."""
-    shown = [output.data["image/png"] for cell in notebook.cells for output in cell.get("outputs", [])
-             if output.output_type == "display_data"]  # fmt: skip
-    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(image))), np.float32) for image in shown]
-
-
-def test_it_shows_what_it_says(run: Any) -> None:
-    photo, lamps, envmap, turns, own_map, own, person = images(run)
+def test_it_shows_what_it_says(run: Run) -> None:
+    photo, lamps, envmap, turns, own_map, own, person = run.images
     assert all(image[..., :3].std() > 5 for image in (photo, lamps, envmap, turns, own_map, own, person))
     face = np.s_[60:180, 170:280]
     left, right = np.split(lamps[:, : photo.shape[1]][face].mean(-1), 2, 1)
@@ -41,14 +55,8 @@ def test_it_shows_what_it_says(run: Any) -> None:
     assert person.shape[-1] == 4 and 0.1 < (person[..., 3] > 128).mean() < 0.9
     assert envmap.shape[1] == 2 * envmap.shape[0]
 
-
-def test_the_light_that_it_prints(run: Any) -> None:
-    text = "".join(
-        output.text for cell in run.cells for output in cell.get("outputs", []) if "text" in output
-    )
-    assert "brightest from azimuth" in text and "Traceback" not in text
+    assert "brightest from azimuth" in run.text
 
 
 def test_it_is_kept_without_outputs() -> None:
-    cells = [cell for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
-    assert not any(cell.outputs or cell.execution_count for cell in cells)
+    assert not any(cell.outputs or cell.execution_count for cell in cells())

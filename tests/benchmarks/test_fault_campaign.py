@@ -3,8 +3,8 @@
 import contextlib
 import io
 import re
+import runpy
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -80,7 +80,10 @@ def test_a_seed_says_the_case() -> None:
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_script_has_help(script: str) -> None:
-    command = [sys.executable, "-m", f"benchmarks.faults.{script}", "--help"]
-    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    assert f"benchmarks.faults.{script}" in said
+def test_a_script_has_help(
+    script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [script, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(f"benchmarks.faults.{script}", run_name="__main__")
+    assert ended.value.code in (0, None) and f"benchmarks.faults.{script}" in capsys.readouterr().out

@@ -26,7 +26,9 @@ def backgrounds() -> Tensor:
 def portraits(tmp_path_factory: pytest.TempPathFactory) -> DatasetPortraits:
     folder = tmp_path_factory.mktemp("dataset")
     write_small_dataset(folder, (2, 1, 0), 1, lights=14, crop_px=192, lacking={"0001": range(LACKS)})
-    return open_dataset_portraits(folder, backgrounds(), SHIPPED_NETWORKS, 1)
+    with pytest.MonkeyPatch.context() as patch:  # another test has processes
+        patch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))
+        return open_dataset_portraits(folder, backgrounds(), SHIPPED_NETWORKS, 1)
 
 
 def drawn(portraits: DatasetPortraits, person: int, seed: int = 1) -> PortraitSample:
