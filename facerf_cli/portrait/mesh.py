@@ -7,26 +7,21 @@ finds a mesh (Grishchenko et al., *Attention Mesh*, 2020), twice; it also says i
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from safetensors.numpy import load_file
 
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.parse import Square, whole_photo
 
-LANDMARK_ASSET = Path(__file__).parents[1] / "assets" / "landmark_weights.safetensors"
 _MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
 _MESH_PX = 192
 _OVERLAP = 1.5  # how many parts along a side cover the photo, over those that just would
 _LEAST_MESH_SCORE, _LEAST_PX = 0.5, 8.0  # of a face; noise has smaller ones
 _SAME = 0.5  # distance of the middles of two boxes below which they hold one face, in sides of the larger
-MESH_POINTS = 468  # of a mesh without irises
-OUTER_CORNERS = (33, 263)  # of the eyes, the picture's left one first
-# Points that are commonly taken for the 68 landmarks (Multi-PIE order); `landmark_weights` are better.
-COMMON_68 = np.array(
+_EYES = (33, 263)  # outer corners, the picture's left one first
+# MediaPipe's 468 points that stand for the 68 landmarks (Multi-PIE order).
+_OF_68 = np.array(
     [
         *(127, 234, 93, 132, 58, 136, 150, 176, 152, 400, 379, 365, 288, 361, 323, 454, 356),  # jaw
         *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),  # brows
@@ -72,15 +67,8 @@ class FaceMesh:
 
     @property
     def landmarks_px(self) -> np.ndarray:
-        """The 68 landmarks [68, 2], where the face model has them."""
-        return landmark_weights() @ self.points_px[:MESH_POINTS, :2]
-
-
-@cache
-def landmark_weights() -> np.ndarray:
-    """Weights [68, P] of the mesh's points in each landmark, of sum 1 (tools/landmark_weights.py)."""
-    weights = load_file(LANDMARK_ASSET)["weights"].astype(np.float64)
-    return np.asarray(weights / weights.sum(1, keepdims=True))
+        """The 68 landmarks [68, 2]."""
+        return self.points_px[_OF_68, :2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +159,10 @@ def mesh_in(network: StoredGraph, image_srgb: np.ndarray, square: Square) -> Fac
 
 def face_square(points_px: np.ndarray) -> Square:
     """The square, level with the eyes, in which a mesh is found again from its points [478, 3]."""
-    left, right = points_px[list(OUTER_CORNERS), :2]
+    left, right = points_px[list(_EYES), :2]
     turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
     level = Square(0.0, 0.0, 1.0, turn_rad)
-    along = level.to_share(points_px[:MESH_POINTS, :2])
+    along = level.to_share(points_px[:468, :2])
     low, high = along.min(0), along.max(0)
     x_px, y_px = level.to_photo((low + high) / 2)
     return Square(float(x_px), float(y_px), _MESH_SIDES * float((high - low).max()), turn_rad)

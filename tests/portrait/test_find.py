@@ -16,7 +16,7 @@ from facerf_cli.face import dlib_landmarks
 from facerf_cli.face.topology import CONTOUR, LANDMARKS_M, MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.portrait.find import Confidence, confidence_in, detect_faces, find_faces
-from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView, look
+from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
 
@@ -52,19 +52,11 @@ def resized(image, scale):
     return np.round(255 * skimage.transform.resize(image, size, anti_aliasing=True)).astype(np.uint8)
 
 
-def test_landmarks_are_where_the_face_model_has_them():
-    """The Parsing Network learnt them there; the mesh's common points are .06 off along the jaw."""
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO)
-    (view,) = look(SHIPPED_NETWORKS.people.parsing, PHOTO, [Square.around(face.landmarks_px, 1.7)])
-    apart = np.linalg.norm(view.landmarks_px[:68] - face.landmarks_px, axis=-1) / view.extent_px
-    assert np.median(apart[: len(CONTOUR)]) < 0.03 and np.median(apart[INNER]) < 0.025
-
-
 @BOTH
 def test_a_mirrored_photo_has_mirrored_landmarks(source, landmarks_px):
     (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[:, ::-1], source)
     back = face.landmarks_px[MIRROR_68] * [-1, 1] + [PHOTO.shape[1], 0]
-    assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.3)  # a pixel too many is 1
+    assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.25)
     assert error_iod(back, landmarks_px) < 0.02
 
 
