@@ -123,10 +123,12 @@ def reflectance_of(
     memory_bytes: int = MEMORY_BYTES,
     photo: np.ndarray | None = None,
     steady: SteadyFrame | None = None,
+    matte: np.ndarray | None = None,
 ) -> Reflectance:
     """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
 
-    A frame of a shot comes with what is steadied by the frames around it.
+    A frame of a shot comes with what is steadied by the frames around it; a photo may come with the person's
+    `matte` [H, W].
 
     The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
     with `network_alone` they are not. The models that the paper compares with have no such correction.
@@ -141,7 +143,7 @@ def reflectance_of(
         return field
     if steady and steady.portrait:
         return PortraitField.of(models.face, head, field, own, *steady.portrait)
-    person = look_at_person(models.networks.people, models.face, photo, head.fit)
+    person = look_at_person(models.networks.people, models.face, photo, head.fit, matte=matte)
     return PortraitField.of(models.face, head, field, own, person, maps_of(models.networks.portrait, person))
 
 
@@ -149,27 +151,34 @@ def reflectance_of(
 class Person:
     """One face of a photo [H, W, 3], fitted once: each light, pose and layer then costs what itself costs.
 
-    Without a photo it is the face alone, in the frame of its crop.
+    Without a photo it is the face alone, in the frame of its crop. The person's matte [H, W] may be given.
     """
 
     models: Models
     photo: np.ndarray | None
     head: Head
     reflectance: Reflectance
+    given_matte: np.ndarray | None = None
 
     @cached_property
     def matte(self) -> np.ndarray:
         """The person's share [H, W] of the photo."""
         assert self.photo is not None
+        if self.given_matte is not None:
+            return self.given_matte
         if isinstance(self.reflectance, PortraitField):
             return self.reflectance.person.segmentation.matte
         landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
         return segment(self.models.networks.people, to_display(self.photo), landmarks_px).matte
 
     def composed(self, target: Target = AS_IN_PHOTO) -> Composition:
-        """Prepare images of the person in a pose, before a background, that differ by their light alone."""
-        if self.photo is not None and target.composite == "photo" and target.matte is None:
-            target = replace(target, matte=self.matte)
+        """Prepare images of the person in a pose, before a background, that differ by their light alone.
+
+        The target's matte says which part of the person changes.
+        """
+        if self.photo is not None and target.composite == "photo":
+            part = target.matte
+            target = replace(target, matte=self.matte if part is None else self.matte * part)
         return Composition(self.models.face, self.photo, self.head, target, self.reflectance)
 
     def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:

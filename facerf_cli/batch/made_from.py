@@ -38,6 +38,7 @@ _OPTIONS = {
     "dataset_format": "facerf's version of datasets",
     "kind": "--background",
     "leaders": "the first photo of --exposure-group",
+    "matte_model": "the model of --matte-from",
     "names": "the layers of --light",
     "non_negative": "--signed",
     "ocio_config": "--ocio",

@@ -72,7 +72,7 @@ def reconstruction(
     inputs: PhotosOrDatasetArgument,
     *,
     data: SplitOptions,
-    photo: Annotated[PhotoOptions, Without("texture_side")],
+    photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     solve: SolveOptions,
     options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
@@ -114,7 +114,7 @@ def transfer(
         ),
     ] = False,
     data: SplitOptions,
-    photo: Annotated[PhotoOptions, Without("texture_side", "face")],
+    photo: Annotated[PhotoOptions, Without("texture_side", "face", "person", "matte_from")],
     solve: SolveOptions,
     options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
@@ -149,7 +149,7 @@ def geometry(
         ),
     ] = None,
     data: Annotated[SplitOptions, Only("split", "every")],
-    photo: Annotated[PhotoOptions, Without("texture_side")],
+    photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).

@@ -209,6 +209,11 @@ def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Band:
     return lambda rows: _share_bare(enlarged(covered, size_px, rows)[0])
 
 
+def uncovered_by(matte: np.ndarray, crop: Crop) -> np.ndarray:
+    """The share of `uncovered` by a matte [H, W] of the photo: what is not its person covers the face."""
+    return _share_bare(1 - crop.apply(matte[..., None])[..., 0])
+
+
 def _places(crop: Crop) -> np.ndarray:
     """Centres [S, S, 2] of a crop's pixels in the photo's."""
     centres = (np.arange(crop.size_px) + PIXEL_CENTRE) / crop.scale

@@ -78,9 +78,16 @@ class Segmentation:
         return {f"class.{name}": partial(self.layer, name) for name in CLASSES[1:]}
 
 
-def segment(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
-    """Segment the person with landmarks [68, 2] in an sRGB uint8 image [H, W, 3], without its neighbours."""
+def segment(
+    people: PeopleNetworks,
+    image_srgb: np.ndarray,
+    landmarks_px: np.ndarray,
+    matte: np.ndarray | None = None,
+) -> Segmentation:
+    """Segment one person, with landmarks [68, 2], in an sRGB uint8 image [H, W, 3]; a matte may be given."""
     small = small_image(image_srgb)
+    if matte is not None:
+        return within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
     classes = seen_classes(people, image_srgb, landmarks_px, small)
     return segmentation_of(classes, image_srgb, landmarks_px)
 
@@ -89,7 +96,7 @@ def seen_classes(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
     """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
-    classes = _parsed(people.parsing, image_srgb, landmarks_px, small)
+    classes = parsed(people.parsing, image_srgb, landmarks_px, small)
     scale = small.shape[2] / image_srgb.shape[1]
     everyone = [landmarks_px, *_neighbours(people, image_srgb, landmarks_px)]
     heads = [HeadPlace.of(points * scale) for points in everyone]
@@ -114,7 +121,13 @@ def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.nd
     return Segmentation(classes, matte_of(1 - classes[0].numpy(), image_srgb, landmarks_px))
 
 
-def _parsed(
+def within_matte(classes: Tensor, matte: np.ndarray) -> Segmentation:
+    """The person that a matte [H, W] shows; what the classes [C, h, w] leave open in it is completed."""
+    share = torch.from_numpy(shrunk(matte, (classes.shape[1], classes.shape[2])))
+    return Segmentation(_within_share(classes, share), matte)
+
+
+def parsed(
     parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
     """Shares [C, h, w] of the classes as the Parsing Network sees them."""

@@ -29,7 +29,14 @@ from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, LandmarksFrom, choose_face, detect_faces, face_near
 from facerf_cli.portrait.parse import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person
-from facerf_cli.portrait.segment import Segmentation, seen_classes, segmentation_of, small_image
+from facerf_cli.portrait.segment import (
+    Segmentation,
+    parsed,
+    seen_classes,
+    segmentation_of,
+    small_image,
+    within_matte,
+)
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.own_light import light_of_frames
 from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
@@ -278,7 +285,7 @@ _UNIT = ("normals", "strands")  # maps of unit vectors
 class ShotView:
     """A person through a shot, whose face was sighted in some frames.
 
-    `read` gives frames [H, W, 3], scene-linear, by number.
+    `read` gives frames [H, W, 3], scene-linear, by number; `given`, if not None, the person's matte [H, W].
     """
 
     def __init__(
@@ -287,8 +294,9 @@ class ShotView:
         sides: Sides,
         read: Callable[[int], np.ndarray],
         sightings: Sequence[Sighting | None],
+        given: Callable[[int], np.ndarray] | None = None,
     ) -> None:
-        self._models, self._sides, self._read = models, sides, read
+        self._models, self._sides, self._read, self._given = models, sides, read, given
         self._path = path_of(sightings)  # [N, 68, 2], NaN where the face is lost
         self._sighted = [frame for frame, seen in enumerate(sightings) if seen]
         self._shown = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
@@ -368,7 +376,10 @@ class ShotView:
         """Classes of a frame alone, and the small image that they were seen in."""
         image = self._display(frame)
         small = small_image(image)
-        return seen_classes(self._models.networks.people, image, self.landmarks_px(frame), small), small
+        people, landmarks_px = self._models.networks.people, self.landmarks_px(frame)
+        if self._given is not None:
+            return parsed(people.parsing, image, landmarks_px, small), small
+        return seen_classes(people, image, landmarks_px, small), small
 
     def _segmentation(self, frame: int) -> Segmentation:
         around = self._around(frame)
@@ -376,6 +387,8 @@ class ShotView:
         own = around.index(frame)
         mean = steadied(classes, images, own)
         mean = mean / mean.sum(0).clamp_min(1e-6)
+        if self._given is not None:
+            return within_matte(mean, self._given(frame))
         return segmentation_of(mean, self._display(frame), self.landmarks_px(frame))
 
     def _seen_person(self, frame: int) -> SeenPerson:

@@ -15,6 +15,7 @@ EXTRAS = {
     "ray": "`--ray`, on clusters",
     "heic": "HEIC photos of phones",
     "video": "films in and out; its wheel holds GPL codecs",
+    "rembg": "`--matte-from rembg:NAME`; its models have licences of their own",
     "dlib": "`--landmarks-from dlib`, not for commercial use",
 }
 Facts = dict[str, Any]

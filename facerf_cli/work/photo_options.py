@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from facerf_cli.baselines import Kind
-from facerf_cli.batch.inputs import OF_PHOTOS, NamePattern
+from facerf_cli.batch.inputs import OF_FILES, NamePattern
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
 from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, option
+from facerf_cli.work.matte_models import MatteModel, parse_matte_from
 
 MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
 _TURNED_AWAY_DEG, _MOST_ROLL_DEG = 90.0, 180.0
@@ -102,6 +103,21 @@ class PhotoOptions:
         "commercial use).",
         panel=FACE,
     )
+    person: Path | None = option(
+        None,
+        "Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies it.",
+        "FILE|DIR|PATTERN",
+        shown_default=False,
+        panel=FACE,
+    )
+    matte_from: MatteModel | None = option(
+        None,
+        "Replace it by that of a model in rembg's folder (an extra); the model's licence is reported.",
+        "rembg:NAME",
+        shown_default=False,
+        parse=parse_matte_from,
+        panel=FACE,
+    )
     ocio_config: str = ""  # that knows the colour space; '' is $OCIO, or the built-in one
 
     def check(self) -> None:
@@ -116,6 +132,16 @@ class PhotoOptions:
         if self.landmarks is not None and self.geometry == "network":
             raise UsageError("--landmarks: --geometry network uses none; leave one out")
         check_companion(self.landmarks, "--landmarks")
+        if self.person is not None and self.matte_from is not None:
+            raise UsageError("--matte-from: --person gives the matte; leave one out")
+        if self.face == "all" and self.has_given_person:
+            raise UsageError("--face all: --person and --matte-from show one person; give --face INDEX")
+        check_companion(self.person, "--person")
+
+    @property
+    def has_given_person(self) -> bool:
+        """True if the person's matte is not facerf's own."""
+        return self.person is not None or self.matte_from is not None
 
     @property
     def first_tag(self) -> str:
@@ -168,7 +194,7 @@ class LightOptions(SolveOptions):
     keep_eyes: bool = option(False, "Use the eyes, too (the paper leaves them out).", panel=FACE)
     matte: Path | None = option(
         None,
-        "Use only what a grey image, or its alpha, of the photo's size shows, such as skin alone.",
+        "Use only what a grey image, or its alpha, shows, such as skin alone; --person replaces the matte.",
         "FILE|DIR|PATTERN",
         shown_default="the photo's alpha",
         panel=FACE,
@@ -202,7 +228,7 @@ class LightOptions(SolveOptions):
 def for_other_photos(photo: PhotoOptions) -> PhotoOptions:
     """Options for photos of which only the light is used: those of the inputs that describe one file go."""
     folder = photo.landmarks if photo.landmarks is not None and not photo.landmarks.is_file() else None
-    return replace(photo, colourspace=None, face="largest", landmarks=folder)
+    return replace(photo, colourspace=None, face="largest", landmarks=folder, person=None, matte_from=None)
 
 
 def networks_of(kinds: Iterable[str]) -> frozenset[str]:
@@ -215,7 +241,7 @@ def check_companion(given: Path | None, option: str) -> None:
     if given is not None and not given.exists():
         if "{" not in str(given):
             raise UsageError(f"{option} {given}: no such file or folder; give one that exists")
-        NamePattern.parse(given.as_posix().lstrip("/"), option, OF_PHOTOS)
+        NamePattern.parse(given.as_posix().lstrip("/"), option, OF_FILES)
 
 
 def parse_pose(text: str | None) -> PoseDeg | None:

@@ -11,27 +11,30 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.batch.inputs import OF_PHOTOS, PHOTO_SUFFIXES, Item, NamePattern
+from facerf_cli.batch.inputs import OF_FILES, PHOTO_SUFFIXES, Item, NamePattern
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
 from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.image.colour import named_space
+from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import parse_lights
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, Face, FaceBox, confidence_in, face_at
+from facerf_cli.portrait.parse import uncovered_by
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 from facerf_cli.work.plan import KEPT_PX, beside_photo
+from facerf_cli.work.rembg_matte import matte_by_rembg, require_rembg
 
 
 def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> Path:
@@ -42,7 +45,7 @@ def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> 
     """
     if "{" in str(given) and not given.exists():
         text = given.as_posix()
-        pattern = NamePattern.parse(text.lstrip("/"), option, OF_PHOTOS)
+        pattern = NamePattern.parse(text.lstrip("/"), option, OF_FILES)
         found = Path("/" if text.startswith("/") else "") / item.pattern_text(pattern)
         candidates = [found]
     elif given.is_dir():
@@ -69,6 +72,7 @@ class FittedFace:
     found: FaceBox
     head: Head
     steady: SteadyFrame | None = None  # of a frame of a shot
+    matte: np.ndarray | None = None  # of the person, [H, W]; None: to be found
 
     @property
     def fit(self) -> FaceFit:
@@ -89,6 +93,9 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
     if options.colourspace is not None:
         named_space(options.colourspace, options.ocio_config)
     face_model(options)
+    if (model := options.matte_from) is not None:
+        require_rembg(model)
+        log.info("mattes by %s: licence %s", model.matte_from, model.licence)
     settings = options.settings
     if not settings.checkpoints_by_default:
         serving_files(settings.checkpoints, uses, "this line")
@@ -124,7 +131,11 @@ def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[Fit
     """Fit the faces of a photo that the options choose, from left to right."""
     models = load_models_once(options)
     found = _find(item, image, options, options.geometry or models.default_geometry)
-    return [FittedFace(tag, face, _fit_one(name, image, face, options)) for tag, name, face in found]
+    matte = person_matte(item, image.pixels, options)
+    return [
+        FittedFace(tag, face, _fit_one(name, image, face, options, matte), matte=matte)
+        for tag, name, face in found
+    ]
 
 
 def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[tuple[str, Face]]:
@@ -188,8 +199,9 @@ def facts_of(faces: list[FittedFace], options: PhotoOptions) -> dict[str, Any]:
 
 
 def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
-    """The report's entry of the networks that were used: file and digest of each."""
-    return {"networks": load_models_once(options).networks.served()}
+    """The report's entries of the networks that were used: file and digest of each, and rembg's model."""
+    facts: dict[str, Any] = {"networks": load_models_once(options).networks.served()}
+    return facts if options.matte_from is None else facts | {"matte_from": options.matte_from.facts()}
 
 
 def stamp(item: Item) -> dict[str, str | int]:
@@ -212,10 +224,14 @@ def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
         raise InputError(f"{path}: {error}") from None
 
 
-def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions) -> Head:
+def _fit_one(
+    name: str, image: LinearImage, face: FaceBox, options: PhotoOptions, matte: np.ndarray | None
+) -> Head:
     try:
         models = load_models_once(options)
         head = head_of(models, image.pixels, face, models.sides(options.texture_side))
+        if matte is not None:
+            head = head.without(models.face, uncovered_by(matte, head.fit.crop))
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
     if head.fit.quality == "poor":
@@ -240,16 +256,42 @@ def _fit_one(name: str, image: LinearImage, face: FaceBox, options: PhotoOptions
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
     """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
     path = companion(item, given, sorted(PHOTO_SUFFIXES), "--matte")
+    matte = _grey_or_alpha(path, size_px)
+    if matte.shape != tuple(size_px):
+        raise InputError(f"{path}: {_sizes(matte, size_px)}; give one of the photo's size")
+    return matte
+
+
+def person_matte(item: Item, pixels: np.ndarray, options: PhotoOptions) -> np.ndarray | None:
+    """The person's matte [H, W] in 0..1 that is given for a photo [H, W, 3], at its size; None if none is."""
+    height, width = pixels.shape[:2]
+    if options.person is not None:
+        path = companion(item, options.person, sorted(PHOTO_SUFFIXES), "--person")
+        matte = _grey_or_alpha(path, (height, width))
+    elif options.matte_from is not None:
+        path, matte = item.input_path, matte_by_rembg(to_display(pixels), options.matte_from)
+    else:
+        return None
+    scale = height / len(matte)
+    if abs(width - scale * matte.shape[1]) > 2 * max(1.0, scale):  # sides were rounded
+        raise InputError(f"{path}: {_sizes(matte, (height, width))}; give one of the photo's aspect")
+    if not matte.any():
+        raise InputError(f"{path}: the matte is black and shows nobody; make it white where the person is")
+    return matte if matte.shape == (height, width) else resized(matte, height, width).clip(0, 1)
+
+
+def _grey_or_alpha(path: Path, size_px: tuple[int, ...]) -> np.ndarray:
+    """Values [h, w] in 0..1 of an image for a photo [H, W]: its alpha, if that varies, or its grey."""
     with beside_photo(size_px):
         image = read_image(path, "linear")
-    matte = image.pixels.mean(-1) if image.alpha is None else image.alpha
-    if matte.shape != tuple(size_px):
-        height, width = matte.shape
-        raise InputError(
-            f"{path}: the matte has {width} x {height} pixels, the photo {size_px[1]} x {size_px[0]}; "
-            "give one of the photo's size"
-        )
-    return matte.clip(0, 1)
+    alpha = image.alpha
+    matte = image.pixels.mean(-1) if alpha is None or alpha.min() == alpha.max() else alpha
+    return np.asarray(matte.clip(0, 1))
+
+
+def _sizes(matte: np.ndarray, size_px: tuple[int, ...]) -> str:
+    height, width = matte.shape
+    return f"the matte has {width} x {height} pixels, the photo {size_px[1]} x {size_px[0]}"
 
 
 def rotation_of(pose: str | None) -> torch.Tensor | None:

@@ -218,8 +218,10 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
     kind, alone = work.reflectance, work.network_alone
     try:
         require_face(models.face, target.fit or face.fit, photo.shape[:2])
-        reflectance = reflectance_of(models, face.head, kind, alone, prediction_bytes(), photo, face.steady)
-        return Person(models, photo, face.head, reflectance).composed(target)
+        reflectance = reflectance_of(
+            models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte
+        )
+        return Person(models, photo, face.head, reflectance, face.matte).composed(target)
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None
 
@@ -231,8 +233,6 @@ def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> 
     if work.composite != "photo":
         return Target(posed, work.composite)
     matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
-    if matte is None and face.steady is not None:
-        matte = face.steady.segmentation.matte
     kind = work.background.kind
     alpha = None if kind == "photo" else image.alpha
     return Target(posed, work.composite, matte, alpha, kind if kind in ("photo", "none") else "given")
@@ -281,6 +281,8 @@ def _check_stack(item: Item, work: Relight) -> None:
         wrong = f"a stack holds the field; for {work.reflectance} give its photo"
     elif work.network_alone:
         wrong = "a stack holds the field as predicted; give its photo"
+    elif work.photo.has_given_person:
+        wrong = "a stack holds its person's matte; give its photo"
     elif any(light.at_m is not None for setup in work.setups for light in setup.lights):
         wrong = "a stack holds far lights; for near ones (at=) give its photo"
     if wrong:

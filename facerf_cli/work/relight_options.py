@@ -193,7 +193,8 @@ class Relight:
     )
     matte: Path | None = option(
         None,
-        "Change only what a grey image shows (mattes/{stem}.png: of each its own).",
+        "Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the "
+        "matte.",
         "FILE|DIR|PATTERN",
         shown_default=False,
         panel=IMAGE,

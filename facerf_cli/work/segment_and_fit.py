@@ -33,6 +33,7 @@ from facerf_cli.work.photos import (
     find_people,
     fit_faces,
     load_models_once,
+    person_matte,
     provenance,
     read_photo,
     stamp,
@@ -62,9 +63,10 @@ def write_segments(
     image = read_photo(item, options, KEPT_OF_SEGMENTS_PX)
     display = to_display(image.pixels)
     people = find_people(item, image, options)
-    networks = load_models_once(options).networks.people
+    networks, matte = load_models_once(options).networks.people, person_matte(item, image.pixels, options)
     for tag, face in reversed(people):
-        _write_segment(item, tag, image, display, face, segment(networks, display, face.landmarks_px))
+        found = segment(networks, display, face.landmarks_px, matte)
+        _write_segment(item, tag, image, display, face, found)
     return [tag for tag, _ in people], facts_of_found([face for _, face in people], options)
 
 

@@ -22,7 +22,14 @@ from facerf_cli.relighting.models import described_file
 from facerf_cli.relighting.sequence import LONGEST_GAP, CutFinder, Follower, ShotView, Sighting, gaps, takes
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.photos import LANDMARK_SUFFIXES, FittedFace, companion, load_models_once, read_photo
+from facerf_cli.work.photos import (
+    LANDMARK_SUFFIXES,
+    FittedFace,
+    companion,
+    load_models_once,
+    person_matte,
+    read_photo,
+)
 from facerf_cli.work.shots import Shot
 
 _DECODED = 12  # frames of a film that are kept as they were decoded
@@ -222,7 +229,15 @@ def takes_with_face(shot: Shot) -> list[range]:
 def _view(shot: Shot, take: range, options: PhotoOptions) -> ShotView:
     models, sightings = load_models_once(options), _takes(shot)[0]
     inside = [seen if number in take else None for number, seen in enumerate(sightings)]
-    return ShotView(models, models.sides(options.texture_side), _opened(shot, options).pixels, inside)
+    read = _opened(shot, options).pixels
+
+    def given(number: int) -> np.ndarray:
+        matte = person_matte(shot.frames[number], read(number), options)
+        assert matte is not None
+        return matte
+
+    sides = models.sides(options.texture_side)
+    return ShotView(models, sides, read, inside, given if options.has_given_person else None)
 
 
 def view_of(shot: Shot, number: int, options: PhotoOptions) -> ShotView:
@@ -236,11 +251,12 @@ def view_of(shot: Shot, number: int, options: PhotoOptions) -> ShotView:
 
 @contextmanager
 def _named(shot: Shot, number: int) -> Iterator[None]:
-    """Put the name of a frame's file before an error."""
+    """Put the name of a frame's file before an error that lacks it."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{shot.frames[number].input_path}: {error}") from None
+        before = f"{shot.frames[number].input_path}: "
+        raise InputError(before + str(error).removeprefix(before)) from None
 
 
 def segmented_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[LinearImage, Face, Segmentation]:
@@ -259,4 +275,5 @@ def frame_with_face(
     with _named(shot, number):
         head, steady = view.head(number), view.steady(number, portrait)
     landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
-    return _opened(shot, options).image(number), FittedFace("", face_at(landmarks_px), head, steady)
+    image, matte = _opened(shot, options).image(number), steady.segmentation.matte
+    return image, FittedFace("", face_at(landmarks_px), head, steady, matte)

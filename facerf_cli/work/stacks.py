@@ -119,8 +119,11 @@ def _of_person(
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
     require_face(models.face, head.fit, photo.shape[:2])
-    field = reflectance_of(models, head, "portrait", work.network_alone, prediction_bytes(), photo)
-    alpha = None if image.alpha is None else resized(image.alpha, *photo.shape[:2])
+    alpha, matte = (
+        None if one is None else resized(one, *photo.shape[:2]) for one in (image.alpha, face.matte)
+    )
+    memory = prediction_bytes()
+    field = reflectance_of(models, head, "portrait", work.network_alone, memory, photo, matte=matte)
     composition = Person(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
     size = composition.size_px
 

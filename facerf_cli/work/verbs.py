@@ -81,7 +81,9 @@ Process = Callable[[T, Item], Outcome]  # the work on one item, which the verb's
 class Segment:
     """`facerf segment`."""
 
-    photo: Annotated[PhotoOptions, Only("colourspace", "face", "landmarks", "landmarks_from")]
+    photo: Annotated[
+        PhotoOptions, Only("colourspace", "face", "landmarks", "landmarks_from", "person", "matte_from")
+    ]
     shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
     def run(self, inputs: Sequence[str], wanted: ShotOptions, batch: BatchOptions) -> int:

@@ -65,13 +65,16 @@ def write_page(
 ) -> None:
     """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
     photo, head = shrunk_photo(photo, face.head, size_px)
-    basis, plate = of_photo(models, photo, head)
+    matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
+    basis, plate = of_photo(models, photo, head, matte)
     _write(path, item, face.tag.replace("_", " "), basis, plate, head_place(head.fit.crop, plate.matte))
 
 
-def of_photo(models: Models, photo: np.ndarray, head: Head) -> tuple[Basis, Plate]:
-    """The basis of a photo's person, and what a page shows around it."""
-    field = reflectance_of(models, head, "portrait", photo=photo)
+def of_photo(
+    models: Models, photo: np.ndarray, head: Head, matte: np.ndarray | None = None
+) -> tuple[Basis, Plate]:
+    """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
+    field = reflectance_of(models, head, "portrait", photo=photo, matte=matte)
     assert isinstance(field, PortraitField)
     composition = Person(models, photo, head, field).composed()
     basis = basis_of_photo(models, photo, head, field, composition)

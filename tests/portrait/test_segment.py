@@ -72,6 +72,19 @@ def test_layers_lie_where_the_network_saw_them(squares: list[Square], people: Pe
     assert np.abs(total - found.matte).max() < 1e-5
 
 
+def test_a_given_matte_is_the_persons_and_its_classes_are_completed(
+    squares: list[Square], people: PeopleNetworks
+) -> None:
+    matte = np.zeros((HEIGHT, WIDTH), np.float32)
+    matte[20:220, 70:250] = 0.5
+    found = segment(people, photo(), FACE, matte)
+    assert found.matte is matte
+    layers = filled(found.layers(), *matte.shape)
+    assert np.abs(sum(layers[f"class.{name}"] for name in CLASSES[1:]) - matte).max() < 1e-5
+    seen, completed = layers["class.garment"][200, 160], layers["class.garment"][200, 80]
+    assert seen == pytest.approx(0.5, abs=0.02) and completed == pytest.approx(0.5, abs=0.02)
+
+
 def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(
     squares: list[Square], people: PeopleNetworks
 ) -> None:

@@ -1,0 +1,267 @@
+"""A person's matte that is given, by a file or by a model of rembg: it is the matte from end to end."""
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from skimage.data import astronaut as photograph
+
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.settings import Settings
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.images import LinearImage, write_display
+from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.image.strips import resized
+from facerf_cli.main import main
+from facerf_cli.pipeline import fit_photo, reflectance_of
+from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.work.matte_models import UNKNOWN, parse_matte_from
+from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photos import fit_faces, load_models_once, person_matte
+from tests.exr_layers import exr_layers
+
+HEIGHT, WIDTH = 192, 224
+CHEAP = ("--reflectance", "field", "--lights", "12", "--light", "70,20", "--format", "exr")
+EIGHT_BITS = 0.5 / 255 + 1e-3  # with the step of half floats
+MODEL = "u2net_human_seg"
+STAND_IN = """
+import numpy as np
+
+def new_session(model_name, *args, **kwargs):
+    return ("session of", model_name)
+
+def remove(data, session=None, only_mask=False, **kwargs):
+    assert only_mask and session == ("session of", "{model}")
+    assert data.dtype == np.uint8 and data.ndim == 3
+    mask = np.zeros(data.shape[:2], np.uint8)
+    mask[:, 20:-30] = 255
+    return mask
+"""
+
+
+def ellipse(shift: float = 0.0, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """A soft ellipse around the head, which no network would see."""
+    y, x = (np.mgrid[:height, :width] + 0.5) / np.array([height, width]).reshape(2, 1, 1)
+    off = np.hypot((x - 0.5 - shift) / 0.4, (y - 0.5) / 0.48)
+    return ((1 - off) / 0.05 + 0.5).clip(0, 1).astype(np.float32)
+
+
+def save(path: Path, matte: np.ndarray, alpha: np.ndarray | None = None) -> Path:
+    """Write values as they are, which `write_display` encodes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_display(path, srgb_to_linear(np.repeat(matte[..., None], 3, -1)), 0.0, alpha)
+    return path
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two photos of one person, a little apart, and a matte of each in another."""
+    folder = tmp_path_factory.mktemp("person")
+    for number in range(2):
+        pixels = photograph()[10 : 10 + HEIGHT, 110 + 2 * number : 110 + 2 * number + WIDTH]
+        linear = srgb_to_linear((pixels / np.float32(255)).astype(np.float32))
+        (folder / "plates").mkdir(exist_ok=True)
+        write_display(folder / f"plates/me.{number:04d}.png", linear, 0.0)
+        save(folder / f"mattes/me.{number:04d}.png", ellipse(0.02 * number))
+    return folder
+
+
+@pytest.fixture
+def item(tmp_path: Path) -> Item:
+    return Item(tmp_path / "me.png", tmp_path / "out/me", "me")
+
+
+def facerf(verb: str, *line: object) -> int:
+    return main([verb, *map(str, line)])
+
+
+def test_the_classes_are_completed_inside_the_given_matte(given: Path, tmp_path: Path) -> None:
+    photo, matte = given / "plates/me.0000.png", given / "mattes/me.0000.png"
+    assert facerf("segment", photo, "--person", matte, "-o", tmp_path) == 0
+    layers = exr_layers(tmp_path / "me.0000_segment.exr")
+    assert np.abs(layers["person.A"] - ellipse()).max() < EIGHT_BITS
+    total = sum(layers[f"class.{name}"] for name in CLASSES[1:])
+    assert np.abs(total - ellipse()).max() < 0.01  # half floats
+
+
+def test_a_relit_person_is_that_of_the_matte_and_another_matte_multiplies_it(
+    given: Path, tmp_path: Path
+) -> None:
+    part = np.ones((HEIGHT, WIDTH), np.float32)
+    part[:, : WIDTH // 2] = 0.25
+    save(tmp_path / "part.png", part)
+    line = (given / "plates/me.0000.png", "--person", given / "mattes", "--light", "70,20", "--format", "exr")
+    line = (*line, "--lights", "12", "--background", "none", "--matte", tmp_path / "part.png")
+    assert facerf("relight", *line, "-o", tmp_path / "out") == 0
+    layers = exr_layers(tmp_path / "out/me_light_70_20.0000.exr")
+    assert np.abs(layers["A"] - part * ellipse()).max() < 2 * EIGHT_BITS
+    assert (layers["A"] == layers["person.A"]).all()
+
+
+def test_the_portrait_field_is_of_the_given_person() -> None:
+    options = PhotoOptions(Settings(device="cpu"))
+    models, photo = load_models_once(options), head_photo()
+    face = fit_faces(Item(Path("me.png"), Path("me"), "me"), photo, options)[0]
+    head = fit_photo(models, photo.pixels, face.found.landmarks_px)  # type: ignore[attr-defined]
+    field = reflectance_of(models, head, "portrait", True, photo=photo.pixels, matte=ellipse())
+    assert isinstance(field, PortraitField)
+    person = field.person
+    assert (person.segmentation.matte == ellipse()).all()
+    square = person.square.apply(np.dstack([ellipse()] * 3))[..., 0]
+    inside = person.square.valid(HEIGHT, WIDTH) > 0
+    assert np.abs(1 - person.classes[0].numpy() - square)[inside].mean() < 0.02
+
+
+def test_a_stack_holds_the_given_matte_at_its_size(given: Path, tmp_path: Path) -> None:
+    line = ("--person", given / "mattes", "--lights", "0,0", "--size", "112", "-o", tmp_path)
+    assert facerf("predict-olat", given / "plates/me.0000.png", *line) == 0
+    seen = read_olat_header(tmp_path / "me.0000_olat.exr").seen
+    assert np.abs(seen - resized(ellipse(), 96, 112)).max() < EIGHT_BITS
+    stack = (tmp_path / "me.0000_olat.exr", "--person", given / "mattes/me.0000.png")
+    assert facerf("relight", *stack, *CHEAP, "-o", tmp_path / "again") == 1
+
+
+def head_photo() -> LinearImage:
+    pixels = photograph()[10 : 10 + HEIGHT, 110 : 110 + WIDTH]
+    return LinearImage(srgb_to_linear((pixels / np.float32(255)).astype(np.float32)))
+
+
+def test_what_the_matte_leaves_out_is_not_taken_for_skin(tmp_path: Path, item: Item) -> None:
+    photo, half = head_photo(), np.ones((HEIGHT, WIDTH), np.float32)
+    half[:, : WIDTH // 2] = 0
+    visible = []
+    for name, matte in (("white", np.ones_like(half)), ("half", half)):
+        options = PhotoOptions(Settings(device="cpu"), person=save(tmp_path / f"{name}.png", matte))
+        visible.append(fit_faces(item, photo, options)[0].head.face.visible)
+    plain = fit_faces(item, photo, PhotoOptions(Settings(device="cpu")))[0].head.face.visible
+    assert torch.equal(visible[0], plain)
+    assert 0.2 * plain.sum() < visible[1].sum() < 0.8 * plain.sum()
+
+
+def test_each_frame_of_a_sequence_has_its_own_matte(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = (given / "plates", "--sequence", "--person", given / "mattes")
+    assert facerf("relight", *line, *CHEAP, "-o", tmp_path) == 0
+    assert facerf("segment", *line, "-o", tmp_path) == 0
+    for number in range(2):
+        frame = f"{number:04d}"
+        relit = exr_layers(tmp_path / f"me_light_70_20.{frame}.exr")["person.A"]
+        cut = exr_layers(tmp_path / f"me.{frame}_segment.exr")["person.A"]
+        for found in (relit, cut):
+            assert np.abs(found - ellipse(0.02 * number)).max() < EIGHT_BITS
+    mattes = save(tmp_path / "few/me.0000.png", ellipse()).parent
+    line = (given / "plates", "--sequence", "--person", mattes)
+    assert facerf("segment", *line, "-o", tmp_path / "again") == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.count("--person has no") == 1 and str(mattes / "me.0001") in said.replace(" ", "")
+    assert (tmp_path / "again/me.0000_segment.exr").is_file()
+
+
+def test_a_matte_of_the_same_aspect_is_resampled(tmp_path: Path, item: Item) -> None:
+    photo, small = np.zeros((HEIGHT, WIDTH, 3)), ellipse(0, HEIGHT // 2, WIDTH // 2)
+    options = PhotoOptions(Settings(), person=save(tmp_path / "small.png", small))
+    found = person_matte(item, photo, options)
+    assert found is not None and found.shape == (HEIGHT, WIDTH)
+    assert np.abs(found - resized(small, HEIGHT, WIDTH)).max() < EIGHT_BITS
+    assert np.abs(found - ellipse()).mean() < 0.01
+    options = PhotoOptions(Settings(), person=save(tmp_path / "wide.png", ellipse(0, 60, 120)))
+    with pytest.raises(InputError, match=r"wide\.png: the matte has 120 x 60 pixels, the photo 224 x 192"):
+        person_matte(item, photo, options)
+    options = PhotoOptions(Settings(), person=save(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH))))
+    with pytest.raises(InputError, match=r"black\.png: the matte is black"):
+        person_matte(item, photo, options)
+
+
+def test_an_alpha_that_varies_is_the_matte_and_else_the_grey(tmp_path: Path, item: Item) -> None:
+    photo, white = np.zeros((HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH), np.float32)
+    for name, grey, alpha in (("cut", white, ellipse()), ("opaque", ellipse(), white)):
+        options = PhotoOptions(Settings(), person=save(tmp_path / f"{name}.png", grey, alpha))
+        found = person_matte(item, photo, options)
+        assert found is not None and np.abs(found - ellipse()).max() < EIGHT_BITS
+
+
+@pytest.fixture
+def rembg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A stand-in of rembg's interface, and its folder with one model; the path of that."""
+    (tmp_path / "python").mkdir()
+    (tmp_path / "python/rembg.py").write_text(STAND_IN.replace("{model}", MODEL))
+    monkeypatch.syspath_prepend(str(tmp_path / "python"))
+    for name in ("U2NET_HOME", "XDG_DATA_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("REMBG_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("MODEL_CHECKSUM_DISABLED", "")
+    path = tmp_path / f"home/models/{MODEL}/{MODEL}.onnx"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"weights")
+    yield path
+    sys.modules.pop("rembg", None)
+
+
+def test_a_model_of_rembg_gives_the_matte_and_its_licence_is_said(
+    rembg: Path, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = (given / "plates/me.0000.png", "--matte-from", f"rembg:{MODEL}", "-o", tmp_path / "out")
+    assert facerf("segment", *line) == 0
+    assert f"mattes by rembg:{MODEL}: licence Apache-2.0" in " ".join(capsys.readouterr().err.split())
+    matte = exr_layers(tmp_path / "out/me.0000_segment.exr")["person.A"]
+    assert (matte[:, 20:-30] == 1).all() and matte[:, :20].max() == 0
+    row = json.loads((tmp_path / "out/report.jsonl").read_text())
+    expected = {"model": f"rembg:{MODEL}", "licence": "Apache-2.0", "file": str(rembg)}
+    assert row["matte_from"] == expected
+    rembg.write_bytes(b"other weights")
+    assert facerf("segment", *line, "--dry-run") == 0
+    assert "made again: the model of --matte-from changed" in capsys.readouterr().err
+
+
+def test_a_model_that_is_not_there_is_refused_with_the_command_that_fetches_it(rembg: Path) -> None:
+    with pytest.raises(UsageError, match="facerf downloads no model; fetch it with `rembg d bria-rmbg`"):
+        parse_matte_from("rembg:bria-rmbg")
+    for wrong in ("rembg", "rembg:", "u2net", "rembg:../u2net"):
+        with pytest.raises(UsageError, match="give rembg:NAME"):
+            parse_matte_from(wrong)
+
+
+def test_models_of_older_versions_lie_in_one_folder(
+    rembg: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("U2NET_HOME", str(tmp_path / "old"))
+    (tmp_path / "old").mkdir()
+    licences = {
+        "u2net": "Apache-2.0",
+        "birefnet-portrait": "MIT",
+        "bria-rmbg": "CC BY-NC 4.0, not for commercial use",
+        "isnet-general-use": UNKNOWN,
+    }
+    for name, licence in licences.items():
+        (tmp_path / f"old/{name}.onnx").touch()
+        model = parse_matte_from(f"rembg:{name}")
+        assert model.matte_model == tmp_path / f"old/{name}.onnx" and model.licence == licence
+
+
+def test_options_that_do_not_go_together(
+    rembg: Path, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    person, model = ("--person", given / "mattes"), ("--matte-from", f"rembg:{MODEL}")
+    for more, said in (
+        ((*person, *model), "leave one out"),
+        ((*person, "--face", "all"), "show one person"),
+        (("--person", tmp_path / "none.png"), "no such file or folder"),
+    ):
+        assert facerf("segment", given / "plates", *more, "-o", tmp_path / "out") == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_without_rembg_its_extra_is_named(
+    rembg: Path, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "python/rembg.py").unlink()
+    line = ("--matte-from", f"rembg:{MODEL}", "-o", tmp_path / "out")
+    assert facerf("segment", given / "plates", *line) == 2
+    assert "pip install 'facerf[rembg]'" in " ".join(capsys.readouterr().err.split())
