@@ -117,7 +117,10 @@ def test_the_format_of_web_viewers_asks_for_its_memory(given: Path, tmp_path: Pa
     assert not (tmp_path / "astronaut_relight").exists()
 
 
-def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path) -> None:
+def test_a_page_is_written_beside_the_stack(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.viewer.basis.rig_directions", lambda: rig_directions(12))
     line = ["--lights", SIDES, "--frame", "photo", "--size", "256", "--page"]
     assert predict(given, tmp_path, *line) == 0
     made = (tmp_path / "astronaut.html").read_text()

@@ -1,4 +1,7 @@
-"""Verbs that end with something of all items: shards leave what one run leaves; the last writes the sum."""
+"""Verbs that end with something of all items: shards leave what one run leaves; the last writes the sum.
+
+Those of synth-stage are in `test_synth_stage.py`.
+"""
 
 import hashlib
 from dataclasses import replace
@@ -54,15 +57,6 @@ def test_relight_dataset(tmp_path: Path, capsys: Said) -> None:
     before = tree(tmp_path / "shards")
     assert main([*shards, "--shard", "1/2", "--overwrite", "always"]) == 2, "it would take the other's away"
     assert tree(tmp_path / "shards") == before
-
-
-@pytest.mark.slow
-def test_synth_stage(tmp_path: Path) -> None:
-    line = ["synth-stage", "--subjects", "2", "--size", "64", "--lights", "12", "-o"]
-    assert main([*line, str(tmp_path / "whole")]) == 0
-    for shard in ("2/2", "1/2"):
-        assert main([*line, str(tmp_path / "shards"), "--shard", shard]) == 0
-    assert tree(tmp_path / "shards") == tree(tmp_path / "whole")
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def tree(folder: Path) -> dict[str, str]:
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != "report.jsonl"
+        if path.is_file() and not path.name.startswith("report")
     }
 
 
@@ -75,18 +75,20 @@ def test_it_is_a_capture_like_any_other(capture: Path) -> None:
     assert image.metadata["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
 
 
-def test_other_threads_and_one_more_person_change_no_byte(capture: Path, tmp_path: Path) -> None:
+def test_other_threads_shards_and_one_more_person_change_no_byte(capture: Path, tmp_path: Path) -> None:
+    """The second person alone, by a shard, beside a first who is finished: the last shard writes the sum."""
+    shutil.copytree(capture / "0000", tmp_path / "0000")
+    (tmp_path / "transport").mkdir()
+    shutil.copy(capture / "transport/0000.safetensors", tmp_path / "transport")
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.exr")}
+    assert photograph(tmp_path, "--subjects", "1", "--transport") == 0
     threads = torch.get_num_threads()
     torch.set_num_threads(1 + threads % 2)  # workers of --jobs have another number of them
-    assert photograph(tmp_path, "--subjects", "1", "--transport") == 0
+    assert photograph(tmp_path, "--subjects", "2", "--transport", "--shard", "2/2") == 0
     torch.set_num_threads(threads)
-    assert tree(tmp_path / "0000") == tree(capture / "0000")
-    shutil.copytree(capture / "0001", tmp_path / "0001")  # a person who is finished is kept
-    shutil.copy(capture / "transport/0001.safetensors", tmp_path / "transport")
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.exr")}
-    assert photograph(tmp_path, "--subjects", "2", "--transport") == 0
+    assert photograph(tmp_path, "--subjects", "2", "--transport", "--shard", "1/2") == 0
     assert tree(tmp_path) == tree(capture)
-    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.exr")}
+    assert before == {path: path.stat().st_mtime_ns for path in tmp_path.glob("0000/**/*.exr")}
 
 
 def test_lights_and_calibration_agree_with_the_images(capture: Path) -> None:

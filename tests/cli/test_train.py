@@ -168,7 +168,8 @@ def test_the_papers_preset_says_what_it_wants(tmp_path: Path, capsys: pytest.Cap
     assert "give --light-features FILE" in capsys.readouterr().err
 
 
-TINY = ["--preset", "tiny", "--heads", "7", "--jobs", "1", "--validate-every", "3", "--device", "cpu"]
+TINY = ["--preset", "tiny", "--heads", "7", "--validate-every", "3", "--device", "cpu"]
+TINY += ["--jobs", "1", "--workers", "0"]
 
 
 @pytest.fixture(scope="module")
@@ -306,7 +307,9 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(
     require_served(tmp_path, "portrait", shipped)
 
 
-def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path) -> None:
+def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # in other processes: tests/dataset/test_portraits.py
+    monkeypatch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))
     dataset = write_small_dataset(tmp_path / "dataset", (1, 1, 0), 1, lights=6, crop_px=192)
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--workers", "0"]
     assert main([*line, "--dataset", str(dataset.folder), "--steps", "1"]) == 0
