@@ -46,15 +46,6 @@ def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) ->
     assert sorted(tmp_path.iterdir()) == sorted([*kept, tmp_path / "a.exr", tmp_path / "folder"])
 
 
-def test_a_folder_is_searched_for_leftovers_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    searched: list[Path] = []
-    monkeypatch.setattr(atomic, "sweep_leftovers", searched.append)
-    for name in ("a", "b", "c"):
-        with atomic_path(tmp_path / name) as temporary:
-            temporary.write_text("x")
-    assert searched == [tmp_path]
-
-
 def test_nothing_stays_where_the_writer_fails(tmp_path: Path) -> None:
     with pytest.raises(KeyError), atomic_path(tmp_path / "a.exr") as temporary:
         temporary.write_text("half")
