@@ -1,4 +1,4 @@
-"""Draw the images of docs/gallery.md: two people under lights that facerf does well, and that it does badly.
+"""Draw the images of docs/gallery.md: two people, cut out, and under lights that facerf does well and badly.
 
     python examples/gallery.py [GRACE_HOPPER.jpg [DOCS]]
 
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.files.images import read_image, write_display
-from facerf_cli.image.strips import fitted, resized
+from facerf_cli.image.strips import resized
 from facerf_cli.main import main
 
 HERE = Path(__file__).parent
@@ -38,18 +38,36 @@ def row(photo: Path, lights: tuple[str, ...]) -> np.ndarray:
     for light in lights:
         name, value = light.split("=")
         options += [name, str(MAPS / value) if name == "--envmap" else value]
+    names = [value.split("=")[1].removesuffix(".exr").replace(",", "_") for value in lights]
+    files = [
+        f"{photo.stem}_{'light_' if light.startswith('--light') else ''}{name}.png"
+        for light, name in zip(lights, names, strict=True)
+    ]
+    return beside([read_image(photo).pixels, *made(["relight", str(photo), *options], files)])
+
+
+def cut_out(photo: Path) -> np.ndarray:
+    """The photo, the person's parts as facerf sees them, and the person before the map that lights it."""
+    words = [str(photo), "--envmap", str(MAPS / "low_sun.exr"), "--background", "envmap"]
+    parts = made(["segment", str(photo)], [f"{photo.stem}_overlay.jpg"])
+    return beside(
+        [read_image(photo).pixels, *parts, *made(["relight", *words], [f"{photo.stem}_low_sun.png"])]
+    )
+
+
+def made(words: list[str], files: list[str]) -> list[np.ndarray]:
+    """Images [H, W, 3], linear, that a command writes."""
     with tempfile.TemporaryDirectory() as folder:
-        if main(["-q", "relight", str(photo), *options, "-o", folder]):
+        if main(["-q", *words, "-o", folder]):
             raise SystemExit(1)
-        names = [value.split("=")[1].removesuffix(".exr").replace(",", "_") for value in lights]
-        written = [
-            Path(folder, f"{photo.stem}_{'light_' if light.startswith('--light') else ''}{name}.png")
-            for light, name in zip(lights, names, strict=True)
-        ]
-        images = [read_image(path).pixels for path in (photo, *written)]
-    height, width = fitted(*images[0].shape[:2], 10**6)
-    scale = HEIGHT_PX / height
-    return np.concatenate([resized(image, HEIGHT_PX, round(width * scale)) for image in images], 1)
+        return [read_image(Path(folder, name)).pixels for name in files]
+
+
+def beside(images: list[np.ndarray]) -> np.ndarray:
+    """Images side by side, of the gallery's height."""
+    height, width = images[0].shape[:2]
+    size = HEIGHT_PX, round(width * HEIGHT_PX / height)
+    return np.concatenate([resized(image, *size) for image in images], 1)
 
 
 if __name__ == "__main__":
@@ -59,3 +77,5 @@ if __name__ == "__main__":
     for name, lights in (("well", WELL), ("badly", BADLY)):
         for photo in (HERE / "astronaut.jpg", second):
             write_display(target / f"gallery_{photo.stem}_{name}.jpg", row(photo, lights), 0.0)
+    both = [cut_out(photo) for photo in (HERE / "astronaut.jpg", second)]
+    write_display(target / "gallery_cut_out.jpg", np.concatenate(both, 1), 0.0)
