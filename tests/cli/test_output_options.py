@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,28 @@ from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.image import colour
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas
-from tests.astronaut import PATH as PHOTO
-from tests.cli.test_relight import relight
+from tests.astronaut import PATH
+from tests.cli import test_relight
 from tests.exr_layers import exr_layers
 
 NAME = "astronaut_light_40_10"
 LIGHT = ("--light", "40,10")
+SIDE = 256
+
+
+@pytest.fixture(scope="module")
+def given(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the other tests with a smaller photo and its landmarks."""
+    folder = Path(shutil.copytree(given, tmp_path_factory.mktemp("small") / "given"))
+    landmarks = np.array(json.loads((given / "astronaut.json").read_text()))
+    with Image.open(PATH) as image:
+        (folder / "astronaut.json").write_text(json.dumps((landmarks * SIDE / image.width).tolist()))
+        image.resize((SIDE, SIDE)).save(folder / "astronaut.png")
+    return folder
+
+
+def relight(given: Path, output: Path, *line: str, photo: Path | None = None) -> int:
+    return test_relight.relight(given, output, *line, photo=photo or given / "astronaut.png")
 
 
 def test_formats_of_the_command_line() -> None:
@@ -85,9 +102,10 @@ def test_one_image_on_standard_output(
     assert relight(given, Path("-"), *LIGHT) == 0
     said = capsysbinary.readouterr()
     (line,) = said.err.decode().splitlines()
-    assert re.fullmatch(rf"{PHOTO} under light_\S+: exposure \S+ EV", line)  # no path that is gone
+    # no path that is gone
+    assert re.fullmatch(rf"{given}/astronaut.png under light_\S+: exposure \S+ EV", line)
     with Image.open(io.BytesIO(said.out)) as image:
-        assert image.format == "PNG" and image.size == (512, 512)
+        assert image.format == "PNG" and image.size == (SIDE, SIDE)
     assert relight(given, Path("-"), *LIGHT, "--format", "exr", "--composite", "face") == 0
     (tmp_path / "piped.exr").write_bytes(capsysbinary.readouterr().out)
     assert read_image(tmp_path / "piped.exr").alpha is not None
@@ -103,13 +121,13 @@ def test_one_image_on_standard_output(
         ("--ball",),
         ("--dry-run",),
         ("--face", "all"),
-        (str(PHOTO.parent),),  # a folder with photos and maps
+        (str(PATH.parent),),  # a folder with photos and maps
     ],
 )
 def test_several_images_are_refused_before_anything_is_loaded(
     given: Path, line: tuple[str, ...], capsysbinary: pytest.CaptureFixture[bytes]
 ) -> None:
-    assert relight(given, Path("-"), *LIGHT, *line) == 2
+    assert relight(given, Path("-"), *LIGHT, *line, photo=PATH) == 2
     said = capsysbinary.readouterr()
     assert said.out == b"" and b"-o -" in said.err and said.err.count(b"\n") == 1
 
@@ -163,7 +181,7 @@ def test_a_configuration_of_a_show_names_spaces_in_and_out(given: Path, tmp_path
     )
     png = oiio.ImageBuf(str(tmp_path / "out" / f"{NAME}.png")).get_pixels(oiio.FLOAT)
     np.testing.assert_allclose(png[behind].mean(0), [0.2, 0.5, 0.9], atol=1e-3)
-    write_exr(tmp_path / "astronaut.exr", read_image(PHOTO).pixels / 2)
+    write_exr(tmp_path / "astronaut.exr", read_image(given / "astronaut.png").pixels / 2)
     line = [*show[:4], *LIGHT, "--input-colourspace", "Half", "--format", "exr"]
     assert relight(given, tmp_path / "in", *line, photo=tmp_path / "astronaut.exr") == 0
     assert relight(given, tmp_path / "in2", *line[2:6], "--format", "exr") == 0
