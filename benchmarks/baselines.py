@@ -27,7 +27,7 @@ from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.diffuse_sh import explain_texture
 from facerf_cli.dataset.dataset import SPLITS, Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, load_pairs
-from facerf_cli.evaluation.people import CropView, DatasetPerson
+from facerf_cli.evaluation.people import DatasetPerson, HeadView, Reading
 from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import mean_interval, si_mse
@@ -44,7 +44,7 @@ STEPS = ("reconstruction", "in the source's true light", "under another map", "a
 class CapturedView:
     """A camera's crop of a person: its view, the lights' directions [L, 3], their images [L, 3, S, S]."""
 
-    view: CropView
+    view: HeadView
     directions: Tensor
     olats: Tensor
 
@@ -75,7 +75,7 @@ def main() -> None:
     models = load_models()
     errors: dict[str, list[tuple[str, list[float], float]]] = defaultdict(list)
     for subject in dataset.splits[given.split]:
-        person = DatasetPerson(dataset, subject, None, models.sides(), models.networks.people)
+        person = DatasetPerson(dataset, subject, Reading(models.networks.people, models.sides()))
         for case in cases(dataset, subject, given.per_person):
             for method in given.reflectance:
                 errors[method].append((subject, *measure(models, person, case, method)))
@@ -124,7 +124,7 @@ def measure(
 
 def captured(models: Models, person: DatasetPerson, camera: str) -> CapturedView:
     """Read a camera's stack of a person."""
-    view, directions = person.lit(camera).by(models).view, person.header(camera).directions
+    view, directions = person.lit(camera).by(models), person.header(camera).directions
     olats = read_olats(person.dataset.stack_path(person.name, camera)).float()
     return CapturedView(view, torch.from_numpy(directions).float(), olats)
 

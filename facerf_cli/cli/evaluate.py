@@ -3,27 +3,30 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import EPILOG, HELP_NAMES, refuse_given, settings_of, with_groups
+from facerf_cli.cli.options import EPILOG, HELP_NAMES, is_default, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
-from facerf_cli.option import DATA, METHODS, Only, Without
-from facerf_cli.work.evaluation_settings import (
+from facerf_cli.evaluation.options import (
     EvaluateOptions,
+    GeometryOptions,
     PairsOptions,
     SplitOptions,
+    TransferOptions,
     YaleOptions,
+    folder_name,
 )
-from facerf_cli.work.photo_options import FieldOptions, LightOptions, PhotoOptions, SolveOptions
+from facerf_cli.option import Only, Without
+from facerf_cli.work.evaluation_settings import FaceSettings
+from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptions
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
-_BATCH = ("overwrite", "dry_run", "jobs", "shard", "ray")
-_GIVEN_LIGHTS = ("output", "reflectance", "against", "compare", "pictures", "space", "lpips", "vgg_weights")
-_GIVEN_IMAGES = ("output", "space", "lpips", "vgg_weights")  # no model is run
+_BATCH = ("output", "measures", "overwrite", "dry_run", "jobs", "shard", "ray")
+_MADE_BY_FIELD = ("network_alone", "held_to_photo", "mean_checkpoint")
 
 DatasetArgument = Annotated[
     Path,
@@ -62,9 +65,11 @@ def olat(
     texture under the cosine of the light: the least that a method must beat. A second checkpoint, --against
     without_normals.safetensors, gives the paper's Table 3.
     """
-    _check(options, data)
-    _refuse_without_field(context, options, "network_alone")
-    _run("olat", [str(dataset)], dataset, options, data, photo, field.network_alone)
+    settings = FaceSettings("olat", options, photo, data, field.network_alone)
+    _check(context, settings, photos=False)
+    from facerf_cli.work.evaluate_items import run_on_people
+
+    raise typer.Exit(run_on_people(settings, dataset))
 
 
 def reconstruction(
@@ -83,10 +88,7 @@ def reconstruction(
     makes: that would be exact by construction. Of a DATASET the sources of its pairs are measured; its true
     light is known, so light_error_deg is the angle between the brightest single lights.
     """
-    _check(options, data)
-    folder = _only_dataset(inputs)
-    _refuse_for_others(context, photos=folder is None)
-    _run("reconstruction", inputs, folder, options, data, photo, solve=solve)
+    _run(context, FaceSettings("reconstruction", options, photo, data, solve=solve), inputs)
 
 
 def transfer(
@@ -101,18 +103,7 @@ def transfer(
         ),
     ],
     *,
-    photos: Annotated[
-        bool,
-        typer.Option("--photos", help="Read photos, two of each person or in folders.", rich_help_panel=DATA),
-    ] = False,
-    held_to_photo: Annotated[
-        bool,
-        typer.Option(
-            "--held-to-photo",
-            help="Correct the field by the quotient of its photo, as `relight` does.",
-            rich_help_panel=METHODS,
-        ),
-    ] = False,
+    exchange: TransferOptions,
     data: SplitOptions,
     photo: Annotated[PhotoOptions, Without("texture_side", "face", "person", "matte_from")],
     solve: SolveOptions,
@@ -124,30 +115,21 @@ def transfer(
     from A's. The same method estimates that light in the image with its own reflectance. Of a DATASET,
     couples are sources of one person with different cameras and different maps.
     """
-    _check(options, data)
-    _refuse_for_others(context, photos)
-    _refuse_without_field(context, options, "held_to_photo")
-    folder = None if photos else _only_dataset(inputs)
-    if not photos and folder is None:
-        raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
-    alone = not held_to_photo
-    _run("transfer", inputs, folder, options, data, photo, alone, solve)
+    alone = not exchange.held_to_photo
+    settings = FaceSettings("transfer", options, photo, data, alone, solve)
+    if not exchange.photos:
+        _run(context, settings, inputs)
+    _check(context, settings, photos=True)
+    from facerf_cli.work.evaluate_items import run_on_couples
+
+    raise typer.Exit(run_on_couples(settings, inputs))
 
 
 def geometry(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
     *,
-    mean_checkpoint: Annotated[
-        Path | None,
-        typer.Option(
-            "--mean-checkpoint",
-            metavar="FILE",
-            help="Use a checkpoint of `facerf train --mean-face` for the mean face.",
-            show_default="that of the fitted face",
-            rich_help_panel=METHODS,
-        ),
-    ] = None,
+    mean: GeometryOptions,
     data: Annotated[SplitOptions, Only("split", "every")],
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     options: Annotated[EvaluateOptions, Without("name")],
@@ -158,13 +140,8 @@ def geometry(
     crop, and compared where both show the face. The paper trained networks with the mean face: give them as
     --mean-checkpoint. --against does not apply.
     """
-    _check(options, data)
-    if options.against:
-        raise UsageError("--against: does not apply to geometry; give --checkpoint and --mean-checkpoint")
-    folder = _only_dataset(inputs)
-    _refuse_for_others(context, photos=folder is None)
-    _refuse_without_field(context, options, "mean_checkpoint")
-    _run("geometry", inputs, folder, options, data, photo, mean_checkpoint=mean_checkpoint)
+    settings = FaceSettings("geometry", options, photo, data, mean_checkpoint=mean.mean_checkpoint)
+    _run(context, settings, inputs)
 
 
 def yale_b(
@@ -181,7 +158,7 @@ def yale_b(
     yale: YaleOptions,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "landmarks_from")],
     field: FieldOptions,
-    options: Annotated[EvaluateOptions, Only(*_GIVEN_LIGHTS, *_BATCH)],
+    options: Annotated[EvaluateOptions, Only("reflectance", "against", "compare", "pictures", *_BATCH)],
 ) -> None:
     """Relight real people to real point lights and compare with their photos under these.
 
@@ -192,13 +169,13 @@ def yale_b(
     runs on the sources that --pictures keeps; its PNGs are read as given, too, and its colours are averaged.
     The database is for research and never trained on.
     """
-    options.check()
-    _refuse_without_field(context, options, "network_alone")
-    if options.reflectance is None and not options.against:
-        options = replace(options, reflectance=["portrait"])
+    if is_default(context, "reflectance") and not options.against:
+        options = replace(options, reflectance=("portrait",))
+    settings = FaceSettings("yale-b", options, photo, network_alone=field.network_alone)
+    _check(context, settings, photos=False)
     from facerf_cli.work.evaluate_items import run_yale_b
 
-    raise typer.Exit(run_yale_b(folder, options, photo, yale, field.network_alone))
+    raise typer.Exit(run_yale_b(settings, yale, folder))
 
 
 def pairs(
@@ -213,32 +190,36 @@ def pairs(
         ),
     ],
     compared: PairsOptions,
-    options: Annotated[EvaluateOptions, Only(*_GIVEN_IMAGES, *_BATCH)],
+    options: Annotated[EvaluateOptions, Only(*_BATCH)],
 ) -> None:
     """Measure folders of predictions against a folder of truths, image by image.
 
     Trees are mirrored; names must match, suffixes may differ. A missing, an additional or a differently sized
     prediction is an error: no table is made of what is left.
     """
-    options = replace(options, reflectance=[])
+    options = replace(options, reflectance=())
     options.check()
     options.require_output_apart([*predictions, *filter(None, (compared.truth, compared.masks))])
+    names = tuple(map(folder_name, predictions))
+    compared = replace(compared, predictions=tuple(predictions), names=names)
     from facerf_cli.work.evaluate_items import run_pairs
 
-    raise typer.Exit(run_pairs(predictions, compared, options, settings_of(context)))
+    raise typer.Exit(run_pairs(compared, options, settings_of(context)))
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
     app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_groups(_protocol))
 
 
-def _check(options: EvaluateOptions, data: SplitOptions) -> None:
-    """Raise UsageError for options that would fail every item, or where `--every` would reduce a preset."""
-    options.check()
-    if options.preset and data.every > 1:
-        raise UsageError(
-            "--preset and --every exclude each other: a preset has a fixed number of images; leave one out"
-        )
+def _run(context: typer.Context, settings: FaceSettings, inputs: Sequence[str]) -> None:
+    """Run a protocol on the dataset of the inputs, or on photos, and exit."""
+    folder = _only_dataset(inputs)
+    if folder is None and settings.protocol == "transfer":
+        raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
+    _check(context, settings, photos=folder is None)
+    from facerf_cli.work.evaluate_items import run_on_people, run_on_photos
+
+    raise typer.Exit(run_on_photos(settings, inputs) if folder is None else run_on_people(settings, folder))
 
 
 def _only_dataset(inputs: Sequence[str]) -> Path | None:
@@ -254,50 +235,13 @@ def _only_dataset(inputs: Sequence[str]) -> Path | None:
     return datasets[0] if datasets else None
 
 
-def _refuse_for_others(context: typer.Context, photos: bool) -> None:
-    """Raise UsageError for an option of datasets given with photos, or of photos given with a dataset."""
+def _check(context: typer.Context, settings: FaceSettings, photos: bool) -> None:
+    """Raise UsageError for options that would fail every item, or that would do nothing."""
+    settings.check()
     if photos:
         refuse_given(context, ("split", "every", "joint_fit"), "is for a prepared dataset; leave it out here")
     else:
         refuse_given(context, ("face", "landmarks", "colourspace"), "is for photos; leave it out here")
-
-
-def _refuse_without_field(context: typer.Context, options: EvaluateOptions, name: str) -> None:
-    """Raise UsageError for an option of the field if that is not among the methods."""
-    if not options.has_field:
-        refuse_given(context, (name,), "is for the field; give --reflectance field too, or leave it out")
-
-
-def _run(
-    protocol: Literal["olat", "reconstruction", "transfer", "geometry"],
-    inputs: Sequence[str],
-    folder: Path | None,
-    options: EvaluateOptions,
-    data: SplitOptions,
-    photo: PhotoOptions,
-    network_alone: bool = True,
-    solve: SolveOptions | None = None,
-    mean_checkpoint: Path | None = None,
-) -> None:
-    """Run a protocol on a dataset's folder, or without one on photos, and exit.
-
-    Args:
-        protocol: The protocol's name.
-        inputs: The photos.
-        folder: The prepared dataset; None for photos.
-        options: What is measured and where it goes.
-        data: The split of the dataset.
-        photo: How faces are found and fitted.
-        network_alone: True to leave the photo's correction out of the field.
-        solve: How lights are estimated.
-        mean_checkpoint: The networks of the mean face.
-    """
-    photo.check()
-    solve = solve or SolveOptions()
-    LightOptions(photo=photo, non_negative=solve.non_negative, refine=solve.refine).check()
-    from facerf_cli.work.evaluate_items import FaceSettings, run_on_people, run_on_photos
-
-    settings = FaceSettings(
-        protocol, options, photo, data, network_alone, solve.non_negative, solve.refine, mean_checkpoint
-    )
-    raise typer.Exit(run_on_photos(settings, inputs) if folder is None else run_on_people(settings, folder))
+    if not settings.options.has_field:
+        why = "is for the field; give --reflectance field too, or leave it out"
+        refuse_given(context, _MADE_BY_FIELD, why)

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
 
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.options import Measures, Space
 from facerf_cli.face.dlib_landmarks import face_descriptor
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.image.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
@@ -61,18 +61,13 @@ _DIGEST = "9153a2043dccf3b525d4f13db916e93ef040548ea923b6f2100de5ebac141a78"
 
 @cache
 def perceptual_metric(
-    heads: Path | None, vgg_weights: str | Path | None
+    heads: Path | None, vgg_weights: str | Path
 ) -> Callable[[np.ndarray, np.ndarray], float]:
     """Load LPIPS of two sRGB images [H, W, 3] in 0..1, once a process.
 
     `heads` is the file of `--lpips` (None: that of the installed package), `vgg_weights` the value of
     `--vgg-weights`. Raises UsageError or InputError for weights that are missing or others.
     """
-    if vgg_weights is None:
-        raise UsageError(
-            "--lpips: needs the weights of VGG-16; give --vgg-weights imagenet (downloads 528 MiB once), or "
-            "--vgg-weights PATH of torchvision's vgg16-397923af.pth"
-        )
     network = Lpips()
     _load_heads(network, heads or _installed_heads())
     load_vgg(vgg_weights, network.trunk)
@@ -111,9 +106,6 @@ def _digest(network: Lpips) -> str:
     return hashlib.sha256(values.tobytes()).hexdigest()
 
 
-Space = Literal["linear", "display"]
-
-
 @dataclass(frozen=True)
 class Metric:
     """A metric in a table: its title, its direction, and its digits after the decimal point."""
@@ -137,30 +129,6 @@ METRICS: Mapping[str, Metric] = {  # by name, in the order of tables; a row has 
     "tone_drift_deg": Metric("skin tone drift, degrees of ITA", digits=1),  # without its sign
     "tone_shift_deg": Metric("skin tone drift, above 0 too light", digits=1),
 }
-
-
-@dataclass(frozen=True)
-class Measures:
-    """The choice of metrics and values; settings only, so that it can be sent to other processes.
-
-    The pixel metrics are of linear values, or with the space 'display' of values encoded by sRGB. LPIPS is
-    measured if VGG-16's weights are given (`vgg_weights`: 'imagenet' or a file); its own heads are read from
-    the file `lpips`, or from the package of that name.
-    """
-
-    space: Space = "linear"
-    lpips: Path | None = None
-    vgg_weights: str | Path | None = None
-
-    def check(self) -> None:
-        """Load the weights, once a process; raises UsageError or InputError where they are missing."""
-        if self.with_lpips:
-            perceptual_metric(self.lpips, self.vgg_weights)
-
-    @property
-    def with_lpips(self) -> bool:
-        """True if LPIPS is measured."""
-        return self.lpips is not None or self.vgg_weights is not None
 
 
 @dataclass(frozen=True)
@@ -188,7 +156,7 @@ def measure(comparison: Comparison, measures: Measures) -> list[Row]:
     for method, prediction in comparison.predictions.items():
         values = _pixel_values(prediction, comparison, measures.space)
         ours = shown(prediction, comparison)
-        if measures.with_lpips:
+        if measures.vgg_weights is not None:
             values["lpips"] = perceptual_metric(measures.lpips, measures.vgg_weights)(ours, true)
         if descriptor is not None and landmarks_px is not None:
             values["face_distance"] = float(np.linalg.norm(face_descriptor(ours, landmarks_px) - descriptor))

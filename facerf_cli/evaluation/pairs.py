@@ -16,8 +16,8 @@ from tokenize import TokenError
 import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation import folder_name
 from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.options import folder_name
 from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.texts import read_text, require_regular
 from facerf_cli.network.stored_graph import PeopleNetworks
@@ -29,22 +29,8 @@ SUFFIXES = frozenset(
 _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file
 _CSV_ADVICE = "begin with a header such as name,person,..."
-
-
-PREDICTION_SUFFIXES = (".exr", ".png", ".npy")  # of predictions in files
+PREDICTION_SUFFIXES = (".exr", ".png", ".npy")  # of `--compare`
 _LARGEST_NUMBER_BYTES, _HEADER_BYTES = 8, 1 << 16  # limits of a .npy file
-
-
-@dataclass(frozen=True)
-class ImagePair:
-    """The files of a truth and of its predictions by method, with the person and the facts of the image."""
-
-    name: str
-    truth: Path
-    predictions: Mapping[str, Path]
-    mask: Path | None = None
-    person: str = ""
-    facts: Mapping[str, str | float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -53,6 +39,16 @@ class Facts:
 
     person: str = ""
     values: Mapping[str, str | float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ImagePair:
+    """The files of a case's truth, of its predictions by method, and of its mask."""
+
+    case: Case
+    truth: Path
+    predictions: Mapping[str, Path]
+    mask: Path | None
 
 
 def collect_pairs(
@@ -70,14 +66,21 @@ def collect_pairs(
     by_method = {folder_name(folder): _images_in(folder, [truths, *others]) for folder in predictions}
     mask_files = {} if masks is None else _images_in(masks, [truths, *predictions])
     described = {} if facts is None else read_facts(facts)
-    complaints = [_mismatch(found, by_method[folder_name(folder)], str(folder)) for folder in predictions]
-    complaints += [_mismatch(found, mask_files, str(masks))] if masks is not None else []
-    complaints += [_mismatch(found, described, str(facts))] if facts is not None else []
-    _refuse(complaints, f"give the names of {truths}, with its subfolders; suffixes may differ")
-    pairs = [
-        _pair(name, found[name], {m: files[name] for m, files in by_method.items()}, mask_files, described)
-        for name in sorted(found)
-    ]
+    named: list[tuple[Path | None, Mapping[str, object]]] = list(
+        zip(predictions, by_method.values(), strict=True)
+    )
+    named += [(masks, mask_files), (facts, described)]
+    complaints = [_mismatch(found, names, str(place)) for place, names in named if place is not None]
+    if said := [complaint for complaint in complaints if complaint]:
+        raise InputError(
+            f"{'; '.join(said)}; give the names of {truths}, with its subfolders; suffixes may differ"
+        )
+    pairs = []
+    for name in sorted(found):
+        known = described.get(name, Facts())
+        case = Case(name, known.person or name.split("/")[0], known.values)
+        files = {method: images[name] for method, images in by_method.items()}
+        pairs.append(ImagePair(case, found[name], files, mask_files.get(name)))
     return pairs
 
 
@@ -91,17 +94,12 @@ def compare_pair(pair: ImagePair, finder: PeopleNetworks | None = None) -> Compa
     truth = _read(pair.truth)
     mask = truth.alpha
     if pair.mask is not None:
-        mask = _read(pair.mask, colourspace="linear").pixels.mean(-1).clip(0, 1)
+        mask = _read(pair.mask, "linear").pixels.mean(-1).clip(0, 1)
     if mask is None:
         mask = np.ones(truth.pixels.shape[:2], np.float32)
     landmarks_px = find_faces(finder, truth.pixels, str(pair.truth))[0].landmarks_px if finder else None
-    return Comparison(
-        Case(pair.name, pair.person, pair.facts),
-        truth.pixels,
-        mask,
-        {method: _read(path).pixels for method, path in pair.predictions.items()},
-        landmarks_px=landmarks_px,
-    )
+    predictions = {method: _read(path).pixels for method, path in pair.predictions.items()}
+    return Comparison(pair.case, truth.pixels, mask, predictions, landmarks_px=landmarks_px)
 
 
 def _check_folders(predictions: Sequence[Path], folders: Sequence[Path]) -> None:
@@ -149,24 +147,6 @@ def _mismatch(truths: Mapping[str, Path], others: Mapping[str, object], where: s
 
 def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED_AT_MOST]) + (", ..." if len(names) > _NAMED_AT_MOST else "")
-
-
-def _refuse(complaints: Sequence[str | None], advice: str) -> None:
-    """Raise InputError with all complaints in one line, if there are any."""
-    if found := [complaint for complaint in complaints if complaint]:
-        raise InputError(f"{'; '.join(found)}; {advice}")
-
-
-def _pair(
-    name: str,
-    truth: Path,
-    predictions: Mapping[str, Path],
-    masks: Mapping[str, Path],
-    facts: Mapping[str, Facts],
-) -> ImagePair:
-    known = facts.get(name, Facts())
-    person = known.person or name.split("/")[0]
-    return ImagePair(name, truth, predictions, masks.get(name), person, known.values)
 
 
 def _read(path: Path, colourspace: str | None = None) -> LinearImage:
@@ -244,8 +224,7 @@ def _prediction(folder: Path, case: str, shape: tuple[int, ...], grey_as_given: 
     if len(there) > 1:
         names = " and ".join(path.name for path in there)
         raise InputError(f"{folder}: case {case} has the files {names}; remove all but one")
-    space = "linear" if grey_as_given else None
-    pixels = read_array(there[0]) if there[0].suffix == ".npy" else read_image(there[0], space).pixels
+    pixels = _read(there[0], "linear" if grey_as_given else None).pixels
     if grey_as_given:
         pixels = np.repeat(pixels.mean(-1, keepdims=True), 3, -1)
     if pixels.shape[:2] != tuple(shape[:2]):

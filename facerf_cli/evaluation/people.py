@@ -1,10 +1,8 @@
 """Faces that protocols measure, and the methods that relight them: people of a dataset, and photos."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,7 +17,6 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, region_mask
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
@@ -44,111 +41,80 @@ from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.appearance.people import skin_albedo
 
+_MASK_SIDE = 256  # texels of the masks
+log = logging.getLogger(LOGGER_NAME)
+
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A reflectance model under the name of its figures; its images are those of `facerf relight`."""
+    """A reflectance model under the name of its figures; its images are those of `facerf relight`.
+
+    Without `network_alone` a field is corrected by its photo, which then comes back by construction.
+    """
 
     name: str
     kind: RelightKind
     models: Models
+    network_alone: bool = True
     estimator: Estimator = DEFAULT_ESTIMATOR
 
-    def explained(self, head: Head, network_alone: bool = True) -> Explained:
-        """Reflectance and light; a field with the photo's correction gives the photo back by construction."""
+    def explained(self, head: Head) -> Explained:
+        """Reflectance and light of a head's photo."""
         if self.kind == "portrait":
             raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
-        return explain(self.models, head, self.kind, network_alone, self.estimator)
+        return explain(self.models, head, self.kind, self.network_alone, self.estimator)
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
         """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
         return Person(self.models, None, head, reflectance).image(light, target).pixels
 
     def images(
-        self,
-        photo: np.ndarray | None,
-        head: Head,
-        directions: Tensor,
-        weights: Tensor,
-        target: Target,
-        network_alone: bool,
+        self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
     ) -> Iterator[np.ndarray]:
-        """Yield images under M sums, weights [M, L, 3], of lights [L, 3]; in the photo, if it is given."""
-        reflectance = reflectance_of(self.models, head, self.kind, network_alone, photo=photo)
+        """Yield an image under each weighted sum of lights; in the photo, if it is given."""
+        reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
         composition = Person(self.models, photo, head, reflectance).composed(target)
-        for relit in composition.relit(Lights(directions, weights)):
+        for relit in composition.relit(lights):
             yield composition.image(relit).pixels
 
 
-LIGHTS_DEG = (0, 30, 60, 90, 180)  # between a light and the camera's axis
-TURNS_DEG = (0, 30, 60, 180)  # of the head, from the source's pose to the target's
-_NO_TURN_DEG = 0.5
-_MASK_SIDE = 256  # texels of the masks
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Settings of finding, fitting and comparing faces.
+
+    Each image is a separate photo, whose face is found, and fitted or regressed as `geometry` says. With
+    `geometry` None heads are those that were fitted to all calibrated cameras of a person at once. Eyes are
+    left out unless `keep_eyes`, since the field of open eyes is not learnt (paper, 'Results').
+    """
+
+    people: PeopleNetworks
+    sides: Sides
+    geometry: Geometry | None = None
+    keep_eyes: bool = False
+    landmarks_from: LandmarksFrom = "facerf"
+
+    def find(self, image: np.ndarray, name: str) -> FaceBox:
+        """The largest face in an image; InputError where none is found."""
+        assert self.geometry is not None
+        return find_for(self.people, self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
 
 
 @dataclass(frozen=True, eq=False)
-class CropView:
-    """A fitted face in its crop [S, S]: the (u, v) of each pixel and the mask of the comparison.
+class HeadView:
+    """A head in its crop [S, S], in its photo's pose or in that of `fit`, and where it is compared.
 
-    `mask` [S, S] in 0..1 is the paper's M_t where the crop shows the photo. Eyes are left out of it unless
-    `keep_eyes`, since the field of open eyes is not learnt (paper, 'Results').
+    `uv` holds the (u, v) of each pixel. `mask` [S, S] in 0..1 is the paper's M_t where the crop shows the
+    photo.
     """
 
+    head: Head
     fit: FaceFit
     uv: Tensor
     mask: np.ndarray
 
-    @staticmethod
-    def of(model: MorphableModel, fit: FaceFit, valid: np.ndarray, keep_eyes: bool = False) -> "CropView":
-        """View a fit of `model`; `valid` [S, S] in 0..1 is where the crop shows the photo.
-
-        Raises InputError where nothing of the face is visible.
-        """
-        vertices = fit.vertices_camera(model)
-        fragments = rasterize(vertices, grid_triangles(), fit.camera)
-        uv = interpolate(grid_uv(), grid_triangles(), fragments)
-        mask = interior_mask(vertices, fragments, uv, _MASK_SIDE)[0]
-        if not keep_eyes:
-            mask = mask * (1 - sample_texture(region_mask("eyes", _MASK_SIDE)[None], uv)[..., 0])
-        inside = mask.numpy() * valid
-        if not inside.max() > 0:
-            raise InputError("nothing of the fitted face is visible in the image; give its --landmarks")
-        return CropView(fit, uv, inside)
-
     def region(self, name: str) -> np.ndarray:
         """The mask [S, S] in 0..1 of a named region of the face (`face/topology.py`)."""
         return sample_texture(region_mask(name, _MASK_SIDE)[None], self.uv)[..., 0].numpy()
-
-
-def angle_of(rotation: Tensor) -> float:
-    """The angle in degrees of a rotation [3, 3]."""
-    return float((((rotation.trace() - 1) / 2).clamp(-1, 1).acos()).rad2deg())
-
-
-def angle_class(angle_deg: float) -> str:
-    """'0 to 30 deg' and so on, of the angle between a light and the camera's axis."""
-    return _class(angle_deg, LIGHTS_DEG)
-
-
-def turn_class(angle_deg: float) -> str:
-    """'none', '0 to 30 deg' and so on, of the angle by which a head is turned."""
-    return "none" if angle_deg < _NO_TURN_DEG else _class(angle_deg, TURNS_DEG)
-
-
-def _class(angle_deg: float, edges_deg: tuple[int, ...]) -> str:
-    return next(f"{low} to {high} deg" for low, high in pairwise(edges_deg) if angle_deg <= high)
-
-
-T = TypeVar("T")
-log = logging.getLogger(LOGGER_NAME)
-
-
-@dataclass(frozen=True, eq=False)
-class FittedPortrait:
-    """A portrait fitted by one method's models: the head, and the view in which it is compared."""
-
-    head: Head
-    view: CropView
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,29 +128,37 @@ class Portrait:
     name: str
     photo: LinearImage
     face: FaceBox | FaceFit
-    sides: Sides
-    keep_eyes: bool = False
-    _fitted: dict[int, tuple[Models, FittedPortrait]] = field(default_factory=dict)
+    reading: Reading
+    _views: dict[int, tuple[Models, HeadView]] = field(default_factory=dict)
 
-    def by(self, models: Models) -> FittedPortrait:
+    def by(self, models: Models) -> HeadView:
         """The portrait by a method's models; InputError where nothing of the face is visible."""
-        if id(models) not in self._fitted:
+        if id(models) not in self._views:
             head = self._head(models)
-            inside, view = self._inside(head.fit.crop), self._view(models, head.fit)
-            self._fitted[id(models)] = models, FittedPortrait(head.without(models.face, inside), view)
-        return self._fitted[id(models)][1]
+            view = self._view(models, head, head.fit)
+            masked = head.without(models.face, self._inside(head.fit.crop))
+            self._views[id(models)] = models, replace(view, head=masked)
+        return self._views[id(models)][1]
 
-    def posed_as(self, fit: FaceFit, models: Models) -> CropView:
-        """The view in which another fit's shape has this portrait's pose."""
-        own = self.by(models).view.fit
-        posed = replace(own, alpha=fit.alpha, beta=fit.beta)
-        return self._view(models, posed)
+    def pose_of(self, view: HeadView, models: Models) -> HeadView:
+        """Another portrait's head in this portrait's pose."""
+        own = self.by(models).fit
+        posed = replace(own, alpha=view.fit.alpha, beta=view.fit.beta)
+        return self._view(models, view.head, posed)
 
-    def _view(self, models: Models, fit: FaceFit) -> CropView:
-        try:
-            return CropView.of(models.face, fit, self._inside(fit.crop), self.keep_eyes)
-        except InputError as error:
-            raise InputError(f"{self.name}: {error}") from None
+    def _view(self, models: Models, head: Head, fit: FaceFit) -> HeadView:
+        vertices = fit.vertices_camera(models.face)
+        fragments = rasterize(vertices, grid_triangles(), fit.camera)
+        uv = interpolate(grid_uv(), grid_triangles(), fragments)
+        mask = interior_mask(vertices, fragments, uv, _MASK_SIDE)[0]
+        if not self.reading.keep_eyes:
+            mask = mask * (1 - sample_texture(region_mask("eyes", _MASK_SIDE)[None], uv)[..., 0])
+        inside = mask.numpy() * self._inside(fit.crop)
+        if not inside.max() > 0:
+            raise InputError(
+                f"{self.name}: nothing of the fitted face is visible in the image; give its --landmarks"
+            )
+        return HeadView(head, fit, uv, inside)
 
     def _inside(self, crop: Crop) -> np.ndarray:
         """The share of the photo in each pixel of a crop [S, S], in 0..1."""
@@ -193,14 +167,13 @@ class Portrait:
         return inside if alpha is None else inside * crop.apply(alpha[..., None])[..., 0]
 
     def _head(self, models: Models) -> Head:
+        image, sides = self.photo.pixels, self.reading.sides
         if not isinstance(self.face, FaceFit):
-            return head_of(models, self.photo.pixels, self.face, self.sides)
-        image = self.photo.pixels
-        face = unwrap_face(models.face, self.face, image, self.sides.texture, image.shape)
-        return Head(image, self.face, face)
+            return head_of(models, image, self.face, sides)
+        return Head(image, self.face, unwrap_face(models.face, self.face, image, sides.texture, image.shape))
 
 
-def common_mask(views: Iterable[CropView]) -> np.ndarray:
+def common_mask(views: Iterable[HeadView]) -> np.ndarray:
     """The mask [S, S] inside those of all views."""
     return np.minimum.reduce([view.mask for view in views])
 
@@ -211,19 +184,11 @@ class NoFaceError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class DatasetPerson:
-    """A subject of a prepared dataset.
-
-    Each source is a separate photo: the face is found in it, and fitted or regressed as `geometry` says.
-    With `geometry` None the head is that which was fitted to all calibrated cameras of the person at once.
-    """
+    """A subject of a prepared dataset."""
 
     dataset: Dataset
     name: str
-    geometry: Geometry | None
-    sides: Sides
-    people: PeopleNetworks
-    keep_eyes: bool = False
-    landmarks_from: LandmarksFrom = "facerf"
+    reading: Reading
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
@@ -251,16 +216,15 @@ class DatasetPerson:
 
     def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
         header = self.header(camera)
-        if self.geometry is None:
-            face: FaceBox | FaceFit = _in_own_frame(fit_from_arrays(header.fit))
+        face: FaceBox | FaceFit
+        if self.reading.geometry is None:
+            face = _in_own_frame(fit_from_arrays(header.fit))
         else:
             try:
-                face = find_for(self.people, self.geometry, image, name, landmarks_from=self.landmarks_from)[
-                    0
-                ]
+                face = self.reading.find(image, name)
             except InputError as error:
                 raise NoFaceError(str(error)) from None
-        return Portrait(name, LinearImage(image, header.seen), face, self.sides, self.keep_eyes)
+        return Portrait(name, LinearImage(image, header.seen), face, self.reading)
 
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
@@ -338,12 +302,3 @@ def _in_own_frame(fit: FaceFit) -> FaceFit:
     """The fit with its crop as a separate image: the crop's pixels are the photo's."""
     side_px = fit.crop.size_px
     return replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px))
-
-
-def evenly(groups: Mapping[str, Sequence[T]], most: int) -> dict[str, list[T]]:
-    """Choose the first of each group, then the second of each, and so on, up to `most` in all."""
-    rounds = sorted((place, name) for name, members in groups.items() for place in range(len(members)))
-    chosen: dict[str, list[T]] = {name: [] for name in groups}
-    for place, name in rounds[:most]:
-        chosen[name].append(groups[name][place])
-    return {name: members for name, members in chosen.items() if members}

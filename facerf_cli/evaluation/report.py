@@ -11,13 +11,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from PIL import Image
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import BeforeValidator
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Comparison, Row
 from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, cell_words, metric_named, published_for
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.documents import Document, read_document
+from facerf_cli.files.documents import read_document
 from facerf_cli.files.sheets import filled_page
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.metrics import best_scale
@@ -142,21 +142,35 @@ def cases_to_keep(rows: Sequence[Row], metric: str) -> list[str]:
     return sorted(chosen)
 
 
+def _badness(row: Row, metric: str) -> float:
+    """A row's figure, larger for a worse image; minus infinity if there is none."""
+    value = row.values.get(metric, math.nan)
+    sign = 1 if metric_named(metric).lower_is_better else -1
+    return sign * value if math.isfinite(value) else -math.inf
+
+
 def _worst_first(rows: Iterable[Row], metric: str) -> list[str]:
     """Cases of one method's rows whose figure is finite, the worst first; of equals by name."""
-    sign = 1 if metric_named(metric).lower_is_better else -1
-    figures = ((-sign * row.values.get(metric, math.nan), row.case) for row in rows)
-    return [case for figure, case in sorted(pair for pair in figures if math.isfinite(pair[0]))]
+    figures = sorted((-_badness(row, metric), row.case) for row in rows)
+    return [case for figure, case in figures if math.isfinite(figure)]
+
+
+def _with_nan(row: Any) -> Any:
+    """A row whose figures are null where they are NaN."""
+    if isinstance(row, dict) and isinstance(values := row.get("values"), dict):
+        return row | {"values": {name: math.nan if v is None else v for name, v in values.items()}}
+    return row
 
 
 @dataclass(frozen=True)
 class ItemFigures:
-    """The figures of a finished item: its rows and its strips.
+    """The document of a finished item: its rows and its strips.
 
     `pictures` are images kept for other methods. Paths are relative to the evaluation's folder.
     """
 
-    rows: tuple[Row, ...]
+    format: Format
+    rows: tuple[Annotated[Row, BeforeValidator(_with_nan)], ...]
     strips: tuple[Strip, ...]
     pictures: tuple[str, ...]
 
@@ -168,35 +182,17 @@ class ItemFigures:
 
 def write_figures(path: Path, figures: ItemFigures) -> None:
     """Write an item's figures as one line of JSON, atomically; NaN and infinity become null."""
-    content = {"format": FORMAT, **asdict(figures)}
     with atomic_path(path) as temporary:
-        temporary.write_text(json_line(content) + "\n", encoding="utf-8", errors="backslashreplace")
-
-
-def _with_nan(row: Any) -> Any:
-    """A row whose figures are null where they are NaN."""
-    if isinstance(row, dict) and isinstance(values := row.get("values"), dict):
-        return row | {"values": {name: math.nan if v is None else v for name, v in values.items()}}
-    return row
-
-
-class _FiguresDocument(Document):
-    model_config = ConfigDict(strict=False)  # lists become tuples
-
-    format: Format
-    rows: tuple[Annotated[Row, BeforeValidator(_with_nan)], ...]
-    strips: tuple[Strip, ...]
-    pictures: tuple[str, ...]
+        temporary.write_text(json_line(asdict(figures)) + "\n", encoding="utf-8", errors="backslashreplace")
 
 
 def read_figures(path: Path) -> ItemFigures:
     """Read an item's figures; null becomes NaN. Raises InputError for any other file."""
     advice = "no figures of an evaluation; remove it, or give --overwrite always"
     try:
-        content = read_document(path, _FiguresDocument, advice)
+        return read_document(path, ItemFigures, advice)
     except InputError as error:
         raise InputError(str(error) if advice in str(error) else f"{error}; {advice}") from None
-    return ItemFigures(content.rows, content.strips, content.pictures)
 
 
 def images_csv(rows: Sequence[Row]) -> str:
@@ -236,14 +232,12 @@ class Chosen:
 def choose(summary: Summary, rows: Sequence[Row], strips: Iterable[Strip], worst: int = WORST) -> Chosen:
     """Choose among the cases whose strips were kept, by the layout's first metric of the first method."""
     metric, first = summary.metrics[0], summary.methods[0]
-    sign = 1 if metric_named(metric).lower_is_better else -1
     of_case: dict[str, list[Row]] = {}
     for row in rows:
         of_case.setdefault(row.case, []).append(row)
 
     def badness(case: CaseImage) -> float:
-        value = next((row.values.get(metric, math.nan) for row in case.rows if row.method == first), math.nan)
-        return sign * value if math.isfinite(value) else -math.inf
+        return next((_badness(row, metric) for row in case.rows if row.method == first), -math.inf)
 
     cases = [CaseImage(strip, tuple(of_case[strip.case])) for strip in strips if strip.case in of_case]
     cases = sorted(cases, key=lambda case: (-badness(case), case.strip.case))
@@ -251,6 +245,7 @@ def choose(summary: Summary, rows: Sequence[Row], strips: Iterable[Strip], worst
         return Chosen(tuple(cases), (), ())
     rest, best = cases[:-BEST], cases[-BEST:][::-1]
     cell = summary.groups[0].cells[metric].get(first)
+    sign = 1 if metric_named(metric).lower_is_better else -1
     median = sign * cell.interval.median if cell else 0.0
     typical = sorted(rest, key=lambda case: abs(badness(case) - median))[:TYPICAL]
     bad = [case for case in rest if case not in typical and badness(case) > median][:worst]

@@ -1,10 +1,12 @@
 """The tables of a run from its rows: each method over all images and by every fact, and against the first."""
 
+import csv
 import math
 import re
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -28,11 +30,11 @@ class PublishedFigure:
     method: str
     metric: str
     mean: float
-    sd: float | None = None
-    group: tuple[str, str] | None = None
-    source: str = "the paper"
-    data: str = "other data than ours"
-    digits: int | None = None  # after the decimal point, as published; None: as ours
+    sd: float | None
+    group: tuple[str, str] | None
+    source: str
+    data: str
+    digits: int | None  # after the decimal point, as published; None: as ours
 
     def words(self, digits: int) -> tuple[str, str]:
         """Format mean and standard deviation, with the published digits if they are known."""
@@ -40,16 +42,22 @@ class PublishedFigure:
         return f"{self.mean:.{digits}f}", "" if self.sd is None else f"{self.sd:.{digits}f}"
 
 
-_METHODS_OF_TABLE_2 = ("the paper's", "Smith et al.", "Schneider et al.", "Tewari et al.")
-
-
-def paper_table_2(
-    metric: str, data: str, figures: Sequence[tuple[float, float]]
-) -> tuple[PublishedFigure, ...]:
-    """A row of the paper's Table 2: mean and standard deviation of each method there."""
+def published(*protocols: str) -> tuple[PublishedFigure, ...]:
+    """Read the figures that are shown with those of protocols, from published.csv."""
+    with Path(__file__).with_name("published.csv").open(encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["protocol"] in protocols]
     return tuple(
-        PublishedFigure(method, metric, mean, sd, None, "Table 2", data, 3)
-        for method, (mean, sd) in zip(_METHODS_OF_TABLE_2, figures, strict=True)
+        PublishedFigure(
+            row["method"],
+            row["metric"],
+            float(row["mean"]),
+            float(row["sd"]) if row["sd"] else None,
+            (row["fact"], row["value"]) if row["fact"] else None,
+            row["source"],
+            row["data"],
+            int(row["digits"]) if row["digits"] else None,
+        )
+        for row in rows
     )
 
 
@@ -91,6 +99,13 @@ class Cell:
     left_out: int  # images whose value is not finite
     paired: Paired | None  # None for the first method, and where no image has both
 
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures for JSON."""
+        entry: dict[str, Any] = self.interval.as_dict() | {"left_out": self.left_out}
+        if self.paired is not None:
+            entry["less_the_first"] = self.paired.difference.as_dict() | {"won": self.paired.won}
+        return entry
+
 
 @dataclass(frozen=True)
 class Group:
@@ -104,6 +119,14 @@ class Group:
     def title(self) -> str:
         """The group's name in a table."""
         return f"{self.fact}: {self.value}" if self.fact else ALL
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the group's tables for JSON."""
+        metrics = {
+            metric: {method: cell.as_dict() for method, cell in by_method.items()}
+            for metric, by_method in self.cells.items()
+        }
+        return {"fact": self.fact or None, "value": self.value or None, "metrics": metrics}
 
 
 @dataclass(frozen=True)
@@ -127,24 +150,9 @@ class Summary:
             "persons": self.persons,
             "methods": self.methods,
             "metrics": self.metrics,
-            "groups": [_group_as_dict(group) for group in self.groups],
+            "groups": [group.as_dict() for group in self.groups],
             "published": [vars(figure) for figure in self.layout.published],
         }
-
-
-def _group_as_dict(group: Group) -> dict[str, Any]:
-    cells = {
-        metric: {method: _cell_as_dict(cell) for method, cell in by_method.items()}
-        for metric, by_method in group.cells.items()
-    }
-    return {"fact": group.fact or None, "value": group.value or None, "metrics": cells}
-
-
-def _cell_as_dict(cell: Cell) -> dict[str, Any]:
-    entry: dict[str, Any] = cell.interval.as_dict() | {"left_out": cell.left_out}
-    if cell.paired is not None:
-        entry["less_the_first"] = cell.paired.difference.as_dict() | {"won": cell.paired.won}
-    return entry
 
 
 def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
@@ -155,15 +163,18 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     keys = {(row.case, row.method) for row in rows}
     if len(keys) < len(rows):
         raise ValueError(f"{len(rows) - len(keys)} images were measured twice")
-    measured = _unique(name for row in rows for name in row.values)
-    metrics = tuple(_unique([*(name for name in layout.metrics if name in measured), *measured]))
-    methods = tuple(_unique(row.method for row in rows))
-    groups = [Group("", "", _cells(rows, methods, metrics))]
+    measured = dict.fromkeys(name for row in rows for name in row.values)
     narrow = tuple(name for name in layout.metrics if name in measured)
+    metrics = tuple(dict.fromkeys([*narrow, *measured]))
+    methods = tuple(dict.fromkeys(row.method for row in rows))
+    groups = [Group("", "", _cells(rows, methods, metrics))]
     for fact in layout.by:
-        for value in sorted({str(row.facts[fact]) for row in rows if fact in row.facts}, key=natural):
-            inside = [row for row in rows if fact in row.facts and str(row.facts[fact]) == value]
-            groups.append(Group(fact, value, _cells(inside, methods, narrow)))
+        by_value: dict[str, list[Row]] = {}
+        for row in rows:
+            if fact in row.facts:
+                by_value.setdefault(str(row.facts[fact]), []).append(row)
+        for value in sorted(by_value, key=natural):
+            groups.append(Group(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
     return Summary(layout, methods, metrics, tuple(groups), len(cases), len(persons))
 
@@ -188,33 +199,27 @@ def natural(text: str) -> list[tuple[int, float, str]]:
     return [(0, float(part), "") if index % 2 else (1, 0.0, part) for index, part in enumerate(parts)]
 
 
-def _unique(names: Iterable[str]) -> list[str]:
-    """The names without repetitions, in their order."""
-    return list(dict.fromkeys(names))
-
-
 def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) -> dict[str, dict[str, Cell]]:
     """The cells that have values, by metric and method."""
     found: dict[str, dict[str, Cell]] = {}
     for metric in metrics:
-        by_method = {
-            method: {row.case: row for row in rows if row.method == method and metric in row.values}
-            for method in methods
-        }
-        cells = {method: _cell(metric, by_method[method], by_method[methods[0]]) for method in methods}
+        by_method: dict[str, dict[str, Row]] = {method: {} for method in methods}
+        for row in rows:
+            if metric in row.values:
+                by_method[row.method][row.case] = row
+        cells = {method: _cell(metric, own, by_method[methods[0]]) for method, own in by_method.items()}
         found[metric] = {method: cell for method, cell in cells.items() if cell is not None}
     return found
 
 
 def _cell(metric: str, ours: Mapping[str, Row], firsts: Mapping[str, Row]) -> Cell | None:
     """The figures of one method's rows by case; None if no value is finite."""
-    values = {case: row.values[metric] for case, row in ours.items()}
-    finite = {case: value for case, value in values.items() if math.isfinite(value)}
+    finite = {case: row.values[metric] for case, row in ours.items() if math.isfinite(row.values[metric])}
     interval = mean_interval((ours[case].person, value) for case, value in finite.items())
     if interval is None:
         return None
     paired = None if ours is firsts else _paired(metric, finite, firsts)
-    return Cell(tuple(sorted(finite.values())), interval, len(values) - len(finite), paired)
+    return Cell(tuple(sorted(finite.values())), interval, len(ours) - len(finite), paired)
 
 
 def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -> Paired | None:

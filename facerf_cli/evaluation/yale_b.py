@@ -17,16 +17,14 @@ import torch
 from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.people import Method
-from facerf_cli.evaluation.summary import Layout, PublishedFigure
-from facerf_cli.face.fit import Geometry
+from facerf_cli.evaluation.people import Method, Reading
+from facerf_cli.evaluation.summary import Layout, published
 from facerf_cli.face.head import Head
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio import StudioLight
-from facerf_cli.light.studio_points import far_samples
-from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.find import FaceBox, LandmarksFrom
+from facerf_cli.light.studio_points import Lights, far_samples
+from facerf_cli.pipeline import head_of
+from facerf_cli.portrait.find import FaceBox
 from facerf_cli.relighting.composition import Target
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
@@ -174,35 +172,7 @@ def face_mask() -> np.ndarray:
     return ((x - 84) / 70) ** 2 + ((y - 98) / 88) ** 2 <= 1
 
 
-COLUMNS = ("frontal", "soft", "environment")
 PUBLISHED_SUBJECTS = 21
-_SOURCE = "Yale B"
-_SAME = f"same images, {PUBLISHED_SUBJECTS} people"
-_MORE = _SAME + ", given more data"  # learns from other subjects under the same flashes
-
-# Data, then (Si-MSE, SSIM) by column, then Si-MSE by angle.
-FIGURES: dict[str, tuple[str, tuple[tuple[float, float], ...], tuple[float, ...]]] = {
-    "copy of the source": (
-        _SAME,
-        ((0.0299, 0.609), (0.0512, 0.495), (0.0361, 0.646)),
-        (0.0044, 0.0122, 0.0308, 0.0540, 0.0570),
-    ),
-    "DPR": (
-        _SAME,
-        ((0.0111, 0.686), (0.0131, 0.641), (0.0145, 0.729)),
-        (0.0057, 0.0080, 0.0122, 0.0164, 0.0155),
-    ),
-    "GeomConsistentFR": (
-        _SAME,
-        ((0.0119, 0.674), (0.0151, 0.629), (0.0145, 0.709)),
-        (0.0055, 0.0101, 0.0139, 0.0178, 0.0145),
-    ),
-    "quotient image": (
-        _MORE,
-        ((0.0074, 0.751), (0.0093, 0.724), (0.0078, 0.789)),
-        (0.0024, 0.0046, 0.0094, 0.0120, 0.0105),
-    ),
-}
 
 
 def layout(
@@ -214,7 +184,7 @@ def layout(
         title="Extended Yale B: real people relit to real point lights",
         metrics=("si_mse", "ssim"),
         by=("column", "angle", "subjects"),
-        published=published(),
+        published=published("yale-b"),
         notes=tuple(_notes(database, subjects, network_alone, room)),
     )
 
@@ -241,29 +211,8 @@ def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool, room: 
         yield f"Settings were chosen on {', '.join(chosen)}."
 
 
-def published() -> tuple[PublishedFigure, ...]:
-    """The published rows for the tables."""
-    rows: list[PublishedFigure] = []
-    for method, (data, by_column, by_angle) in FIGURES.items():
-        for column, (si_mse, ssim) in zip(COLUMNS, by_column, strict=True):
-            group = "column", column
-            rows.append(PublishedFigure(method, "si_mse", si_mse, None, group, _SOURCE, data, 4))
-            rows.append(PublishedFigure(method, "ssim", ssim, None, group, _SOURCE, data, 3))
-        for (low, high), si_mse in zip(pairwise(ANGLES_DEG), by_angle, strict=True):
-            group = "angle", f"{low}-{high} deg"
-            rows.append(PublishedFigure(method, "si_mse", si_mse, None, group, _SOURCE, data, 4))
-    return tuple(rows)
-
-
 def compare_subject(
-    database: YaleB,
-    name: str,
-    methods: Sequence[Method],
-    people: PeopleNetworks,
-    network_alone: bool = False,
-    geometry: Geometry = "landmarks",
-    landmarks_from: LandmarksFrom = "facerf",
-    room: float = 0.0,
+    database: YaleB, name: str, methods: Sequence[Method], reading: Reading, room: float = 0.0
 ) -> Iterator[Comparison]:
     """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
 
@@ -274,28 +223,23 @@ def compare_subject(
         database: The images.
         name: The subject's.
         methods: What is compared, at least one.
-        people: Finds the face.
-        network_alone: True to leave the photo's correction out of the field.
-        geometry: Whether heads are fitted to landmarks or regressed.
-        landmarks_from: Where landmarks come from.
+        reading: How the face is found.
         room: What the room sends back from all around, as a share of what a flash sends.
     """
     subject = YaleSubject(database, name)
     relightings = list(subject.relightings())
-    frontal = _rgb(subject.image("frontal"))
-    where = str(database.folder / name)
-    face = find_for(people, geometry, frontal, where, landmarks_from=landmarks_from)[0]
+    face = reading.find(_rgb(subject.image("frontal")), str(database.folder / name))
     for source in dict.fromkeys(one.source for one in relightings):
         of_source = [one for one in relightings if one.source == source]
-        photo = subject.image(source)
-        relit = _relit_by_all(subject, photo, face, of_source, methods, network_alone, room)
+        photo = _rgb(subject.image(source))
+        relit = _relit_by_all(subject, photo, face, of_source, methods, room)
         for row, one in enumerate(of_source):
             yield Comparison(
                 case=_case(name, one),
                 truth=_rgb(subject.image(one.light)),
                 mask=face_mask().astype(np.float32),
                 predictions={method: _rgb(images[row]) for method, images in relit.items()},
-                source=_rgb(photo),
+                source=photo,
                 grey_as_given=True,
             )
 
@@ -321,10 +265,23 @@ def _relit_by_all(
     face: FaceBox,
     relightings: Sequence[Relighting],
     methods: Sequence[Method],
-    network_alone: bool,
     room: float,
 ) -> Mapping[str, list[np.ndarray]]:
     """The images [H, W] of one source under every target light, by method."""
+    lights = _lights(subject, relightings, room)
+    heads: dict[int, Head] = {}
+    relit = {}
+    for method in methods:
+        key = id(method.models)  # methods over the same networks share the fit
+        if key not in heads:
+            heads[key] = head_of(method.models, photo, face)
+        images = method.images(photo, heads[key], lights, Target())
+        relit[method.name] = [image.mean(-1).clip(min=0) for image in images]
+    return relit
+
+
+def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float) -> Lights:
+    """A sum of flashes for each target, with the room's share of each."""
     weights = torch.from_numpy(np.stack([subject.weights(one.light) for one in relightings])).float()
     used = weights.sum(0) > 0
     directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()[used]
@@ -333,13 +290,4 @@ def _relit_by_all(
         around, share = far_samples(StudioLight())
         directions = torch.cat([directions, around])
         weights = torch.cat([weights, room * share * weights.sum(1, keepdim=True)], 1)
-    rgb_weights = weights[..., None].expand(-1, -1, 3)
-    pixels, heads = _rgb(photo), dict[int, Head]()
-    relit = {}
-    for method in methods:
-        key = id(method.models)  # methods over the same networks share the fit
-        if key not in heads:
-            heads[key] = head_of(method.models, pixels, face)
-        images = method.images(pixels, heads[key], directions, rgb_weights, Target(), network_alone)
-        relit[method.name] = [image.mean(-1).clip(min=0) for image in images]
-    return relit
+    return Lights(directions, weights[..., None].expand(-1, -1, 3))

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
+from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.main import main
-from facerf_cli.work.evaluation_settings import EvaluateOptions
 from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
 
 Said = pytest.CaptureFixture[str]
@@ -119,11 +119,7 @@ def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said)
 
 
 def test_reflectance_models_are_named_and_files_are_there() -> None:
-    options = EvaluateOptions(Path("out"), reflectance=["prt", "field"])
-    assert options.kinds == ("prt", "field") and options.has_field
-    assert (
-        EvaluateOptions(Path("out")).kinds == ("field",)
-        and not EvaluateOptions(Path("out"), reflectance=[]).kinds
-    )
+    assert EvaluateOptions(Path("out"), reflectance=("prt", "field")).has_field
+    assert not EvaluateOptions(Path("out"), reflectance=("prt",)).has_field
     with pytest.raises(UsageError, match="no such file"):
-        EvaluateOptions(Path("out"), against=[Path("none.safetensors")]).check()
+        EvaluateOptions(Path("out"), against=(Path("none.safetensors"),)).check()

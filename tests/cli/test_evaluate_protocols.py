@@ -19,6 +19,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.evaluation import people
+from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import write_exr
@@ -26,9 +27,10 @@ from facerf_cli.main import main
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.relighting.models import Models
-from facerf_cli.work.evaluate_items import FaceSettings, faces_of
-from facerf_cli.work.evaluation_settings import EvaluateOptions, SplitOptions
-from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work import evaluate_items
+from facerf_cli.work.evaluate_items import faces_of, methods_of
+from facerf_cli.work.evaluation_settings import FaceSettings
+from facerf_cli.work.photo_options import PhotoOptions, SolveOptions
 from facerf_cli.work.photos import load_models_once
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double
@@ -51,7 +53,7 @@ def doubles(monkeypatch: pytest.MonkeyPatch) -> None:
     def load(settings: FaceSettings) -> tuple[Double, ...]:
         return (Double("field", models=load_models_once(settings.photo)),)
 
-    monkeypatch.setattr(FaceSettings, "methods", load)
+    monkeypatch.setattr(evaluate_items, "methods_of", load)
 
 
 def run(protocol: str, *words: str | Path) -> int:
@@ -152,18 +154,18 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(
     path = tmp_path / "half.png"
     Image.fromarray(np.dstack([photo, shown])).save(path)
     options = PhotoOptions(Settings(device="cpu"))
-    settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), options, SplitOptions())
+    settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), options)
     models = load_models_once(options)
     whole, half = (next(faces_of(Item(x, x, x.stem), settings)).portrait for x in (PHOTO, path))
     seen, part = whole.by(models), half.by(models)
-    crop = part.view.fit.crop
+    crop = part.fit.crop
     column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
     left, right = column < 215, column > 225
-    assert seen.view.mask[:, left].max() == 1 and part.view.mask[:, left].max() == 0
-    np.testing.assert_allclose(part.view.mask[:, right], seen.view.mask[:, right], atol=0.01)
+    assert seen.mask[:, left].max() == 1 and part.mask[:, left].max() == 0
+    np.testing.assert_allclose(part.mask[:, right], seen.mask[:, right], atol=0.01)
     assert part.head.face.visible.sum() < 0.8 * seen.head.face.visible.sum()
     mean = replace(models, face=models.face.pose_only())
-    assert half.by(mean).view.mask[:, left].max() == 0
+    assert half.by(mean).mask[:, left].max() == 0
     Image.fromarray(np.dstack([photo, np.zeros_like(shown)])).save(path)
     assert run("reconstruction", path, "-o", tmp_path / "out") == 1
     assert f"{path}: " in capsys.readouterr().err
@@ -229,9 +231,9 @@ def test_a_photo_without_a_face_fails_and_no_summary_is_written(
 def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Signed least squares, then features: it reaches every method, and the light of every image."""
     photo = PhotoOptions(Settings(device="cpu"))
-    settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), photo, SplitOptions())
-    (method,) = replace(settings, non_negative=False, refine="features").methods()
-    (plain,) = settings.methods()
+    settings = FaceSettings("reconstruction", EvaluateOptions(tmp_path), photo)
+    (method,) = methods_of(replace(settings, solve=SolveOptions(non_negative=False, refine="features")))
+    (plain,) = methods_of(settings)
     assert not method.estimator.non_negative and isinstance(method.estimator.features, LightNetwork)
     assert plain.estimator.non_negative and plain.estimator.features is None
     asked = []

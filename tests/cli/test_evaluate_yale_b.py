@@ -2,24 +2,19 @@
 
 import csv
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from facerf_cli.batch.settings import Settings
-from facerf_cli.capture.yale_b import Flash, read_yale_b
-from facerf_cli.evaluation import yale_b
+from facerf_cli.capture.yale_b import Flash
+from facerf_cli.evaluation import people, yale_b
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
-from facerf_cli.work.evaluate_items import FaceSettings, YaleWork
-from facerf_cli.work.evaluation_settings import EvaluateOptions, YaleOptions
-from facerf_cli.work.photo_options import PhotoOptions
-from tests.capture.yale_fixture import ramp, write_pgm, write_yale_b
-from tests.evaluation.method_doubles import FaceModelOnly
-from tests.evaluation.toy_subjects import Lambert, someone
+from facerf_cli.work import evaluate_items
+from tests.capture.yale_fixture import write_pgm, write_yale_b
+from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
 
 Said = pytest.CaptureFixture[str]
 FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
@@ -34,11 +29,11 @@ def folder(tmp_path: Path) -> Path:
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    monkeypatch.setattr(FaceSettings, "methods", lambda _: (Lambert("field", models),))
+    monkeypatch.setattr(evaluate_items, "methods_of", lambda _: (Lambert("field", models),))
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("overhead",))
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
-    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
 
 
 @pytest.mark.usefixtures("toys")
@@ -118,11 +113,3 @@ def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) ->
     out = tmp_path / "out"
     assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--dry-run"]) == 0
     assert "yaleB05.json" in capsys.readouterr().out and not out.exists()
-
-
-def test_the_work_goes_to_other_processes(folder: Path) -> None:
-    settings = FaceSettings("yale-b", EvaluateOptions(folder), PhotoOptions(Settings()), network_alone=False)
-    sent = pickle.loads(pickle.dumps(YaleWork(settings, YaleOptions(room=0.1), read_yale_b(folder))))
-    assert sent.yale.room == 0.1 and sent.settings == settings
-    assert sent.database.flashes("yaleB07") == sorted(FEW)
-    np.testing.assert_allclose(sent.database.image("yaleB07", FEW[0]), ramp(0) / 255, atol=1e-6)

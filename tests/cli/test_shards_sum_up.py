@@ -4,19 +4,16 @@ Those of synth-stage are in `test_synth_stage.py`.
 """
 
 import hashlib
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from facerf_cli.batch.settings import Settings, Shard
+from facerf_cli.batch.settings import Shard
 from facerf_cli.main import main
 from facerf_cli.run.logs import configure_logging
-from facerf_cli.work.evaluate import run_protocol
-from facerf_cli.work.evaluation_settings import EvaluateOptions
 from tests.dataset.capture import write_capture
 from tests.dataset.dataset_fixture import write_small_dataset
-from tests.evaluation.toy_protocol import LAYOUT, Toy, evaluate, items
+from tests.evaluation.toy_protocol import evaluate
 
 Said = pytest.CaptureFixture[str]
 
@@ -33,13 +30,12 @@ def tree(folder: Path) -> dict[str, str]:
 def test_evaluate(tmp_path: Path) -> None:
     configure_logging()
     assert evaluate(tmp_path / "whole") == 0
-    options = EvaluateOptions(tmp_path / "shards", reflectance=[])
+    output = tmp_path / "shards"
     for number in (2, 1):
-        assert not (options.output / "summary.json").exists()
-        shard = replace(options, shard=Shard(number, 2))
-        assert run_protocol(LAYOUT, items(options.output), Toy(), shard, Settings()) == 0
-    assert tree(options.output) == tree(tmp_path / "whole")
-    assert (options.output / "report.html").exists()
+        assert not (output / "summary.json").exists()
+        assert evaluate(output, shard=Shard(number, 2)) == 0
+    assert tree(output) == tree(tmp_path / "whole")
+    assert (output / "report.html").exists()
 
 
 def test_relight_dataset(tmp_path: Path, capsys: Said) -> None:

@@ -1,4 +1,4 @@
-"""Methods without networks that record what the protocols ask of them, and a person of known albedo."""
+"""Methods without networks that record what the protocols ask of them, and people of known albedo."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -10,13 +10,17 @@ from torch import Tensor
 
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
+from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX
 from facerf_cli.evaluation.people import DatasetPerson, Method, Portrait
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.pipeline import Person
+from facerf_cli.portrait.find import Face
+from facerf_cli.raster.camera import Camera, project
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
@@ -47,7 +51,7 @@ class FaceModelOnly:
     networks: Networks = SHIPPED_NETWORKS
     device: str = "cpu"
 
-    def sides(self) -> Sides:
+    def sides(self, texture_side: int | None = None) -> Sides:
         return Sides(256, 512)
 
 
@@ -64,23 +68,17 @@ class Double(Method):
     gain: float = 1.0
     made: list[Explained] = field(default_factory=list)
 
-    def explained(self, head: Head, network_alone: bool = True) -> Explained:
+    def explained(self, head: Head) -> Explained:
         weights = torch.tensor([0.1, 0.2, 1.0])[:, None].expand(3, 3) * (1 + len(self.made))
         self.made.append(Explained(Unlit(head.face, self.gain), RigLight(LIGHTS, weights)))
         return self.made[-1]
 
     def images(
-        self,
-        photo: np.ndarray | None,
-        head: Head,
-        directions: Tensor,
-        weights: Tensor,
-        target: Target,
-        network_alone: bool,
+        self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
     ) -> Iterator[np.ndarray]:
         reflectance = Unlit(head.face, self.gain)
-        for row in weights:
-            light = RigLight(directions, row)
+        for row in lights.weights:
+            light = RigLight(lights.directions, row)
             yield Person(self.models, photo, head, reflectance).image(light, target).pixels
 
 
@@ -106,3 +104,29 @@ class PersonOfAlbedo(DatasetPerson):
         header = self.header(camera)
         front = int(header.directions[:, 2].argmax())
         return front, header.normals @ header.directions[front]
+
+
+@dataclass(frozen=True, eq=False)
+class Lambert:
+    """A method whose face is white and flat: the cosine of the light to the camera's axis."""
+
+    name: str
+    models: Any
+
+    def images(self, photo: np.ndarray, head: Head, lights: Lights, target: Target) -> Iterator[np.ndarray]:
+        assert head.face.texture.shape == (3, 256, 256)
+        for row in lights.weights:
+            light = RigLight(lights.directions, row)
+            yield Person(self.models, photo, head, self).image(light, target).pixels
+
+    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
+        cosines = torch.einsum("mlc,l->mc", weights, directions[:, 2].clamp_min(0))
+        return cosines[..., None, None].expand(-1, -1, 256, 256)
+
+
+def someone() -> Face:
+    """The mean face, seen by a camera that it fills."""
+    model = load_face_model("builtin")
+    points = model.landmarks(model.mean[None])[0] + torch.tensor([0, 0, -0.9])
+    landmarks_px = project(points, Camera(4.0 * WIDTH_PX, WIDTH_PX, HEIGHT_PX, WIDTH_PX / 2, HEIGHT_PX / 2))
+    return Face((0, 0, WIDTH_PX, HEIGHT_PX), 1.0, landmarks_px.numpy())

@@ -7,9 +7,10 @@ import pytest
 from PIL import Image
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.measure import Measures, measure
-from facerf_cli.evaluation.pairs import collect_pairs, compare_pair
-from facerf_cli.files.images import write_exr
+from facerf_cli.evaluation.measure import measure
+from facerf_cli.evaluation.options import Measures
+from facerf_cli.evaluation.pairs import collect_pairs, compare_pair, read_predictions
+from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.image.colour import srgb_to_linear
 
 NAMES = ("anna/one", "anna/two", "bert/one")
@@ -49,7 +50,7 @@ def ours(tmp_path: Path) -> Path:
 
 def test_images_of_all_formats_meet_their_truths(truths: Path, ours: Path) -> None:
     pairs = collect_pairs([ours], truths)
-    assert [(pair.name, pair.person) for pair in pairs] == list(
+    assert [(pair.case.name, pair.case.person) for pair in pairs] == list(
         zip(NAMES, ("anna", "anna", "bert"), strict=True)
     )
     errors = [measure(compare_pair(pair), Measures())[0].values["mse"] for pair in pairs]
@@ -69,7 +70,7 @@ def test_several_methods_stand_side_by_side(truths: Path, ours: Path) -> None:
 
 def test_folders_may_lie_in_the_truths(truths: Path, ours: Path) -> None:
     ours.rename(truths / "ours")
-    assert [pair.name for pair in collect_pairs([truths / "ours"], truths)] == list(NAMES)
+    assert [pair.case.name for pair in collect_pairs([truths / "ours"], truths)] == list(NAMES)
 
 
 def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: Path) -> None:
@@ -121,8 +122,8 @@ def test_facts_of_a_list(truths: Path, ours: Path) -> None:
         "\ufeffname, person, pose, angle\nanna/one, A, same, 5\nanna/two, A, other,\nbert/one,, same, 7.5\n"
     )
     pairs = collect_pairs([ours], truths, facts=path)
-    assert [pair.person for pair in pairs] == ["A", "A", "bert"]
-    assert [dict(pair.facts) for pair in pairs] == [
+    assert [pair.case.person for pair in pairs] == ["A", "A", "bert"]
+    assert [dict(pair.case.facts) for pair in pairs] == [
         {"pose": "same", "angle": 5.0},
         {"pose": "other"},
         {"pose": "same", "angle": 7.5},
@@ -186,3 +187,34 @@ def test_files_that_hold_no_image(truths: Path, ours: Path, trouble: str) -> Non
         (ours / "anna/one.exr").write_text("no picture")
     with pytest.raises(InputError, match=r"anna/one\.(npy|exr)"):
         compare_pair(collect_pairs([ours], truths)[0])
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> Path:
+    folder = tmp_path / "theirs"
+    write_exr(folder / "a/00.exr", np.full(SHAPE, 0.25, np.float32))
+    write_display(folder / "a/01.png", np.full(SHAPE, 0.25, np.float32))
+    np.save(folder / "a/02.npy", np.full(SHAPE[:2], 0.25))
+    return folder
+
+
+@pytest.mark.parametrize("case", ["a/00", "a/01", "a/02"])
+def test_every_kind_of_file_is_linear_light(theirs: Path, case: str) -> None:
+    (found,) = read_predictions((theirs,), case, SHAPE).items()
+    assert found[0] == "theirs" and found[1].shape == SHAPE
+    np.testing.assert_allclose(found[1], 0.25, atol=2e-3)
+
+
+def test_all_that_is_missing_is_named(theirs: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError) as error:
+        read_predictions((theirs, tmp_path / "empty"), "a/03", SHAPE)
+    assert all(part in str(error.value) for part in (str(theirs), "empty", "case a/03", ".npy"))
+
+
+def test_a_wrong_size_and_two_files_of_a_case(theirs: Path) -> None:
+    with pytest.raises(InputError, match="9 x 6 pixels, the truth has 6 x 9"):
+        read_predictions((theirs,), "a/00", (9, 6, 3))
+    write_exr(theirs / "a/02.exr", np.zeros(SHAPE, np.float32))
+    with pytest.raises(InputError, match=r"02.exr and 02.npy; remove all but one"):
+        read_predictions((theirs,), "a/02", SHAPE)

@@ -87,14 +87,3 @@ def test_other_files_are_refused(tmp_path: Path, vgg: Path, trouble: str) -> Non
         save(path, {"features.0.weight": torch.zeros(1)})
     with pytest.raises(InputError, match=r"heads\.pth: no "):
         perceptual_metric(path, vgg)
-
-
-def test_the_published_file_is_known() -> None:
-    """With the package `lpips` at hand; it is no dependency."""
-    spec = perceptual.find_spec("lpips")
-    if spec is None or spec.origin is None:
-        pytest.skip("the package lpips is not installed")
-    network = Lpips()
-    perceptual._load_heads(network, Path(spec.origin).parent / "weights/v0.1/vgg.pth")
-    with pytest.raises(InputError, match="not the published"):
-        perceptual._load_heads(network, Path(spec.origin).parent / "weights/v0.0/vgg.pth")

@@ -18,23 +18,26 @@ from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.olat import LAMBERT, compare_olats
-from facerf_cli.evaluation.people import (
-    CropView,
-    DatasetPerson,
-    SourceFace,
+from facerf_cli.evaluation.people import DatasetPerson, Reading, SourceFace, compare_people
+from facerf_cli.evaluation.protocols import (
+    FULL,
+    LAMBERT,
+    MEAN,
     angle_class,
     angle_of,
-    compare_people,
-    evenly,
+    brightest,
+    compare_olats,
+    fitted_and_mean,
+    reconstruct,
+    transfer,
     turn_class,
 )
-from facerf_cli.evaluation.reconstruction import FULL, MEAN, brightest, compare_geometries, reconstruct
-from facerf_cli.evaluation.transfer import couples_of, transfer
+from facerf_cli.evaluation.selection import couples_of, evenly
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.image.metrics import si_mse, si_mse_channels
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
@@ -54,7 +57,11 @@ def person(dataset: Dataset) -> DatasetPerson:
 
 def person_of(dataset: Dataset, geometry: Geometry | None = None) -> PersonOfAlbedo:
     """Of the joint fit, which is the true one here, unless another geometry is given."""
-    return PersonOfAlbedo(dataset, "0000", geometry, Sides(128, 96), SHIPPED_NETWORKS.people)
+    return PersonOfAlbedo(dataset, "0000", reading(geometry))
+
+
+def reading(geometry: Geometry | None = None, crop_px: int = 96) -> Reading:
+    return Reading(SHIPPED_NETWORKS.people, Sides(128, crop_px), geometry)
 
 
 def pair(index: int, source: str, target: str, light: int, envmap: str = "a") -> Pair:
@@ -68,11 +75,8 @@ def unlit(gain: float = 1.0, models: FaceModelOnly = FACE_ONLY) -> Double:
     return Double("unlit", models=models, gain=gain)
 
 
-def olats(
-    person: DatasetPerson, pairs: list[Pair], methods: list[Double], network_alone: bool = False
-) -> Iterator[Comparison]:
-    compare = partial(compare_olats, methods=methods, network_alone=network_alone)
-    return compare_people(person, [(pair,) for pair in pairs], compare)
+def olats(person: DatasetPerson, pairs: list[Pair], methods: list[Double]) -> Iterator[Comparison]:
+    return compare_people(person, [(pair,) for pair in pairs], partial(compare_olats, methods=methods))
 
 
 def side_light(person: DatasetPerson, camera: str) -> int:
@@ -106,7 +110,7 @@ def test_drift_of_the_tone_is_measured_where_the_skin_is_known(
     known = person_of(replace(dataset, traits={"0000": traits}))
     front = int(known.header("C0").directions[:, 2].argmax())
     asked = [pair(0, "C0", "C0", front), pair(1, "C0", "C0", side_light(known, "C0"))]
-    near, aside = olats(known, asked, [unlit()], network_alone=True)
+    near, aside = olats(known, asked, [unlit()])
     assert near.case.facts["tone"] == "intermediate"
     assert abs(near.extra[LAMBERT]["tone_shift_deg"]) < 1  # it is the truth
     assert near.extra["unlit"]["tone_drift_deg"] == abs(near.extra["unlit"]["tone_shift_deg"])
@@ -128,7 +132,7 @@ def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: DatasetP
     assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
     assert np.array_equal(brightest(*truth), [0, 1, 0]) and BRIGHTEST.tolist() == [0, 0, 1]
-    np.testing.assert_allclose(found.landmarks_px, portrait.by(FACE_ONLY).head.fit.landmarks_px)
+    np.testing.assert_allclose(found.landmarks_px, portrait.by(FACE_ONLY).fit.landmarks_px)
 
 
 def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> None:
@@ -137,7 +141,7 @@ def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> No
     for camera in ("C0", "C1"):
         asked = pair(0, camera, camera, 0)
         sides.append(SourceFace(Case(f"by {camera}", "0000"), person.portrait(asked)))
-    first, second = transfer(sides, [method], network_alone=True)
+    first, second = transfer(sides, [method])
     assert first.case.name == "by C0_by_by C1"
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
@@ -165,15 +169,14 @@ def test_the_mean_face_is_compared_where_both_see_the_face(
     mean = FaceModelOnly(FACE_ONLY.face.pose_only())
     face = person.face_of(pair(0, "C1", "C1", 0))
     portrait = face.portrait
-    views = [portrait.by(models).view for models in (FACE_ONLY, mean)]
+    views = [portrait.by(models) for models in (FACE_ONLY, mean)]
     assert views[0].fit.alpha.any() and not views[1].fit.alpha.any()
-    forms = {FULL: [unlit()], MEAN: [unlit(models=mean)]}
-    (found,) = compare_geometries([face], forms)
+    forms = [unlit()], [unlit(models=mean)]
+    (found,) = reconstruct([face], fitted_and_mean(*forms), with_light=False)
     assert list(found.predictions) == [FULL, MEAN]
     assert np.array_equal(found.mask, np.minimum(views[0].mask, views[1].mask))
-    two = {name: [replace(methods[0], name=method) for method in "xy"] for name, methods in forms.items()}
-    (of_two,) = compare_geometries([face], two)
-    names = list(of_two.predictions)
+    two = [[replace(methods[0], name=method) for method in "xy"] for methods in forms]
+    names = [method.name for method in fitted_and_mean(*two)]
     assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
@@ -232,11 +235,9 @@ def test_in_its_own_pose_the_image_is_that_of_relight_in_the_crop(
 
     @dataclass(frozen=True, eq=False)
     class Records(Double):
-        def images(
-            self, photo: Any, head: Any, directions: torch.Tensor, *given: Any
-        ) -> Iterator[np.ndarray]:
-            asked_for.append(directions)
-            return super().images(photo, head, directions, *given)
+        def images(self, photo: Any, head: Any, lights: Lights, target: Any) -> Iterator[np.ndarray]:
+            asked_for.append(lights.directions)
+            return super().images(photo, head, lights, target)
 
     light = side_light(person, "C0")
     records = Records("unlit", models=FACE_ONLY)
@@ -252,11 +253,11 @@ def test_in_another_pose_the_shape_stays_the_sources(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     person = found_by_truth(dataset, monkeypatch)
-    source = person.portrait(pair(0, "C0", "C0", 0)).by(FACE_ONLY).view.fit
+    source = person.portrait(pair(0, "C0", "C0", 0)).by(FACE_ONLY)
     target = person.lit("C1")
-    posed = target.posed_as(source, FACE_ONLY).fit
-    assert torch.equal(posed.alpha, source.alpha) and torch.equal(posed.beta, source.beta)
-    own = target.by(FACE_ONLY).view.fit
+    posed = target.pose_of(source, FACE_ONLY).fit
+    assert torch.equal(posed.alpha, source.fit.alpha) and torch.equal(posed.beta, source.fit.beta)
+    own = target.by(FACE_ONLY).fit
     assert torch.equal(posed.rotation, own.rotation) and not torch.equal(posed.alpha, own.alpha)
 
 
@@ -281,17 +282,19 @@ def test_any_other_trouble_with_a_source_is_an_error(person: DatasetPerson) -> N
 
 
 def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
-    view, header = person.lit("C0").by(FACE_ONLY).view, person.header("C0")
-    kept = CropView.of(FACE_ONLY.face, view.fit, header.seen, keep_eyes=True)
+    lit = person.lit("C0")
+    view = lit.by(FACE_ONLY)
+    kept = replace(lit, reading=replace(lit.reading, keep_eyes=True), _views={}).by(FACE_ONLY)
     eyes = view.region("eyes") > 0.9
     assert eyes.sum() > 10 and view.mask[eyes].max() < 0.11
     assert kept.mask[eyes].min() > 0.5 and (kept.mask >= view.mask).all()
 
 
 def test_a_face_of_which_nothing_is_seen_is_named(person: DatasetPerson) -> None:
-    fit = person.lit("C0").by(FACE_ONLY).view.fit
-    with pytest.raises(InputError, match="nothing of the fitted face"):
-        CropView.of(FACE_ONLY.face, fit, 0 * person.header("C0").seen)
+    lit = person.lit("C0")
+    unseen = replace(lit.photo, alpha=0 * person.header("C0").seen)
+    with pytest.raises(InputError, match="0000/C0: nothing of the fitted face"):
+        replace(lit, photo=unseen, _views={}).by(FACE_ONLY)
 
 
 def test_couples_are_of_two_cameras_and_two_maps_and_each_image_is_in_one() -> None:
@@ -328,7 +331,7 @@ def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:
     from facerf_cli.dataset.pairs import image_path, read_pairs, weights_path
 
     person, (first, second) = (
-        DatasetPerson(dataset, "0000", None, Sides(128, 32), SHIPPED_NETWORKS.people),
+        DatasetPerson(dataset, "0000", reading(crop_px=32)),
         read_pairs(dataset),
     )
     directions, weights = person.light(second)
@@ -349,12 +352,7 @@ def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, t
         if traits is None:
             del content["subjects"]["0000"]["traits"]
         (folder / "dataset.json").write_text(json.dumps(content))
-        assert (
-            DatasetPerson(read_dataset(folder), "0000", None, Sides(128, 96), SHIPPED_NETWORKS.people).facts[
-                "tone"
-            ]
-            == tone
-        )
+        assert DatasetPerson(read_dataset(folder), "0000", reading()).facts["tone"] == tone
     content["subjects"]["0000"]["traits"] = ["dark"]
     (folder / "dataset.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="traits"):

@@ -16,31 +16,30 @@ from PIL import Image
 from facerf_cli import pipeline
 from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation import yale_b
-from facerf_cli.evaluation.measure import Measures, measure
+from facerf_cli.evaluation import people, yale_b
+from facerf_cli.evaluation.measure import measure
+from facerf_cli.evaluation.options import Measures
 from facerf_cli.evaluation.pairs import read_predictions
-from facerf_cli.evaluation.people import Method
+from facerf_cli.evaluation.people import Method, Reading
+from facerf_cli.evaluation.summary import published
 from facerf_cli.evaluation.yale_b import (
-    FIGURES,
     Relighting,
     YaleSubject,
     compare_subject,
     environment_weights,
     face_mask,
-    published,
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.pipeline import Person, fit_photo, head_of, reflectance_of
 from facerf_cli.portrait.find import Face
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
-from tests.evaluation.method_doubles import FaceModelOnly
-from tests.evaluation.toy_subjects import Lambert, someone
+from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
 
 BENCH = SHARED / "bench" / "yale_b"
-PARSING = SHIPPED_NETWORKS.people
+READING = Reading(SHIPPED_NETWORKS.people, Sides(256, 512), "landmarks")
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +106,8 @@ def test_scores_are_the_benchmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
-    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
-    comparisons = list(compare_subject(databases[0], "yaleB05", [], PARSING))
+    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    comparisons = list(compare_subject(databases[0], "yaleB05", [], READING))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
         subject, _, light = comparison.case.name.split("/")
@@ -124,7 +123,7 @@ def too_bright_sources(
 ) -> dict[str, np.ndarray]:
     """In the place of methods: the source itself, twice as bright, so that scale and clipping count."""
     assert face.landmarks_px.shape == (68, 2)
-    return {"copy": np.stack([2 * photo] * len(asked))}
+    return {"copy": np.stack([2 * photo[..., 0]] * len(asked))}
 
 
 def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]) -> None:
@@ -133,9 +132,11 @@ def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]
     figures = [
         [float(number) for cell in row for number in cell.replace("·", "/").split("/")] for row in table
     ]
-    assert all([*sum(columns, ()), *angles] in figures for _, columns, angles in FIGURES.values())
-    quotient = [row for row in published() if row.method == "quotient image"]
-    assert len(published()) == 11 * 4 and len(quotient) == 11
+    ours = published("yale-b")
+    for method in dict.fromkeys(row.method for row in ours):
+        assert [row.mean for row in ours if row.method == method] in figures, method
+    quotient = [row for row in ours if row.method == "quotient image"]
+    assert len(ours) == 11 * 4 and len(quotient) == 11
     assert all(row.data == "same images, 21 people, given more data" for row in quotient)
 
 
@@ -150,7 +151,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
     monkeypatch.setattr(yale_b, "_CORE", (Flash(0, 0), Flash(-70, 0)))
-    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     monkeypatch.setattr(
         pipeline.Person, "matte", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
     )
@@ -159,7 +160,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
     models = FaceModelOnly(load_face_model("builtin"))
     methods: Any = [Lambert("a", models), Lambert("b", models)]
-    comparisons = list(compare_subject(small, "yaleB07", methods, PARSING))
+    comparisons = list(compare_subject(small, "yaleB07", methods, READING))
     columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
     assert columns == {"frontal": 6, "soft": 2, "environment": 1} and fits["fitted"] == 2  # one a source
     for comparison in comparisons:
@@ -175,7 +176,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
     one = Relighting("frontal", "frontal", "A-070E+00")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (in_room,) = compare_subject(small, "yaleB07", methods[:1], PARSING, room=0.5)
+    (in_room,) = compare_subject(small, "yaleB07", methods[:1], READING, room=0.5)
     lighter = in_room.predictions["a"][110, 84]
     np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
@@ -184,7 +185,7 @@ def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
     with pytest.raises(InputError, match=r"yaleB07: no undamaged image under A\+000E\+00"):
-        list(compare_subject(read_yale_b(folder), "yaleB07", [], PARSING))
+        list(compare_subject(read_yale_b(folder), "yaleB07", [], READING))
 
 
 def test_environments_come_from_their_side(small: YaleB) -> None:
@@ -198,7 +199,7 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 
 
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(yale_b, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     models = load_models()
     subject = YaleSubject(small, "yaleB07")
     photo = np.repeat(subject.image("win_left")[..., None], 3, -1)
@@ -207,7 +208,9 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
     directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()
     one = Relighting("environment", "win_left", "env_two_side")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (comparison,) = compare_subject(small, "yaleB07", [Method("a", "diffuse-sh", models)], PARSING)
+    (comparison,) = compare_subject(
+        small, "yaleB07", [Method("a", "diffuse-sh", models, network_alone=False)], READING
+    )
     weights = torch.from_numpy(subject.weights(one.light)).float()[:, None].expand(-1, 3)
     expected = person.image(RigLight(directions, weights)).pixels.mean(-1).clip(0)
     np.testing.assert_allclose(comparison.predictions["a"][..., 1], expected, rtol=1e-4, atol=1e-5)

@@ -10,10 +10,9 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.olat import TABLE_1
-from facerf_cli.evaluation.summary import Layout
-from facerf_cli.work.evaluate import run_protocol
-from facerf_cli.work.evaluation_settings import EvaluateOptions
+from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.summary import Layout, published
+from facerf_cli.work.evaluate import Evaluation
 from facerf_cli.work.photo_options import PhotoOptions
 
 PEOPLE = ("anna", "bea", "carl")
@@ -22,7 +21,7 @@ LAYOUT = Layout(
     "Toy <images> & more",
     ("si_mse", "psnr", "light_error_deg"),
     ("pose", "angle"),
-    TABLE_1,
+    published("olat"),
     ("A note with a <b>tag</b>.",),
 )
 HEIGHT, WIDTH = 36, 48
@@ -83,5 +82,16 @@ def evaluate(
     photo: PhotoOptions | None = None,
     **options: object,
 ) -> int:
-    given = EvaluateOptions(output, **{"reflectance": [], **options})  # type: ignore[arg-type]
-    return run_protocol(layout, items(output), toy or Toy(), given, Settings(), photo)
+    return evaluation(output, toy, layout, photo, **options).run(items(output))
+
+
+def evaluation(
+    output: Path,
+    toy: Toy | None = None,
+    layout: Layout = LAYOUT,
+    photo: PhotoOptions | None = None,
+    **options: object,
+) -> Evaluation:
+    given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
+    toy = toy or Toy()
+    return Evaluation(layout, toy, (toy,), given, Settings(), photo)

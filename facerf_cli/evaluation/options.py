@@ -1,0 +1,237 @@
+"""The options of `facerf evaluate`: groups of the command line, light to import."""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from facerf_cli.baselines import RelightKind
+from facerf_cli.batch.run import BatchOptions
+from facerf_cli.errors import UsageError
+from facerf_cli.option import DATA, MEASURES, METHODS, option
+
+Space = Literal["linear", "display"]
+_KINDS = get_args(RelightKind)
+
+
+def folder_name(folder: Path) -> str:
+    """The name of a folder of predictions, and of its method; '.' is resolved, a link is not."""
+    return Path(os.path.abspath(folder)).name
+
+
+@dataclass(frozen=True)
+class SplitOptions:
+    """The images of a prepared dataset that are measured."""
+
+    split: Literal["train", "validation", "test", "all"] = option(
+        "test", "Measure this split of DATASET; all if no network was trained on it.", panel=DATA
+    )
+    every: int = option(1, "Measure every Nth pair of DATASET's split only.", "N", least=1, panel=DATA)
+    joint_fit: bool = option(
+        False,
+        "Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once, instead "
+        "of each image alone.",
+        panel=DATA,
+    )
+
+
+@dataclass(frozen=True)
+class YaleOptions:
+    """The images of Extended Yale B that are measured."""
+
+    shifts: Path | None = option(
+        None,
+        "Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its "
+        "subject's frontal one.",
+        "CSV",
+        shown_default="no alignment",
+        panel=DATA,
+    )
+    subjects: list[str] | None = option(
+        None,
+        "Measure these subjects only, such as yaleB05,yaleB15. Repeatable.",
+        "NAME,...",
+        in_recipe=False,  # an item is a subject
+        shown_default="all",
+        panel=DATA,
+    )
+    room: float = option(
+        0.0,
+        "Light from all around that comes with each flash, as a room sends it back: a share of it.",
+        "SHARE",
+        least=0.0,
+        most=1.0,
+        panel=DATA,
+    )
+
+
+@dataclass(frozen=True)
+class PairsOptions:
+    """The images that predictions are compared with."""
+
+    truth: Path = option(
+        ...,
+        "Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...",
+        "DIR",
+        in_recipe=False,  # an item's input
+        shown_default=False,
+    )
+    masks: Path | None = option(
+        None,
+        "Compare inside masks: images with the truths' names, white inside.",
+        "DIR",
+        shown_default="the truths' alpha, else everything",
+        panel=DATA,
+    )
+    facts: Path | None = option(
+        None,
+        "Read a row for each image: name, person, and columns for the tables (text) or for the list of "
+        "images (numbers).",
+        "CSV",
+        shown_default="a person is a truth's topmost folder",
+        panel=DATA,
+    )
+    face_distance: bool = option(False, "Detect the truths' faces and measure Face dis, too.", panel=MEASURES)
+    predictions: tuple[Path, ...] = ()
+    names: tuple[str, ...] = ()  # of the predictions' methods
+
+
+@dataclass(frozen=True)
+class GeometryOptions:
+    """The mean face of Table 4."""
+
+    mean_checkpoint: Path | None = option(
+        None,
+        "Use a checkpoint of `facerf train --mean-face` for the mean face.",
+        "FILE",
+        shown_default="that of the fitted face",
+        panel=METHODS,
+    )
+
+
+@dataclass(frozen=True)
+class TransferOptions:
+    """The images of a person whose reflectances are exchanged, and how these are read."""
+
+    photos: bool = option(
+        False,
+        "Read photos, two of each person or in folders.",
+        in_recipe=False,
+        flags=("--photos",),
+        panel=DATA,
+    )
+    held_to_photo: bool = option(
+        False,
+        "Correct the field by the quotient of its photo, as `relight` does.",
+        flags=("--held-to-photo",),
+        panel=METHODS,
+    )
+
+
+@dataclass(frozen=True)
+class Measures:
+    """The values and metrics of images; LPIPS is measured if VGG-16's weights are given."""
+
+    space: Space = option("linear", "Measure scene-linear values, or values encoded by sRGB.", panel=MEASURES)
+    lpips: Path | None = option(
+        None,
+        "Read the linear heads of LPIPS (v0.1, VGG) from a file.",
+        "FILE",
+        shown_default="where installed",
+        panel=MEASURES,
+    )
+    vgg_weights: str | None = option(
+        None,
+        "Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.",
+        "imagenet|PATH",
+        shown_default="no LPIPS",
+        panel=MEASURES,
+    )
+
+    def check(self) -> None:
+        """Raise UsageError for heads without the network that they belong to."""
+        if self.lpips is not None and self.vgg_weights is None:
+            raise UsageError("--lpips: needs VGG-16; add --vgg-weights imagenet, or a file of its weights")
+
+
+def _parse_kinds(names: Sequence[str]) -> tuple[RelightKind, ...]:
+    """The reflectance models of `--reflectance`; raises UsageError for a name of none."""
+    if unknown := [name for name in names if name not in _KINDS]:
+        raise UsageError(f"--reflectance {unknown[0]}: give {', '.join(_KINDS)}")
+    return tuple(kind for name in names for kind in _KINDS if kind == name)
+
+
+@dataclass(frozen=True)
+class EvaluateOptions(BatchOptions):
+    """Settings of what is measured, by which methods, and where it goes, for other processes too."""
+
+    reflectance: tuple[RelightKind, ...] = option(
+        ("field",),
+        "Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and the "
+        "others are compared with the first.",
+        "KIND",
+        shown_default="field; of yale-b portrait",
+        typed=list[str] | None,
+        parse=_parse_kinds,
+        panel=METHODS,
+    )
+    against: tuple[Path, ...] = option(
+        (),
+        "Measure another checkpoint of the field, named by its stem. Repeatable.",
+        "FILE",
+        shown_default="none",
+        typed=list[Path] | None,
+        parse=tuple,
+        panel=METHODS,
+    )
+    compare: tuple[Path, ...] = option(
+        (),
+        "Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name. "
+        "Repeatable.",
+        "DIR",
+        shown_default="none",
+        typed=list[Path] | None,
+        parse=tuple,
+        panel=METHODS,
+    )
+    pictures: bool = option(
+        False,
+        "Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.",
+        panel=MEASURES,
+    )
+    keep_eyes: bool = option(False, "Compare open eyes, too (default: not, as in the paper).", panel=MEASURES)
+    measures: Measures = Measures()
+    preset: Literal["paper"] | None = option(
+        None, "Measure as many images as the paper did.", shown_default="none", panel=MEASURES
+    )
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """The names of all methods: reflectance models, checkpoints, and folders of predictions."""
+        return (*self.reflectance, *(path.stem for path in self.against), *map(folder_name, self.compare))
+
+    @property
+    def has_field(self) -> bool:
+        """True if the neural field is among the methods."""
+        return bool({"field", "portrait"} & set(self.reflectance) or self.against)
+
+    def check(self) -> None:
+        """Raise UsageError for an option that would fail every item."""
+        twice = sorted({name for name in self.methods if self.methods.count(name) > 1})
+        if twice:
+            raise UsageError(f"two methods have the name {twice[0]!r}; rename the file or folder of one")
+        for path in self.against:
+            if not path.is_file():
+                raise UsageError(f"--against {path}: no such file; give one that exists")
+        for folder in self.compare:
+            if not folder.is_dir():
+                raise UsageError(f"--compare {folder}: no such folder; give one that exists")
+        self.require_output_apart(self.compare)
+        self.measures.check()
+
+    def require_output_apart(self, folders: Iterable[Path]) -> None:
+        """Raise UsageError for an output folder inside one that is read: the next run would read it, too."""
+        for folder in folders:
+            if Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(folder)):
+                raise UsageError(f"-o {self.output}: lies in {folder}, which is read; give another folder")
