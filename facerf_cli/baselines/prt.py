@@ -23,13 +23,12 @@ from torch import Tensor
 
 from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.synthesis import (
-    DETAIL,
     SIDE,
     Scene,
-    SolveSettings,
-    coarse,
+    known,
     light_given,
     light_prior,
+    scene_of,
     shrunk,
     skin_prior,
     solve,
@@ -53,7 +52,7 @@ from facerf_cli.run.logs import LOGGER_NAME
 log = logging.getLogger(LOGGER_NAME)
 
 _ROUNDS = 2  # of estimating the mean albedo of the face, which tints the bounce
-_MOST_BYTES = 256 << 20  # of the cache: beyond it the files that were not used for longest are removed
+_MOST_FILES = 160  # of the cache, 1.6 MB each: beyond, those that were not used for longest are removed
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class TransferSettings:
     blur_texels: float = 1.0  # removes the noise of few samples
 
 
-SETTINGS, BAKE = SolveSettings(), TransferSettings()
+BAKE = TransferSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,29 +98,21 @@ class Prt:
         return F.interpolate(coarse_shading, side, mode="bilinear", align_corners=False)
 
 
-def explain_by_prt(
-    models: Models,
-    fit: FaceFit,
-    face: FaceTexture,
-    settings: SolveSettings = SETTINGS,
-    bake: TransferSettings = BAKE,
-    detail: float = DETAIL,
-) -> Explained:
+def explain_by_prt(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
     """Estimate the most probable albedo and light of a fitted photo."""
     vertices = models.face.vertices(fit.alpha[None], fit.beta[None])[0]
-    direct, bounce = baked_transfer(vertices, bake)
-    side = face.texture.shape[-1]
-    tint = skin_prior().diffuse.mean.exp().mean((1, 2))
-    light = light_prior(bake.order)
+    direct, bounce = baked_transfer(vertices, BAKE)
+    skin, light, side = skin_prior(), light_prior(BAKE.order), face.texture.shape[-1]
+    tint = skin.diffuse.mean.exp().mean((1, 2))
     for _ in range(_ROUNDS):
         transfer = direct + tint[:, None, None, None] * bounce  # [3, K, t, t]
         scene = _scene(transfer, fit, face)
-        found = solve(scene, skin_prior().diffuse, skin_prior().gloss, light, settings)
-        albedo = skin_prior().diffuse.at(found.albedo, side)
+        found = solve(scene, skin.diffuse, known(skin.gloss.mean), light)
+        albedo = skin.diffuse.at(found.albedo, side)
         tint = albedo.exp().mean((1, 2))
     shading = Prt(albedo, transfer, fit.rotation).shading(rotated(found.light, fit.rotation.T)[None])[0]
-    albedo = with_detail(albedo, face, shading, torch.zeros_like(shading), detail)
-    coefficients = light_given(scene, shrunk(albedo), skin_prior().gloss.mean, light)
+    albedo = with_detail(albedo, face, shading, torch.zeros_like(shading))
+    coefficients = light_given(scene, shrunk(albedo), skin.gloss.mean, light)
     return Explained(Prt(albedo.exp(), transfer, fit.rotation), coefficients_to_rig(coefficients))
 
 
@@ -129,9 +120,8 @@ def _scene(transfer: Tensor, fit: FaceFit, face: FaceTexture) -> Scene:
     """The photo with its transfer, rotated from the head frame to camera space, as the prior of light is."""
     camera_to_head = rotated(torch.eye(transfer.shape[1]), fit.rotation.T)  # [K, K] of coefficients
     small = F.interpolate(transfer, (SIDE, SIDE), mode="area").flatten(2)
-    radiance, trust = coarse(face)
     in_camera = torch.einsum("ckn,kj->cnj", small, camera_to_head)
-    return Scene(radiance.flatten(1), trust.flatten(), in_camera, None)
+    return scene_of(face, in_camera, torch.zeros_like(in_camera[0]))
 
 
 def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Path | None = None) -> Tensor:
@@ -148,7 +138,7 @@ def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Pat
     try:
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.save(file, transfer.numpy())
-        _remove_oldest(path)
+        _remove_oldest(path.parent)
     except FacerfError as error:
         log.warning("%s; the next run bakes the transfer again", error)
     return transfer.float()
@@ -197,19 +187,8 @@ def _read(path: Path, settings: TransferSettings) -> Tensor | None:
     return torch.from_numpy(kept).float()
 
 
-def _remove_oldest(newest: Path) -> None:
-    """Remove the files that were not used for longest until the folder is small enough.
-
-    Other processes may remove files at the same time.
-    """
-    found = []
-    for path in newest.parent.glob("*.npy"):
-        with suppress(OSError):
-            state = path.stat()
-            found.append((state.st_mtime_ns, state.st_size, path))
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
-        if total <= _MOST_BYTES or path == newest:
-            break
-        path.unlink(missing_ok=True)
-        total -= size
+def _remove_oldest(folder: Path) -> None:
+    """Remove the files that were not used for longest, where there are too many."""
+    with suppress(FileNotFoundError):  # other processes may remove files at the same time
+        for path in sorted(folder.glob("*.npy"), key=lambda path: path.stat().st_mtime_ns)[:-_MOST_FILES]:
+            path.unlink()

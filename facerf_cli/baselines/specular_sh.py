@@ -18,13 +18,10 @@ from torch import Tensor
 
 from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.synthesis import (
-    DETAIL,
     SIDE,
-    Scene,
-    SolveSettings,
-    coarse,
     light_given,
     light_prior,
+    scene_of,
     shrunk,
     skin_prior,
     solve,
@@ -40,7 +37,6 @@ from facerf_cli.relighting.models import Models
 
 DIFFUSE_ORDER, GLOSS_ORDER = 2, 6
 EXPONENT = 12.0  # of the Blinn-Phong lobe, which then has no degrees above GLOSS_ORDER
-SETTINGS = SolveSettings()
 _NODES = 256  # of the quadrature of the lobe
 
 
@@ -90,13 +86,7 @@ class SpecularSh:
         return shading.clamp_min(0), torch.einsum("ijk,mkc->mcij", mirror, light).clamp_min(0)
 
 
-def explain_by_specular_sh(
-    models: Models,
-    fit: FaceFit,
-    face: FaceTexture,
-    settings: SolveSettings = SETTINGS,
-    detail: float = DETAIL,
-) -> Explained:
+def explain_by_specular_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
     """Estimate the most probable albedo, gloss and light of a fitted photo."""
     vertices = fit.vertices_camera(models.face)
     small = _surface(vertices, fit, SIDE)
@@ -104,15 +94,14 @@ def explain_by_specular_sh(
     mirror = mirror_transfer(small.normals, small.views(None))
     missing = mirror.shape[-1] - transfer.shape[-1]
     transfer = F.pad(transfer, (0, missing)).flatten(0, 1).expand(3, -1, -1)
-    radiance, trust = coarse(face)
-    scene = Scene(radiance.flatten(1), trust.flatten(), transfer, mirror.flatten(0, 1))
+    scene = scene_of(face, transfer, mirror.flatten(0, 1))
     skin, light = skin_prior(), light_prior(GLOSS_ORDER)
-    found = solve(scene, skin.diffuse, skin.gloss, light, settings)
+    found = solve(scene, skin.diffuse, skin.gloss, light)
     side = face.texture.shape[-1]
     albedo, gloss = skin.diffuse.at(found.albedo, side), skin.gloss.at(found.gloss, side)
     surface = _surface(vertices, fit, side)
     shading, shining = SpecularSh(surface, albedo, gloss).parts(found.light[None])
-    albedo = with_detail(albedo, face, shading[0], gloss.exp() * shining[0], detail)
+    albedo = with_detail(albedo, face, shading[0], gloss.exp() * shining[0])
     coefficients = light_given(scene, shrunk(albedo), shrunk(gloss), light)
     return Explained(SpecularSh(surface, albedo.exp(), gloss.exp()), coefficients_to_rig(coefficients))
 

@@ -109,13 +109,13 @@ class Scene:
     """N texels of a photo, in the order of the priors' texels.
 
     radiance [3, N]; trust [N] in 0..1; transfer [3, N, K], the radiance of a white diffuse face per
-    coefficient of the light; mirror [N, K], that of a face with gloss 1, or None without gloss.
+    coefficient of the light; mirror [N, K], that of a face with gloss 1: zeros without gloss.
     """
 
     radiance: Tensor
     trust: Tensor
     transfer: Tensor
-    mirror: Tensor | None
+    mirror: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +127,12 @@ class Solution:
     light: Tensor
 
 
-def coarse(face: FaceTexture) -> tuple[Tensor, Tensor]:
-    """Radiance [3, t, t] of a photo at the side of the priors, and its trust [t, t], 0 in the eyes."""
+def scene_of(face: FaceTexture, transfer: Tensor, mirror: Tensor) -> Scene:
+    """A photo at the side of the priors; its trust is 0 in the eyes."""
     share = F.interpolate(face.visible[None, None], (SIDE, SIDE), mode="area")[0, 0]
     seen = F.interpolate((face.texture * face.visible)[None], (SIDE, SIDE), mode="area")[0]
     trust = share * (share > _SEEN) * (1 - region_mask("eyes", SIDE))
-    return seen / share.clamp_min(1e-6), trust
+    return Scene((seen / share.clamp_min(1e-6)).flatten(1), trust.flatten(), transfer, mirror)
 
 
 def shrunk(field: Tensor) -> Tensor:
@@ -161,22 +161,23 @@ def solve(
 
 def light_given(scene: Scene, albedo: Tensor, gloss: Tensor, light: LightPrior) -> Tensor:
     """Find the light [K, 3] of a scene whose logarithms of albedo [3, t, t] and gloss [1, t, t] are known."""
-    return solve(scene, _known(albedo), _known(gloss), light, _LIGHT_SETTINGS).light
+    return solve(scene, known(albedo), known(gloss), light, _LIGHT_SETTINGS).light
 
 
-def _known(logarithm: Tensor) -> LogGaussian:
+def known(logarithm: Tensor) -> LogGaussian:
+    """A prior that allows one logarithm [C, t, t] only."""
     return LogGaussian(logarithm, logarithm.new_zeros(0, *logarithm.shape))
 
 
-def with_detail(albedo: Tensor, face: FaceTexture, shading: Tensor, shining: Tensor, share: float) -> Tensor:
+def with_detail(
+    albedo: Tensor, face: FaceTexture, shading: Tensor, shining: Tensor, share: float = DETAIL
+) -> Tensor:
     """Add a share of the photo's residual to the logarithm of an albedo [3, T, T].
 
     `shading` [3, T, T] is the radiance of a white diffuse face in the photo's light, `shining` that of the
     gloss. Less is added where the photo is dark or the face hidden: it is the most probable residual under a
     Gaussian prior, with noise relative to the shading.
     """
-    if share == 0:
-        return albedo
     floor = _SHADOW_FLOOR * (shading * face.visible).sum((1, 2)) / face.visible.sum()
     floor = floor.clamp_min(1e-9)[:, None, None]
     lit = shading.clamp_min(0) + floor
@@ -192,7 +193,7 @@ class _Problem:
     radiance: Tensor  # [3, N], of mean 1
     evidence: Tensor  # [N], weight of a texel's squared relative error
     transfer: Tensor  # [3, N, K]
-    mirror: Tensor | None
+    mirror: Tensor  # [N, K]
     albedo: tuple[Tensor, Tensor]  # mean [3, N] and modes [Q, 3, N] of logarithms
     gloss: tuple[Tensor, Tensor]  # [N], [P, N]
     light: LightPrior
@@ -223,14 +224,13 @@ def _problem(
 
     radiance = scene.radiance[:, seen].double() / scale
     share = scene.trust[seen].double() / scene.trust.sum() / 3
-    modes = 0 if scene.mirror is None else len(gloss.modes)
     return _Problem(
         radiance=radiance,
         evidence=settings.evidence * share,
         transfer=scene.transfer[:, seen].double(),
-        mirror=None if scene.mirror is None else scene.mirror[seen].double(),
+        mirror=scene.mirror[seen].double(),
         albedo=(at(albedo.mean), at(albedo.modes)),
-        gloss=(at(gloss.mean)[0], at(gloss.modes)[:modes, 0]),
+        gloss=(at(gloss.mean)[0], at(gloss.modes)[:, 0]),
         light=LightPrior(light.mean.double(), light.modes.double()),
     )
 
@@ -274,17 +274,14 @@ def _synthesise(problem: _Problem, state: Tensor, with_slopes: bool = True) -> t
     light = problem.light_of(state)
     diffuse = (problem.albedo[0] + torch.einsum("q,qcn->cn", albedo_at, problem.albedo[1])).exp()
     lit = diffuse * torch.einsum("cnk,kc->cn", problem.transfer, light)
-    shining, gloss = torch.zeros_like(lit), torch.zeros_like(lit[0])
-    if problem.mirror is not None:
-        gloss = (problem.gloss[0] + torch.einsum("p,pn->n", gloss_at, problem.gloss[1])).exp()
-        shining = gloss * (problem.mirror @ light).T
+    gloss = (problem.gloss[0] + torch.einsum("p,pn->n", gloss_at, problem.gloss[1])).exp()
+    shining = gloss * (problem.mirror @ light).T
     image = lit + shining
     if not with_slopes:
         return image, image
     lights = strength.exp() * problem.light.modes  # [R, K, 3]
     by_light = torch.einsum("cnk,rkc->rcn", problem.transfer, lights) * diffuse
-    if problem.mirror is not None:
-        by_light = by_light + torch.einsum("nk,rkc->rcn", problem.mirror, lights) * gloss
+    by_light = by_light + torch.einsum("nk,rkc->rcn", problem.mirror, lights) * gloss
     by_gloss = problem.gloss[1][:, None] * shining
     return image, torch.cat([image[None], by_light, problem.albedo[1] * lit, by_gloss])
 

@@ -1,13 +1,26 @@
-"""A scene that the priors made is taken apart again."""
+"""A scene that the priors made is taken apart again; what a photo's texture adds to it."""
 
-import pytest
 import torch
 from torch import Tensor
 
 from facerf_cli.baselines import synthesis
-from facerf_cli.baselines.synthesis import LightPrior, LogGaussian, Scene, SolveSettings, light_given, solve
+from facerf_cli.baselines.synthesis import (
+    SIDE,
+    LightPrior,
+    LogGaussian,
+    Scene,
+    SolveSettings,
+    light_given,
+    scene_of,
+    shrunk,
+    solve,
+    with_detail,
+)
+from facerf_cli.face.head import FaceTexture
+from facerf_cli.face.topology import region_mask
 
 T, K = 12, 9
+TEXELS = 128  # of a photo's texture
 
 
 def priors() -> tuple[LogGaussian, LogGaussian, LightPrior]:
@@ -94,15 +107,62 @@ def test_the_light_of_a_known_face() -> None:
     assert float((found - light).norm() / light.norm()) < 0.02
 
 
-@pytest.mark.parametrize("shines", [True, False])
-def test_slopes_are_those_of_the_image(shines: bool) -> None:
-    parts, (transfer, mirror), radiance = drawn()
-    scene = Scene(radiance, torch.ones(T * T), transfer, mirror if shines else None)
+def test_slopes_are_those_of_the_image() -> None:
+    parts, given, radiance = drawn()
+    scene = Scene(radiance, torch.ones(T * T), *given)
     seen = scene.trust > 0
     problem = synthesis._problem(scene, seen, 1.0, *parts, SolveSettings())
-    state = 0.3 * torch.randn(1 + 6 + 4 + (2 if shines else 0), dtype=torch.float64)
+    state = 0.3 * torch.randn(1 + 6 + 4 + 2, dtype=torch.float64)
     _, slopes = synthesis._synthesise(problem, state)
     wanted = torch.autograd.functional.jacobian(
         lambda at: synthesis._synthesise(problem, at, False)[0], state
     )
     assert torch.allclose(slopes, wanted.permute(2, 0, 1), atol=1e-9)
+
+
+def face_of(texture: torch.Tensor, visible: torch.Tensor | None = None) -> FaceTexture:
+    normals = torch.zeros(3, TEXELS, TEXELS)
+    normals[2] = 1
+    return FaceTexture(texture, torch.ones(TEXELS, TEXELS) if visible is None else visible, normals)
+
+
+def test_unseen_texels_do_not_bleed_into_coarse_ones() -> None:
+    texture, visible = torch.full((3, TEXELS, TEXELS), 0.4), torch.ones(TEXELS, TEXELS)
+    texture[:, :, 64:] = 9.0
+    visible[:, 63:] = 0
+    scene = scene_of(face_of(texture, visible), torch.zeros(3, 1, 1), torch.zeros(1, 1))
+    trust = scene.trust.view(SIDE, SIDE)
+    assert torch.allclose(scene.radiance[:, scene.trust > 0], torch.tensor(0.4))
+    assert not trust[:, 32:].any()
+    assert float((trust * region_mask("eyes", SIDE)).max()) < 0.3
+
+
+def test_all_of_the_detail_is_the_true_albedo_where_it_is_bright() -> None:
+    true = 0.2 + 0.3 * torch.rand(3, TEXELS, TEXELS)
+    shading = torch.full((3, TEXELS, TEXELS), 2.0)
+    shading[:, :, :10] = 0.0
+    guess = torch.full((3, TEXELS, TEXELS), 0.3).log()
+    visible = torch.ones(TEXELS, TEXELS)
+    visible[100:] = 0
+    face = face_of(true * shading + 0.1, visible)
+    shining = torch.full_like(shading, 0.1)
+    whole = with_detail(guess, face, shading, shining, 1.0).exp()
+    lit = whole[:, :100, 10:]
+    assert float((lit - true[:, :100, 10:]).abs().mean()) < 0.2 * float((true - 0.3).abs().mean())
+    assert torch.allclose(whole[:, 100:], guess[:, 100:].exp())  # not seen
+    assert torch.allclose(whole[:, :100, :10], guess[:, :100, :10].exp(), atol=1e-4)  # black: nothing to see
+    half = with_detail(guess, face, shading, shining, 0.5)
+    assert torch.allclose(half - guess, 0.5 * (whole.log() - guess), atol=1e-5)
+
+
+def test_no_albedo_is_above_one() -> None:
+    guess = torch.full((3, TEXELS, TEXELS), 0.5).log()
+    black = torch.zeros_like(guess)
+    found = with_detail(guess, face_of(black + 7), black + 1, black, 1.0)
+    assert float(found.max()) <= 0
+    assert shrunk(found).shape == (3, SIDE, SIDE)
+
+
+def test_a_black_photo_is_no_trouble() -> None:
+    guess, black = torch.full((3, TEXELS, TEXELS), 0.5).log(), torch.zeros(3, TEXELS, TEXELS)
+    assert with_detail(guess, face_of(black), black, black, 0.5).isfinite().all()

@@ -9,7 +9,6 @@ import torch
 
 from facerf_cli.baselines import prt
 from facerf_cli.baselines.prt import TransferSettings
-from facerf_cli.baselines.synthesis import DETAIL
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.main import main
@@ -24,7 +23,7 @@ def _quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A coarse bake, and a cache of the test's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     small = TransferSettings(order=4, side=32, lights=60, light_samples=1, bounce_samples=2)
-    monkeypatch.setattr(prt.explain_by_prt, "__defaults__", (prt.SETTINGS, small, DETAIL))
+    monkeypatch.setattr(prt, "BAKE", small)
 
 
 def attribute(path: Path, name: str) -> str:
