@@ -10,6 +10,9 @@ from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
 from tests import astronaut
 from tests.cli.toy_checkpoint import save_toy_checkpoint
+from tests.synth.conftest import transport_folder
+
+__all__ = ["transport_folder"]
 
 
 @pytest.fixture(scope="session")

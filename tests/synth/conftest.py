@@ -1,11 +1,18 @@
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from filelock import FileLock
+from safetensors.torch import save_file
+from torch import Tensor
 
 from facerf_cli.light.transport import BakeSettings
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth import bank as bank_room
 from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
+from facerf_cli.synth.bank.transport import TransportBankSettings, look_at_views, transport_of
 
 TINY = HeadBakeSettings(side=32, lights=20, bake=BakeSettings(light_samples=1, bounce_samples=2))
 
@@ -27,3 +34,36 @@ def bank(bank_folder: Path) -> Bank:
     return load_bank(
         bank_folder / "heads", bank_folder / "views", {"heads": "six for a test", "licence": "MIT"}
     )
+
+
+SMALL = TransportBankSettings(views=2, looks=2, lights=14)
+
+
+def backgrounds() -> Tensor:
+    random = torch.Generator().manual_seed(0)
+    return (60 + 100 * torch.rand(2, 3, 32, 32, generator=random)).byte()
+
+
+@pytest.fixture(scope="session")
+def transport_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bank of one person, whom two views show; all processes of a run have the same."""
+
+    def fill(folder: Path) -> None:
+        for view, tensors in enumerate(transport_of("builtin", 1, 3, SMALL)):
+            save_file(tensors, folder / f"00001_{view}.safetensors")
+        for stored in sorted(folder.iterdir()):
+            look_at_views(backgrounds(), SHIPPED_NETWORKS, 0, [stored])
+
+    return made_once(tmp_path_factory, "transport", fill)
+
+
+def made_once(factory: pytest.TempPathFactory, name: str, fill: Callable[[Path], None]) -> Path:
+    """A folder that the first process that needs it fills; others of the same run wait for it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name
+    with FileLock(folder.with_suffix(".lock")):
+        if not folder.with_suffix(".made").exists():
+            folder.mkdir(exist_ok=True)
+            fill(folder)
+            folder.with_suffix(".made").touch()
+    return folder

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -13,7 +13,6 @@ from facerf_cli.light.sh import sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDE_PX
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth import bank
 from facerf_cli.synth.bank import transport
 from facerf_cli.synth.bank.transport import (
@@ -23,29 +22,15 @@ from facerf_cli.synth.bank.transport import (
     TransportBankSettings,
     add_transport,
     load_view,
-    look_at_views,
     seen_path,
-    transport_of,
 )
 from facerf_cli.synth.portraits import albedo_of, images_under
-
-SMALL = TransportBankSettings(views=2, looks=2, lights=14)
-
-
-def backgrounds() -> Tensor:
-    random = torch.Generator().manual_seed(0)
-    return (60 + 100 * torch.rand(2, 3, 32, 32, generator=random)).byte()
+from tests.synth.conftest import SMALL, backgrounds
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bank of one person."""
-    path = tmp_path_factory.mktemp("transport")
-    for view, tensors in enumerate(transport_of("builtin", 1, 3, SMALL)):
-        save_file(tensors, path / f"00001_{view}.safetensors")
-    for stored in sorted(path.iterdir()):
-        look_at_views(backgrounds(), SHIPPED_NETWORKS, 0, [stored])
-    return path
+def folder(transport_folder: Path) -> Path:
+    return transport_folder
 
 
 @pytest.fixture(scope="module")
