@@ -31,7 +31,7 @@ from facerf_cli.portrait.find import detect_faces
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.synth.portraits import bake_portrait, photograph
+from facerf_cli.synth.portraits import bake_subject, images_under, materials_of, view_of
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
 
@@ -159,11 +159,12 @@ def measured(subject: Subject, index: int) -> tuple[dict[str, float], np.ndarray
     lens = Camera(SIDE_PX * distance_m / 0.55, SIDE_PX, SIDE_PX, SIDE_PX / 2, SIDE_PX / 2)
     camera = StageCamera(lens, pose_to_rotation(yaw, pitch, 0), torch.tensor([0, 0.05, -distance_m]))
     directions = rig_directions(LIGHTS).double().numpy()
-    baked = bake_portrait(subject, camera, directions, BAKE, index)
+    baked = view_of(subject, bake_subject(subject, [camera], directions, BAKE, index), camera)
     weights = torch.full((LIGHTS, 3), 0.3)
     weights[int(random.integers(LIGHTS // 3))] += 4
-    photo = photograph(baked, subject.appearance, weights)
-    image = photo.image / photo.image.mean((1, 2)).mean() * 0.18 + 0.25 * (1 - photo.alpha)
+    (photo,) = images_under(baked, materials_of(baked, subject.appearance), weights[None])
+    alpha, classes = baked.alpha, baked.classes.float() / 255
+    image = photo / photo.mean((1, 2)).mean() * 0.18 + 0.25 * (1 - alpha)
     display = to_display(image.permute(1, 2, 0).contiguous().numpy())
     faces = detect_faces(SHIPPED_NETWORKS.people, display)
     shown = [display, display]
@@ -173,9 +174,9 @@ def measured(subject: Subject, index: int) -> tuple[dict[str, float], np.ndarray
         everything, inner = distances(face.landmarks_px, baked.landmarks_px[:68].numpy())
         found = segment(SHIPPED_NETWORKS.people, display, face.landmarks_px)
         scores |= {"landmarks, all %": everything, "inner %": inner}
-        scores["IoU matte"] = overlap(found.matte, photo.alpha.numpy())
+        scores["IoU matte"] = overlap(found.matte, alpha.numpy())
         for name in ("skin", "hair", "ears"):
-            truth = photo.classes[CLASSES.index(name)].numpy()
+            truth = classes[..., CLASSES.index(name)].numpy()
             if (truth > 0.5).sum() >= LEAST_PX:
                 scores[f"IoU {name}"] = overlap(found.layer(name), truth)
         cut = display * found.matte[..., None] + (1 - found.matte[..., None]) * np.array([255, 0, 220])

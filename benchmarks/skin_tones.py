@@ -24,10 +24,11 @@ from facerf_cli.pipeline import find_for, fit
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, load_models
-from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
+from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.bank.transport import StoredView, load_view
 from facerf_cli.synth.portraits import albedo_of, images_under, materials_of
+from facerf_cli.synth.shading import Material
 from facerf_cli.training.loop import seeded
 
 SEED, SKINS, LOOK_PX = 17, 6, 128
@@ -71,14 +72,14 @@ def skin_of(view: StoredView) -> np.ndarray:
     return np.asarray(view.portrait.classes.numpy()[..., class_index("skin")] > 127)
 
 
-def albedo_of_skin(view: StoredView, look: MaterialPoints) -> float:
+def albedo_of_skin(view: StoredView, look: Material) -> float:
     """Mean luminance of the skin's true albedo."""
     albedo = albedo_of(view.portrait, look)[0].permute(1, 2, 0).numpy()
     return float(luminance(albedo)[skin_of(view)].mean())
 
 
 def measured(
-    models: Models, view: StoredView, look: MaterialPoints
+    models: Models, view: StoredView, look: Material
 ) -> tuple[float, np.ndarray, dict[str, np.ndarray]]:
     """Albedo of the skin, and the face's luminances in the photo and as shown."""
     rig, skin = view.portrait.directions, skin_of(view)

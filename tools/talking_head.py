@@ -17,7 +17,7 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.portraits import bake_portrait, photograph
+from facerf_cli.synth.portraits import bake_subject, images_under, materials_of, view_of
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera, stage_cameras, surface_samples
 
@@ -224,10 +224,10 @@ def draw_clip(person: int, frames: int, size_px: int) -> Clip:
     images, alphas = [], []
     for one in people:
         seen = seen_from(rig_directions(LIGHTS), one.camera)
-        baked = bake_portrait(one.subject, one.camera, seen, BAKE, 0)
-        photos = [photograph(baked, one.subject.appearance, weights) for weights in (SOURCE, TARGET)]
-        images.append([photo.image.permute(1, 2, 0).numpy() for photo in photos])
-        alphas.append(photos[0].alpha.numpy())
+        baked = view_of(one.subject, bake_subject(one.subject, [one.camera], seen, BAKE, 0), one.camera)
+        surface = materials_of(baked, one.subject.appearance)
+        images.append(images_under(baked, surface, torch.stack([SOURCE, TARGET])).permute(0, 2, 3, 1).numpy())
+        alphas.append(baked.alpha.numpy())
     alpha = np.stack(alphas)
     linear = np.array(images)
     linear *= MEAN / ((linear[:, 0].mean(-1) * alpha).sum() / alpha.sum())

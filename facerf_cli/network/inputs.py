@@ -6,7 +6,7 @@ These are exposure, colour cast, roots, resizing and head pose.
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from typing import Annotated, Any, ClassVar, Self, TypeVar
@@ -159,9 +159,14 @@ Blocks = Annotated[tuple[Annotated[int, Field(ge=0, le=8)], ...], Field(min_leng
 class Batch:
     """Base of dataclasses whose fields are tensors [B, ...], or such dataclasses again."""
 
+    def each(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """Apply a function to every tensor."""
+        values = (getattr(self, field.name) for field in fields(self))
+        return type(self)(*(x.each(function) if isinstance(x, Batch) else function(x) for x in values))
+
     def to(self, device: torch.device) -> Self:
-        """Copy all of them to `device`."""
-        return type(self)(*(getattr(self, field.name).to(device) for field in fields(self)))
+        """Copy all tensors to `device`."""
+        return self.each(lambda values: values.to(device))
 
 
 Samples = TypeVar("Samples", bound=Batch)

@@ -10,7 +10,7 @@ logit V'_l = a (2 V_l - 1) + sum_k b_k(l) W_k. All maps come from one forward pa
 products a pixel. The sum over lights is linear in their intensities.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -67,10 +67,9 @@ class PortraitInputs(Batch):
 
     def mirrored(self) -> "PortraitInputs":
         """The people as a mirror shows them."""
-        seen = {name: getattr(self, name).flip(-1) for name in self.__dataclass_fields__}
-        seen["normals"] = mirrored_x(seen["normals"])
-        seen["reached"] = mirrored_harmonics(seen["reached"])
-        return PortraitInputs(**seen)
+        seen = self.each(lambda layer: layer.flip(-1))
+        normals, reached = mirrored_x(seen.normals), mirrored_harmonics(seen.reached)
+        return replace(seen, normals=normals, reached=reached)
 
     def stacked(self) -> Tensor:
         """All of it [B, C, S, S] as the first layer sees it."""

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
-from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.random_fields import CANVAS_SPAN
-from facerf_cli.synth.shading import LOBES
+from facerf_cli.synth.shading import LOBES, Material
 from facerf_cli.synth.views import StageCamera
 
 _LIGHT = "light.to_world"  # parameter that turns the light

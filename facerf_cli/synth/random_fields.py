@@ -21,6 +21,12 @@ Random = np.random.Generator
 _PAIRED = ("eyes", "brows", "nostrils")  # `inside_mm` covers only the left part of these
 
 
+def generators(*seeds: int) -> tuple[Random, torch.Generator]:
+    """Make generators for numpy and for torch, a function of the numbers."""
+    random = np.random.default_rng(seeds)
+    return random, torch.Generator().manual_seed(int(random.integers(1 << 62)))
+
+
 @dataclass(frozen=True, eq=False)
 class Uniform:
     """Uniform random numbers of a default `shape`, which a call may override."""

@@ -16,9 +16,11 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from facerf_cli.light.mesh_transport import MeshTransport
+from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
+from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.synth.appearance.materials import Appearance, sample
+from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, doubled_areas
 from facerf_cli.synth.shading import Strands, strand_cosines, strand_highlights, widened_lobes
 from facerf_cli.synth.views import Facets, StageCamera, facets_of
@@ -38,6 +40,23 @@ class RenderSettings:
     scattering: bool = True
     gloss: bool = True
     relief: bool = True
+
+
+def bake_person(
+    mesh: HeadMesh, directions: np.ndarray, settings: BakeSettings, seed: int, wanted: np.ndarray
+) -> MeshTransport:
+    """Bake the light transport of a person's vertices `wanted` [V] under lights at directions [L, 3]."""
+    return bake_mesh(
+        mesh.vertices,
+        mesh.normals,
+        mesh.triangles,
+        directions,
+        settings,
+        seed,
+        wanted=wanted,
+        two_sided=mesh.is_part("hair"),
+        clearance_m=clearance_m(mesh),
+    )
 
 
 def photograph(
@@ -202,11 +221,10 @@ class Lenses:
 
 def lenses_in(lenses: HeadMesh, camera: StageCamera, depth_m: np.ndarray) -> Lenses:
     """Find the pixels that show lenses before everything else, whose depth [H, W] (m) is 0 for nothing."""
-    rotation = camera.head_to_camera.float()
-    vertices = torch.from_numpy(lenses.vertices).float() @ rotation.T + camera.translation_m.float()
-    triangles = torch.from_numpy(lenses.triangles).long()
+    vertices = camera.to_camera(torch.from_numpy(lenses.vertices))
+    triangles = torch.from_numpy(lenses.triangles)
     fragments = rasterize(vertices, triangles, camera.camera)
-    normals = torch.from_numpy(lenses.normals).float() @ rotation.T
+    normals = torch.from_numpy(lenses.normals) @ camera.head_to_camera.T
     found = interpolate(torch.cat([vertices, normals], 1), triangles, fragments)
     nothing_before = torch.from_numpy(depth_m == 0) | (-found[..., 2] < torch.from_numpy(depth_m))
     pixels = (fragments.covered & nothing_before).flatten().nonzero()[:, 0]

@@ -4,13 +4,14 @@ Lights are directional, of rgb 1: a white Lambertian surface that faces one has 
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.synth.appearance.skin import Skin
+from facerf_cli.network.inputs import Batch
 
 LOBES = ((1.0, 0.75), (0.55, 0.25))  # skin: (roughness factor, weight) of a broad and of a narrow, oily lobe
 _NORMAL_VARIANCE = 0.18  # largest addition to alpha squared where normals vary within a facet
@@ -21,6 +22,31 @@ _STRAND_LOBES = (
     (0.06, 0.7),
 )  # hair, R, TRT and TT: (shift to the tip in radians, width factor)
 _TRANSMITTED, _TRANSMITTED_WIDTH = 0.5, 0.45  # of TT: strength, standard deviation around the strand
+
+
+@dataclass(frozen=True)
+class Material(Batch):
+    """A surface as textures [C, H, W] with row v = 0 at the top, or at N points [N, C] ([N] if C is 1).
+
+    albedo [3, H, W] linear Rec.709; specular [1, H, W] reflectance at normal incidence; roughness [1, H, W]
+    (GGX alpha is its square); relief [2, H, W] slopes of fine relief along +u and +v.
+    """
+
+    albedo: Tensor
+    specular: Tensor
+    roughness: Tensor
+    relief: Tensor
+
+    def part(self, which: Any) -> Self:
+        """Select by the first dimension of every field."""
+        return self.each(lambda values: values[which])
+
+
+@dataclass(frozen=True)
+class Skin(Material):
+    """Textures [B, C, T, T] of B faces; scattering_texels [B, 3]: see `scatter`."""
+
+    scattering_texels: Tensor
 
 
 def diffuse_irradiance(

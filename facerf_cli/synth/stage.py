@@ -19,13 +19,12 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.texts import read_json
-from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
+from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.synth import path_tracer, renderer
-from facerf_cli.synth.head.body import clearance_m
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.renderer import lenses_in, over_lenses
 from facerf_cli.synth.stage_settings import StageSettings
@@ -113,28 +112,15 @@ def photograph_subject(
     if settings.renderer == "mitsuba":
         images = (path_tracer.photograph(mesh, appearance, directions, camera)[0] for camera in cameras)
         return images, None
-    transport = bake_mesh(
-        mesh.vertices,
-        mesh.normals,
-        mesh.triangles,
-        directions,
-        _BAKE,
-        settings.seed,
-        wanted=_visible_vertices(mesh, cameras),
-        two_sided=mesh.is_part("hair"),
-        clearance_m=clearance_m(mesh),
-    )
+    wanted = _visible_vertices(mesh, cameras)
+    transport = renderer.bake_person(mesh, directions, _BAKE, settings.seed, wanted)
     irradiance = renderer.scattered_irradiance(mesh, appearance, transport)
-    images = (
-        _with_lenses(
-            renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)[0],
-            subject,
-            camera,
-            directions,
-        )
-        for camera in cameras
-    )
-    return images, transport
+
+    def photo(camera: StageCamera) -> Tensor:
+        images, _ = renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)
+        return _with_lenses(images, subject, camera, directions)
+
+    return map(photo, cameras), transport
 
 
 def _with_lenses(images: Tensor, subject: Subject, camera: StageCamera, directions: np.ndarray) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from facerf_cli.face.morphable import EXPRESSION_STD, MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_scalp
+from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_short_hair
 from facerf_cli.synth.bank.heads import HeadBakeSettings, draw_coefficients
 from facerf_cli.synth.head.body import chin_height_m, draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
@@ -19,7 +19,7 @@ from facerf_cli.synth.head.hair_styles import scalp_cover
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh, joined
 from facerf_cli.synth.head.worn import Headwear, draw_earrings, draw_hand, draw_headwear, draw_microphone
-from facerf_cli.synth.random_fields import Random
+from facerf_cli.synth.random_fields import Random, generators
 from facerf_cli.synth.views import more_landmarks
 
 _SMALL_PX = 96  # images up to this side show coarse meshes
@@ -52,8 +52,7 @@ def subject_model(name_or_path: str) -> MorphableModel:
 
 def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> Subject:
     """Draw subject number `index`, a function of (model, seed, index); `size_px` sets only its resolution."""
-    random = np.random.default_rng([seed, index])
-    generator = torch.Generator().manual_seed(int(random.integers(1 << 62)))
+    random, generator = generators(seed, index)
     alpha, beta = draw_coefficients(model, random, HeadBakeSettings())
     closed = random.random() < _CLOSED_SHARE
     if closed:
@@ -69,7 +68,7 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     headwear = draw_headwear(bare, chin_height_m(bare), random) if random.random() < _HEADWEAR_SHARE else None
     hair, style = draw_hair(dressed, random, headwear)
     cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))
-    appearance = with_scalp(appearance, cover, generator)
+    appearance = with_short_hair(appearance, cover, generator)
     more = more_landmarks(bare)
     lobes = [place for name, place in more.items() if name.endswith("ear lobe")]
     worn, lenses, seen = _worn(bare, landmarks_m, lobes, appearance, headwear, random)

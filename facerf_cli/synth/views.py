@@ -3,7 +3,7 @@
 Further landmarks than the 68 of `face.topology` have names: centres and outlines of the irises, and ears.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -14,10 +14,10 @@ from torch import Tensor
 from facerf_cli.portrait.classes import CLASSES, IRIS_POINTS, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
-from facerf_cli.synth.appearance.materials import Appearance, MaterialPoints, sample
+from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.appearance.people import IRIS_DEG
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, unit
-from facerf_cli.synth.shading import unit_along
+from facerf_cli.synth.shading import Material, unit_along
 from facerf_cli.synth.stage_settings import Frame
 
 CAMERA_DISTANCE_M = 1.2  # from the head
@@ -34,6 +34,10 @@ class StageCamera:
     camera: Camera
     head_to_camera: Tensor
     translation_m: Tensor
+
+    def to_camera(self, points: Tensor) -> Tensor:
+        """Points [..., 3] of the head's frame in camera space."""
+        return points @ self.head_to_camera.T.to(points) + self.translation_m.to(points)
 
 
 @lru_cache(maxsize=4)
@@ -60,7 +64,7 @@ class Facets:
     part: Tensor  # [N] index into PARTS
     corners: csr_matrix  # [N, W] mean barycentric weights; rows sum to 1
     tinted: list[csr_matrix]  # per channel [N, V]: weights times albedo
-    surface: MaterialPoints
+    surface: Material
     uv: Tensor  # [N, 2]
     normals: Tensor  # [N, 3] smooth normals
     bent: Tensor  # [N, 3] normals with relief
@@ -75,7 +79,7 @@ class Facets:
             self.part[rows],
             self.corners[rows],
             [matrix[rows] for matrix in self.tinted],
-            MaterialPoints(*(getattr(self.surface, field.name)[rows] for field in fields(MaterialPoints))),
+            self.surface.part(rows),
             *(getattr(self, name)[rows] for name in ("uv", "normals", "bent", "views", "tangents", "spread")),
         )
 
@@ -109,9 +113,7 @@ def facets_of(
             groups.matrix(weights * albedo.numpy()[:, None], samples.corners, len(head.part))
             for albedo in surface.albedo.T
         ],
-        surface=MaterialPoints(
-            *(groups.mean(getattr(surface, field.name)) for field in fields(MaterialPoints))
-        ),
+        surface=surface.each(groups.mean),
         uv=groups.mean(samples.interpolate(head.uv)),
         normals=unit_along(groups.mean(smooth), 1),
         bent=unit_along(bent, 1),
@@ -177,8 +179,7 @@ def surface_samples(head: HeadMesh, stage_camera: StageCamera, scale: int) -> Sa
         camera.cx_px * scale,
         camera.cy_px * scale,
     )
-    rotation, translation = stage_camera.head_to_camera.double(), stage_camera.translation_m.double()
-    vertices = torch.from_numpy(head.vertices).double() @ rotation.T + translation
+    vertices = stage_camera.to_camera(torch.from_numpy(head.vertices).double())
     fragments = rasterize(vertices, torch.from_numpy(head.triangles), finer)
     row, column = (index.numpy() for index in torch.nonzero(fragments.covered, as_tuple=True))
     triangle = fragments.triangle.numpy()[row, column]

@@ -77,7 +77,7 @@ class PortraitObjective(Objective):
     def forward(self, batch: PortraitSample) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over samples."""
         maps, settings = self._maps(batch), self.settings
-        found, own = maps.olats(batch.lights, _larger(batch.visible, batch.image)), _own(maps, batch)
+        found, own = maps.olats(batch.lights, _larger(batch.visible, batch.inputs.image)), _own(maps, batch)
         scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1])
         alpha = (1 - batch.shares[:, :1])[:, None]
         off = (_root(found * scale) - _root(batch.targets)) * alpha
@@ -109,7 +109,7 @@ class PortraitObjective(Objective):
         """Measure held-out people: relative error by region under one scale of the head, and its SSIM."""
         parts = [sample.to(self.device) for sample in self.held_out_samples()]
         batch = concatenate(parts)
-        found = torch.cat([self._maps(p).olats(p.lights, _larger(p.visible, p.image)) for p in parts])
+        found = torch.cat([self._maps(p).olats(p.lights, _larger(p.visible, p.inputs.image)) for p in parts])
         scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1], clamp=False)
         squared = (found * scale - batch.targets).square().mean(2)
         truth = batch.targets.square().mean(2)
@@ -127,13 +127,13 @@ class PortraitObjective(Objective):
         rows = []
         for index in range(min(_SHEET_ROWS, len(found))):
             pairs = torch.stack([found[index], batch.targets[index]], 1).flatten(0, 1)
-            rows.append(torch.cat([batch.image[index], *pairs], -1))
+            rows.append(torch.cat([batch.inputs.image[index], *pairs], -1))
         return torch.cat(rows, 1).permute(1, 2, 0).cpu().numpy()
 
 
 def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:
     """The photo under its own light [B, 3, S / 4, S / 4], as the network sees it."""
-    side = batch.image.shape[-1] // SMALL
+    side = batch.inputs.image.shape[-1] // SMALL
     small = type(maps)(*(F.interpolate(values, size=(side, side), mode="area") for values in maps))
     visible = F.interpolate(batch.rig_visible, size=small.gain.shape[-2:], mode="area")
     shading, glow, _ = small.shaded(batch.rig, visible)

@@ -53,8 +53,8 @@ def test_targets_are_the_stacks_lights(portraits: DatasetPortraits) -> None:
     """A matt face without shadows: each target is its light's cosine, but for the exposure."""
     sample = drawn(portraits, 0)
     assert sample.targets.shape == (1, 2, 3, SIDE_PX, SIDE_PX) and sample.labelled.tolist() == [0.0]
-    sure = (sample.shares[0, SKIN] > 0.95) & (sample.covered[0, 0] > 0.5)
-    cosine = torch.einsum("tc,cij->tij", sample.lights[0], sample.normals[0]).clamp_min(0)
+    sure = (sample.shares[0, SKIN] > 0.95) & (sample.inputs.covered[0, 0] > 0.5)
+    cosine = torch.einsum("tc,cij->tij", sample.lights[0], sample.inputs.normals[0]).clamp_min(0)
     for light in range(2):
         lambert = (sample.albedo[0].mean(0) * cosine[light])[sure]
         found = sample.targets[0, light].mean(0)[sure]

@@ -13,10 +13,11 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.synth import path_tracer, renderer
-from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.path_tracer import PathSettings
 from facerf_cli.synth.renderer import RenderSettings
+from facerf_cli.synth.shading import Material
 from facerf_cli.synth.views import StageCamera
 
 LIGHTS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall

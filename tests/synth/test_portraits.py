@@ -14,14 +14,18 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth import renderer
-from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, joined, strandless
 from facerf_cli.synth.portraits import (
     BakedPortrait,
-    bake_portrait,
-    photograph,
+    albedo_of,
+    bake_subject,
+    images_under,
+    materials_of,
+    view_of,
 )
 from facerf_cli.synth.renderer import RenderSettings
+from facerf_cli.synth.shading import Material
 from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera
 
@@ -75,7 +79,11 @@ def camera() -> StageCamera:
 
 @pytest.fixture(scope="module")
 def portrait(subject: Subject, camera: StageCamera) -> BakedPortrait:
-    return bake_portrait(subject, camera, LIGHTS, BAKE, 0)
+    return view_of(subject, bake_subject(subject, [camera], LIGHTS, BAKE, 0), camera)
+
+
+def photograph(portrait: BakedPortrait, look: Appearance, weights: torch.Tensor) -> torch.Tensor:
+    return images_under(portrait, materials_of(portrait, look), weights[None])[0]
 
 
 def weights(seed: int) -> torch.Tensor:
@@ -102,37 +110,21 @@ def test_it_shades_as_the_bake_renderer_does(
     expected = torch.einsum("lchw,lc->chw", olats, weights(seed))
     photo = photograph(portrait, other, weights(seed))
     # Bytes of irradiance and smooth harmonics of the bounce, whose white balls tint it by one mean albedo.
-    off = (photo.image - expected).abs()
+    off = (photo - expected).abs()
     assert off.mean() < 0.015 * expected.mean()
     # On the rim of the ball a facet spans many angles, and the mean of products is not that of the factors.
     assert off.flatten().quantile(0.99) < 0.04 * expected.max()
 
 
 def test_truth_lies_beside_the_photo(portrait: BakedPortrait) -> None:
-    photo = photograph(portrait, appearance(), weights(0))
-    assert photo.image.shape == photo.albedo.shape == photo.normals.shape == (3, SIDE_PX, SIDE_PX)
-    background = photo.classes[class_index("background")]
-    assert (photo.alpha + background - 1).abs().max() < 0.15  # other samples of a pixel
-    assert (photo.alpha + background - 1).abs().mean() < 0.01
-    inside = photo.alpha > 0.99
-    assert torch.allclose(photo.albedo[0][inside], torch.tensor(0.5), atol=2e-3)
-    assert (photo.image[:, photo.alpha == 0] == 0).all()
-
-
-def test_the_specular_share_is_what_gloss_adds(portrait: BakedPortrait) -> None:
-    dull = appearance()
-    materials = {
-        name: replace(material, specular=0 * material.specular) for name, material in dull.materials.items()
-    }
-    dull = replace(dull, materials=materials)
-    glossy, matte = photograph(portrait, appearance(), weights(0)), photograph(portrait, dull, weights(0))
-    skin = glossy.classes[class_index("skin")] > 0.99
-    shining, rest = (
-        photo.specular * photo.image.mean(0) for photo in (glossy, matte)
-    )  # rest: at grazing angles
-    added = glossy.image.mean(0) - matte.image.mean(0)
-    assert glossy.specular[skin].max() > 0.05
-    assert torch.allclose((shining - rest)[skin], added[skin], atol=1e-5)
+    photo, alpha = photograph(portrait, appearance(), weights(0)), portrait.alpha
+    albedo, normals = albedo_of(portrait, materials_of(portrait, appearance()))
+    assert photo.shape == albedo.shape == normals.shape == (3, SIDE_PX, SIDE_PX)
+    background = portrait.classes[..., class_index("background")].float() / 255
+    assert (alpha + background - 1).abs().max() < 0.15  # other samples of a pixel
+    assert (alpha + background - 1).abs().mean() < 0.01
+    assert torch.allclose(albedo[0][alpha > 0.99], torch.tensor(0.5), atol=2e-3)
+    assert (photo[:, alpha == 0] == 0).all()
 
 
 def test_landmarks_and_pose_are_those_of_the_camera(subject: Subject, portrait: BakedPortrait) -> None:

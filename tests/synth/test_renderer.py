@@ -14,7 +14,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.synth import renderer
-from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless
 from facerf_cli.synth.renderer import (
     Lenses,
@@ -25,7 +25,7 @@ from facerf_cli.synth.renderer import (
     reflections,
     scattered_irradiance,
 )
-from facerf_cli.synth.shading import LOBES
+from facerf_cli.synth.shading import LOBES, Material
 from facerf_cli.synth.views import StageCamera
 
 DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)

@@ -2,8 +2,9 @@ import math
 
 import torch
 
-from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.appearance.skin import draw_skin
 from facerf_cli.synth.shading import (
+    Skin,
     Strands,
     diffuse_irradiance,
     highlights,

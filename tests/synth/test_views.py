@@ -9,10 +9,11 @@ import trimesh
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
-from facerf_cli.synth.appearance.materials import Appearance, Material
+from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
+from facerf_cli.synth.shading import Material
 from facerf_cli.synth.views import StageCamera, more_landmarks, stage_cameras, truth_of
 
 SIDE_PX, RADIUS_M, FAR_M = 64, 0.05, 10.0

@@ -52,13 +52,15 @@ def truth() -> PortraitSample:
     shares[:, 0, :, SIDE // 2 :] = 1  # the right half is background
     targets = 0.4 * cosines.view(1, 2, 1, 1, 1).expand(1, 2, 3, SIDE, SIDE)
     return PortraitSample(
-        image=whole(own),
-        classes=shares,
-        normals=whole(NORMAL),
-        depth=whole(0, 1),
-        covered=whole(1, 1),
-        reached=whole(0, 16),
-        own_shading=whole(1, 1),
+        inputs=PortraitInputs(
+            image=whole(own),
+            classes=shares,
+            normals=whole(NORMAL),
+            depth=whole(0, 1),
+            covered=whole(1, 1),
+            reached=whole(0, 16),
+            own=whole(1, 1),
+        ),
         lights=lights,
         visible=torch.ones(1, 2, SIDE // 2, SIDE // 2),
         targets=targets,
@@ -170,6 +172,8 @@ def test_validation_is_by_region() -> None:
 
 
 def test_a_sample_moves_as_one() -> None:
-    sample = replace(truth(), image=whole(0.1))
+    sample = truth()
+    sample = replace(sample, inputs=replace(sample.inputs, image=whole(0.1)))
     moved = sample.to(torch.device("cpu"))
-    assert torch.equal(moved.inputs.image, sample.image) and torch.equal(moved.inputs.own, sample.own_shading)
+    assert torch.equal(moved.inputs.image, sample.inputs.image)
+    assert torch.equal(moved.inputs.own, sample.inputs.own)

@@ -16,29 +16,16 @@ from facerf_cli.synth.appearance.people import (
     hair_albedo,
     parameters_of,
 )
-from facerf_cli.synth.appearance.skin import bare_skin, paint_skin, scattering_mm
+from facerf_cli.synth.appearance.skin import bare_skin, paint_skin, scattering_mm, with_scalp
 from facerf_cli.synth.head.mesh import PARTS
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Uniform, Window, plain_noise
+from facerf_cli.synth.shading import Material
 
 _SIDE = 256  # of the textures of eyes and cloth
 _CLOTHS = ("plain", "plain", "plain", "heather", "stripes", "check")
 _DYES = tables_of(__file__)["dyes"]  # of garments, linear Rec.709
 _HAIR_WISPS = 512  # different wisps in the texture of hair
 _PAINTED_HAIR = ("bald", "hairline_mm")  # parameters of painted scalp hair; here hair is geometry
-
-
-@dataclass(frozen=True)
-class Material:
-    """Textures of one part, float32, with row v = 0 at the top.
-
-    albedo [3, H, W] linear Rec.709; specular [1, H, W] reflectance at normal incidence; roughness [1, H, W]
-    (GGX alpha is its square); relief [2, H, W] slopes of fine relief along +u and +v.
-    """
-
-    albedo: Tensor
-    specular: Tensor
-    roughness: Tensor
-    relief: Tensor
 
 
 @dataclass(frozen=True)
@@ -54,16 +41,6 @@ class Appearance:
     traits: dict[str, float | str | bool]
 
 
-@dataclass(frozen=True)
-class MaterialPoints:
-    """Material at N points: albedo [N, 3], specular [N], roughness [N], relief [N, 2]."""
-
-    albedo: Tensor
-    specular: Tensor
-    roughness: Tensor
-    relief: Tensor
-
-
 def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
     """Draw one person with clothes and glasses; `side` of the canvas only sets the resolution of the skin."""
     people = replace(draw_people(1, generator), random_texture=torch.zeros(1))
@@ -71,16 +48,15 @@ def draw_appearance(side: int, generator: torch.Generator) -> Appearance:
     frame, frame_kind = _frame(generator)
     cloth, cloth_kind = _cloth(generator)
     materials = {
-        "eye": Material(*eye),
+        "eye": eye,
         "mouth": _mouth(generator),
         "teeth": _teeth(people, generator),
         "cloth": cloth,
         "hair": _hair(people, generator),
         "frame": frame,
         "hat": _cloth(generator)[0],
+        "skin": paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False).part(0),
     }
-    skin = paint_skin(people, Window(side, CANVAS_SPAN), generator, painted_eyes=False)
-    materials["skin"] = Material(skin.albedo[0], skin.specular[0], skin.roughness[0], skin.relief[0])
     traits = parameters_of(people, 0)
     for name in _PAINTED_HAIR:
         del traits[name]
@@ -96,25 +72,17 @@ def canvas_uv(side: int) -> Tensor:
     return CANVAS_SPAN[0] + (CANVAS_SPAN[1] - CANVAS_SPAN[0]) * texel_centres_uv(side)
 
 
-def with_scalp(appearance: Appearance, cover: Tensor, generator: torch.Generator) -> Appearance:
+def with_short_hair(appearance: Appearance, cover: Tensor, generator: torch.Generator) -> Appearance:
     """The same person with short hair painted on the scalp, with the cover [T, T] on the canvas.
 
     Its colour is the mean of the hair's roots.
     """
-    skin, hair = appearance.materials["skin"], appearance.materials["hair"]
-    colour = hair.albedo[:, :8].mean((1, 2)).view(3, 1, 1)
-    streaks = (1 + 0.2 * torch.randn(1, *cover.shape, generator=generator)).clamp(0.3, 1.8)
-    share = 0.9 * cover.float()[None]
-    stained = Material(
-        skin.albedo + share * (colour * streaks - skin.albedo),
-        skin.specular * (1 - 0.5 * share),
-        (skin.roughness + 0.15 * share).clamp(max=0.85),
-        skin.relief * (1 - share),
-    )
-    return replace(appearance, materials=appearance.materials | {"skin": stained})
+    colour = appearance.materials["hair"].albedo[:, :8].mean((1, 2)).view(3, 1, 1)
+    skin = with_scalp(appearance.materials["skin"], 0.9 * cover.float()[None], colour, generator)
+    return replace(appearance, materials=appearance.materials | {"skin": skin})
 
 
-def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> MaterialPoints:
+def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> Material:
     """Sample the materials at points, bilinear; cloth is repeated in mirror image, the others are clamped.
 
     part [N] is an index into `mesh.PARTS`, uv [N, 2] as in `HeadMesh`.
@@ -132,7 +100,7 @@ def sample(appearance: Appearance, part: Tensor, uv: Tensor) -> MaterialPoints:
         beyond = "reflection" if name in ("cloth", "hat") else "border"
         found = F.grid_sample(texture[None], grid, padding_mode=beyond, align_corners=False)
         values[chosen] = found[0, :, 0].T
-    return MaterialPoints(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
+    return Material(values[:, :3], values[:, 3], values[:, 4], values[:, 5:])
 
 
 def _flat(albedo: Tensor, specular: float, roughness: float, relief: Tensor | None = None) -> Material:

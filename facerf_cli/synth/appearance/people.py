@@ -23,6 +23,7 @@ from facerf_cli.image.colour import REC709_CHROMATICITIES, rgb_to_xyz
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.synth import tables_of
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, places_mm, plain_noise
+from facerf_cli.synth.shading import Material
 
 DARKEST, LIGHTEST = 0.23, 0.0075  # melanin fractions of the darkest and of the lightest skin
 RANDOM_TEXTURES = 0.06  # fraction of people with random colours instead of skin tones
@@ -234,8 +235,8 @@ def draw_irises(people: People, generator: torch.Generator) -> tuple[Tensor, lis
 
 def eyeball_textures(
     side: int, people: People, generator: torch.Generator
-) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], dict[str, float | str | bool]]:
-    """Draw albedo, specular, roughness and relief [C, T, T] of the first person's eyes, and their traits.
+) -> tuple[Material, dict[str, float | str | bool]]:
+    """Draw the textures of the first person's eyes, and their traits.
 
     The texture is a disc around the gaze axis, azimuthal equidistant to 90 degrees at its edge.
     """
@@ -255,7 +256,7 @@ def eyeball_textures(
     pupil_mm = 2 * _RADIUS_MM * math.radians(pupil_deg)
     traits: dict[str, float | str | bool] = {"iris": names[0], "pupil_mm": round(pupil_mm, 2)}
     roughness = torch.where(angle < IRIS_DEG, 0.08, 0.14)[None]
-    return (albedo.clamp(0.003, 0.9), 0.03 * wet, roughness, relief), traits
+    return Material(albedo.clamp(0.003, 0.9), 0.03 * wet, roughness, relief), traits
 
 
 def _sclera(side: int, angle: Tensor, redness: float, age: float, generator: torch.Generator) -> Tensor:

@@ -3,8 +3,9 @@
 The same code paints the UV map of the face, for the training bank, and the wider canvas of whole heads.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -32,6 +33,9 @@ from facerf_cli.synth.random_fields import (
     smooth,
     splat,
 )
+from facerf_cli.synth.shading import Material, Skin
+
+M = TypeVar("M", bound=Material)
 
 _WRINKLE_WIDTH_MM = 0.9  # sigma of a wrinkle's profile
 _STEP_MM = 0.4  # between sample points along a wrinkle
@@ -129,22 +133,6 @@ def _wrinkles(people: People, window: Window, generator: torch.Generator) -> Ten
 _SCATTERING_MM = (1.18, 0.26, 0.16)
 
 
-@dataclass(frozen=True)
-class Skin:
-    """Material textures of B faces.
-
-    albedo [B, 3, T, T] linear Rec.709; specular [B, 1, T, T] reflectance at normal incidence; roughness
-    [B, 1, T, T] (GGX alpha is its square); relief [B, 2, T, T] slopes of the surface along u and v;
-    scattering_texels [B, 3]: sigma by which light of each channel spreads under the surface.
-    """
-
-    albedo: Tensor
-    specular: Tensor
-    roughness: Tensor
-    relief: Tensor
-    scattering_texels: Tensor
-
-
 def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     """Draw B people's skins as textures of `side` texels with painted eyes, evenly from light to dark.
 
@@ -155,7 +143,8 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     skin = paint_skin(people, window, generator, painted_eyes=True)
     scalp = scalp_hair(people, window, above_hairline(people, window), generator)
     scalp = scalp * each(1 - people.bald) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.8)
-    skin = _with_scalp(skin, people, scalp, generator)
+    colour = hair_albedo(people.hair_eumelanin, people.hair_pheomelanin, people.grey)[..., None, None]
+    skin = with_scalp(skin, scalp, colour, generator)
     clothed = mask(window, "neck", 5.0) * (torch.rand(faces, 1, 1, 1, generator=generator) < 0.4)
     cloth = 0.02 + 0.58 * torch.rand(faces, 3, 1, 1, generator=generator)
     slit = torch.where(torch.rand(faces, 1, 1, 1, generator=generator) < 0.5, 0.5, 0.06)
@@ -166,19 +155,18 @@ def draw_skin(faces: int, side: int, generator: torch.Generator) -> Skin:
     shine = torch.exp(uniform(-0.5, 0.5))
     smoothness = 0.24 * uniform(0, 1) ** 2 - 0.06
     specular, roughness = skin.specular * shine, (skin.roughness - smoothness).clamp(0.16, 0.85)
-    return Skin(albedo, specular, roughness, skin.relief, skin.scattering_texels)
+    return replace(skin, albedo=albedo, specular=specular, roughness=roughness)
 
 
-def _with_scalp(skin: Skin, people: People, cover: Tensor, generator: torch.Generator) -> Skin:
-    """The skin under short hair with the cover [B, 1, T, T], in the colour of the hair."""
-    colour = hair_albedo(people.hair_eumelanin, people.hair_pheomelanin, people.grey)[..., None, None]
+def with_scalp(skin: M, cover: Tensor, colour: Tensor, generator: torch.Generator) -> M:
+    """The skin under short hair of a colour, with a cover [..., 1, T, T] in 0..1."""
     streaks = (1 + 0.2 * torch.randn(cover.shape, generator=generator)).clamp(0.3, 1.8)
-    return Skin(
-        skin.albedo + cover * (colour * streaks - skin.albedo).clamp(-1, 1),
-        skin.specular * (1 - 0.5 * cover),
-        (skin.roughness + 0.15 * cover).clamp(max=0.85),
-        skin.relief * (1 - cover),
-        skin.scattering_texels,
+    return replace(
+        skin,
+        albedo=skin.albedo + cover * (colour * streaks - skin.albedo),
+        specular=skin.specular * (1 - 0.5 * cover),
+        roughness=(skin.roughness + 0.15 * cover).clamp(max=0.85),
+        relief=skin.relief * (1 - cover),
     )
 
 

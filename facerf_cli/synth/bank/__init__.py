@@ -1,31 +1,65 @@
-"""Banks of training data: folders of safetensors."""
+"""Banks of training data: folders of safetensors, a file or more a person."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.run.workers import in_shards
 
-T = TypeVar("T")
-Entries = Iterable[tuple[Path, dict[str, Tensor]]]
+Files = dict[str, dict[str, Tensor]]  # tensors by the names of files, without ending
 
 
 def fill(
-    make: Callable[[T], Entries], items: Sequence[T], jobs: int, metadata: dict[str, str] | None = None
+    folder: Path,
+    make: Callable[[int], Files],
+    people: Iterable[int],
+    jobs: int,
+    metadata: dict[str, str] | None = None,
+    last: str = "",
 ) -> None:
-    """Write the files that `make` gives for each item, by `jobs` processes of one thread."""
-    in_shards(partial(_fill_shard, make, metadata), list(items), jobs)
+    """Write the files that `make` gives for each person, by `jobs` processes of one thread.
+
+    People whose file, or whose last one of several with this ending, exists are finished and kept.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [index for index in people if not file_of(folder, f"{index:05d}{last}").exists()]
+    in_shards(partial(_fill_shard, folder, make, metadata), missing, jobs)
 
 
-def _fill_shard(make: Callable[[T], Entries], metadata: dict[str, str] | None, items: list[T]) -> None:
+def _fill_shard(
+    folder: Path, make: Callable[[int], Files], metadata: dict[str, str] | None, people: list[int]
+) -> None:
     torch.set_num_threads(1)
-    for item in items:
-        for path, tensors in make(item):
-            with atomic_path(path) as temporary:
+    for index in people:
+        for name, tensors in make(index).items():
+            with atomic_path(file_of(folder, name)) as temporary:
                 save_file(tensors, temporary, metadata=metadata)
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """A file of a bank."""
+    return folder / f"{name}.safetensors"
+
+
+def files_in(folder: Path, otherwise: str = "") -> list[Path]:
+    """All files of people; InputError that ends with `otherwise`, if given, where there are none."""
+    found = sorted(folder.glob("[0-9]*.safetensors"))
+    if otherwise and not found:
+        raise InputError(f"{folder}: {otherwise}")
+    return found
+
+
+def split_heads(count: int, held_out: int) -> tuple[Tensor, Tensor]:
+    """Indices of the training heads, and of the first `held_out` heads after the mean face."""
+    return torch.arange(held_out + 1, count), torch.arange(1, held_out + 1)
+
+
+def split_people(count: int, held_out: int) -> tuple[list[int], list[int]]:
+    """Indices of the people to train on, and of the first `held_out` ones."""
+    return list(range(held_out, count)), list(range(held_out))

@@ -19,7 +19,6 @@ import torch.nn.functional as F
 from safetensors.torch import load_file
 from torch import Tensor
 
-from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import GRID, MIRROR_68, grid_uv, landmark_weights
@@ -28,8 +27,8 @@ from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera, 
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.people import hair_albedo
-from facerf_cli.synth.appearance.skin import Skin, draw_skin
-from facerf_cli.synth.bank import Entries, fill
+from facerf_cli.synth.appearance.skin import draw_skin
+from facerf_cli.synth.bank import Files, file_of, files_in, fill, split_heads
 from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, photograph_head
 from facerf_cli.synth.bank.texture_samples import HeadFields, draw_light, head_fields
 from facerf_cli.synth.head.body import draw_body
@@ -37,8 +36,8 @@ from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined
 from facerf_cli.synth.head.shell import shell_head
-from facerf_cli.synth.random_fields import Random, Uniform
-from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
+from facerf_cli.synth.random_fields import Random, Uniform, generators
+from facerf_cli.synth.shading import Skin, diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
 
 BRIGHTEST = 6.0  # largest stored radiance, over the mean radiance of the face
 _HIGHLIGHTS = 10  # only the brightest lights have highlights
@@ -70,15 +69,13 @@ def add_head_images(
     heads: Path, folder: Path, count: int, jobs: int, seed: int, settings: ImageSettings = ImageSettings()
 ) -> None:
     """Write `count` images of every baked head in `heads` to `folder`; keep finished heads."""
-    found = sorted(heads.glob("*.safetensors"))
-    if not found:
-        raise InputError(f"{heads}: no baked heads; run `facerf train` to bake them")
-    missing = [path for path in found if not (folder / path.name).exists()]
-    fill(partial(_imaged, folder, count, seed, settings), missing, jobs)
+    people = [int(path.stem) for path in files_in(heads, "no baked heads; run `facerf train` to bake them")]
+    fill(folder, partial(_imaged, heads, count, seed, settings), people, jobs)
 
 
-def _imaged(folder: Path, count: int, seed: int, settings: ImageSettings, path: Path) -> Entries:
-    return [(folder / path.name, image_head(load_file(path), count, seed, int(path.stem), settings))]
+def _imaged(heads: Path, count: int, seed: int, settings: ImageSettings, index: int) -> Files:
+    name = f"{index:05d}"
+    return {name: image_head(load_file(file_of(heads, name)), count, seed, index, settings)}
 
 
 @torch.no_grad()
@@ -91,8 +88,7 @@ def image_head(
     face, and cover; S is crop_px + 2 margin_px. landmarks_px [W, 68, 2] in the crop. Of the fit, through the
     crop camera: rotation [W, 3, 3], translation_m [W, 3], alpha [W, Ki], beta [W, Ke].
     """
-    random = np.random.default_rng([seed, index, 2])
-    generator = torch.Generator().manual_seed(int(random.integers(1 << 62)))
+    random, generator = generators(seed, index, 2)
     fields, vertices = head_fields(head), head["vertices"]
     around = _surroundings(vertices, random)
     photos = [photograph_head(vertices, random, settings.views) for _ in range(count)]
@@ -261,16 +257,14 @@ class RenderedFaces:
     """Images of the bank's heads, held in memory as bytes, from which crops are drawn."""
 
     def __init__(self, folder: Path, provenance: dict[str, Any], settings: ImageSettings = _IMAGES) -> None:
-        paths = sorted(folder.glob("*.safetensors"))
-        if not paths:
-            raise InputError(f"{folder}: no images of heads; make them with `facerf train --stage geometry`")
+        paths = files_in(folder, "no images of heads; make them with `facerf train --stage geometry`")
         self.provenance = provenance
         self.settings = settings
         self.images = [load_file(path) for path in paths]
 
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
-        """Indices of the training heads, and of the first `held_out` heads after the mean face."""
-        return torch.arange(held_out + 1, len(self.images)), torch.arange(1, held_out + 1)
+        """See `split_heads`."""
+        return split_heads(len(self.images), held_out)
 
     def mean_translation_m(self) -> tuple[float, float, float]:
         """Mean translation of all images, the starting point of the network."""

@@ -34,7 +34,7 @@ from facerf_cli.light.transport import BakeSettings, bake_transport
 from facerf_cli.raster.camera import Camera, crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv, unwrap
-from facerf_cli.synth.bank import Entries, fill
+from facerf_cli.synth.bank import Files, file_of, files_in, fill, split_heads
 from facerf_cli.synth.bank.texture_samples import HeadFields, Sample, draw_sample, head_fields
 from facerf_cli.synth.random_fields import Random
 
@@ -72,24 +72,17 @@ def bake_heads(
 
     Raises InputError for heads of another face model, which would be used under the wrong name and licence.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     name = load_face_model(face_model).name
-    _require_face_model(name, folder)
-    missing = [index for index in range(count) if not (folder / f"{index:05d}.safetensors").exists()]
-    fill(partial(_baked, folder, face_model, seed, settings), missing, jobs, {"face_model": name})
-
-
-def _require_face_model(name: str, folder: Path) -> None:
-    for path in sorted(folder.glob("*.safetensors")):
+    for path in files_in(folder):
         with safe_open(path, framework="pt") as file:
             found = (file.metadata() or {}).get("face_model")
         if found != name:
             raise InputError(f"{path}: the head is of face model {found}, not of {name}; give another --bank")
+    fill(folder, partial(_baked, face_model, seed, settings), range(count), jobs, {"face_model": name})
 
 
-def _baked(folder: Path, face_model: str, seed: int, settings: HeadBakeSettings, index: int) -> Entries:
-    tensors = bake_head(cached_face_model(face_model), index, seed, settings)
-    return [(folder / f"{index:05d}.safetensors", tensors)]
+def _baked(face_model: str, seed: int, settings: HeadBakeSettings, index: int) -> Files:
+    return {f"{index:05d}": bake_head(cached_face_model(face_model), index, seed, settings)}
 
 
 def bake_head(model: MorphableModel, index: int, seed: int, settings: HeadBakeSettings) -> dict[str, Tensor]:
@@ -221,19 +214,14 @@ def build_views(
         offset = (texture[:2] / on_face - identity) * (seen > 0)
         warp = identity + inpaint(offset, (seen > 0.3).float())  # invisible texels move as their neighbours
         views.append(
-            (
-                photo.rotation,
-                warp.half(),
-                (seen * 255).round().byte(),
-                normal_map(fitted_camera.float(), triangles, side).half(),
-            )
+            {
+                "rotation": photo.rotation,
+                "warp": warp.half(),
+                "visible": (seen * 255).round().byte(),
+                "normals": normal_map(fitted_camera.float(), triangles, side).half(),
+            }
         )
-    return {
-        name: torch.stack(list(column)).contiguous()
-        for name, column in zip(
-            ("rotation", "warp", "visible", "normals"), zip(*views, strict=True), strict=True
-        )
-    }
+    return {name: torch.stack([view[name] for view in views]) for name in views[0]}
 
 
 @dataclass(frozen=True)
@@ -318,8 +306,8 @@ class Bank:
         return int(self.baked[0].normals.shape[-1])
 
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
-        """Indices of the training heads, and of the first `held_out` heads after the mean face."""
-        return torch.arange(held_out + 1, len(self.baked)), torch.arange(1, held_out + 1)
+        """See `split_heads`."""
+        return split_heads(len(self.baked), held_out)
 
     def draw(self, heads: Tensor, lights: int, generator: torch.Generator) -> Sample:
         """Draw one sample of each head in `heads` [B], with `lights` target lights."""
@@ -334,21 +322,19 @@ class Bank:
 
 def add_views(heads: Path, views: Path, fitted_with: str, count: int, jobs: int, seed: int) -> None:
     """Write `count` fitted views of every baked head in `heads` to `views`; keep finished ones."""
-    views.mkdir(parents=True, exist_ok=True)
-    missing = [path for path in sorted(heads.glob("*.safetensors")) if not (views / path.name).exists()]
-    name = load_face_model(fitted_with).name
-    fill(partial(_viewed, views, fitted_with, count, seed), missing, jobs, {"fitted_with": name})
+    people, fitted = [int(path.stem) for path in files_in(heads)], load_face_model(fitted_with).name
+    fill(views, partial(_viewed, heads, fitted_with, count, seed), people, jobs, {"fitted_with": fitted})
 
 
-def _viewed(views: Path, fitted_with: str, count: int, seed: int, path: Path) -> Entries:
-    head, model = load_file(path), cached_face_model(fitted_with)
-    seed, side = seed + int(path.stem), head["visibility"].shape[-1]
-    return [(views / path.name, build_views(head["vertices"], model, count, side, seed))]
+def _viewed(heads: Path, fitted_with: str, count: int, seed: int, index: int) -> Files:
+    name, model = f"{index:05d}", cached_face_model(fitted_with)
+    head = load_file(file_of(heads, name))
+    return {name: build_views(head["vertices"], model, count, head["visibility"].shape[-1], seed + index)}
 
 
 def load_bank(heads: Path, views: Path, provenance: dict[str, Any]) -> Bank:
     """Load all heads that have both a bake and views; raise InputError if there are none."""
-    found = [path for path in sorted(heads.glob("*.safetensors")) if (views / path.name).exists()]
+    found = [path for path in files_in(heads) if (views / path.name).exists()]
     if not found:
         raise InputError(f"{heads}: no baked heads with views; run `facerf train` to build them")
     return Bank(

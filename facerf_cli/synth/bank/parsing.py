@@ -22,12 +22,12 @@ from PIL import Image
 from safetensors import safe_open
 from torch import Tensor
 
-from facerf_cli.errors import InputError
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.network.inputs import Batch
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.synth.bank import files_in, split_people
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.random_fields import Uniform
@@ -141,15 +141,13 @@ class StoredPortraits:
     """The bank's photos, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
-        self.paths = sorted(folder.glob("[0-9]*.safetensors"))
-        if not self.paths:
-            raise InputError(f"{folder}: no portraits; make them with `facerf train --stage parsing`")
+        self.paths = files_in(folder, "no portraits; make them with `facerf train --stage parsing`")
         self.backgrounds = backgrounds
         self.provenance = provenance
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        """Indices of the people to train on, and of the first `held_out` ones."""
-        return list(range(held_out, len(self.paths))), list(range(held_out))
+        """See `split_people`."""
+        return split_people(len(self.paths), held_out)
 
     def draw(self, people: Sequence[int], side: int, generator: torch.Generator) -> PortraitCrops:
         """Draw one crop [1, ...] of one of some people."""

@@ -7,9 +7,11 @@ natural images*, 2001). A network that has seen them takes no pattern of a backg
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,14 +23,14 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation
-from facerf_cli.synth.appearance.materials import draw_appearance
-from facerf_cli.synth.bank import Entries, fill
+from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
+from facerf_cli.synth.bank import Files, fill
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.texture_samples import draw_light
-from facerf_cli.synth.portraits import BakedPortrait, bake_subject, photograph, view_of
-from facerf_cli.synth.random_fields import Random, Uniform
+from facerf_cli.synth.portraits import BakedPortrait, bake_subject, images_under, materials_of, view_of
+from facerf_cli.synth.random_fields import Random, Uniform, generators
 from facerf_cli.synth.sky.skies import draw_sky
-from facerf_cli.synth.subjects import draw_subject, subject_model
+from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
 
 BACKGROUND_PX = 320
@@ -146,9 +148,7 @@ def background_of(stored: Tensor, side: int, generator: torch.Generator) -> Tens
 
 BRIGHTEST = 6.0  # largest stored radiance, over the mean radiance of the person
 _LIGHTS = 48
-_LAMP_SHARE = 0.25  # of the photos are lit by one small lamp
-_OTHER_LOOKS = 2  # further skins and clothes of a person
-_LOOK_PX = 256  # texture side of those
+_LOOKS, _LOOK_PX = 3, 256  # skins and clothes of a person, and texture side of those besides the person's own
 _BAKE = BakeSettings(light_samples=1, bounce_samples=4)
 # Standard deviations of the camera's yaw, pitch and roll, and their largest values, in degrees.
 _POSE_STD_DEG, _POSE_MAX_DEG = (32.0, 12.0, 8.0), (75.0, 35.0, 25.0)
@@ -176,20 +176,11 @@ def add_portraits(
     settings: PortraitBankSettings = PortraitBankSettings(),
 ) -> None:
     """Photograph synthetic people into `folder`; keep finished ones. The face models take turns."""
-    folder.mkdir(parents=True, exist_ok=True)
-    missing = [index for index in people if not _path(folder, index).exists()]
-    fill(partial(_photographed, folder, face_models, seed, settings), missing, jobs)
+    fill(folder, partial(_photographed, face_models, seed, settings), people, jobs)
 
 
-def _path(folder: Path, index: int) -> Path:
-    return folder / f"{index:05}.safetensors"
-
-
-def _photographed(
-    folder: Path, face_models: list[str], seed: int, settings: PortraitBankSettings, index: int
-) -> Entries:
-    face_model = face_models[index % len(face_models)]
-    return [(_path(folder, index), photos_of(face_model, index, seed, settings))]
+def _photographed(face_models: list[str], seed: int, settings: PortraitBankSettings, index: int) -> Files:
+    return {f"{index:05d}": photos_of(face_models[index % len(face_models)], index, seed, settings)}
 
 
 @torch.no_grad()
@@ -200,27 +191,19 @@ def photos_of(face_model: str, index: int, seed: int, settings: PortraitBankSett
     alpha [V, S, S] uint8, of 255; label [V, S, S] uint8: class of most of what is covered; landmarks_px
     [V, 68 + M, 2], NaN for those that a person does not have; rotation [V, 3, 3], head_to_camera.
     """
-    random = np.random.default_rng([seed, index, 3])
-    generator = torch.Generator().manual_seed(int(random.integers(1 << 62)))
+    random, generator = generators(seed, index, 3)
     subject = draw_subject(subject_model(face_model), index, seed, settings.side_px)
     cameras = [_draw_camera(settings.side_px, random) for _ in range(settings.views)]
-    turn = pose_to_rotation(*random.uniform(-180, 180, 3).tolist()).double()
-    directions = (rig_directions(_LIGHTS).double() @ turn).numpy()
-    transport = bake_subject(subject, cameras, directions, _BAKE, index)
-    looks = [subject.appearance, *(draw_appearance(_LOOK_PX, generator) for _ in range(_OTHER_LOOKS))]
-    views = [view_of(subject, transport, camera) for camera in cameras]
+    views = seen_by(cameras, subject, _LIGHTS, _BAKE, index, random)
+    looks = draw_looks(subject, _LOOKS, generator)
     pictures = [
-        torch.stack(
-            [
-                _picture(view, photograph(view, looks[photo % len(looks)], _light(view, generator)).image)
-                for photo in range(settings.photos)
-            ]
-        )
+        _picture(view, looks[photo % len(looks)], draw_photo_light(view.directions, generator, _LAMP))
         for view in views
+        for photo in range(settings.photos)
     ]
     classes = torch.stack([view.classes for view in views])
     return {
-        "pictures": torch.stack(pictures),
+        "pictures": torch.stack(pictures).view(len(views), -1, *pictures[0].shape),
         "alpha": 255 - classes[..., 0],
         "label": 1 + classes[..., 1:].argmax(-1).byte(),
         "landmarks_px": torch.stack([view.landmarks_px for view in views]),
@@ -228,27 +211,66 @@ def photos_of(face_model: str, index: int, seed: int, settings: PortraitBankSett
     }
 
 
+def seen_by(
+    cameras: list[StageCamera], subject: Subject, lights: int, bake: BakeSettings, index: int, random: Random
+) -> list[BakedPortrait]:
+    """Bake what cameras see of person number `index`, under a rig that is turned at random."""
+    turn = pose_to_rotation(*random.uniform(-180, 180, 3).tolist()).double()
+    directions = (rig_directions(lights).double() @ turn).numpy()
+    transport = bake_subject(subject, cameras, directions, bake, index)
+    return [view_of(subject, transport, camera) for camera in cameras]
+
+
+def draw_looks(subject: Subject, count: int, generator: torch.Generator) -> list[Appearance]:
+    """The person's own skin and clothes, and others."""
+    return [subject.appearance, *(draw_appearance(_LOOK_PX, generator) for _ in range(count - 1))]
+
+
+def draw_turn(random: Random, std_deg: Sequence[float], most_deg: Sequence[float]) -> Tensor:
+    """Draw the rotation of a camera from standard deviations and largest values of yaw, pitch and roll."""
+    limit = np.array(most_deg)
+    return pose_to_rotation(*random.normal(0, std_deg).clip(-limit, limit).tolist())
+
+
 def _draw_camera(side_px: int, random: Random) -> StageCamera:
     """Draw a camera: pose, distance, and how much of the person it shows."""
-    limit = np.array(_POSE_MAX_DEG)
-    pose_deg = (random.normal(0, _POSE_STD_DEG)).clip(-limit, limit)
+    rotation = draw_turn(random, _POSE_STD_DEG, _POSE_MAX_DEG)
     distance_m, height_m = (math.exp(random.uniform(*np.log(ends))) for ends in (_DISTANCE_M, _HEIGHT_M))
     right, up = random.normal(0, _SHIFT, 2).clip(-2 * _SHIFT, 2 * _SHIFT) * height_m
     lens = Camera(side_px * distance_m / height_m, side_px, side_px, side_px / 2, side_px / 2)
-    rotation = pose_to_rotation(*pose_deg.tolist())
     return StageCamera(lens, rotation, torch.tensor([right, up - _MIDDLE_M, -distance_m]).float())
 
 
-def _light(view: BakedPortrait, generator: torch.Generator) -> Tensor:
-    """Draw weights [L, 3] of a view's lights: as in training of the field, or one lamp in near darkness."""
-    if torch.rand((), generator=generator) >= _LAMP_SHARE:
-        return draw_light(view.directions, generator)
-    weights = torch.full((len(view.directions), 3), 0.1 * float(torch.rand((), generator=generator)) ** 3)
-    weights[torch.multinomial((view.directions[:, 2] + 0.6).clamp_min(0), 1, generator=generator)] += 4.0
+class Lamp(NamedTuple):
+    """One small lamp in near darkness: share of photos, and how dim the rest is (weight, exponent).
+
+    `behind`: z by which the lamp may stand behind the person; `power`: its weight.
+    """
+
+    share: float
+    dim: float
+    exponent: int
+    behind: float
+    power: float
+
+
+_LAMP = Lamp(0.25, 0.1, 3, 0.6, 4.0)
+
+
+def draw_photo_light(directions: Tensor, generator: torch.Generator, lamp: Lamp) -> Tensor:
+    """Draw weights [L, 3] of a photo's lights: as in training of the field, or one lamp in near darkness."""
+    if torch.rand((), generator=generator) >= lamp.share:
+        return draw_light(directions, generator)
+    dim = lamp.dim * float(torch.rand((), generator=generator)) ** lamp.exponent
+    weights = torch.full((len(directions), 3), dim)
+    at = torch.multinomial((directions[:, 2] + lamp.behind).clamp_min(0), 1, generator=generator)
+    weights[at] += lamp.power
     return weights
 
 
-def _picture(view: BakedPortrait, image: Tensor) -> Tensor:
+def _picture(view: BakedPortrait, look: Appearance, weights: Tensor) -> Tensor:
     """A photo [3, S, S] in bytes, as `photos_of` describes."""
-    mean = image.sum() / 3 / ((255.0 - view.classes[..., 0].float()).sum() / 255).clamp_min(1)
+    (image,) = images_under(view, materials_of(view, look), weights[None])
+    total = image.permute(1, 2, 0).contiguous().sum()  # in this order, since sums depend on it
+    mean = total / 3 / ((255.0 - view.classes[..., 0].float()).sum() / 255).clamp_min(1)
     return (255 * (image / (BRIGHTEST * mean.clamp_min(1e-6))).clamp(0, 1).sqrt()).round().byte()

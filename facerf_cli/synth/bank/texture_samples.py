@@ -7,7 +7,7 @@ Fringes and glasses are dark matte surfaces on the face: a texture cannot show t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -17,9 +17,9 @@ from torch import Tensor
 from facerf_cli.face.topology import GRID, UV_SIZE_MM, grid_triangles
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, texel_centres_uv
-from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.appearance.skin import draw_skin
 from facerf_cli.synth.random_fields import LANDMARK_MM, Uniform, Window, mask, noise, places_mm, smooth
-from facerf_cli.synth.shading import diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
+from facerf_cli.synth.shading import Skin, diffuse_irradiance, highlights, scatter, tilt_normals, unit_along
 
 _FLASH_SHARE = 0.2  # share of draws that are lit by a flash near the camera
 
@@ -246,10 +246,7 @@ def draw_sample(
     faces = [_draw_face(head, views, lights, generator) for head, views in heads]
     side = faces[0].head.normals.shape[-1]
     skin = with_occluders(draw_skin(len(faces), side, generator), Window(side), generator)
-    single = [
-        Skin(*columns) for columns in zip(*(vars(skin)[f.name].split(1) for f in fields(Skin)), strict=True)
-    ]
-    shaded = [_shade_face(face, one) for face, one in zip(faces, single, strict=True)]
+    shaded = [_shade_face(face, skin.part(slice(k, k + 1))) for k, face in enumerate(faces)]
     source = torch.stack([s for s, _ in shaded])
     target = torch.stack([t for _, t in shaded])
     warp = torch.stack([face.view.warp for face in faces])

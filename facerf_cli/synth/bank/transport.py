@@ -8,8 +8,8 @@ photos (`portrait.proxy`). A sample is a photo in a random light, and the same p
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
-from functools import cache, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,38 +22,42 @@ from facerf_cli.batch.made_from import is_made_from
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
-from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
+from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
-from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_harmonics, mirrored_x, reached_by
+from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_x, reached_by
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SIDE_PX, SIDES, SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.proxy import own_shading
-from facerf_cli.raster.camera import Camera, pose_to_rotation, project
+from facerf_cli.raster.camera import Camera, project
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.workers import in_shards, one_thread
-from facerf_cli.synth.appearance.materials import MaterialPoints, draw_appearance
-from facerf_cli.synth.bank import Entries, fill
+from facerf_cli.synth.bank import Files, files_in, fill, split_people
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
-from facerf_cli.synth.bank.portraits import background_of
+from facerf_cli.synth.bank.heads import cached_face_model
+from facerf_cli.synth.bank.portraits import (
+    Lamp,
+    background_of,
+    draw_looks,
+    draw_photo_light,
+    draw_turn,
+    seen_by,
+)
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 from facerf_cli.synth.portraits import (
     BakedPortrait,
     albedo_of,
-    bake_subject,
     images_under,
     materials_of,
     portrait_tensors,
-    view_of,
 )
-from facerf_cli.synth.random_fields import Random, Uniform
+from facerf_cli.synth.random_fields import Random, Uniform, generators
+from facerf_cli.synth.shading import Material
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
 
-_LOOK_PX = 256  # texture side of looks other than the person's own
 _BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=6)
 # Standard deviations of the camera's yaw, pitch and roll, and their largest values, in degrees.
 _POSE_STD_DEG, _POSE_MAX_DEG = (24.0, 9.0, 5.0), (65.0, 28.0, 18.0)
@@ -80,21 +84,13 @@ def add_transport(
     settings: TransportBankSettings = TransportBankSettings(),
 ) -> None:
     """Bake synthetic people into `folder`; keep finished ones. The face models take turns."""
-    folder.mkdir(parents=True, exist_ok=True)
-    last = settings.views - 1
-    missing = [index for index in people if not _path(folder, index, last).exists()]
-    fill(partial(_baked, folder, face_models, seed, settings), missing, jobs)
+    baked = partial(_baked, face_models, seed, settings)
+    fill(folder, baked, people, jobs, last=f"_{settings.views - 1}")
 
 
-def _path(folder: Path, index: int, view: int) -> Path:
-    return folder / f"{index:05}_{view}.safetensors"
-
-
-def _baked(
-    folder: Path, face_models: list[str], seed: int, settings: TransportBankSettings, index: int
-) -> Entries:
+def _baked(face_models: list[str], seed: int, settings: TransportBankSettings, index: int) -> Files:
     views = transport_of(face_models[index % len(face_models)], index, seed, settings)
-    return [(_path(folder, index, view), tensors) for view, tensors in enumerate(views)]
+    return {f"{index:05d}_{view}": tensors for view, tensors in enumerate(views)}
 
 
 @torch.no_grad()
@@ -103,25 +99,20 @@ def transport_of(
 ) -> list[dict[str, Tensor]]:
     """Bake one person: for each view the fields of `BakedPortrait`, and its facets' materials in K looks.
 
-    look_albedo [K, N, 3], look_specular and look_roughness [K, N]: float16, see `MaterialPoints`.
+    look_albedo [K, N, 3], look_specular and look_roughness [K, N]: float16, see `Material`.
     """
-    random = np.random.default_rng([seed, index, 5])
-    generator = torch.Generator().manual_seed(int(random.integers(1 << 62)))
+    random, generator = generators(seed, index, 5)
     subject = draw_subject(subject_model(face_model), index, seed, SIDE_PX)
     cameras = [_draw_camera(subject, random) for _ in range(settings.views)]
-    turn = pose_to_rotation(*random.uniform(-180, 180, 3).tolist()).double()
-    directions = (rig_directions(settings.lights).double() @ turn).numpy()
-    transport = bake_subject(subject, cameras, directions, _BAKE, index)
-    others = [draw_appearance(_LOOK_PX, generator) for _ in range(settings.looks - 1)]
-    looks = [subject.appearance, *others]
-    views = [view_of(subject, transport, camera) for camera in cameras]
+    views = seen_by(cameras, subject, settings.lights, _BAKE, index, random)
+    looks = draw_looks(subject, settings.looks, generator)
     return [
         {**portrait_tensors(view), **_materials([materials_of(view, look) for look in looks])}
         for view in views
     ]
 
 
-def _materials(looks: list[MaterialPoints]) -> dict[str, Tensor]:
+def _materials(looks: list[Material]) -> dict[str, Tensor]:
     return {
         f"look_{name}": torch.stack([getattr(look, name) for look in looks]).half()
         for name in ("albedo", "specular", "roughness")
@@ -130,8 +121,7 @@ def _materials(looks: list[MaterialPoints]) -> dict[str, Tensor]:
 
 def _draw_camera(subject: Subject, random: Random) -> StageCamera:
     """Draw a camera whose image is the square around the head, a little off."""
-    limit = np.array(_POSE_MAX_DEG)
-    rotation = pose_to_rotation(*random.normal(0, _POSE_STD_DEG).clip(-limit, limit).tolist())
+    rotation = draw_turn(random, _POSE_STD_DEG, _POSE_MAX_DEG)
     distance_m = math.exp(random.uniform(*np.log(_DISTANCE_M)))
     towards = torch.tensor([*random.normal(0, 0.05, 2), -distance_m]).float()  # off the axis of the lens
     landmarks = torch.from_numpy(subject.landmarks_world).float() @ rotation.T.float() + towards
@@ -145,8 +135,8 @@ def _draw_camera(subject: Subject, random: Random) -> StageCamera:
 
 def add_proxies(folder: Path, backgrounds: Tensor, networks: Networks, jobs: int, seed: int) -> None:
     """Add to each portrait of a bank what the networks see of it (`seen_in`); keep finished ones."""
-    sha256, paths = networks.sha256("parsing"), sorted(folder.glob("[0-9]*.safetensors"))
-    missing = [path for path in paths if not is_made_from(seen_path(path), sha256)]
+    sha256 = networks.sha256("parsing")
+    missing = [path for path in files_in(folder) if not is_made_from(seen_path(path), sha256)]
     in_shards(partial(look_at_views, backgrounds, networks, seed), missing, jobs)
 
 
@@ -193,8 +183,8 @@ def person_in(people: PeopleNetworks, photo: np.ndarray, square: Crop | None = N
     """
     face = find_faces(people, photo, "portrait")[0]
     crop = from_landmarks(face.landmarks_px, _CROP_PX)
-    fit = fit_landmarks(_builtin(), crop.to_crop(face.landmarks_px), crop)
-    return look_at_person(people, _builtin(), photo, fit, square)
+    fit = fit_landmarks(cached_face_model(BUILTIN), crop.to_crop(face.landmarks_px), crop)
+    return look_at_person(people, cached_face_model(BUILTIN), photo, fit, square)
 
 
 def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:
@@ -213,17 +203,12 @@ def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:
     }
 
 
-@cache
-def _builtin() -> MorphableModel:
-    return load_face_model(BUILTIN)
-
-
 @dataclass(frozen=True, eq=False)
 class StoredView:
     """One view of the bank, and the materials of its facets in several looks."""
 
     portrait: BakedPortrait
-    looks: list[MaterialPoints]
+    looks: list[Material]
 
     @property
     def alpha(self) -> Tensor:
@@ -238,11 +223,11 @@ def load_view(path: Path) -> StoredView:
         tensors.pop(f"look_{name}").float() for name in ("albedo", "specular", "roughness")
     )
     relief = torch.zeros(albedo.shape[1], 2)
-    looks = [MaterialPoints(*look, relief) for look in zip(albedo, specular, roughness, strict=True)]
+    looks = [Material(*look, relief) for look in zip(albedo, specular, roughness, strict=True)]
     return StoredView(BakedPortrait(**tensors), looks)
 
 
-_LAMP_SHARE = 0.3  # of photos, lit by one lamp in near darkness
+_LAMP = Lamp(0.3, 0.01, 2, 0.3, 1.0)
 _GREY = 0.2  # share of grey photos
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
@@ -259,13 +244,7 @@ class PortraitSample(Batch):
     the true classes.
     """
 
-    image: Tensor
-    classes: Tensor
-    normals: Tensor
-    depth: Tensor
-    covered: Tensor
-    reached: Tensor
-    own_shading: Tensor
+    inputs: PortraitInputs
     lights: Tensor
     visible: Tensor
     targets: Tensor
@@ -277,12 +256,6 @@ class PortraitSample(Batch):
     true_normals: Tensor
     shares: Tensor
     labelled: Tensor
-
-    @property
-    def inputs(self) -> PortraitInputs:
-        """Inputs of the network."""
-        names = ("image", "classes", "normals", "depth", "covered", "reached", "own_shading")
-        return PortraitInputs(*(getattr(self, name) for name in names))
 
 
 class PortraitSource(Protocol):
@@ -307,7 +280,7 @@ class StoredTransport:
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
         people: dict[str, list[Path]] = {}
-        for path in sorted(folder.glob("[0-9]*.safetensors")):
+        for path in files_in(folder):
             if seen_path(path).exists() and seen_path(path).stat().st_size > _EMPTY_BYTES:
                 people.setdefault(path.stem.split("_")[0], []).append(path)
         if not people:
@@ -317,8 +290,8 @@ class StoredTransport:
         self.provenance = provenance
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        """Indices of the people to train on, and of the first `held_out` ones."""
-        return list(range(held_out, len(self.views))), list(range(held_out))
+        """See `split_people`."""
+        return split_people(len(self.views), held_out)
 
     def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
         """Draw one sample [1, ...] of one of some people, with `targets` lights."""
@@ -382,14 +355,17 @@ def sample_of(
     background = 4 * background_of(stored, side, generator) * lit.behind
     photo = _as_taken(images[0] / _mean_over(images[0], skin) + background, generator)
     normals = seen["normals"].float()
-    sample = PortraitSample(
+    inputs = PortraitInputs(
         image=photo / _mean_over(photo, skin) * MEAN_RADIANCE,
         classes=classes,
         normals=normals,
         depth=seen["depth"].float(),
         covered=seen["covered"].float() / 255,
         reached=reached_by(directions, around, side),
-        own_shading=own_shading(photo, classes, normals, directions, around),
+        own=own_shading(photo, classes, normals, directions, around),
+    )
+    sample = PortraitSample(
+        inputs=inputs,
         lights=lit.rig[lit.chosen],
         visible=visible[lit.chosen],
         targets=(images[1:] * scale).clamp(max=_BRIGHTEST),
@@ -402,7 +378,7 @@ def sample_of(
         shares=lit.shares,
         labelled=torch.tensor(float(lit.normals is not None)),
     )
-    batched = PortraitSample(*(getattr(sample, field.name)[None] for field in fields(sample)))
+    batched = sample.each(lambda values: values[None])
     return mirrored(batched) if torch.rand((), generator=generator) < 0.5 else batched
 
 
@@ -421,11 +397,7 @@ def _below(count: int, generator: torch.Generator) -> int:
 
 def source_light(rig: Tensor, generator: torch.Generator) -> Tensor:
     """Draw weights [L, 3] of the photo's light."""
-    if torch.rand((), generator=generator) >= _LAMP_SHARE:
-        return draw_light(rig, generator)
-    weights = torch.full((len(rig), 3), 0.01 * float(torch.rand((), generator=generator)) ** 2)
-    weights[torch.multinomial((rig[:, 2] + 0.3).clamp_min(0), 1, generator=generator)] += 1.0
-    return weights
+    return draw_photo_light(rig, generator, _LAMP)
 
 
 def _mean_over(image: Tensor, weight: Tensor) -> Tensor:
@@ -446,13 +418,12 @@ def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
 
 def mirrored(sample: PortraitSample) -> PortraitSample:
     """Mirror a sample: images, and the x of vectors."""
-    values = {}
-    for field in fields(sample):
-        value = getattr(sample, field.name)
-        values[field.name] = value.flip(-1) if value.dim() > 3 else value
-    for name in ("normals", "true_normals"):
-        values[name] = mirrored_x(values[name])
-    for name in ("lights", "rig"):
-        values[name] = values[name] * torch.tensor([-1.0, 1, 1])
-    values["reached"] = mirrored_harmonics(values["reached"])
-    return PortraitSample(**values)
+    flipped = sample.each(lambda values: values.flip(-1) if values.dim() > 3 else values)
+    other_side = torch.tensor([-1.0, 1, 1])
+    return replace(
+        flipped,
+        inputs=sample.inputs.mirrored(),
+        true_normals=mirrored_x(flipped.true_normals),
+        lights=sample.lights * other_side,
+        rig=sample.rig * other_side,
+    )

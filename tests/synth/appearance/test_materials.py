@@ -1,7 +1,13 @@
 import pytest
 import torch
 
-from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, sample, with_scalp
+from facerf_cli.synth.appearance.materials import (
+    Appearance,
+    canvas_uv,
+    draw_appearance,
+    sample,
+    with_short_hair,
+)
 from facerf_cli.synth.head.mesh import PARTS
 
 SIDE = 128
@@ -106,7 +112,7 @@ def test_hair_is_lighter_at_its_tips_and_dark_people_have_dark_eyes() -> None:
 def test_a_scalp_is_stained_where_hair_grows(people: list[Appearance]) -> None:
     person = next(p for p in people if p.traits["hair_colour"] == "black")
     cover = (canvas_uv(SIDE)[..., 1] < 0).float()
-    stained = with_scalp(person, cover, torch.Generator().manual_seed(0)).materials["skin"]
+    stained = with_short_hair(person, cover, torch.Generator().manual_seed(0)).materials["skin"]
     bare = person.materials["skin"]
     assert stained.albedo[:, : SIDE // 4].mean() < 0.5 * bare.albedo[:, : SIDE // 4].mean()
     assert torch.equal(stained.albedo[:, SIDE // 4 :], bare.albedo[:, SIDE // 4 :])

@@ -3,9 +3,10 @@
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.synth.appearance.skin import Skin, draw_skin
+from facerf_cli.synth.appearance.skin import draw_skin
 from facerf_cli.synth.bank.texture_samples import lid_shadows, with_occluders
 from facerf_cli.synth.random_fields import Window, mask
+from facerf_cli.synth.shading import Skin
 
 SIDE = 128
 

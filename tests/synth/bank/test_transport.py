@@ -93,11 +93,11 @@ def test_what_is_seen_lies_where_the_truth_does(folder: Path, view: str) -> None
 def test_samples_are_exposed_by_the_skin(folder: Path) -> None:
     sample = drawn(folder, 1)
     assert sample.targets.shape == (1, 3, 3, SIDE_PX, SIDE_PX)
-    for image in (sample.image, sample.albedo):
-        skin = sample.classes[:, SKIN]
+    for image in (sample.inputs.image, sample.albedo):
+        skin = sample.inputs.classes[:, SKIN]
         mean = (image.mean(1) * skin).sum() / skin.sum()
         assert float(mean) == pytest.approx(MEAN_RADIANCE, rel=1e-3)
-    small = F.avg_pool2d(sample.own, 8), F.avg_pool2d(sample.image, 8)
+    small = F.avg_pool2d(sample.own, 8), F.avg_pool2d(sample.inputs.image, 8)
     covered = F.avg_pool2d(1 - sample.shares[:, :1], 8)[0, 0] > 0.99
     dark, light = (x.mean(1)[0][covered] for x in small)
     assert float(torch.corrcoef(torch.stack([dark, light]))[0, 1]) > 0.8
@@ -109,7 +109,7 @@ def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
 
     sample = drawn(folder, 2)
     other = mirrored(sample)
-    cosine, flipped = (torch.einsum("btc,bcij->btij", s.lights, s.normals) for s in (sample, other))
+    cosine, flipped = (torch.einsum("btc,bcij->btij", s.lights, s.inputs.normals) for s in (sample, other))
     torch.testing.assert_close(flipped, cosine.flip(-1))
     assert torch.equal(other.targets, sample.targets.flip(-1))
     assert torch.equal(other.visible, sample.visible.flip(-1))
@@ -118,10 +118,10 @@ def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
         """Visibility toward the image's upper right, or in the mirror its upper left."""
         sign = 1.0 if one is sample else -1.0
         at = F.normalize(torch.tensor([sign * 0.6, 0.5, 0.6]), dim=0)
-        return torch.einsum("k,bkij->bij", sh_basis(at, 3), one.reached)
+        return torch.einsum("k,bkij->bij", sh_basis(at, 3), one.inputs.reached)
 
     torch.testing.assert_close(towards(other), towards(sample).flip(-1), rtol=1e-4, atol=1e-5)
-    assert torch.equal(mirrored(other).image, sample.image)
+    assert torch.equal(mirrored(other).inputs.image, sample.inputs.image)
 
 
 def test_a_bank_without_portraits(tmp_path: Path) -> None:
