@@ -20,7 +20,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.downloads import PublishedFile, fetch
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork, VggFeatures
-from facerf_cli.network.files import FORMAT, read_metadata
+from facerf_cli.network.files import FORMAT, read_metadata, title_of
 from facerf_cli.network.geometry import GeometryNetwork
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
@@ -41,6 +41,17 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
     ("parsing", "default"): ParsingNetwork,
     ("portrait", "default"): PortraitNetwork,
 }
+
+
+def new_network(name: str, form: str, settings: Mapping[str, Any]) -> Any:
+    """Make an untrained network of a form; settings that are missing have their defaults.
+
+    Raises UsageError for an unknown form, TypeError or ValueError for settings that it does not have.
+    """
+    forms = [known for network, known in _CLASSES if network == name]
+    if form not in forms:
+        raise UsageError(f"form {form}: no such {title_of(name)}; give one of {', '.join(forms)}")
+    return _CLASSES[name, form].from_metadata({"form": form, **settings})
 
 
 def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[str, Any]) -> None:

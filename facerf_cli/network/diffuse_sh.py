@@ -19,6 +19,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.inputs import (
     MEAN_RADIANCE,
     Count,
+    Down,
     SavedNetwork,
     Side,
     Widths,
@@ -26,7 +27,6 @@ from facerf_cli.network.inputs import (
     head_rotation,
     resize,
 )
-from facerf_cli.network.reflectance_default import Down
 
 ORDER = 2
 COEFFICIENTS = (ORDER + 1) ** 2

@@ -115,16 +115,8 @@ class VggFeatures(nn.Module):
 
         Raises ValueError that names a layer which is missing or does not fit.
         """
-        own = self.state_dict()
-        for name, tensor in own.items():
-            given = tensors.get(name)
-            if not isinstance(given, Tensor):
-                raise ValueError(f"it has no {name}")
-            if given.shape != tensor.shape or not given.is_floating_point():
-                raise ValueError(f"its {name} is {_shape_and_type(given)}, not {_shape_and_type(tensor)}")
-            if not given.isfinite().all():
-                raise ValueError(f"its {name} holds values that are not finite")
-        self.load_state_dict({name: tensors[name] for name in own})
+        own = self.state_dict().items()
+        self.load_state_dict({name: _fitting(tensors, name, tensor) for name, tensor in own})
 
 
 def encode_display(linear: Tensor) -> Tensor:
@@ -142,6 +134,18 @@ def _convolution(channels_in: int, channels_out: int) -> nn.Conv2d:
     nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
     nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
     return convolution
+
+
+def _fitting(tensors: Mapping[str, Tensor], name: str, like: Tensor) -> Tensor:
+    """A published tensor with the shape of another; ValueError where it is missing or does not fit."""
+    given = tensors.get(name)
+    if not isinstance(given, Tensor):
+        raise ValueError(f"it has no {name}")
+    if given.shape != like.shape or not given.is_floating_point():
+        raise ValueError(f"its {name} is {_shape_and_type(given)}, not {_shape_and_type(like)}")
+    if not given.isfinite().all():
+        raise ValueError(f"its {name} holds values that are not finite")
+    return given
 
 
 def _shape_and_type(tensor: Tensor) -> str:
@@ -231,17 +235,12 @@ class Lpips(nn.Module):
         found = []
         for index, head in enumerate(self.heads):
             name = f"lin{index}.model.1.weight"
-            given = tensors.get(name)
-            if not isinstance(given, Tensor):
-                raise ValueError(f"it has no {name}")
-            if given.shape != (1, len(head), 1, 1) or not given.is_floating_point():
-                raise ValueError(f"its {name} is {' x '.join(map(str, given.shape))} of {given.dtype}")
-            if not (given.isfinite() & (given >= 0)).all():
-                raise ValueError(f"its {name} holds values below 0 or not finite")
-            found.append(given.flatten())
+            found.append(_fitting(tensors, name, head.view(1, -1, 1, 1)))
+            if (found[-1] < 0).any():
+                raise ValueError(f"its {name} holds values below 0")
         with torch.no_grad():
             for head, values in zip(self.heads, found, strict=True):
-                head.copy_(values)
+                head.copy_(values.flatten())
 
 
 def _unit(features: Tensor) -> Tensor:

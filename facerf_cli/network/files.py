@@ -94,7 +94,7 @@ def serving_files(given: Sequence[Path], uses: Collection[str] = SHIPPED, user: 
         for name in one.trained:
             if name in trained:
                 raise UsageError(
-                    f"--checkpoint {one.path}: holds a {_title(name)}, as does {trained[name]}; "
+                    f"--checkpoint {one.path}: holds a {title_of(name)}, as does {trained[name]}; "
                     "give one of them"
                 )
             trained[name] = one.path
@@ -102,7 +102,7 @@ def serving_files(given: Sequence[Path], uses: Collection[str] = SHIPPED, user: 
     serving = {name: found[name] for name in SHIPPED if name in uses}
     for one in held:
         if one.path not in serving.values():
-            has = " and ".join(map(_title, one.trained or one.networks)) or "no network"
+            has = " and ".join(map(title_of, one.trained or one.networks)) or "no network"
             needs = f"{user} uses the {_listed(serving)}" if serving else f"{user} uses no network"
             raise UsageError(f"--checkpoint {one.path}: holds a {has}, but {needs}; leave it out")
     return serving
@@ -119,10 +119,11 @@ def _held_by(path: Path) -> _Held:
     return _Held(path, networks, trained or networks)
 
 
-def _title(name: str) -> str:
+def title_of(name: str) -> str:
+    """Name of a network in messages."""
     return _TITLES.get(name, f"network {name}")
 
 
 def _listed(names: Iterable[str]) -> str:
-    *before, last = map(_title, names)
+    *before, last = map(title_of, names)
     return f"{', '.join(before)} and {last}" if before else last

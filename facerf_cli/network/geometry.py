@@ -17,7 +17,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import SavedNetwork
+from facerf_cli.network.inputs import Down, SavedNetwork, resize
 
 GeometryForm = Literal["default", "paper"]
 _SIDES: dict[str, int] = {"default": 64, "paper": 224}  # of the crop that each form reads
@@ -72,10 +72,7 @@ class GeometryNetwork(SavedNetwork):
 
     def _normalised(self, crops: Tensor) -> Tensor:
         """Square roots of the crops at the network's side, each of zero mean and unit deviation."""
-        if crops.shape[-1] > self.side:
-            crops = F.interpolate(crops, (self.side, self.side), mode="area")
-        elif crops.shape[-1] < self.side:
-            crops = F.interpolate(crops, (self.side, self.side), mode="bilinear", align_corners=False)
+        crops = resize(crops, self.side)
         root = (crops.clamp_min(0) / crops.mean((1, 2, 3), keepdim=True).clamp_min(1e-8)).sqrt()
         centred = root - root.mean((1, 2, 3), keepdim=True)
         deviation = (centred * centred).mean((1, 2, 3), keepdim=True).sqrt()
@@ -130,20 +127,5 @@ def _small() -> tuple[nn.Module, int]:
     """
     widths = (24, 48, 88, 144, 192)
     enter = (nn.Conv2d(3, widths[0], 3, stride=2, padding=1), nn.GroupNorm(8, widths[0]), nn.SiLU())
-    stages = [*enter, *(_Stage(a, b) for a, b in pairwise(widths))]
+    stages = [*enter, *(Down(a, b, groups=8) for a, b in pairwise(widths))]
     return nn.Sequential(*stages, nn.Flatten(), nn.Linear(widths[-1] * 2 * 2, 160), nn.SiLU()), 160
-
-
-class _Stage(nn.Module):
-    """Halve the side, then apply a residual convolution."""
-
-    def __init__(self, channels_in: int, channels_out: int) -> None:
-        super().__init__()
-        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=2, padding=1)
-        self.norm = nn.GroupNorm(8, channels_out)
-        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        x = F.silu(self.norm(self.enter(x)))
-        result: Tensor = x + F.silu(self.inner(x))
-        return result

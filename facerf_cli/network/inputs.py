@@ -22,6 +22,8 @@ log = logging.getLogger(LOGGER_NAME)
 MEAN_RADIANCE = 0.25  # of the visible face once its exposure is divided out
 _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
 
+_DECODER_CHANNELS = 220  # that a decoder holds at once for each light, at its working side
+_TEXTURE_CHANNELS = 16  # that its output holds at once for each light, at the side of the texture
 _ORDINARY_CAST = 2.0  # standard deviations within which a colour cast is left to the network
 _GREY = 1e-4  # difference of the channels of a grey image, of its mean, left by resampling
 _LEAST_DEVIATION = 0.02  # of a log ratio of colours: that of grey data would be 0
@@ -140,6 +142,30 @@ def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
     signs = torch.ones(len(moment), 3, dtype=moment.dtype)
     signs[:, 2] = torch.det(u @ vt)
     return (u @ torch.diag_embed(signs) @ vt).to(normals)
+
+
+def decoder_bytes(side: int, texels: int) -> int:
+    """Memory of a reflectance decoder for one light of one face, for a texture of so many texels (T x T).
+
+    It is that of the form default, by count of channels enough for the form paper, too.
+    """
+    return 4 * (_DECODER_CHANNELS * side**2 + _TEXTURE_CHANNELS * texels)
+
+
+class Down(nn.Module):
+    """Halve the side (except in the first), then apply a residual convolution."""
+
+    def __init__(self, channels_in: int, channels_out: int, first: bool = False, groups: int = 4) -> None:
+        super().__init__()
+        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=1 if first else 2, padding=1)
+        self.norm = nn.GroupNorm(groups, channels_out)
+        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features [B, C, H, W] to [B, C', H / 2, W / 2], or to the same side."""
+        x = F.silu(self.norm(self.enter(x)))
+        result: Tensor = x + F.silu(self.inner(x))
+        return result
 
 
 Count = Annotated[int, Field(ge=1, le=4096)]

@@ -7,7 +7,6 @@ from typing import Any, Protocol, Self
 
 from torch import Tensor
 
-from facerf_cli.errors import UsageError
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
 
@@ -63,16 +62,3 @@ REFLECTANCE_FORMS: dict[str, type[ReflectanceNetwork]] = {
     "default": DefaultReflectanceNetwork,
     "paper": PaperReflectanceNetwork,
 }
-
-
-def make_reflectance_network(form: str = "default", **settings: Any) -> ReflectanceNetwork:
-    """Make an untrained network of a form, with the form's default settings except for those given.
-
-    Raises UsageError for an unknown form, and TypeError or ValueError for settings that the form does not
-    have.
-    """
-    if form not in REFLECTANCE_FORMS:
-        raise UsageError(
-            f"form {form}: no such Reflectance Network; give one of {', '.join(REFLECTANCE_FORMS)}"
-        )
-    return REFLECTANCE_FORMS[form].from_metadata({"form": form, **settings})

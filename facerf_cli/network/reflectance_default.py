@@ -15,9 +15,11 @@ from torch import Tensor, nn
 
 from facerf_cli.network.inputs import (
     Count,
+    Down,
     SavedNetwork,
     Side,
     Widths,
+    decoder_bytes,
     exposure_of,
     from_root,
     head_rotation,
@@ -30,8 +32,6 @@ _LIGHT_MAPS = 4  # cosine, gloss, shadow and base gain
 _LIGHT_FEATURES = 12  # numbers that describe a light: camera and head direction, products of the latter
 _CODE_CHANNELS = 96  # of the light's code, which modulates the decoder
 _KERNEL_SHARPNESS = 70.0  # of the interpolation between the shadow maps of neighbouring lights
-_DECODER_CHANNELS = 220  # that the decoder holds at once for each light, at its working side
-_TEXTURE_CHANNELS = 16  # that the output holds at once for each light, at the side of the texture
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class DefaultReflectanceNetwork(SavedNetwork):
 
     def bytes_per_light(self, texels: int) -> int:
         """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
-        return 4 * (_DECODER_CHANNELS * self.settings.side**2 + _TEXTURE_CHANNELS * texels)
+        return decoder_bytes(self.settings.side, texels)
 
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> DefaultEncoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
@@ -181,22 +181,6 @@ class DefaultReflectanceNetwork(SavedNetwork):
         weights = (_KERNEL_SHARPNESS * (lights_head @ self.rig.T)).softmax(-1)
         flat = weights @ (self.mean_visibility.to(weights) / 255).flatten(1)
         return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
-
-
-class Down(nn.Module):
-    """Halve the side (except in the first), then apply a residual convolution."""
-
-    def __init__(self, channels_in: int, channels_out: int, first: bool) -> None:
-        super().__init__()
-        self.enter = nn.Conv2d(channels_in, channels_out, 3, stride=1 if first else 2, padding=1)
-        self.norm = nn.GroupNorm(4, channels_out)
-        self.inner = nn.Conv2d(channels_out, channels_out, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Features [B, C, H, W] to [B, C', H / 2, W / 2], or to the same side."""
-        x = F.silu(self.norm(self.enter(x)))
-        result: Tensor = x + F.silu(self.inner(x))
-        return result
 
 
 class LitUp(nn.Module):

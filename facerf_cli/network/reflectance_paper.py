@@ -20,16 +20,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.network.inputs import Count, SavedNetwork, Side, Widths, exposure_of, resize, to_root
+from facerf_cli.network.inputs import (
+    Count,
+    SavedNetwork,
+    Side,
+    Widths,
+    decoder_bytes,
+    exposure_of,
+    resize,
+    to_root,
+)
 
 _SLOPE = 0.2  # of the leaky rectifiers
 _GROUPS = 4  # of the group normalisations
 _LIGHT_CONVOLUTIONS = 5  # over the U-Net's features and the target's normals
 _FIRST_ROOT = 0.3  # square root of the radiance that an untrained network predicts everywhere, about
-# Channels that count for the memory of one light, at the working side and at the side of the texture: the
-# default form's, which by count are enough for this form, too.
-_DECODER_CHANNELS = 220
-_TEXTURE_CHANNELS = 16
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ class PaperReflectanceNetwork(SavedNetwork):
 
     def bytes_per_light(self, texels: int) -> int:
         """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
-        return 4 * (_DECODER_CHANNELS * self.settings.side**2 + _TEXTURE_CHANNELS * texels)
+        return decoder_bytes(self.settings.side, texels)
 
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> PaperEncoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""

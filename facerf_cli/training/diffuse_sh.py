@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, metrics_by_pose
+from facerf_cli.training.loop import Objective, Validation, metrics_by_pose, tiled
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 
 _SHEET_FACES = 5
@@ -57,18 +57,17 @@ class DiffuseBatch(Batch):
 class DiffuseObjective(Objective):
     """`root_loss` of the source under its estimated light, and of sums of known lights."""
 
+    chooses_by = "si_mse"
+
     def __init__(
         self,
         source: SampleSource,
         network: DiffuseNetwork | None = None,
         settings: SumSettings = SumSettings(),
     ) -> None:
-        super().__init__()
         network = network or DiffuseNetwork()
         network.set_mean_face(source.mean_face()[0])
-        self.networks = nn.ModuleDict({"diffuse_sh": network})
-        self.chooses_by = "si_mse"
-        self.provenance = source.provenance
+        super().__init__({"diffuse_sh": network}, source.provenance)
         self.source = source
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
@@ -165,6 +164,4 @@ def _sheet_rows(batch: DiffuseBatch, estimate: DiffuseEstimate, own: Tensor, rel
     truth = [batch.source[0] / exposure, *(batch.targets[0] / exposure * mask)]
     guess = [own[0, 0] * seen, *(relit[0] * mask)]
     blank = torch.zeros_like(albedo)
-    rows = (torch.cat([*truth, blank, blank], -1), torch.cat([*guess, albedo, lit / 4], -1))
-    image: np.ndarray = torch.cat(rows, -2).permute(1, 2, 0).numpy()
-    return image
+    return tiled([[*truth, blank, blank], [*guess, albedo, lit / 4]])

@@ -19,7 +19,7 @@ from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, Geome
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.loop import FOUND_COLOUR, TRUE_COLOUR, Objective, Validation, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192
 
@@ -40,7 +40,7 @@ class GeometryObjectiveSettings:
 class GeometryObjective(Objective):
     """Errors of landmarks, pose and coefficients on rendered faces."""
 
-    validation_seed = 20211
+    chooses_by, validation_seed = "landmarks_percent", 20211
     mean_m: Tensor
     identity_m: Tensor
     expression_m: Tensor
@@ -51,13 +51,10 @@ class GeometryObjective(Objective):
         network: GeometryNetwork | None = None,
         settings: GeometryObjectiveSettings = GeometryObjectiveSettings(),
     ) -> None:
-        super().__init__()
         network = network or GeometryNetwork(
             GeometryNetworkSettings(mean_translation_m=faces.mean_translation_m())
         )
-        self.networks = nn.ModuleDict({"geometry": network})
-        self.chooses_by = "landmarks_percent"
-        self.provenance = faces.provenance
+        super().__init__({"geometry": network}, faces.provenance)
         self.faces = faces
         self.side = network.side
         self.settings = settings
@@ -146,21 +143,10 @@ class GeometryObjective(Objective):
         images = nn.functional.interpolate(batch.crops[:count].cpu(), (size, size), mode="nearest")
         images = images / images.mean((1, 2, 3), keepdim=True).clamp_min(1e-6) * 0.18
         predicted = self.landmarks_px(estimate, side)[:count].cpu()
-        for points, colour in (
-            (batch.landmarks_px[:count].cpu(), (0.0, 1.0, 0.0)),
-            (predicted, (1.0, 0.0, 0.0)),
-        ):
-            for image, own in zip(images, points, strict=True):
-                column, row = (own * size / side).long().clamp(0, size - 2).unbind(-1)
-                for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)):
-                    image[:, row + y, column + x] = torch.tensor(colour)[:, None]
-        rows = [
-            torch.cat(list(chunk), 2)
-            for chunk in torch.split(images, _SHEET_COLUMNS)
-            if len(chunk) == _SHEET_COLUMNS
-        ]
-        sheet: np.ndarray = torch.cat(rows or [torch.cat(list(images), 2)], 1).permute(1, 2, 0).numpy()
-        return sheet
+        for image, true_px, found_px in zip(images, batch.landmarks_px[:count].cpu(), predicted, strict=True):
+            mark(image, true_px * size / side, TRUE_COLOUR)
+            mark(image, found_px * size / side, FOUND_COLOUR)
+        return tiled(in_rows([*images], _SHEET_COLUMNS))
 
 
 def _frontal_iod_px(mean_m: Tensor, batch: FaceCrops) -> Tensor:

@@ -35,7 +35,7 @@ from facerf_cli.network.inputs import SourceColours, concatenate, resize, withou
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
-from facerf_cli.training.loop import Objective, Validation, seeded
+from facerf_cli.training.loop import Objective, Validation, seeded, tiled
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -171,6 +171,8 @@ class JointObjective(Objective):
     saved.
     """
 
+    chooses_by = "si_mse"
+
     def __init__(
         self,
         dataset: Dataset,
@@ -182,11 +184,8 @@ class JointObjective(Objective):
         photos: Photos | None = None,
         settings: JointSettings = JointSettings(),
     ) -> None:
-        super().__init__()
         trained = {"reflectance": reflectance} | ({} if geometry is None else {"geometry": geometry})
-        self.networks = nn.ModuleDict(trained)
-        self.chooses_by = "si_mse"
-        self.provenance = _provenance(dataset, model, photos, appearance, light)
+        super().__init__(trained, _provenance(dataset, model, photos, appearance, light))
         self.settings = settings
         self.photos = photos
         self.skips_networks = photos is not None  # photos train the geometry alone
@@ -378,9 +377,7 @@ def _sheet_row(batch: CropPairs, relit: _Relit, camera: Camera) -> np.ndarray:
     normals = head_normals(relit.target, _SHEET_PX)
     shape, _ = render_textures((normals + 1) / 4, relit.target, camera)
     images = (batch.source, batch.target, relit.image * relit.mask, shape)
-    row = torch.cat([resize(image[:1], min(_SHEET_PX, camera.width_px))[0] for image in images], -1)
-    result: np.ndarray = row.permute(1, 2, 0).cpu().numpy()
-    return result
+    return tiled([[resize(image[:1], min(_SHEET_PX, camera.width_px))[0] for image in images]])
 
 
 def _provenance(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
@@ -19,7 +19,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import Batch, concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.loop import Objective, Validation, tiled
 
 _NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
 _SHEET_FACES = 6
@@ -49,16 +49,15 @@ class LightFeaturesSettings:
 class LightFeaturesObjective(Objective):
     """1 minus the cosine between the predicted and the true direction of light."""
 
+    chooses_by = "angle_deg"
+
     def __init__(
         self,
         source: SampleSource,
         network: LightNetwork | None = None,
         settings: LightFeaturesSettings = LightFeaturesSettings(),
     ) -> None:
-        super().__init__()
-        self.networks = nn.ModuleDict({"light_features": network or LightNetwork()})
-        self.chooses_by = "angle_deg"
-        self.provenance = source.provenance
+        super().__init__({"light_features": network or LightNetwork()}, source.provenance)
         self.source = source
         self.settings = settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
@@ -114,10 +113,8 @@ def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
     rows = []
     for textures, lights in zip(batch.textures[:_SHEET_FACES], batch.lights_head[:_SHEET_FACES], strict=True):
         predicted = network(textures.to(next(network.parameters()).device)).cpu()
-        for images in (textures, _balls(lights, textures.shape[-1]), _balls(predicted, textures.shape[-1])):
-            rows.append(torch.cat(list(images), -1))
-    image: np.ndarray = torch.cat(rows, -2).permute(1, 2, 0).numpy()
-    return image
+        rows += [textures, *(_balls(one, textures.shape[-1]) for one in (lights, predicted))]
+    return tiled(rows)
 
 
 def _balls(lights: Tensor, side: int) -> Tensor:
@@ -141,6 +138,8 @@ class AppearanceObjectiveSettings:
 class AppearanceObjective(Objective):
     """Cross-entropy over the people of both crops of a pair, and 1 - cosine to the target's light."""
 
+    chooses_by = "angle_deg"
+
     def __init__(
         self,
         dataset: Dataset,
@@ -148,10 +147,7 @@ class AppearanceObjective(Objective):
         network: AppearanceNetwork,
         settings: AppearanceObjectiveSettings = AppearanceObjectiveSettings(),
     ) -> None:
-        super().__init__()
-        self.networks = nn.ModuleDict({"appearance_features": network})
-        self.chooses_by = "angle_deg"
-        self.provenance = provenance_of(dataset, model)
+        super().__init__({"appearance_features": network}, provenance_of(dataset, model))
         pairs = open_pairs(dataset, "train", network.settings.side)
         kept = [pair for place, pair in enumerate(pairs.pairs) if place % settings.every]
         self._train = pairs.of(kept)

@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -55,17 +55,35 @@ class Validation:
     sheet: np.ndarray | None  # contact sheet [H, W, 3], scene-linear
 
 
+def tiled(rows: Iterable[Iterable[Tensor]]) -> np.ndarray:
+    """A contact sheet [H, W, 3] of rows of images [3, h, w]."""
+    sheet: np.ndarray = torch.cat([torch.cat([*row], -1) for row in rows], -2).permute(1, 2, 0).cpu().numpy()
+    return sheet
+
+
+def in_rows(cells: Sequence[Tensor], columns: int) -> list[Sequence[Tensor]]:
+    """Images in rows of so many, without a last one that is shorter."""
+    rows = [cells[first : first + columns] for first in range(0, len(cells), columns)]
+    return [row for row in rows if len(row) == len(rows[0])]
+
+
+def mark(image: Tensor, points_px: Tensor, colour: tuple[float, float, float]) -> None:
+    """Draw dots of 2 x 2 pixels at points [N, 2] of an image [3, S, S], in place."""
+    for x, y in points_px.long().clamp(0, image.shape[-1] - 2).tolist():
+        image[:, y : y + 2, x : x + 2] = torch.tensor(colour).view(3, 1, 1)
+
+
+TRUE_COLOUR, FOUND_COLOUR = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)  # of landmarks on sheets
+
+
 class Objective(nn.Module):
     """A training stage: its batches, its loss terms and its validation.
 
-    Subclasses set the first three attributes after `super().__init__()`, and `held_out` and `settings` where
-    they use `held_out_samples`; they implement `draw_one`, `forward` and `validate`.
+    Subclasses set `held_out` and `settings` where they use `held_out_samples`; they implement `draw_one`,
+    `forward` and `validate`.
     """
 
-    networks: nn.ModuleDict  # trained, averaged, saved: by the names of `network/checkpoint.py`
     chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
-    provenance: dict[str, Any]  # for the checkpoint; 'licence' is that of the whole
-    inputs: dict[str, Any]  # entries of `INPUTS`
     source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
     skips_networks: bool = False  # True if a batch may leave some weights without a gradient
     bf16: bool = False  # set by the loop, for `mixed_precision`
@@ -73,9 +91,15 @@ class Objective(nn.Module):
     settings: Any  # with `held_out_draws`, of each of them
     validation_seed: int = 12345
 
-    def __init__(self) -> None:
+    def __init__(self, networks: dict[str, nn.Module], provenance: dict[str, Any]) -> None:
+        """Make a stage that trains, averages and saves networks, by the names of `network/checkpoint.py`.
+
+        provenance: of the data, for the checkpoint; 'licence' is that of the whole.
+        """
         super().__init__()
-        self.inputs = {}
+        self.networks = nn.ModuleDict(networks)
+        self.provenance = provenance
+        self.inputs: dict[str, Any] = {}  # entries of `INPUTS`
         self._held_out_samples: list[Any] = []
 
     def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:

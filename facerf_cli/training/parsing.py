@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
@@ -18,7 +18,7 @@ from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.loop import FOUND_COLOUR, TRUE_COLOUR, Objective, Validation, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS = 6, 4
 _RARE = ("brows", "eyes", "lips", "mouth", "beard", "ears", "glasses", "headwear", "hand")
@@ -42,7 +42,7 @@ class ParsingObjectiveSettings:
 class ParsingObjective(Objective):
     """Errors of classes, matte, landmarks and presence on synthetic portraits."""
 
-    validation_seed = 20212
+    chooses_by, validation_seed = "total", 20212
     rarity: Tensor
 
     def __init__(
@@ -51,11 +51,8 @@ class ParsingObjective(Objective):
         network: ParsingNetwork | None = None,
         settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
     ) -> None:
-        super().__init__()
         network = network or ParsingNetwork()
-        self.networks = nn.ModuleDict({"parsing": network})
-        self.chooses_by = "total"
-        self.provenance = portraits.provenance
+        super().__init__({"parsing": network}, portraits.provenance)
         self.portraits = portraits
         self.side = network.side
         self.settings = settings
@@ -137,15 +134,9 @@ class ParsingObjective(Objective):
         count, side = min(_SHEET_ROWS * _SHEET_COLUMNS, len(batch.crops)), batch.crops.shape[-1]
         cells = []
         for index in range(count):
-            image = batch.crops[index].cpu().permute(1, 2, 0).clone()
-            for points, colour in (
-                (batch.landmarks[index][batch.known[index]], (0.0, 1.0, 0.0)),
-                (found.landmarks[index][batch.known[index]], (1.0, 0.0, 0.0)),
-            ):
-                for x, y in (points.cpu() * side).long().clamp(0, side - 2).tolist():
-                    image[y : y + 2, x : x + 2] = torch.tensor(colour)
+            image, known = batch.crops[index].cpu().clone(), batch.known[index]
+            mark(image, batch.landmarks[index][known].cpu() * side, TRUE_COLOUR)
+            mark(image, found.landmarks[index][known].cpu() * side, FOUND_COLOUR)
             shares = found.classes[index].permute(1, 2, 0).cpu()
-            cells.append(torch.cat([image, shares @ palette], 1))
-        rows = [cells[first : first + _SHEET_COLUMNS] for first in range(0, count, _SHEET_COLUMNS)]
-        shown = torch.cat([torch.cat(row, 1) for row in rows if len(row) == len(rows[0])], 0)
-        return np.asarray(srgb_to_linear(shown.numpy()))
+            cells.append(torch.cat([image, (shares @ palette).permute(2, 0, 1)], 2))
+        return np.asarray(srgb_to_linear(tiled(in_rows(cells, _SHEET_COLUMNS))))

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.bank.transport import SMALL, PortraitSample, PortraitSource
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.loop import Objective, Validation, tiled
 
 _ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black
 _SCALE = (0.4, 2.5)  # of exposure between prediction and truth that is forgiven
@@ -50,7 +50,7 @@ class PortraitObjectiveSettings:
 class PortraitObjective(Objective):
     """Errors of the images that the Portrait Network predicts."""
 
-    validation_seed = 20216
+    chooses_by, validation_seed = "error", 20216
 
     def __init__(
         self,
@@ -58,10 +58,7 @@ class PortraitObjective(Objective):
         network: PortraitNetwork | None = None,
         settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
     ) -> None:
-        super().__init__()
-        self.networks = nn.ModuleDict({"portrait": network or PortraitNetwork()})
-        self.chooses_by = "error"
-        self.provenance = portraits.provenance
+        super().__init__({"portrait": network or PortraitNetwork()}, portraits.provenance)
         self.portraits = portraits
         self.settings = settings
         self.people, self.held_out = portraits.people(settings.held_out_people)
@@ -127,8 +124,8 @@ class PortraitObjective(Objective):
         rows = []
         for index in range(min(_SHEET_ROWS, len(found))):
             pairs = torch.stack([found[index], batch.targets[index]], 1).flatten(0, 1)
-            rows.append(torch.cat([batch.inputs.image[index], *pairs], -1))
-        return torch.cat(rows, 1).permute(1, 2, 0).cpu().numpy()
+            rows.append([batch.inputs.image[index], *pairs])
+        return tiled(rows)
 
 
 def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:

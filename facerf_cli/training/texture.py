@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.network.checkpoint import new_network
 from facerf_cli.network.features import LightNetwork, feature_distance
 from facerf_cli.network.inputs import Batch, SourceColours, from_root, mean_colours, without_cast
-from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, metrics_by_pose, seeded
+from facerf_cli.training.loop import Objective, Validation, metrics_by_pose, seeded, tiled
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 
 _COLOUR_SEED, _COLOURS_MEASURED = 31415, 192
@@ -44,6 +44,8 @@ class TextureBatch(Batch):
 class TextureObjective(Objective):
     """`root_loss` of OLAT textures at the network's exposure; `light` is a frozen S_f."""
 
+    chooses_by = "si_mse"
+
     def __init__(
         self,
         source: SampleSource,
@@ -51,13 +53,10 @@ class TextureObjective(Objective):
         light: LightNetwork | None = None,
         settings: TextureObjectiveSettings = TextureObjectiveSettings(),
     ) -> None:
-        super().__init__()
-        network = network or make_reflectance_network()
+        network = network or new_network("reflectance", "default", {})
         if network.rig_lights:
             _set_mean_face(network, source)
-        self.networks = nn.ModuleDict({"reflectance": network})
-        self.chooses_by = "si_mse"
-        self.provenance = source.provenance
+        super().__init__({"reflectance": network}, source.provenance)
         self.source = source
         self.light = light
         self.settings = settings
@@ -135,7 +134,5 @@ def _set_mean_face(network: Any, source: SampleSource) -> None:
 def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
     """Two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
     mask = (sample.weight[0] > 0).float()
-    truth = torch.cat([sample.source[0], *(sample.target[0] * mask)], -1)
-    guess = torch.cat([sample.source[0] * sample.visible[0], *(predicted[0] * mask)], -1)
-    image: np.ndarray = torch.cat([truth, guess], -2).permute(1, 2, 0).numpy()
-    return image
+    truth = [sample.source[0], *(sample.target[0] * mask)]
+    return tiled([truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch import Tensor
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
@@ -21,14 +21,8 @@ from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.checkpoint import load_networks, load_vgg
-from facerf_cli.network.diffuse_sh import DiffuseNetwork, DiffuseSettings
-from facerf_cli.network.features import AppearanceNetwork, AppearanceSettings, LightNetwork, LightSettings
+from facerf_cli.network.checkpoint import load_networks, load_vgg, new_network
 from facerf_cli.network.files import serving_files
-from facerf_cli.network.geometry import GeometryForm, GeometryNetwork, GeometryNetworkSettings
-from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
-from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
-from facerf_cli.network.reflectance import make_reflectance_network
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
@@ -64,25 +58,24 @@ from facerf_cli.training.losses import load_features
 from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettings
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 from facerf_cli.training.run_folder import refuse_another_run
-from facerf_cli.training.settings import Preset
+from facerf_cli.training.settings import Preset, TrainSettings
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 from facerf_cli.work.train_options import TrainOptions
 
 _WORKERS_ON_GPU = 4
 _MAPS, _SHAPES = 60, 240  # backgrounds: surroundings, each from several sides, and piles of shapes
 _SMOOTH = 0.95  # of the moving average of the losses
+_PACE_S = 600.0  # of the last steps, whose pace gives the time left
 # Sizes of networks with the preset `tiny`, and the lights of the rig that it bakes heads under.
-_TINY_WIDTHS, _TINY_LIGHTS = (8, 12, 16), 20
+_TINY_LIGHTS = 20
+_TINY_CODER: dict[str, Any] = {"side": 32, "encoder_widths": (8, 12, 16), "decoder_widths": (8, 12, 16)}
 _TINY_UNET: dict[str, Any] = {"widths": (8, 8, 12, 16), "blocks": (0, 1, 1, 1)}
-_TINY_FORMS: dict[str, dict[str, Any]] = {
-    "default": {
-        "side": 32,
-        "encoder_widths": _TINY_WIDTHS,
-        "decoder_widths": _TINY_WIDTHS,
-        "template_channels": 2,
-        "rig_lights": _TINY_LIGHTS,
-    },
-    "paper": {"side": 32, "widths": _TINY_WIDTHS, "features": 8},
+_TINY_NETWORKS: dict[str, dict[str, Any]] = {
+    "reflectance default": _TINY_CODER | {"template_channels": 2, "rig_lights": _TINY_LIGHTS},
+    "reflectance paper": {"side": 32, "widths": (8, 12, 16), "features": 8},
+    "diffuse_sh default": _TINY_CODER | {"light_channels": 4, "light_grid": 4, "light_hidden": 16},
+    "parsing default": _TINY_UNET | {"side": 64},
+    "portrait default": _TINY_UNET,
 }
 log = logging.getLogger(LOGGER_NAME)
 
@@ -121,7 +114,8 @@ def run_training(options: TrainOptions) -> None:
                 refuse_another_run(options.output)  # before hours of baking
             stage = _TrainedStage(options, trained, networks)
             objective: Objective = getattr(stage, options.stage.replace("-", "_"))()
-        with TrainProgress(training.steps, training.max_seconds, options.settings, first) as progress:
+        progress = TrainProgress(training, options.settings, first)
+        with progress.bar:
             checkpoint = train(
                 objective, options.output, training, start, options.resume, device, progress.row
             )
@@ -159,17 +153,14 @@ class _TrainedStage:
     def reflectance(self) -> Objective:
         """The Reflectance Network on textures."""
         side = self._texture_side
-        light = self._frozen_light_features(side)
-        network = self.trained.get("reflectance") or self._new_reflectance(side)
+        light, network = self._frozen_light_features(side), self._reflectance(side)
         settings = TextureObjectiveSettings(held_out_heads=self._sizes.held_out_heads)
         return TextureObjective(self._samples(), network, light, settings)
 
     def light_features(self) -> Objective:
         """S_f on textures."""
         sizes, side = self._sizes, self._texture_side
-        network = self.trained.get("light_features")
-        network = network or LightNetwork(LightSettings(width=sizes.light_width, side=side))
-        self._require_side(network.settings.side, side)
+        network = self._features("light_features", side)
         settings = LightFeaturesSettings(held_out_heads=sizes.held_out_heads)
         return LightFeaturesObjective(self._samples(), network, settings)
 
@@ -177,20 +168,13 @@ class _TrainedStage:
         """V_f on a dataset's crops."""
         assert self.options.dataset
         dataset, side = read_dataset(self.options.dataset), self._joint_side
-        network = self.trained.get("appearance_features")
-        if network is None:
-            people, width = len(dataset.subjects), self._sizes.light_width
-            network = AppearanceNetwork(AppearanceSettings(people, side, width))
-        self._require_side(network.settings.side, side)
+        network = self._features("appearance_features", side, people=len(dataset.subjects))
         return AppearanceObjective(dataset, load_face_model(dataset.face_model), network)
 
     def diffuse_sh(self) -> Objective:
         """The network of the baseline diffuse-sh, on textures."""
-        tiny = self.options.preset == "tiny"
-        sizes = DiffuseSettings(32, _TINY_WIDTHS, _TINY_WIDTHS, 4, 4, 16) if tiny else DiffuseSettings()
-        network = self.trained.get("diffuse_sh") or DiffuseNetwork(sizes)
         settings = SumSettings(held_out_heads=self._sizes.held_out_heads)
-        return DiffuseObjective(self._samples(), network, settings)
+        return DiffuseObjective(self._samples(), self._network("diffuse_sh"), settings)
 
     def geometry(self) -> Objective:
         """The Geometry Network on rendered heads."""
@@ -199,7 +183,7 @@ class _TrainedStage:
         images = folder / "pictures"
         add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
         faces = RenderedFaces(images, provenance)
-        network = self.trained.get("geometry") or self._new_geometry(faces.mean_translation_m())
+        network = self._geometry(faces.mean_translation_m())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
         return GeometryObjective(faces, network, settings)
 
@@ -214,10 +198,9 @@ class _TrainedStage:
                 "--preset paper: its loss needs S_f; give --light-features FILE, a checkpoint of "
                 "`facerf train --stage light-features`, or another preset"
             )
-        reflectance = self.trained.get("reflectance") or self._new_reflectance(side)
-        geometry = None  # heads are fitted to landmarks
+        reflectance, geometry = self._reflectance(side), None  # heads are fitted to landmarks
         if options.geometry == "network":
-            geometry = self.trained.get("geometry") or self._new_geometry(mean_translation_m(dataset))
+            geometry = self._geometry(mean_translation_m(dataset))
         light, photos = self._frozen_light_features(side), None
         if options.photos:
             items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
@@ -234,23 +217,20 @@ class _TrainedStage:
         settings = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
-        sizes = ParsingSettings(**_TINY_UNET, side=64) if tiny else ParsingSettings()
         objective = ParsingObjectiveSettings(held_out_people=self._sizes.held_out_heads)
-        return ParsingObjective(stored, self.trained.get("parsing") or ParsingNetwork(sizes), objective)
+        return ParsingObjective(stored, self._network("parsing"), objective)
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""
-        options, tiny = self.options, self.options.preset == "tiny"
+        options, targets = self.options, 2 if self.options.preset == "tiny" else 4
         source: PortraitSource
         if options.dataset:
             backgrounds = self._backgrounds(options.output)
             source = open_dataset_portraits(options.dataset, backgrounds, self.networks, options.jobs)
         else:
             source = self._stored_transport()
-        sizes = PortraitSettings(**_TINY_UNET) if tiny else PortraitSettings()
-        held_out = self._sizes.held_out_heads
-        settings = PortraitObjectiveSettings(held_out_people=held_out, targets=2 if tiny else 4)
-        return PortraitObjective(source, self.trained.get("portrait") or PortraitNetwork(sizes), settings)
+        settings = PortraitObjectiveSettings(held_out_people=self._sizes.held_out_heads, targets=targets)
+        return PortraitObjective(source, self._network("portrait"), settings)
 
     def _stored_transport(self) -> StoredTransport:
         """Synthetic people; those that are missing in the bank are baked and looked at first."""
@@ -323,37 +303,42 @@ class _TrainedStage:
         path = self.options.light_features
         return load_features(path, "light_features", side) if path else None
 
-    def _require_side(self, trained: int, side: int) -> None:
-        """Raise InputError where a network of --start-from was trained on images of another side."""
-        if trained != side:
+    def _network(self, name: str, form: str = "default", **settings: Any) -> Any:
+        """The network of --start-from, or an untrained one of the preset's sizes."""
+        tiny = _TINY_NETWORKS.get(f"{name} {form}") if self.options.preset == "tiny" else None
+        return self.trained.get(name) or new_network(name, form, settings | (tiny or {}))
+
+    def _features(self, name: str, side: int, **settings: Any) -> Any:
+        """S_f or V_f; InputError for one of --start-from that was trained on images of another side."""
+        network = self._network(name, "vgg", width=self._sizes.light_width, side=side, **settings)
+        if network.settings.side != side:
+            trained = network.settings.side
             raise InputError(
                 f"{self.options.start_from}: trained on images of {trained} px, here they have {side}; "
                 f"give --texture-size {trained}"
             )
+        return network
 
-    def _new_reflectance(self, side: int) -> Any:
-        """Make an untrained network of the options' form; the paper's works at the textures' side."""
-        options = self.options
-        settings = {"side": side} if options.form == "paper" else {}
-        if options.preset == "tiny":
-            settings = _TINY_FORMS.get(options.form, {})
-        ablation = {"normals": False} if options.without_normals else {}
+    def _reflectance(self, side: int) -> Any:
+        """The Reflectance Network of the options' form; the paper's works at the textures' side."""
+        form, without_normals = self.options.form, self.options.without_normals
+        settings: dict[str, Any] = {"side": side} if form == "paper" else {}
+        if without_normals:
+            settings["normals"] = False
         try:
-            return make_reflectance_network(options.form, **settings, **ablation)
+            return self._network("reflectance", form, **settings)
         except TypeError:
-            if not options.without_normals:
+            if not without_normals:
                 raise
             raise UsageError(
-                f"--without-normals: the form {options.form} has no setting normals; leave it out"
+                f"--without-normals: the form {form} has no setting normals; leave it out"
             ) from None
 
-    def _new_geometry(self, mean_translation_m: tuple[float, float, float]) -> GeometryNetwork:
-        """Make an untrained network; with --mean-face of the pose alone (paper, 'Ablative Study')."""
-        form: GeometryForm = "paper" if self.options.preset == "paper" else "default"
-        settings = GeometryNetworkSettings(form, mean_translation_m=mean_translation_m)
-        if self.options.mean_face:
-            settings = replace(settings, identity=0, expression=0)
-        return GeometryNetwork(settings)
+    def _geometry(self, mean_translation_m: tuple[float, float, float]) -> Any:
+        """The Geometry Network; with --mean-face of the pose alone (paper, 'Ablative Study')."""
+        form = "paper" if self.options.preset == "paper" else "default"
+        none = {"identity": 0, "expression": 0} if self.options.mean_face else {}
+        return self._network("geometry", form, mean_translation_m=mean_translation_m, **none)
 
     def _samples(self) -> SampleSource:
         """Open a dataset's textures, or the bank of synthetic heads, whose missing views are fitted first."""
@@ -400,56 +385,34 @@ def drawn_backgrounds(path: Path, seed: int, tiny: bool) -> Tensor:
 class TrainProgress:
     """Progress of a run: a bar on a terminal, otherwise a log line a validation.
 
-    It shows step, losses, last validation, the share of time spent waiting for batches, and the time left.
+    It shows losses, last validation, the share of time spent waiting for batches, and the time left.
     """
 
-    def __init__(self, steps: int | None, max_seconds: float | None, settings: Settings, shown: bool) -> None:
-        texts = [TextColumn("{task.description}"), TextColumn("{task.fields[left]}")]
-        columns = (texts[0], BarColumn(bar_width=20), TimeElapsedColumn(), texts[1])
+    def __init__(self, training: TrainSettings, settings: Settings, shown: bool) -> None:
+        text, left = TextColumn("{task.description}"), TextColumn("left")
+        columns = (text, BarColumn(bar_width=20), TimeElapsedColumn(), TimeRemainingColumn(), left)
         self.on = shown and STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-        self.steps, self.max_seconds = steps, max_seconds
-        self.bar = Progress(*columns, console=STDERR, disable=not self.on)
-        self.task = self.bar.add_task("training", total=1.0, left="")
+        self.training = training
+        self.bar = Progress(*columns, console=STDERR, disable=not self.on, speed_estimate_period=_PACE_S)
+        self.task = self.bar.add_task("training", total=1.0)
         self.smooth: dict[str, float] = {}
         self.validation = ""
-        self.begun: tuple[int, float] | None = None
-
-    def __enter__(self) -> "TrainProgress":
-        self.bar.start()
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.bar.stop()
 
     def row(self, row: dict[str, Any]) -> None:
         """Show one row of the log."""
         losses = {"loss": row["loss"], **(row["terms"] if len(row["terms"]) > 1 else {})}
         for name, value in losses.items():
             self.smooth[name] = _SMOOTH * self.smooth.get(name, value) + (1 - _SMOOTH) * value
-        words = "  ".join(f"{name} {value:.4g}" for name, value in self.smooth.items())
+        words = _figures(self.smooth)
         if "validation" in row:
-            self.validation = "  ".join(f"{name} {value:.4g}" for name, value in row["validation"].items())
+            self.validation = _figures(row["validation"])
             if not self.on:
                 log.info("step %d  %s  |  %s", row["step"], words, self.validation)
         text = f"step {row['step']}  {words}  waiting {100 * row['waiting']:.0f} %"
         text += f"  |  {self.validation}" if self.validation else ""
-        left_s = self._left_s(row)
-        done = 0.0 if left_s is None else row["seconds"] / max(row["seconds"] + left_s, 1e-9)
-        left = "" if left_s is None else f"{_clock(left_s)} left"
-        self.bar.update(self.task, completed=done, description=text, left=left)
-
-    def _left_s(self, row: dict[str, Any]) -> float | None:
-        """Seconds left by this process's pace or by --max-time, whichever ends first; None while unknown."""
-        self.begun = self.begun or (row["step"], row["seconds"])
-        steps = row["step"] - self.begun[0]
-        left = []
-        if self.max_seconds:
-            left.append(self.max_seconds - row["seconds"])
-        if self.steps and steps:
-            left.append((self.steps - row["step"]) * (row["seconds"] - self.begun[1]) / steps)
-        return max(0.0, min(left)) if left else None
+        done = self.training.done(row["step"], row["seconds"])
+        self.bar.update(self.task, completed=done, description=text)
 
 
-def _clock(seconds: float) -> str:
-    minutes = int(seconds) // 60
-    return f"{minutes // 60}:{minutes % 60:02d}:{int(seconds) % 60:02d}"
+def _figures(values: dict[str, float]) -> str:
+    return "  ".join(f"{name} {value:.4g}" for name, value in values.items())

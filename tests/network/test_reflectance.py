@@ -8,8 +8,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.errors import UsageError
+from facerf_cli.network.checkpoint import new_network
 from facerf_cli.network.inputs import to_root
-from facerf_cli.network.reflectance import REFLECTANCE_FORMS, ReflectanceNetwork, make_reflectance_network
+from facerf_cli.network.reflectance import REFLECTANCE_FORMS, ReflectanceNetwork
 
 SMALL: dict[str, dict[str, Any]] = {
     "default": {"side": 32, "encoder_widths": [8, 12], "decoder_widths": [8, 12], "rig_lights": 5},
@@ -20,7 +21,7 @@ SMALL: dict[str, dict[str, Any]] = {
 @pytest.fixture(params=SMALL)
 def network(request: pytest.FixtureRequest) -> Any:
     torch.manual_seed(0)
-    return make_reflectance_network(request.param, **SMALL[request.param])
+    return new_network("reflectance", request.param, SMALL[request.param])
 
 
 def face(side: int = 24) -> tuple[Tensor, Tensor, Tensor]:
@@ -59,7 +60,7 @@ def test_memory_grows_with_the_texture_and_is_positive(network: ReflectanceNetwo
 
 def test_memory_of_a_light_is_that_of_the_shipped_networks() -> None:
     with torch.device("meta"):
-        default, paper = make_reflectance_network(), make_reflectance_network("paper")
+        default, paper = (new_network("reflectance", form, {}) for form in ("default", "paper"))
     assert default.bytes_per_light(256**2) == 4 * (220 * 128**2 + 16 * 256**2)
     assert paper.bytes_per_light(256**2) == 4 * (220 * 512**2 + 16 * 256**2)
 
@@ -75,6 +76,6 @@ def test_unknown_forms_and_settings_are_refused() -> None:
     with pytest.raises(
         UsageError, match="form other: no such Reflectance Network; give one of default, paper"
     ):
-        make_reflectance_network("other")
+        new_network("reflectance", "other", {})
     with pytest.raises(TypeError):
-        make_reflectance_network("paper", rig_lights=3)
+        new_network("reflectance", "paper", {"rig_lights": 3})

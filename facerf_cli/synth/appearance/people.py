@@ -214,10 +214,7 @@ def hair_albedo(eumelanin: Tensor, pheomelanin: Tensor, grey: Tensor) -> Tensor:
 _CORNERS = ((36, 39), (42, 45))  # landmarks of the eyes' corners
 IRIS_DEG = 29.0  # edge of the iris, from the gaze axis
 _RADIUS_MM = 12.0  # of the eyeball
-# Colours of irises, linear Rec.709.
-_BROWN, _AMBER = (0.055, 0.026, 0.012), (0.16, 0.085, 0.030)
-_GREEN, _BLUE, _GREY = (0.11, 0.115, 0.055), (0.10, 0.155, 0.22), (0.15, 0.17, 0.18)
-_IRISES = {"brown": _BROWN, "amber": _AMBER, "green": _GREEN, "blue": _BLUE, "grey": _GREY}
+_IRISES: dict[str, list[float]] = _TABLES["irises"]  # colours, linear Rec.709
 _FAIR_SHARES = (0.35, 0.15, 0.15, 0.25, 0.10)  # frequency among fair people; all others are brown
 
 

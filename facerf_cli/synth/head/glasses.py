@@ -9,10 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.head.mesh import HeadMesh, joined, ring_triangles, strandless, unit
 from facerf_cli.synth.random_fields import Random
 
-GLASSES = ("round", "rectangular", "square", "aviator", "half-rim")
+_LENSES = tables_of(__file__)
+GLASSES = tuple(_LENSES)
 
 _EYES = ((36, 39), (42, 45))  # landmarks of the corners
 _GAP_M = 0.0012  # between frame and skin
@@ -115,13 +117,7 @@ def _greatest(tree: cKDTree, values: np.ndarray, at: np.ndarray) -> np.ndarray:
 def _rims(kind: str, landmarks_m: np.ndarray, random: Random) -> list[np.ndarray]:
     """Draw the outlines [64, 3] of both lenses, left in the image first, from the inner end over the top."""
     size = random.uniform(0.92, 1.08)
-    half_width, half_height, power = {
-        "round": (0.0225, 0.0215, 2.0),
-        "rectangular": (0.0265, 0.0165, 4.5),
-        "square": (0.0260, 0.0205, 3.6),
-        "aviator": (0.0275, 0.0230, 2.5),
-        "half-rim": (0.0260, 0.0165, 3.2),
-    }[kind]
+    half_width, half_height, power = _LENSES[kind]
     span = abs(landmarks_m[45, 0] - landmarks_m[36, 0]) / 0.089  # relative to the mean face
     half_width, half_height = half_width * size * span, half_height * size * random.uniform(0.95, 1.1)
     centres = [landmarks_m[list(pair)].mean(0) for pair in _EYES]

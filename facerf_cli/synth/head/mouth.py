@@ -7,13 +7,10 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.head.mesh import arc_lengths, capped, ring_triangles, unit
 
-# Rings of the bag from the rim of the lips back: distance behind the rim, and growth in width and height.
-_BAG_MM = ((0, 0, 0), (1.5, 0.2, 2), (4, 0.2, 5), (9, 0, 8), (18, -1, 10), (28, -5, 9), (38, -11, 4))
-# Widths and heights of the teeth of half a row, from the midline outward.
-_UPPER_WIDTHS_MM, _LOWER_WIDTHS_MM = (8.4, 6.7, 7.4, 6.8, 6.6, 9.5), (5.4, 5.9, 6.7, 6.8, 6.8, 10.0)
-_UPPER_HEIGHTS_MM, _LOWER_HEIGHTS_MM = (9.8, 8.6, 9.4, 8.0, 7.2, 6.8), (8.6, 8.8, 9.4, 8.2, 7.6, 7.0)
+_TABLES = tables_of(__file__)
 _ARCH_HALF_MM, _ARCH_DEPTH_MM = 27.0, 38.0  # half width and depth of the arch of a row
 _EDGE_MM = np.array([0.0, -35.0, 117.0])  # edge of the upper incisors in the average head
 _OVERLAP_MM, _OVERJET_MM = 2.0, 2.2  # by which the upper incisors lie below and in front of the lower ones
@@ -35,7 +32,7 @@ def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     direction = unit(offset[:, :2] / reach)
     rings = []
     flat = rim[:, 2].mean()
-    for behind, wider, taller in _BAG_MM:
+    for behind, wider, taller in _TABLES["bag_mm"]:
         ring = rim.copy()
         ring[:, :2] += direction * [wider, taller]
         share = min(behind / 10, 1)
@@ -54,11 +51,11 @@ def bag(rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def teeth(landmarks_mm: np.ndarray, rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Both rows of teeth behind the rim of the lips [N, 3]: vertices [V, 3], triangles [F, 3], uv [V, 2]."""
-    rows = [_row(_UPPER_WIDTHS_MM, _UPPER_HEIGHTS_MM, 1.0), _row(_LOWER_WIDTHS_MM, _LOWER_HEIGHTS_MM, -1.0)]
+    rows = [_row(_TABLES["upper_teeth_mm"], 1.0), _row(_TABLES["lower_teeth_mm"], -1.0)]
     placed = [place(row) for place, row in zip(_placements(landmarks_mm, rim), rows, strict=True)]
     one = capped(_TOOTH_RINGS, _TOOTH_SEGMENTS)
     count = _TOOTH_RINGS * _TOOTH_SEGMENTS
-    number = 2 * 2 * len(_UPPER_WIDTHS_MM)
+    number = 2 * 2 * len(_TABLES["upper_teeth_mm"])
     triangles = (one + count * np.arange(number)[:, None, None]).reshape(-1, 3)
     return np.concatenate(placed), triangles, np.tile(_ring_uv(_TOOTH_RINGS, _TOOTH_SEGMENTS), (number, 1))
 
@@ -162,12 +159,13 @@ def _ridge(up: float) -> np.ndarray:
     return points.reshape(-1, 3)
 
 
-def _row(widths: tuple[float, ...], heights: tuple[float, ...], up: float) -> np.ndarray:
+def _row(sizes_mm: list[list[float]], up: float) -> np.ndarray:
     """Teeth [V, 3] of a row with the edge of its incisors at the origin; `up`: 1 if roots point up, or -1."""
     curve, _ = _arch()
+    widths = [width for width, _ in sizes_mm]
     centres = np.cumsum(widths) - np.array(widths) / 2
     sides = []
-    for centre, width, height in zip(centres, widths, heights, strict=True):
+    for centre, (width, height) in zip(centres, sizes_mm, strict=True):
         x, z = curve(centre)
         tangent = curve(centre, 1)
         angle = np.arctan2(-tangent[1], tangent[0])

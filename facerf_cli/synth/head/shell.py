@@ -14,6 +14,7 @@ from torch import Tensor
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, UV_SIZE_MM, landmark_weights
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.synth import tables_of
 from facerf_cli.synth.head import mouth
 from facerf_cli.synth.head.cranium import Surroundings, average_head_mm, face_surface
 from facerf_cli.synth.head.mesh import (
@@ -89,11 +90,6 @@ def eyeball(centre: np.ndarray, gaze_deg: tuple[float, float]) -> tuple[np.ndarr
     return vertices, capped(len(_RINGS_DEG), _SEGMENTS), uv
 
 
-# Outline in the ear's plane, (a, b) in millimetres, starting at the front of the helix.
-_OUTLINE_MM = """
--6 8 | -5 17 | -1 27 | 7 34.5 | 17 36 | 26 31 | 30.5 21 | 30.5 9 | 27 -3 | 21.5 -14 | 15.5 -22 | 8 -27 | 0 -26
--5 -20 | -7.5 -11 | -7.5 -1
-"""
 _CENTRE_MM = np.array([6.0, 2.0])  # rings of vertices shrink from the outline to this point
 _RINGS, _SPOKES = 34, 112
 _OUT_DEG, _BACK_TILT_DEG, _IN_DEG = 27.0, 10.0, 4.0  # orientation of the ear's plane against the head
@@ -137,8 +133,7 @@ def ear_hollow_mm(points: np.ndarray) -> np.ndarray:
 
 def _outline(turn: np.ndarray) -> np.ndarray:
     """Points [S, 2] of the outline at fractions [S] of its length."""
-    text = _OUTLINE_MM.strip().replace("\n", " | ")
-    points = np.array([[float(x) for x in cell.split()] for cell in text.split("|")])
+    points = np.array(tables_of(__file__)["ear_mm"], float)
     points = np.concatenate([points, points[:1]])
     length = arc_lengths(points)
     return CubicSpline(length / length[-1], points, bc_type="periodic")(turn)

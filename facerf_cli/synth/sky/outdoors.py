@@ -31,14 +31,7 @@ from facerf_cli.synth.sky.painting import (
 )
 
 _TABLES = {name: np.array(values, float) for name, values in tables_of(__file__).items()}
-# Rec.709 primaries, white D65.
-_XYZ_TO_REC709 = np.array(
-    [
-        [3.2404542, -1.5371385, -0.4985314],
-        [-0.969266, 1.8760108, 0.041556],
-        [0.0556434, -0.2040259, 1.0572252],
-    ]
-)
+_XYZ_TO_REC709, _GROUNDS = _TABLES["xyz_to_rec709"], _TABLES["grounds"]
 SUN_RADIUS_DEG = 0.2665  # angular radius of the disc
 SUN_SR = 2 * np.pi * (1 - np.cos(np.radians(SUN_RADIUS_DEG)))  # its solid angle
 _SUN_NM = np.arange(380, 751, 10.0)  # wavelengths of the spectra of sun and ozone
@@ -124,11 +117,6 @@ def _lobe(nm: np.ndarray, height: float, middle: float, left: float, right: floa
 
 
 EYE_M = 1.6  # height of the head above the ground
-# Linear RGB albedos of ground; the list repeats the common ones.
-_ASPHALT, _SAND, _PAVING = (0.12, 0.12, 0.125), (0.38, 0.31, 0.22), (0.28, 0.26, 0.23)
-_GRASS, _EARTH, _BRICK = (0.09, 0.12, 0.04), (0.22, 0.17, 0.12), (0.26, 0.13, 0.09)
-_SNOW, _WATER = (0.75, 0.78, 0.82), (0.05, 0.06, 0.07)
-_GROUNDS = (_ASPHALT, _SAND, _GRASS, _GRASS, _EARTH, _PAVING, _PAVING, _SNOW, _BRICK, _WATER)
 
 
 @dataclass(frozen=True)
