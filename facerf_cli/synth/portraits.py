@@ -42,31 +42,23 @@ _MISSING = (math.nan,) * 3
 
 @dataclass(frozen=True, eq=False)
 class BakedPortrait:
-    """One image [S, S] of a person, as N facets: parts of the mesh in a pixel; vectors in camera space.
+    """One image [S, S] of a person, as N facets: parts of the mesh in a pixel; vectors in camera space."""
 
-    pixel [N] int32, row by row; share [N] float16 of the pixel; part [N] uint8; uv [N, 2] float32 of the
-    part's texture; normals, tangents [N, 3] and spread [N] (variance of the normals) float16; positions_m
-    [N, 3] float32; direct [N, L] uint8, of 255: visibility of each light, on surfaces times n.l; bounce
-    [N, 16] float16: spherical harmonics of the light after one bounce off white surroundings; directions
-    [L, 3] of the lights; classes [S, S, C] uint8: shares, of 255; landmarks_px [68 + M, 2]; rotation [3, 3]:
-    head_to_camera; lens_*: see `Lenses`.
-    """
-
-    pixel: Tensor
-    share: Tensor
-    part: Tensor
-    uv: Tensor
-    normals: Tensor
-    tangents: Tensor
-    spread: Tensor
-    positions_m: Tensor
-    direct: Tensor
-    bounce: Tensor
-    directions: Tensor
-    classes: Tensor
-    landmarks_px: Tensor
-    rotation: Tensor
-    lens_pixel: Tensor
+    pixel: Tensor  # [N] int32, row by row
+    share: Tensor  # [N] float16, of the pixel
+    part: Tensor  # [N] uint8
+    uv: Tensor  # [N, 2] float32 of the part's texture
+    normals: Tensor  # [N, 3] float16
+    tangents: Tensor  # [N, 3] float16
+    spread: Tensor  # [N] float16, variance of the normals
+    positions_m: Tensor  # [N, 3] float32
+    direct: Tensor  # [N, L] uint8, of 255: visibility of each light, on surfaces times n.l
+    bounce: Tensor  # [N, 16] float16: spherical harmonics of light after one bounce off white surroundings
+    directions: Tensor  # [L, 3] of the lights
+    classes: Tensor  # [S, S, C] uint8: shares, of 255
+    landmarks_px: Tensor  # [68 + M, 2]
+    rotation: Tensor  # [3, 3] head_to_camera
+    lens_pixel: Tensor  # see `Lenses`
     lens_normals: Tensor
     lens_views: Tensor
 

@@ -215,19 +215,14 @@ _NEAR = 4  # vertices of the eyeball around a point of the iris
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Layers [H, W] or [H, W, C] float32 of an image; surface and material are means over what is covered.
+    """Layers [H, W] or [H, W, C] float32 of an image; surface and material are means over what is covered."""
 
-    classes [H, W, len(CLASSES)]: share of each class in a pixel, with the background their sum is 1; albedo:
-    linear Rec.709; normals: unit, camera space; positions_m: camera space; specular: reflectance at normal
-    incidence; roughness: of the highlight.
-    """
-
-    classes: np.ndarray
-    albedo: np.ndarray
-    normals: np.ndarray
-    positions_m: np.ndarray
-    specular: np.ndarray
-    roughness: np.ndarray
+    classes: np.ndarray  # [H, W, len(CLASSES)] share of each in a pixel; with the background their sum is 1
+    albedo: np.ndarray  # linear Rec.709
+    normals: np.ndarray  # unit, camera space
+    positions_m: np.ndarray  # camera space
+    specular: np.ndarray  # reflectance at normal incidence
+    roughness: np.ndarray  # of the highlight
 
     @property
     def alpha(self) -> np.ndarray:

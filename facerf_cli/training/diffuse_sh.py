@@ -17,8 +17,9 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, metrics_by_pose, tiled
+from facerf_cli.training.loop import Objective, Validation, metrics_by_pose
 from facerf_cli.training.losses import clipped_si_mse, root_loss
+from facerf_cli.training.sheets import tiled
 
 _SHEET_FACES = 5
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
@@ -38,20 +39,16 @@ class SumSettings:
 
 @dataclass(frozen=True)
 class DiffuseBatch(Batch):
-    """B faces with M targets each: fields as in `Sample`, and the targets' lights.
+    """B faces with M targets each: fields as in `Sample`, and the targets' lights."""
 
-    source, normals_source, normals_target [B, 3, T, T], visible and weight [B, 1, T, T], targets
-    [B, M, 3, T, T], coefficients [B, M, 9, 3] in camera space; `heads` [B] are the heads' indices.
-    """
-
-    source: Tensor
-    visible: Tensor
-    normals_source: Tensor
-    normals_target: Tensor
-    targets: Tensor
-    coefficients: Tensor
-    weight: Tensor
-    heads: Tensor
+    source: Tensor  # [B, 3, T, T]
+    visible: Tensor  # [B, 1, T, T]
+    normals_source: Tensor  # [B, 3, T, T]
+    normals_target: Tensor  # [B, 3, T, T]
+    targets: Tensor  # [B, M, 3, T, T]
+    coefficients: Tensor  # [B, M, 9, 3] in camera space
+    weight: Tensor  # [B, 1, T, T]
+    heads: Tensor  # [B] indices
 
 
 class DiffuseObjective(Objective):

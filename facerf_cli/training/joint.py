@@ -6,7 +6,7 @@ with its head, relit by the Reflectance Network, rendered with the target's head
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,11 +31,11 @@ from facerf_cli.face.topology import (
 from facerf_cli.network.checkpoint import VGG16_LICENCE
 from facerf_cli.network.features import VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
-from facerf_cli.network.inputs import SourceColours, concatenate, resize, without_cast
+from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize, without_cast
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
-from facerf_cli.training.loop import Objective, Validation, seeded, tiled
+from facerf_cli.training.loop import Objective, Validation, seeded
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -48,6 +48,7 @@ from facerf_cli.training.losses import (
     regularisation,
     slid_contour,
 )
+from facerf_cli.training.sheets import tiled
 
 FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)
 LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011), the contour's first
@@ -57,7 +58,7 @@ _DEPTH_PX, _DEPTH_PER_PX = 512, 3
 
 
 @dataclass(frozen=True)
-class PosedHeads:
+class PosedHeads(Batch):
     """B meshes in camera space [B, V, 3], rotations head_to_camera [B, 3, 3] and fixed landmarks."""
 
     vertices: Tensor
@@ -83,14 +84,9 @@ def pose_heads(model: MorphableModel, estimate: GeometryEstimate) -> PosedHeads:
 
 def leading(model: MorphableModel, identities: int, expressions: int) -> MorphableModel:
     """Keep the leading shapes of a model, as many as a Geometry Network has coefficients."""
-    return MorphableModel(
-        model.name,
-        model.licence,
-        model.mean,
-        model.identity[:identities],
-        model.expression[:expressions],
-        model.expression_names[:expressions],
-    )
+    identity, expression = model.identity[:identities], model.expression[:expressions]
+    names = model.expression_names[:expressions]
+    return replace(model, identity=identity, expression=expression, expression_names=names, head=None)
 
 
 @dataclass(frozen=True)
@@ -274,7 +270,7 @@ class JointObjective(Objective):
     def _relit(self, batch: CropPairs, heads: PosedHeads) -> _Relit:
         """Relight and pose the sources of pairs as their targets; `heads` are of both, sources first."""
         side, count = self.settings.texture_side, len(batch.source)
-        source, target = _part(heads, slice(None, count)), _part(heads, slice(count, None))
+        source, target = heads.each(lambda x: x[:count]), heads.each(lambda x: x[count:])
         face = unwrap_images(batch.source, source, self.camera, side)
         normals = head_normals(target, side)
         network: Any = self.networks["reflectance"]
@@ -358,10 +354,6 @@ class JointObjective(Objective):
         return {
             kind: [self._held_out.read(pair) for pair in pairs] for kind, pairs in chosen.items() if pairs
         }
-
-
-def _part(heads: PosedHeads, which: slice) -> PosedHeads:
-    return PosedHeads(heads.vertices[which], heads.rotation[which], heads.fixed_landmarks[which])
 
 
 def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tensor:

@@ -19,7 +19,8 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import Batch, concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.loop import Objective, Validation, tiled
+from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.sheets import tiled
 
 _NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
 _SHEET_FACES = 6

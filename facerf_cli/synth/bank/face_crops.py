@@ -21,15 +21,15 @@ from torch import Tensor
 
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.face.topology import GRID, MIRROR_68, grid_uv, landmark_weights
+from facerf_cli.face.topology import GRID, MIRROR_68, grid_uv
 from facerf_cli.network.inputs import Batch
-from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera, crop_camera, project
+from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import sample_texture
+from facerf_cli.raster.texture import sample_texture, texel_centres_uv
 from facerf_cli.synth.appearance.people import hair_albedo
 from facerf_cli.synth.appearance.skin import draw_skin
 from facerf_cli.synth.bank import Files, file_of, files_in, fill, split_heads
-from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, photograph_head
+from facerf_cli.synth.bank.heads import HeadPhoto, ViewSettings, landmarks_of, photograph_head
 from facerf_cli.synth.bank.texture_samples import HeadFields, draw_light, head_fields
 from facerf_cli.synth.head.body import draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
@@ -116,8 +116,7 @@ class _Surroundings:
 def _surroundings(vertices: Tensor, random: Random) -> _Surroundings:
     """Draw clothes, hair and glasses for a head, and keep what is visible outside the face."""
     bare = shell_head(vertices, (0.0, 0.0), 0)
-    corners, weights = landmark_weights()
-    landmarks_m = (vertices[corners] * weights[..., None]).sum(1).numpy()
+    landmarks_m = landmarks_of(vertices).numpy()
     dressed, _ = draw_body(bare, random, _BODY_EDGE_M)
     worn: list[HeadMesh] = []
     if random.random() < _HAIR_SHARE:
@@ -346,9 +345,8 @@ class _Move:
 
     def image(self, stored: Tensor, side: int, settings: ImageSettings) -> Tensor:
         """Resample a stored image [4, P, P] to a crop [4, side, side] of linear colour and cover."""
-        centre = (torch.arange(side) + PIXEL_CENTRE) / side
-        y, x = torch.meshgrid(centre, centre, indexing="ij")
-        source = (torch.stack([x, y], -1) - 0.5 - self.shift) @ torch.linalg.inv(self._matrix()).T + 0.5
+        away = texel_centres_uv(side) - 0.5 - self.shift
+        source = away @ torch.linalg.inv(self._matrix()).T + 0.5
         whole_px = settings.crop_px + 2 * settings.margin_px
         grid = 2 * (source * settings.crop_px + settings.margin_px) / whole_px - 1
         linear = stored.float() / 255
@@ -398,9 +396,7 @@ def _occluder(side: int, generator: torch.Generator) -> Tensor:
     angle, distance = uniform(0, 2 * math.pi), uniform(0.3, 0.6)
     centre = 0.5 + distance * torch.stack([angle.cos(), angle.sin()])
     radii, tilt = uniform(0.06, 0.22, 2), uniform(0, math.pi)
-    along = (torch.arange(side) + PIXEL_CENTRE) / side
-    y, x = torch.meshgrid(along - centre[1], along - centre[0], indexing="ij")
-    a, b = x * tilt.cos() + y * tilt.sin(), y * tilt.cos() - x * tilt.sin()
+    a, b = turned(*(texel_centres_uv(side) - centre).unbind(-1), tilt)
     return ((1 - (a / radii[0]) ** 2 - (b / radii[1]) ** 2) * 8 + 0.5).clamp(0, 1)[None]
 
 
@@ -415,6 +411,11 @@ def _with_camera_errors(image: Tensor, generator: torch.Generator) -> Tensor:
     image = gaussian_blurred(image, float(uniform(0, 1.3))) ** torch.exp(uniform(-0.3, 0.3))
     noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.04) ** 1.2
     return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
+
+
+def turned(x: Tensor, y: Tensor, tilt: Tensor) -> tuple[Tensor, Tensor]:
+    """Coordinates along and across a direction that is turned by `tilt` radians."""
+    return x * tilt.cos() + y * tilt.sin(), y * tilt.cos() - x * tilt.sin()
 
 
 def gaussian_blurred(image: Tensor, sigma_px: float) -> Tensor:

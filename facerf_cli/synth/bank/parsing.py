@@ -27,8 +27,9 @@ from facerf_cli.network.inputs import Batch
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.parse import MIRROR
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.synth.bank import files_in, split_people
-from facerf_cli.synth.bank.face_crops import gaussian_blurred
+from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
 from facerf_cli.synth.bank.portraits import background_of
 from facerf_cli.synth.random_fields import Uniform
 
@@ -101,20 +102,15 @@ _BUST_BELOW = (0.8, 0.6, 0.3)  # share of crops of each side that end where the 
 
 @dataclass(frozen=True)
 class PortraitCrops(Batch):
-    """Crops of B photos as a screen shows them, and what the Parsing Network should see in them.
+    """Crops of B photos as a screen shows them, and what the Parsing Network should see in them."""
 
-    crops [B, 3, S, S] in 0..1; alpha [B, S, S] in 0..1; label [B, S, S] long, class of what is covered;
-    weight [B, S, S], 0 where the truth is unknown; landmarks [B, N, 2] in sides of the crop; known [B, N]:
-    whether a landmark is in the crop; present [B]: whether there is a person.
-    """
-
-    crops: Tensor
-    alpha: Tensor
-    label: Tensor
-    weight: Tensor
-    landmarks: Tensor
-    known: Tensor
-    present: Tensor
+    crops: Tensor  # [B, 3, S, S] in 0..1
+    alpha: Tensor  # [B, S, S] in 0..1
+    label: Tensor  # [B, S, S] long, class of what is covered
+    weight: Tensor  # [B, S, S], 0 where the truth is unknown
+    landmarks: Tensor  # [B, N, 2] in sides of the crop
+    known: Tensor  # [B, N] whether a landmark is in the crop
+    present: Tensor  # [B] whether there is a person
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,9 +253,7 @@ class _Placement:
         Below the stored photo its lowest row goes on, and is true where it shows a garment. Beside it nothing
         is known of a person who touches the border there.
         """
-        along = (torch.arange(side) + PIXEL_CENTRE) / side - 0.5
-        y, x = torch.meshgrid(along, along, indexing="ij")
-        place = torch.stack([x, y], -1) @ self.matrix.T + self.centre
+        place = (texel_centres_uv(side) - 0.5) @ self.matrix.T + self.centre
         landmarks_px = photo.landmarks_px
         if warp is not None:
             place, landmarks_px = place + warp.shift(place), warp.shown_at(landmarks_px)
@@ -340,12 +334,10 @@ def _with_decoys(image: Tensor, crop: PortraitCrops, generator: torch.Generator)
     """
     uniform, side = Uniform(generator), crop.alpha.shape[-1]
     person = torch.cat([crop.crops[0], crop.alpha])
-    along = 2 * (torch.arange(side) + PIXEL_CENTRE) / side - 1
-    y, x = torch.meshgrid(along, along, indexing="ij")
     outline = _outline(crop.alpha[0])
     for _ in range(int(torch.randint(1, _DECOYS + 1, (), generator=generator))):
         matrix = _turn(float(uniform(-math.pi, math.pi))) * torch.exp(uniform(-1.0, 0.3))
-        grid = torch.stack([x, y], -1) @ matrix.T + uniform(-0.8, 0.8, 2)
+        grid = (2 * texel_centres_uv(side) - 1) @ matrix.T + uniform(-0.8, 0.8, 2)
         shown = F.grid_sample(person[None], grid[None], padding_mode="reflection", align_corners=False)[0]
         place = uniform(0, 1, 2)
         if len(outline) and torch.rand((), generator=generator) < _TOUCHING:
@@ -376,9 +368,8 @@ def _shape(centre: Tensor, side: int, generator: torch.Generator) -> Tensor:
     uniform = Uniform(generator)
     long, wide = torch.exp(uniform(-3.2, -0.9)), torch.exp(uniform(-3.5, -1.4))
     tilt = uniform(0, math.pi)
-    along = (torch.arange(side) + PIXEL_CENTRE) / side
-    y, x = torch.meshgrid(along - centre[1], along - centre[0], indexing="ij")
-    a, b = (x * tilt.cos() + y * tilt.sin()) / long, (y * tilt.cos() - x * tilt.sin()) / wide
+    along, across = turned(*(texel_centres_uv(side) - centre).unbind(-1), tilt)
+    a, b = along / long, across / wide
     round_one = torch.rand((), generator=generator) < 0.5
     distance = a.square() + b.square() if round_one else torch.maximum(a.abs(), b.abs()) ** 2
     return ((1 - distance) * side * float(torch.minimum(long, wide)) / 2 + 0.5).clamp(0, 1)

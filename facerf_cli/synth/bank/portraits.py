@@ -25,7 +25,7 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.bank import Files, fill
-from facerf_cli.synth.bank.face_crops import gaussian_blurred
+from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
 from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.portraits import BakedPortrait, bake_subject, images_under, materials_of, view_of
 from facerf_cli.synth.random_fields import Random, Uniform, generators
@@ -106,7 +106,8 @@ def _heap(generator: torch.Generator) -> Tensor:
         if high_y <= low_y or high_x <= low_x:
             continue
         y, x = torch.meshgrid(at[low_y:high_y] - y0, at[low_x:high_x] - x0, indexing="ij")
-        along, across = (x * tilt.cos() + y * tilt.sin()) / long, (y * tilt.cos() - x * tilt.sin()) / wide
+        along, across = turned(x, y, tilt)
+        along, across = along / long, across / wide
         if torch.rand((), generator=generator) < boxes:
             inside = torch.maximum(along.abs(), across.abs()) < 1
         else:

@@ -236,26 +236,20 @@ _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
 
 @dataclass(frozen=True)
 class PortraitSample(Batch):
-    """Photos of B people, what is seen in them (`PortraitInputs`), and T target images of each.
-
-    `lights` [B, T, 3] and `visible` [B, T, s, s] are of the targets [B, T, 3, S, S]; `rig` [B, L, 3],
-    `rig_visible` [B, L, s, s] and `weights` [B, L, 3] of the photo's own light, `own` [B, 3, S, S] the photo
-    without noise; albedo, true_normals [B, 3, S, S], known where `labelled` [B] is 1; shares [B, C, S, S] of
-    the true classes.
-    """
+    """Photos of B people, what is seen in them, and T target images of each."""
 
     inputs: PortraitInputs
-    lights: Tensor
-    visible: Tensor
-    targets: Tensor
-    rig: Tensor
-    rig_visible: Tensor
-    weights: Tensor
-    own: Tensor
-    albedo: Tensor
-    true_normals: Tensor
-    shares: Tensor
-    labelled: Tensor
+    lights: Tensor  # [B, T, 3] of the targets
+    visible: Tensor  # [B, T, s, s]
+    targets: Tensor  # [B, T, 3, S, S]
+    rig: Tensor  # [B, L, 3] of the photo's own light
+    rig_visible: Tensor  # [B, L, s, s]
+    weights: Tensor  # [B, L, 3]
+    own: Tensor  # [B, 3, S, S] the photo without noise
+    albedo: Tensor  # [B, 3, S, S], known where `labelled` is 1
+    true_normals: Tensor  # [B, 3, S, S], likewise
+    shares: Tensor  # [B, C, S, S] of the true classes
+    labelled: Tensor  # [B]
 
 
 class PortraitSource(Protocol):
@@ -319,21 +313,16 @@ class StoredTransport:
 
 @dataclass(frozen=True, eq=False)
 class LitPerson:
-    """A person under the light of a photo, and under T lights of a rig.
+    """A person under the light of a photo, and under T lights of a rig."""
 
-    images [1 + T, 3, S, S]; weights [L, 3] of the rig [L, 3] light the first, each of the lights `chosen`
-    [T] one of the others. albedo [3, S, S], or what stands for it; normals [3, S, S], None where nobody
-    knows them; shares [C, S, S] of the classes; behind [S, S], the share of what lies behind the person.
-    """
-
-    images: Tensor
-    albedo: Tensor
-    normals: Tensor | None
-    shares: Tensor
-    behind: Tensor
-    rig: Tensor
-    weights: Tensor
-    chosen: Tensor
+    images: Tensor  # [1 + T, 3, S, S]
+    albedo: Tensor  # [3, S, S], or what stands for it
+    normals: Tensor | None  # [3, S, S]; None where nobody knows them
+    shares: Tensor  # [C, S, S] of the classes
+    behind: Tensor  # [S, S], the share of what lies behind the person
+    rig: Tensor  # [L, 3]
+    weights: Tensor  # [L, 3] of the rig's lights in the first image
+    chosen: Tensor  # [T] lights of the others
 
 
 def sample_of(

@@ -25,7 +25,18 @@ from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.head.cranium import average_head_mm
 from facerf_cli.synth.random_fields import Random
 
-PARTS = ("skin", "eye", "mouth", "teeth", "cloth", "hair", "frame", "hat")  # of HeadMesh.part, by index
+# Parts of a mesh, in the order of their indices, and the class that all of a part has by default.
+CLASS_OF_PART = {
+    "skin": "skin",
+    "eye": "eyes",
+    "mouth": "mouth",
+    "teeth": "mouth",
+    "cloth": "garment",
+    "hair": "hair",
+    "frame": "glasses",
+    "hat": "headwear",
+}
+PARTS = tuple(CLASS_OF_PART)
 _OF_VERTICES = ("vertices", "normals", "part", "uv", "tangents", "label")  # fields of HeadMesh
 CLOTH_M = 0.5  # size of the texture of cloth
 
@@ -174,16 +185,6 @@ def arc_lengths(points: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
 
 
-CLASS_OF_PART = {
-    "skin": "skin",
-    "eye": "eyes",
-    "mouth": "mouth",
-    "teeth": "mouth",
-    "cloth": "garment",
-    "hair": "hair",
-    "frame": "glasses",
-    "hat": "headwear",
-}
 # Lower edge of the face on the mean head: height in metres at an azimuth in degrees, the same on both sides.
 # It follows the jaw to the lobe of the ear, then the nape below the hair.
 _JAW_DEG = (0, 15, 27, 38, 50, 65, 80, 95, 110, 180)

@@ -222,7 +222,7 @@ def _snapped(points: np.ndarray, faces: np.ndarray, polygon: np.ndarray) -> tupl
     The side [N] is 1 inside, 0 on and -1 outside the outline.
     """
     signed, nearest = _signed(points, polygon)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = _edges(faces)
     crossing = edges[signed[edges[:, 0]] * signed[edges[:, 1]] < 0]
     distance = np.abs(signed[crossing])
     distance = distance + np.where(signed[crossing] > 0, 0, 1e-6)  # breaks ties alike on both halves
@@ -234,6 +234,11 @@ def _snapped(points: np.ndarray, faces: np.ndarray, polygon: np.ndarray) -> tupl
         on = np.flatnonzero(side == 0)
         moved[on[np.linalg.norm(points[on] - corner, axis=-1).argmin()]] = corner
     return moved, side
+
+
+def _edges(faces: np.ndarray) -> np.ndarray:
+    """Directed edges [3 F, 2] of triangles [F, 3]."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _signed(points: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -254,9 +259,7 @@ def _signed(points: np.ndarray, polygon: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: np.ndarray) -> np.ndarray:
     """Even out the samples outside the rim, so that none of their triangles stays squeezed."""
-    edges = np.unique(
-        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), -1), axis=0
-    )
+    edges = np.unique(np.sort(_edges(faces), -1), axis=0)
     count = np.bincount(edges.ravel(), minlength=len(points))
     distance = np.abs(_signed(points, polygon)[0])
     free = (side < 0) & (distance < _RELAXED_MM)
@@ -272,8 +275,7 @@ def _relaxed(points: np.ndarray, faces: np.ndarray, side: np.ndarray, polygon: n
 
 def _rim(inner: np.ndarray) -> np.ndarray:
     """The border of the removed triangles, in order, counter-clockwise from outside."""
-    edges = np.concatenate([inner[:, [0, 1]], inner[:, [1, 2]], inner[:, [2, 0]]])
-    pairs = {(int(a), int(b)) for a, b in edges}
+    pairs = {(int(a), int(b)) for a, b in _edges(inner)}
     onward = {a: b for a, b in pairs if (b, a) not in pairs}
     start = min(onward)
     rim = [start]
