@@ -17,9 +17,10 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, metrics_by_pose
+from facerf_cli.training.loop import Validation, metrics_by_pose
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.sheets import tiled
+from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 
 _SHEET_FACES = 5
 _TOTAL = 1.5  # of a sum's weights: a face lit from the front then has about the albedo's radiance
@@ -28,13 +29,10 @@ _TINT = 0.15  # standard deviation of the logarithm of a light's colour
 
 
 @dataclass(frozen=True)
-class SumSettings:
-    """Single lights and sums of a face and step, and held-out heads, each drawn `held_out_draws` times."""
+class SumSettings(HeadsSettings):
+    """Settings of the stage, with the sums of a face and step."""
 
-    lights: int = 8
     sums: int = 3
-    held_out_heads: int = 12
-    held_out_draws: int = 4
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class DiffuseBatch(Batch):
     heads: Tensor  # [B] indices
 
 
-class DiffuseObjective(Objective):
+class DiffuseObjective(HeadsObjective):
     """`root_loss` of the source under its estimated light, and of sums of known lights."""
 
     chooses_by = "si_mse"
@@ -64,18 +62,13 @@ class DiffuseObjective(Objective):
     ) -> None:
         network = network or DiffuseNetwork()
         network.set_mean_face(source.mean_face()[0])
-        super().__init__({"diffuse_sh": network}, source.provenance)
-        self.source = source
-        self.settings = settings
-        self.heads, self.held_out = source.heads(settings.held_out_heads)
+        super().__init__("diffuse_sh", network, source, settings)
 
-    def draw_one(self, generator: torch.Generator) -> DiffuseBatch:
-        """Draw a face."""
-        return self._sums(self.heads[torch.randint(len(self.heads), (1,), generator=generator)], generator)
-
-    def draw_held_out(self, person: int, generator: torch.Generator) -> DiffuseBatch:
-        """Draw a held-out face."""
-        return self._sums(torch.tensor([person]), generator)
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> DiffuseBatch:
+        """Draw a face and random sums of its single lights."""
+        sample = self.source.draw(head, self.settings.lights, generator)
+        weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
+        return sum_lights(sample, weights, head)
 
     def forward(self, batch: DiffuseBatch) -> dict[str, Tensor]:
         """Compute `source`, for the light alone, and `targets`, for the albedo; means over faces."""
@@ -109,12 +102,6 @@ class DiffuseObjective(Objective):
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(batch, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
         return Validation(_metrics(torch.tensor(errors), torch.tensor(same_pose)), np.concatenate(rows))
-
-    def _sums(self, heads: Tensor, generator: torch.Generator) -> DiffuseBatch:
-        """Draw a face and random sums of its single lights."""
-        sample = self.source.draw(heads, self.settings.lights, generator)
-        weights = draw_sums(self.settings.sums, sample.lights.shape[1], generator)
-        return sum_lights(sample, weights, heads)
 
 
 def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:

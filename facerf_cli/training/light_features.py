@@ -21,9 +21,11 @@ from facerf_cli.network.inputs import Batch, concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.training.loop import Objective, Validation
 from facerf_cli.training.sheets import tiled
+from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 
 _NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
 _SHEET_FACES = 6
+_HEADS = HeadsSettings()
 
 
 @dataclass(frozen=True)
@@ -38,16 +40,7 @@ class LightTextures(Batch):
     heads: Tensor
 
 
-@dataclass(frozen=True)
-class LightFeaturesSettings:
-    """Lights of a face and step, and held-out heads, each drawn `held_out_draws` times."""
-
-    lights: int = 8
-    held_out_heads: int = 12
-    held_out_draws: int = 4
-
-
-class LightFeaturesObjective(Objective):
+class LightFeaturesObjective(HeadsObjective):
     """1 minus the cosine between the predicted and the true direction of light."""
 
     chooses_by = "angle_deg"
@@ -56,22 +49,18 @@ class LightFeaturesObjective(Objective):
         self,
         source: SampleSource,
         network: LightNetwork | None = None,
-        settings: LightFeaturesSettings = LightFeaturesSettings(),
+        settings: HeadsSettings = _HEADS,
     ) -> None:
-        super().__init__({"light_features": network or LightNetwork()}, source.provenance)
-        self.source = source
-        self.settings = settings
-        self.heads, self.held_out = source.heads(settings.held_out_heads)
+        super().__init__("light_features", network or LightNetwork(), source, settings)
         self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
 
-    def draw_one(self, generator: torch.Generator) -> LightTextures:
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures:
         """Draw a face."""
-        head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-        return self._textures(head, generator)
-
-    def draw_held_out(self, person: int, generator: torch.Generator) -> LightTextures:
-        """Draw a held-out face."""
-        return self._textures(torch.tensor([person]), generator)
+        sample = self.source.draw(head, self.settings.lights, generator)
+        seen = (sample.weight > 0).float()
+        head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
+        lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
+        return LightTextures(sample.target * seen[:, None], lights_head, head)
 
     def forward(self, batch: LightTextures) -> dict[str, Tensor]:
         """Compute the term `light`, a mean over faces and lights."""
@@ -91,13 +80,6 @@ class LightFeaturesObjective(Objective):
             if lights.any():
                 metrics[name] = float(angles[lights].mean())
         return Validation(metrics, _sheet(self.network, concatenate(faces)))
-
-    def _textures(self, heads: Tensor, generator: torch.Generator) -> LightTextures:
-        sample = self.source.draw(heads, self.settings.lights, generator)
-        seen = (sample.weight > 0).float()
-        head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
-        lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
-        return LightTextures(sample.target * seen[:, None], lights_head, heads)
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from facerf_cli.errors import InputError
 from facerf_cli.network.checkpoint import new_network
@@ -24,12 +24,41 @@ _SHEET_FACES = 5
 
 
 @dataclass(frozen=True)
-class TextureObjectiveSettings:
+class HeadsSettings:
     """Lights of a face and step, and held-out heads, each drawn `held_out_draws` times."""
 
-    lights: int = 4
+    lights: int = 8
     held_out_heads: int = 12
     held_out_draws: int = 4
+
+
+class HeadsObjective(Objective):
+    """A stage that trains one network on textures of heads."""
+
+    def __init__(self, name: str, network: nn.Module, source: SampleSource, settings: HeadsSettings) -> None:
+        super().__init__({name: network}, source.provenance)
+        self.source, self.settings = source, settings
+        self.heads, self.held_out = source.heads(settings.held_out_heads)
+
+    def draw_one(self, generator: torch.Generator) -> Any:
+        """Draw a face."""
+        head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+        return self.draw_head(head, generator)
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
+        """Draw a held-out face."""
+        return self.draw_head(torch.tensor([person]), generator)
+
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> Any:
+        """Draw a sample of a head [1]."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class TextureObjectiveSettings(HeadsSettings):
+    """Settings of the stage `reflectance`."""
+
+    lights: int = 4
     held_out_lights: int = 6
     light_features: float = 0.25  # weight of L_L; its gradient is then a third of the other term's
 
@@ -42,7 +71,7 @@ class TextureBatch(Batch):
     heads: Tensor
 
 
-class TextureObjective(Objective):
+class TextureObjective(HeadsObjective):
     """`root_loss` of OLAT textures at the network's exposure; `light` is a frozen S_f."""
 
     chooses_by = "si_mse"
@@ -57,16 +86,12 @@ class TextureObjective(Objective):
         network = network or new_network("reflectance", "default", {})
         if network.rig_lights:
             _set_mean_face(network, source)
-        super().__init__({"reflectance": network}, source.provenance)
-        self.source = source
+        super().__init__("reflectance", network, source, settings)
         self.light = light
-        self.settings = settings
-        self.heads, self.held_out = source.heads(settings.held_out_heads)
         self.source_colours = _measure_colours(source, self.heads)
 
-    def draw_one(self, generator: torch.Generator) -> TextureBatch:
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> TextureBatch:
         """Draw a face."""
-        head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
         return TextureBatch(self.source.draw(head, self.settings.lights, generator), head)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> Sample:

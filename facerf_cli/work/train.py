@@ -44,7 +44,6 @@ from facerf_cli.training.joint import JointObjective, JointSettings
 from facerf_cli.training.light_features import (
     AppearanceObjective,
     LightFeaturesObjective,
-    LightFeaturesSettings,
 )
 from facerf_cli.training.loop import (
     Objective,
@@ -59,7 +58,7 @@ from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettin
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import Preset, TrainSettings
-from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
+from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
 from facerf_cli.work.train_options import TrainOptions
 
 _WORKERS_ON_GPU = 4
@@ -159,9 +158,9 @@ class _TrainedStage:
 
     def light_features(self) -> Objective:
         """S_f on textures."""
-        sizes, side = self._sizes, self._texture_side
+        side = self._texture_side
         network = self._features("light_features", side)
-        settings = LightFeaturesSettings(held_out_heads=sizes.held_out_heads)
+        settings = HeadsSettings(held_out_heads=self._sizes.held_out_heads)
         return LightFeaturesObjective(self._samples(), network, settings)
 
     def appearance_features(self) -> Objective:

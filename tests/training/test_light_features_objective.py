@@ -8,11 +8,12 @@ from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.light_features import LightFeaturesObjective, LightFeaturesSettings
+from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.loop import seeded
+from facerf_cli.training.texture import HeadsSettings
 from tests.toy_faces import ToyFaces
 
-SETTINGS = LightFeaturesSettings(lights=4, held_out_heads=2, held_out_draws=3)
+SETTINGS = HeadsSettings(lights=4, held_out_heads=2, held_out_draws=3)
 
 
 def objective(bank: Bank) -> LightFeaturesObjective:
