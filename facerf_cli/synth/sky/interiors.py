@@ -191,8 +191,7 @@ def _outside(grid: Grid, random: Random) -> np.ndarray:
         0.6 + 0.3 * sample_ring(grid, ring_noise(random, 0.8, 2, 300))
     )
     land = np.array([0.12, 0.16, 0.07]) * random.uniform(0.5, 1.6)
-    share = np.clip((tops - elevation) / grid.pixel_rad + 0.5, 0, 1)
-    share = np.maximum(share, np.clip(0.5 - elevation / grid.pixel_rad, 0, 1))[..., None]
+    share = np.maximum(grid.share(tops - elevation), grid.share(-elevation))[..., None]
     sky = np.array([0.9, 1.0, 1.12]) * (1.1 - 0.25 * np.clip(elevation, 0, 1))[..., None]
     return np.asarray(share * land + (1 - share) * sky)
 
@@ -200,10 +199,8 @@ def _outside(grid: Grid, random: Random) -> np.ndarray:
 def _pane(grid: Grid, pane: Rectangle) -> np.ndarray:
     """Coverage [H, W] of the glass of a window: the pane without its glazing bars."""
     x, y, _ = pane.place(grid.directions)
-    bars = np.maximum(
-        np.clip((0.05 - np.abs(x)) * pane.wide / grid.pixel_rad + 0.5, 0, 1),
-        np.clip((0.03 - np.abs(y - 0.35)) * pane.high / grid.pixel_rad + 0.5, 0, 1),
-    )
+    upright, across = (0.05 - np.abs(x)) * pane.wide, (0.03 - np.abs(y - 0.35)) * pane.high
+    bars = np.maximum(grid.share(upright), grid.share(across))
     thin = min(1.0, 0.1 * pane.wide / grid.pixel_rad)  # bars thinner than a pixel darken it in part
     return np.asarray(pane.cover(grid.directions, grid.pixel_rad) * (1 - thin * bars))
 
@@ -292,9 +289,9 @@ def _with_backdrop(grid: Grid, random: Random, room: Room) -> Room:
     paper = random.choice([0.85, 0.8, 0.45, 0.2]) * np.array([1, 1, 1.0])
     middle, half = random.uniform(-np.pi, np.pi), random.uniform(0.35, 1.2)
     away = np.abs((grid.azimuths_rad - middle + np.pi) % (2 * np.pi) - np.pi)
-    across = np.clip((half - away) / grid.pixel_rad + 0.5, 0, 1)
-    below = np.clip((random.uniform(0.2, 0.6) - grid.elevations_rad) / grid.pixel_rad + 0.5, 0, 1)
-    spread = np.clip((grid.elevations_rad + 1.1) / grid.pixel_rad + 0.5, 0, 1)
+    across = grid.share(half - away)
+    below = grid.share(random.uniform(0.2, 0.6) - grid.elevations_rad)
+    spread = grid.share(grid.elevations_rad + 1.1)
     share = (across * below * spread)[..., None]
     albedo = room.albedo + share * (paper - room.albedo)
     return replace(room, albedo=albedo)

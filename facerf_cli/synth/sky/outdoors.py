@@ -210,7 +210,7 @@ def add_land(
     `fronts` [3] is additional irradiance on skylines, `pools` [H, W, 3] on the ground. All surfaces are
     Lambertian. Skylines are lit as walls that face the viewer, and cast no shadow on the ground.
     """
-    above = np.clip(grid.directions[..., 1:2] / grid.pixel_rad + 0.5, 0, 1)
+    above = grid.share(grid.directions[..., 1:2])
     cosine_sr = (np.clip(grid.directions[..., 1], 0, None) * grid.solid_angles_sr)[..., None]
     level = (sky * cosine_sr).sum((0, 1)) + beam * max(float(sun[1]), 0)
     scene = above * sky + (1 - above) * _ground(grid, land, (level + pools) / np.pi)
@@ -245,8 +245,8 @@ def _add_skyline(
     """Composite a skyline over the scene; `level` [W, 3] is the radiance of a white one."""
     tops = sample_ring(grid, line.tops_rad)
     elevation = grid.elevations_rad
-    share = np.clip((tops - elevation) / grid.pixel_rad + 0.5, 0, 1)
-    share = share * np.clip(elevation / grid.pixel_rad + 0.5, 0, 1) * (tops > 0)
+    share = grid.share(tops - elevation)
+    share = share * grid.share(elevation) * (tops > 0)
     rows = np.flatnonzero(share.any(1))
     if not len(rows):
         return scene
@@ -439,7 +439,7 @@ def _pool(grid: Grid, place_m: np.ndarray) -> np.ndarray:
     down = np.minimum(grid.directions[..., 1:2], -0.003)
     away = place_m - grid.directions * (EYE_M / -down)
     square = (away * away).sum(-1)
-    share = np.clip(0.5 - grid.directions[..., 1] / grid.pixel_rad, 0, 1)
+    share = grid.share(-grid.directions[..., 1])
     return np.asarray(share * np.pi * _LAMP_M**2 * (place_m[1] + EYE_M) / square**1.5)
 
 

@@ -40,6 +40,10 @@ class Grid:
         """Elevation of every row [H, 1]."""
         return np.arcsin(np.clip(self.directions[:, :1, 1], -1, 1))
 
+    def share(self, depth_rad: np.ndarray) -> np.ndarray:
+        """Share [...] of a pixel that lies inside an edge, from its centre's depth inside."""
+        return np.asarray(np.clip(depth_rad / self.pixel_rad + 0.5, 0, 1))
+
 
 @lru_cache(maxsize=2)
 def make_grid(width_px: int) -> Grid:
