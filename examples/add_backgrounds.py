@@ -15,8 +15,7 @@ from safetensors.torch import save_file
 
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.light_files import read_map_file
-from facerf_cli.synth.bank.portraits import views_of
-from facerf_cli.work.train import drawn_backgrounds
+from facerf_cli.synth.bank.portraits import BACKGROUND_HEAPS, BACKGROUND_MAPS, load_backgrounds, views_of
 
 VIEWS = 16  # of each map
 SEED = 15
@@ -24,6 +23,7 @@ SEED = 15
 bank = Path(sys.argv[1])
 generator = torch.Generator().manual_seed(SEED)
 seen = [views_of(read_map_file(name), VIEWS, generator) for name in sys.argv[2:]]
-drawn = drawn_backgrounds(bank / "drawn_backgrounds.safetensors", SEED, tiny=False)
+path = bank / "drawn_backgrounds.safetensors"
+drawn = load_backgrounds(path, BACKGROUND_MAPS, BACKGROUND_HEAPS, SEED)
 with atomic_path(bank / "backgrounds.safetensors") as path:
     save_file({"backgrounds": torch.cat([drawn, *seen])}, path)

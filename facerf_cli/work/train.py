@@ -28,7 +28,13 @@ from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.synth.bank.heads import HeadBakeSettings, add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.parsing import StoredPortraits
-from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, load_backgrounds
+from facerf_cli.synth.bank.portraits import (
+    BACKGROUND_HEAPS,
+    BACKGROUND_MAPS,
+    PortraitBankSettings,
+    add_portraits,
+    load_backgrounds,
+)
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.synth.bank.transport import (
     PortraitSource,
@@ -62,7 +68,6 @@ from facerf_cli.training.texture import HeadsSettings, TextureObjective, Texture
 from facerf_cli.work.train_options import TrainOptions
 
 _WORKERS_ON_GPU = 4
-_MAPS, _SHAPES = 60, 240  # backgrounds: surroundings, each from several sides, and piles of shapes
 _SMOOTH = 0.95  # of the moving average of the losses
 _PACE_S = 600.0  # of the last steps, whose pace gives the time left
 # Sizes of networks with the preset `tiny`, and the lights of the rig that it bakes heads under.
@@ -257,8 +262,8 @@ class _TrainedStage:
 
     def _backgrounds(self, folder: Path) -> Tensor:
         """Backgrounds of photos, drawn where the folder lacks their file."""
-        tiny = self.options.preset == "tiny"
-        return drawn_backgrounds(folder / "backgrounds.safetensors", self.options.settings.seed, tiny)
+        maps, shapes = (1, 4) if self.options.preset == "tiny" else (BACKGROUND_MAPS, BACKGROUND_HEAPS)
+        return load_backgrounds(folder / "backgrounds.safetensors", maps, shapes, self.options.settings.seed)
 
     @property
     def _sizes(self) -> _PresetSizes:
@@ -372,13 +377,6 @@ class _TrainedStage:
             "heads": f"{found} synthetic heads drawn from {drawn.credit}",
             "licence": f"MIT; the heads' shapes: {drawn.licence}",
         }
-
-
-def drawn_backgrounds(path: Path, seed: int, tiny: bool) -> Tensor:
-    """Backgrounds of photos, drawn where their file is missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    maps, shapes = (1, 4) if tiny else (_MAPS, _SHAPES)
-    return load_backgrounds(path, maps, shapes, seed)
 
 
 class TrainProgress:

@@ -33,7 +33,7 @@ from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
 
-BACKGROUND_PX = 320
+BACKGROUND_PX, BACKGROUND_MAPS, BACKGROUND_HEAPS = 320, 60, 240  # side, and numbers of a bank
 _MAP_PX = 768  # width of the maps
 _VIEWS = 4  # of each map
 _ANGLE = (0.35, 0.9)  # tangent of half the angle that a view shows
@@ -45,6 +45,7 @@ _WHITE = 4.0  # radiance, over the image's mean, that is stored as white
 def load_backgrounds(path: Path, maps: int, heaps: int, seed: int) -> Tensor:
     """Read the backgrounds [N, 3, S, S] of a bank, or draw and save them; uint8, the root of radiance."""
     if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
         drawn = torch.cat([*(views_of_map(index, seed) for index in range(maps)), heaps_of(heaps, seed)])
         with atomic_path(path) as temporary:
             save_file({"backgrounds": drawn}, temporary)
