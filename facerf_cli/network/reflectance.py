@@ -3,7 +3,7 @@
 A new form is one file with a class that fits `ReflectanceNetwork`, and one line in `REFLECTANCE_FORMS`.
 """
 
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from torch import Tensor
 
@@ -14,7 +14,7 @@ from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
 class ReflectanceNetwork(Protocol):
     """Predict OLAT textures from a texture, its normals and lights (paper, 'Network Architecture').
 
-    A form is also a `SavedNetwork`. Its encoder runs once a face, its decoder once a light. Lights and
+    A form is also a `torch.nn.Module`. Its encoder runs once a face, its decoder once a light. Lights and
     normals are in camera space; all textures are scene-linear.
     """
 
@@ -46,6 +46,16 @@ class ReflectanceNetwork(Protocol):
 
     def bytes_per_light(self, texels: int) -> int:
         """Memory of the decoder for one light of one face, for a texture of so many texels (T x T)."""
+
+    def as_metadata(self) -> dict[str, Any]:
+        """Form and settings, for a checkpoint."""
+
+    @classmethod
+    def from_metadata(cls, metadata: dict[str, Any]) -> Self:
+        """Make an untrained network; settings that are missing have their defaults.
+
+        Raises KeyError, TypeError or ValueError if the settings describe no network.
+        """
 
 
 REFLECTANCE_FORMS: dict[str, type[ReflectanceNetwork]] = {
