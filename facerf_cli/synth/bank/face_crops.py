@@ -396,7 +396,8 @@ def _occluder(side: int, generator: torch.Generator) -> Tensor:
     angle, distance = uniform(0, 2 * math.pi), uniform(0.3, 0.6)
     centre = 0.5 + distance * torch.stack([angle.cos(), angle.sin()])
     radii, tilt = uniform(0.06, 0.22, 2), uniform(0, math.pi)
-    a, b = turned(*(texel_centres_uv(side) - centre).unbind(-1), tilt)
+    x, y = (texel_centres_uv(side) - centre).unbind(-1)
+    a, b = turned(x, y, tilt)
     return ((1 - (a / radii[0]) ** 2 - (b / radii[1]) ** 2) * 8 + 0.5).clamp(0, 1)[None]
 
 

@@ -368,7 +368,8 @@ def _shape(centre: Tensor, side: int, generator: torch.Generator) -> Tensor:
     uniform = Uniform(generator)
     long, wide = torch.exp(uniform(-3.2, -0.9)), torch.exp(uniform(-3.5, -1.4))
     tilt = uniform(0, math.pi)
-    along, across = turned(*(texel_centres_uv(side) - centre).unbind(-1), tilt)
+    x, y = (texel_centres_uv(side) - centre).unbind(-1)
+    along, across = turned(x, y, tilt)
     a, b = along / long, across / wide
     round_one = torch.rand((), generator=generator) < 0.5
     distance = a.square() + b.square() if round_one else torch.maximum(a.abs(), b.abs()) ** 2
