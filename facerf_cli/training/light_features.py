@@ -46,10 +46,7 @@ class LightFeaturesObjective(HeadsObjective):
     chooses_by = "angle_deg"
 
     def __init__(
-        self,
-        source: SampleSource,
-        network: LightNetwork | None = None,
-        settings: HeadsSettings = _HEADS,
+        self, source: SampleSource, network: LightNetwork | None = None, settings: HeadsSettings = _HEADS
     ) -> None:
         super().__init__("light_features", network or LightNetwork(), source, settings)
         self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]

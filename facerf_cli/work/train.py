@@ -47,10 +47,7 @@ from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
 from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.joint import JointObjective, JointSettings
-from facerf_cli.training.light_features import (
-    AppearanceObjective,
-    LightFeaturesObjective,
-)
+from facerf_cli.training.light_features import AppearanceObjective, LightFeaturesObjective
 from facerf_cli.training.loop import (
     Objective,
     Start,

@@ -235,11 +235,7 @@ def test_terms_whose_networks_are_missing_are_left_out(dataset: Dataset) -> None
     objective = JointObjective(
         dataset, load_face_model(), PaperReflectanceNetwork(PAPER), SmallGeometry(), settings=SETTINGS
     )
-    assert set(objective(batch_of(objective, photos=False))) == {
-        "landmarks",
-        "regularisation",
-        "photometric",
-    }
+    assert set(objective(batch_of(objective, photos=False))) == {"landmarks", "regularisation", "photometric"}
     assert objective.provenance["feature_losses"] == [] and objective.provenance["photos"] == 0
     assert objective.provenance["licence"]
 

@@ -46,13 +46,7 @@ from facerf_cli.synth.bank.portraits import (
     seen_by,
 )
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
-from facerf_cli.synth.portraits import (
-    BakedPortrait,
-    albedo_of,
-    images_under,
-    materials_of,
-    portrait_tensors,
-)
+from facerf_cli.synth.portraits import BakedPortrait, albedo_of, images_under, materials_of, portrait_tensors
 from facerf_cli.synth.random_fields import Random, Uniform, generators
 from facerf_cli.synth.shading import Material
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model

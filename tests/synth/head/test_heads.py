@@ -181,10 +181,7 @@ def test_loop_subdivision_keeps_a_flat_sheet_flat_and_its_border_straight():
     points = np.stack([x, y, x + 2 * y], -1).reshape(-1, 3).astype(float)
     corner = (np.arange(4)[:, None] * 5 + np.arange(4)).reshape(-1)
     triangles = np.concatenate(
-        [
-            np.stack([corner, corner + 1, corner + 6], -1),
-            np.stack([corner, corner + 6, corner + 5], -1),
-        ]
+        [np.stack([corner, corner + 1, corner + 6], -1), np.stack([corner, corner + 6, corner + 5], -1)]
     )
     fine = loop_step(triangles, 25)[0] @ points
     assert np.allclose(fine[:, 2], fine[:, 0] + 2 * fine[:, 1])
