@@ -19,6 +19,7 @@ from facerf_cli.synth.path_tracer import PathSettings
 from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.shading import Material
 from facerf_cli.synth.views import StageCamera
+from tests.synth.shapes import square
 
 LIGHTS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
 CAMERA = StageCamera(Camera(400, 60, 40, 24.0, 25.0), torch.eye(3), torch.tensor([0.0, 0.0, -1.0]))
@@ -39,14 +40,7 @@ def test_without_mitsuba_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyP
 def _corner() -> HeadMesh:
     """A floor that faces +z and, 1 mm away, a wall on the right that faces -x; each 8 x 8 cm."""
     side, count = 0.08, 17
-    v, u = np.meshgrid(*2 * [np.linspace(0, 1, count)], indexing="ij")
-    cells = np.arange(count * count).reshape(count, count)[:-1, :-1].ravel()
-    square = np.concatenate(
-        [
-            np.stack([cells, cells + count, cells + count + 1], -1),
-            np.stack([cells, cells + count + 1, cells + 1], -1),
-        ]
-    )
+    u, v, faces = square(count)
     floor = np.stack([(u - 0.5) * side, (0.5 - v) * side, 0 * u], -1).reshape(-1, 3)
     wall = np.stack([0 * u + side / 2 + 0.001, (0.5 - v) * side, u * side], -1).reshape(-1, 3)
     normals = np.repeat(np.array([[0, 0, 1.0], [-1, 0, 0]]), count * count, 0)
@@ -54,7 +48,7 @@ def _corner() -> HeadMesh:
     return HeadMesh(
         np.concatenate([floor, wall]).astype(np.float32),
         normals.astype(np.float32),
-        np.concatenate([square, square + count * count]),
+        np.concatenate([faces, faces + count * count]),
         np.repeat(np.array([PARTS.index("skin"), PARTS.index("cloth")], np.uint8), count * count),
         np.concatenate([uv, uv]).astype(np.float32),
         np.zeros((2 * count * count, 3), np.float32),

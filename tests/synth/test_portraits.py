@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
 
 from facerf_cli.face.topology import GRID
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
-from facerf_cli.raster.camera import Camera, pose_to_rotation
+from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, joined, strandless
@@ -25,9 +24,9 @@ from facerf_cli.synth.portraits import (
     view_of,
 )
 from facerf_cli.synth.renderer import RenderSettings
-from facerf_cli.synth.shading import Material
 from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import StageCamera
+from tests.synth import shapes
 
 EAR = "left ear top"
 LIGHTS = rig_directions(24).numpy().astype(np.float64)
@@ -36,27 +35,14 @@ SIDE_PX = 48
 
 
 def appearance(albedo: tuple[float, float, float] = (0.5, 0.4, 0.3)) -> Appearance:
-    one = torch.ones(1, 8, 8)
-    material = Material(
-        torch.tensor(albedo).view(3, 1, 1) * one, 0.04 * one, 0.45 * one, torch.zeros(2, 8, 8)
-    )
-    return Appearance(dict.fromkeys(PARTS, material), torch.zeros(3), {})
+    return shapes.appearance(shapes.material(albedo, roughness=0.45))
 
 
 @pytest.fixture(scope="module")
 def subject() -> Subject:
     """A ball of skin beside a board of hair, turned a little."""
-    ball = trimesh.creation.icosphere(4, 0.05)
-    points = np.array(ball.vertices)
-    skin = strandless("skin", points, points, np.array(ball.faces), np.full((len(points), 2), 0.5))
-    grid = np.stack(np.meshgrid(np.linspace(-0.06, 0.06, 25), np.linspace(-0.06, 0.06, 25)), -1).reshape(
-        -1, 2
-    )
-    wall = np.column_stack([grid[:, 0], grid[:, 1], np.full(len(grid), -0.055)])
-    cells = np.arange(625).reshape(25, 25)[:-1, :-1].ravel()
-    faces = np.concatenate(
-        [np.stack([cells, cells + 1, cells + 26], -1), np.stack([cells, cells + 26, cells + 25], -1)]
-    )
+    skin, (u, v, faces) = shapes.ball(), shapes.square(25)
+    wall = np.stack([0.12 * u - 0.06, 0.06 - 0.12 * v, 0 * u - 0.055], -1).reshape(-1, 3)
     hair = strandless("hair", wall, np.broadcast_to([0, 0, 1.0], wall.shape), faces, np.full((625, 2), 0.5))
     hair = replace(hair, tangents=np.broadcast_to(np.float32([0, -1, 0]), wall.shape).copy())
     turn = pose_to_rotation(10, 5, 0)
@@ -73,8 +59,7 @@ def subject() -> Subject:
 
 @pytest.fixture(scope="module")
 def camera() -> StageCamera:
-    lens = Camera(SIDE_PX * 10 / 0.14, SIDE_PX, SIDE_PX, SIDE_PX / 2, SIDE_PX / 2)
-    return StageCamera(lens, pose_to_rotation(-15, 0, 0), torch.tensor([0.0, 0, -10.0]))
+    return shapes.camera(SIDE_PX, 0.14, yaw_deg=-15)
 
 
 @pytest.fixture(scope="module")

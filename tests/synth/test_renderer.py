@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import trimesh
 from scipy.stats import norm
 
 from facerf_cli.light.mesh_transport import MeshTransport, bake_mesh
@@ -14,7 +13,6 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera
 from facerf_cli.synth import renderer
-from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, joined, strandless
 from facerf_cli.synth.renderer import (
     Lenses,
@@ -25,63 +23,23 @@ from facerf_cli.synth.renderer import (
     reflections,
     scattered_irradiance,
 )
-from facerf_cli.synth.shading import LOBES, Material
+from facerf_cli.synth.shading import LOBES
 from facerf_cli.synth.views import StageCamera
+from tests.synth.shapes import appearance, ball, camera, material, square
 
 DIFFUSE = RenderSettings(bounces=0, scattering=False, gloss=False, relief=False)
 POINT_LIGHT = BakeSettings(light_radius_deg=0, bounce_samples=0)
 AHEAD = np.array([[0.0, 0, 1]], np.float32)
 
 
-def material(albedo: float = 0.5, specular: float = 0.04, relief: tuple = (0.0, 0.0)) -> Material:
-    def full(channels: int, value: float) -> torch.Tensor:
-        return torch.full((channels, 8, 8), value)
-
-    slopes = torch.tensor(relief).view(2, 1, 1).expand(2, 8, 8)
-    return Material(full(3, albedo), full(1, specular), full(1, 0.4), slopes)
-
-
-def appearance(one: Material, scattering_mm: tuple = (0.0, 0.0, 0.0)) -> Appearance:
-    return Appearance(dict.fromkeys(PARTS, one), torch.tensor(scattering_mm), {})
-
-
 def board(part: str = "skin", side_m: float = 0.1, count: int = 21, z: float = 0.0) -> HeadMesh:
     """A square facing +z with u to the right and v down, tangents (of hair) down."""
-    v, u = np.meshgrid(*2 * [np.linspace(0, 1, count)], indexing="ij")
+    u, v, triangles = square(count)
     vertices = np.stack([(u - 0.5) * side_m, (0.5 - v) * side_m, 0 * u + z], -1).reshape(-1, 3)
-    cells = np.arange(count * count).reshape(count, count)[:-1, :-1].ravel()
-    first = np.stack([cells, cells + count, cells + count + 1], -1)
-    second = np.stack([cells, cells + count + 1, cells + 1], -1)
-    ahead, down = np.zeros((2, *vertices.shape), np.float32)
-    ahead[:, 2], down[:, 1] = 1, -1 if part == "hair" else 0
-    return HeadMesh(
-        vertices.astype(np.float32),
-        ahead,
-        np.concatenate([first, second]),
-        np.full(len(vertices), PARTS.index(part), np.uint8),
-        np.stack([u, v], -1).reshape(-1, 2).astype(np.float32),
-        down,
-        np.zeros(len(vertices), np.uint8),
-    )
-
-
-def ball(radius_m: float = 0.05) -> HeadMesh:
-    sphere = trimesh.creation.icosphere(4, radius_m)
-    normals = np.array(sphere.vertices / radius_m, np.float32)
-    return HeadMesh(
-        np.array(sphere.vertices, np.float32),
-        normals,
-        np.array(sphere.faces, np.int64),
-        np.zeros(len(normals), np.uint8),
-        np.full((len(normals), 2), 0.5, np.float32),
-        np.zeros_like(normals),
-        np.zeros(len(normals), np.uint8),
-    )
-
-
-def camera(side_px: int = 64, field_m: float = 0.12, distance_m: float = 10.0) -> StageCamera:
-    lens = Camera(side_px * distance_m / field_m, side_px, side_px, side_px / 2, side_px / 2)
-    return StageCamera(lens, torch.eye(3), torch.tensor([0.0, 0, -distance_m]))
+    ahead, uv = np.broadcast_to([0, 0, 1.0], vertices.shape), np.stack([u, v], -1).reshape(-1, 2)
+    mesh = strandless(part, vertices, ahead, triangles, uv)
+    mesh.tangents[:, 1] = -1 if part == "hair" else 0
+    return mesh
 
 
 def bake(head: HeadMesh, lights: np.ndarray, settings: BakeSettings = POINT_LIGHT) -> MeshTransport:

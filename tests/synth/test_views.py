@@ -4,42 +4,27 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-import trimesh
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head.heads import build_head
-from facerf_cli.synth.head.mesh import PARTS, HeadMesh, strandless
-from facerf_cli.synth.shading import Material
-from facerf_cli.synth.views import StageCamera, more_landmarks, stage_cameras, truth_of
+from facerf_cli.synth.head.mesh import HeadMesh
+from facerf_cli.synth.views import more_landmarks, stage_cameras, truth_of
+from tests.synth.shapes import appearance, ball, camera, material
 
 SIDE_PX, RADIUS_M, FAR_M = 64, 0.05, 10.0
 
 
-def camera(yaw_deg: float = 0.0) -> StageCamera:
-    lens = Camera(SIDE_PX * FAR_M / 0.12, SIDE_PX, SIDE_PX, SIDE_PX / 2, SIDE_PX / 2)
-    return StageCamera(lens, pose_to_rotation(yaw_deg, 0, 0), torch.tensor([0.0, 0, -FAR_M]))
-
-
 def halves() -> HeadMesh:
     """A ball whose right half is hair to the classes."""
-    ball = trimesh.creation.icosphere(5, RADIUS_M)
-    points = np.array(ball.vertices)
-    mesh = strandless("skin", points, points, np.array(ball.faces), np.full((len(points), 2), 0.5))
-    return replace(mesh, label=np.where(points[:, 0] > 0, class_index("hair"), class_index("skin")))
+    mesh = ball(RADIUS_M, 5)
+    return replace(mesh, label=np.where(mesh.vertices[:, 0] > 0, class_index("hair"), class_index("skin")))
 
 
 def painted() -> Appearance:
-    one = torch.ones(1, 8, 8)
-    colour = torch.tensor([0.6, 0.4, 0.2]).view(3, 1, 1) * one
-    return Appearance(
-        dict.fromkeys(PARTS, Material(colour, 0.03 * one, 0.4 * one, torch.zeros(2, 8, 8))),
-        torch.zeros(3),
-        {},
-    )
+    return appearance(material((0.6, 0.4, 0.2), 0.03))
 
 
 def test_layers_of_a_ball_are_those_of_geometry() -> None:
@@ -66,7 +51,7 @@ def test_layers_of_a_ball_are_those_of_geometry() -> None:
 
 
 def test_normals_and_positions_are_in_camera_space() -> None:
-    turned = truth_of(halves(), painted(), camera(90.0))
+    turned = truth_of(halves(), painted(), camera(yaw_deg=90.0))
     middle = SIDE_PX // 2
     # The head's left half in the image, skin, turns to the camera when the head turns to the right.
     assert turned.classes[middle, middle, class_index("skin")] > 0.99
