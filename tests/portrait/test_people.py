@@ -34,8 +34,9 @@ def test_a_view_is_laid_over_where_it_was_cut() -> None:
 
 
 def test_a_border_beyond_the_photo_weighs_fully() -> None:
-    _, weight = Square(10, 60, 100).laid_over(torch.ones(1, 256, 256), (120, 160), (120, 160), 0.12)
-    assert weight[60, 0] == 1 and weight[60, 59] < 0.1
+    """The photo's border lies in the square's rim, where the weight would be a half."""
+    _, weight = Square(45, 60, 100).laid_over(torch.ones(1, 256, 256), (120, 160), (120, 160), 0.12)
+    assert weight[60, 0] == 1 and weight[60, 94] < 0.1
 
 
 def test_two_people_are_divided_where_they_touch() -> None:
