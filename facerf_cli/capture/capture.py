@@ -82,7 +82,7 @@ class Capture:
 
     def frame_path(self, subject: str, camera: str, light: str) -> Path:
         """Path of the frame of a subject seen by a camera under one light."""
-        return self.folder / fill_pattern(self.pattern, subject=subject, camera=camera, light=light)
+        return self.folder / self.pattern.format(subject=subject, camera=camera, light=light)
 
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
         """Read a frame [H, W, 3] as under a light of rgb 1, linear Rec.709, float32.
@@ -111,7 +111,7 @@ class Capture:
 
         None where there is none, or none of the camera's size.
         """
-        path = self.folder / fill_pattern(self.ambient_pattern, subject=subject, camera=camera)
+        path = self.folder / self.ambient_pattern.format(subject=subject, camera=camera)
         pixels = _read_ambient(path, self.colour_space) if self.ambient_pattern and path.is_file() else None
         posed = self.cameras[camera]
         return pixels if pixels is not None and pixels.shape == (posed.height_px, posed.width_px, 3) else None
@@ -165,13 +165,6 @@ def require_pattern(
     return pattern
 
 
-def fill_pattern(pattern: str, **names: str) -> str:
-    """Replace the fields of a pattern by names."""
-    for key, name in names.items():
-        pattern = pattern.replace(f"{{{key}}}", name)
-    return pattern
-
-
 def compile_pattern(pattern: str) -> re.Pattern[str]:
     """Make a regular expression with a group per field; a repeated field must match the same text."""
     expression = re.escape(pattern)
@@ -186,13 +179,11 @@ def find_subjects(folder: Path, pattern: str, cameras: list[str], lights: list[s
     parts = pattern.split("/")
     depth = next(index for index, part in enumerate(parts) if "{subject}" in part)
     expression = compile_pattern("/".join(parts[: depth + 1]))
-    above = fill_pattern("/".join([*parts[:depth], "*"]), camera="*", light="*")
+    above = "/".join([*parts[:depth], "*"]).format(camera="*", light="*")
     relatives = (path.relative_to(folder).as_posix() for path in folder.glob(above) if path.name[0] != ".")
     matches = (expression.fullmatch(relative) for relative in relatives)
     for name in sorted({match["subject"] for match in matches if match}):
-        paths = (
-            folder / fill_pattern(pattern, subject=name, camera=c, light=i) for c in cameras for i in lights
-        )
+        paths = (folder / pattern.format(subject=name, camera=c, light=i) for c in cameras for i in lights)
         if any(path.exists() for path in paths):
             if not is_name(name):
                 raise InputError(f"{folder}: the subject {name!r} is no name of letters, digits, - and _")

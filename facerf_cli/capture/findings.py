@@ -70,15 +70,9 @@ class Finding:
     @staticmethod
     def of_row(row: Mapping[str, Any]) -> "Finding":
         """Read a row of findings.jsonl."""
-        return Finding(
-            row["severity"],
-            row["check"],
-            row["subject"],
-            row["words"],
-            row["camera"] or "",
-            row["light"] or "",
-            row["figures"],
-        )
+        names = ("severity", "check", "subject", "words", "camera", "light")
+        known: dict[str, Any] = {name: row[name] or "" for name in names}
+        return Finding(**known, figures=row["figures"])
 
 
 def stopping(findings: Iterable[Finding], strict: bool = False) -> list[Finding]:

@@ -273,11 +273,8 @@ def _crops(
             sheet_images[place] = image
         clipped += int((image > HALF_MAX).any(-1).sum())
         yield torch.from_numpy(image).permute(2, 0, 1)[None]
-    _warn_of_half_float_limits(f"{person.name}/{camera}", clipped, float(header.source.max()))
-
-
-def _warn_of_half_float_limits(name: str, clipped: int, lit: float) -> None:
-    """Warn where values leave the range of half floats; under a constant map of 1 a face is below 1."""
+    # Under a constant map of 1 a face is below 1; what leaves the range of half floats is warned of.
+    name, lit = f"{person.name}/{camera}", float(header.source.max())
     if clipped:
         advice = "the lights' intensities in stage.json are too small"
         log.warning("%s: %d pixels are above %g and were clipped; %s", name, clipped, HALF_MAX, advice)

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.capture.capture import fill_pattern
 from facerf_cli.capture.draft import (
     as_text,
     draft_stage,
@@ -262,7 +261,7 @@ def test_a_given_pattern_names_subject_camera_and_light(
     assert sorted(frames.paths.values()) == sorted(paths) and not frames.strays
     assert tuple(frames.ids(field)[0] for field in ("subject", "camera", "light")) == first
     for (subject, camera, light), path in frames.paths.items():
-        assert fill_pattern(pattern, subject=subject, camera=camera, light=light) == path
+        assert pattern.format(subject=subject, camera=camera, light=light) == path
 
 
 @pytest.mark.parametrize(
