@@ -133,8 +133,7 @@ def _global_options(
         ),
     ] = None,
     null: Annotated[
-        bool,
-        typer.Option("--null", "-0", help="Names on standard input end in NUL, as of find -print0."),
+        bool, typer.Option("--null", "-0", help="Names on standard input end in NUL, as of find -print0.")
     ] = Settings.null_separated,
     config: Annotated[
         Path | None,

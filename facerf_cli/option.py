@@ -1,10 +1,13 @@
 """Options of the command line as fields of frozen dataclasses, in the files of the functions that take them.
 
-A field made by `option` holds its help and limits; `cli/options.py` turns the fields of the groups that a
-verb names into the verb's options. Nothing here knows the library of the command line.
+A field made by `option` holds its limits; the docstring's section `Attributes` has its help. `cli/options.py`
+turns the fields of the groups that a verb names into the verb's options. Nothing here knows the library of
+the command line.
 """
 
 import dataclasses
+import inspect
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -48,12 +51,14 @@ class Without(Only):
     """The options of a group that a verb has not."""
 
 
-def option(default: Any, help: str, metavar: str | None = None, in_recipe: bool = True, **more: Any) -> Any:
+def option(
+    default: Any, help: str = "", metavar: str | None = None, in_recipe: bool = True, **more: Any
+) -> Any:
     """Make a dataclass field that is an option.
 
     Args:
         default: The value without the option; `...` where the option must be given.
-        help: A sentence: verb, object, unit.
+        help: A sentence: verb, object, unit; by default that of `Attributes` in the dataclass's docstring.
         metavar: The placeholder of the value in the help.
         in_recipe: False for a field that shapes no output.
         more: Further fields of `Option`.
@@ -64,6 +69,16 @@ def option(default: Any, help: str, metavar: str | None = None, in_recipe: bool 
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def attributes_of(kind: type) -> dict[str, str]:
+    """The sections `Attributes` in the docstrings of a class and its bases: a line of words by name."""
+    found = {}
+    for one in reversed(kind.__mro__):
+        section = inspect.cleandoc(one.__doc__ or "").partition("\nAttributes:\n")[2]
+        for name, text in re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", section, re.MULTILINE):
+            found[name] = " ".join(text.split())
+    return found
+
+
 def flag(name: str) -> str:
-    """An option as it is typed on the command line."""
-    return f"--{name.replace('_', '-')}"
+    """An option as it is typed on the command line: the name of its field, without its unit."""
+    return f"--{name.removesuffix('_px').replace('_', '-')}"

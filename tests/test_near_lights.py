@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.image.strips import whole
+from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.relighting.composition import Composition, Target

@@ -1,5 +1,6 @@
 """`facerf convert-light`: a light from one form and other programs' axes to another."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import typer
@@ -8,7 +9,26 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions, Outcome
 from facerf_cli.cli.options import refuse_given, settings_of
 from facerf_cli.option import Without
-from facerf_cli.work.verbs import MADE_FOR, ConvertLight
+from facerf_cli.work.verbs import ConvertLight, Form
+
+_MAPS: tuple[Form, ...] = ("latlong", "blender", "mitsuba")
+_MADE_FOR: dict[str, tuple[Form, ...]] = {  # the forms that an option is for
+    "width_px": _MAPS,
+    "order": ("json", "sh"),
+    "lights": ("json",),
+    "signed": ("json", *_MAPS),
+}
+
+
+@dataclass(frozen=True)
+class ConvertLights(ConvertLight):
+    """`facerf convert-light`."""
+
+    def __call__(self, item: Item) -> Outcome:
+        """Write the light in every form."""
+        from facerf_cli.work.convert_lights import write_forms
+
+        return Outcome(self.outputs_of(item), {"light": write_forms(item, self)})
 
 
 def convert_light(
@@ -22,7 +42,7 @@ def convert_light(
             show_default=False,
         ),
     ],
-    work: ConvertLight,
+    work: ConvertLights,
     batch: Annotated[BatchOptions, Without("name")],
 ) -> None:
     """Convert lights between maps, weights of a rig, spherical harmonics, and the axes of other programs.
@@ -34,13 +54,7 @@ def convert_light(
     Spherical harmonics lose what is finer than their order; the weights of a rig are integrated from a map as
     `relight` does.
     """
-    for option, forms in MADE_FOR.items():
+    for option, forms in _MADE_FOR.items():
         if not set(forms) & set(work.forms):
             refuse_given(context, (option,), f"is for --to {', '.join(forms)}; leave it out here")
-    raise typer.Exit(work.run(inputs, batch, settings_of(context), _process))
-
-
-def _process(options: ConvertLight, item: Item) -> Outcome:
-    from facerf_cli.work.convert_lights import write_forms
-
-    return Outcome(options.outputs_of(item), {"light": write_forms(item, options)})
+    raise typer.Exit(work.run(inputs, batch, settings_of(context)))

@@ -1,18 +1,67 @@
 """`facerf estimate-light`: the light of a photo as a map, as numbers and as an image."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import typer
 
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import FramesArgument
-from facerf_cli.work.shots import ShotOptions
-from facerf_cli.work.verbs import EstimateLight
+from facerf_cli.errors import UsageError
+from facerf_cli.option import LIGHT, option
+from facerf_cli.work.photo_options import LightOptions
+from facerf_cli.work.shots import ShotOptions, collect_frames, whole_shots
+from facerf_cli.work.verbs import LARGEST_MAP_PX, MOST_ORDER, PhotoWork, Written, refuse_odd
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateLight(PhotoWork, LightOptions):
+    """`facerf estimate-light`.
+
+    Attributes:
+        width_px: Write a map of this width; the height is half of it.
+        sh_order: Write spherical harmonics of this order in the JSON.
+    """
+
+    width_px: int = option(512, metavar="PX", least=16, most=LARGEST_MAP_PX, panel=LIGHT)
+    sh_order: int = option(2, least=0, most=MOST_ORDER, panel=LIGHT)
+    verb = "estimate-light"
+    endings = ("_light.exr", "_light.json", "_light.png")
+    networks = LightOptions.networks
+
+    def run(self, inputs: Sequence[str], batch: BatchOptions, wanted: ShotOptions | None = None) -> int:
+        """Estimate the light of photos, and one for each shot; return the exit code."""
+        refuse_odd("--width", self.width_px)
+        self.photo.check()
+        self.check()
+        items, shots = collect_frames(inputs, wanted or ShotOptions(), batch, self.photo)
+        if shots and (self.refine != "none" or self.reflectance != "field" or self.matte is not None):
+            raise UsageError(
+                "a film or --sequence: its light is that of the field; leave out --refine, "
+                "--reflectance and --matte"
+            )
+        return replace(self, shots=shots).run_on(whole_shots(items, shots), batch)
+
+    def prepare(self) -> None:
+        """Load the network whose features are compared."""
+        from facerf_cli.work.light_of_photo import feature_network
+
+        if self.refine == "features":
+            feature_network(self)
+
+    def write(self, item: Item) -> Written:
+        """Estimate the light of every chosen face, or that of a shot."""
+        from facerf_cli.work.light_of_photo import write_lights, write_shot_light
+
+        for shot in self.shots:
+            if item.output_base == shot.base:
+                return write_shot_light(shot, item, self, self.width_px, self.sh_order)
+        return write_lights(item, self, self.width_px, self.sh_order)
 
 
 def estimate_light(
-    inputs: FramesArgument,
-    work: EstimateLight,
-    shots: ShotOptions,
-    batch: BatchOptions,
+    inputs: FramesArgument, work: EstimateLight, shots: ShotOptions, batch: BatchOptions
 ) -> None:
     """Estimate the light of photos from the shading of their faces.
 
@@ -27,4 +76,4 @@ def estimate_light(
     A face shows much of the light in front of it and little of the light behind it. Brightness and colour of
     the light cannot be separated from those of the skin; they depend on the albedo that the network assumes.
     """
-    raise typer.Exit(work.run(inputs, shots, batch))
+    raise typer.Exit(work.run(inputs, batch, shots))

@@ -25,8 +25,7 @@ def _group() -> None:
 @app.command("import")
 def import_model(
     kind: Annotated[
-        Kind,
-        typer.Argument(metavar="KIND", help="ict-facekit, flame, basel-2009, basel-2017 or basel-2019."),
+        Kind, typer.Argument(metavar="KIND", help="ict-facekit, flame, basel-2009, basel-2017 or basel-2019.")
     ],
     source: Annotated[
         Path,

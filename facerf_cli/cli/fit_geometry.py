@@ -1,17 +1,33 @@
 """`facerf fit-geometry`: the face model fitted to photos, as files that other programs open."""
 
+from dataclasses import dataclass
+
 import typer
 
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import InputsArgument
-from facerf_cli.work.verbs import FitGeometry
+from facerf_cli.work.photo_options import FITTING
+from facerf_cli.work.verbs import PhotoWork, Written
+
+_TEXTURES = ("_texture.exr", "_texture.png", "_normals.exr", "_normals.png")
+_MESHES = ("_mesh.glb", "_mesh.mtl", "_mesh.obj")
 
 
-def fit_geometry(
-    inputs: InputsArgument,
-    work: FitGeometry,
-    batch: BatchOptions,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class FitGeometry(PhotoWork):
+    """`facerf fit-geometry`."""
+
+    verb, endings, networks = "fit-geometry", (*_TEXTURES, *_MESHES, "_overlay.jpg", "_fit.npz"), FITTING
+
+    def write(self, item: Item) -> Written:
+        """Fit every chosen face."""
+        from facerf_cli.work.segment_and_fit import write_fits
+
+        return write_fits(item, self.photo)
+
+
+def fit_geometry(inputs: InputsArgument, work: FitGeometry, batch: BatchOptions) -> None:
     """Fit the face model to photos: mesh, texture, normals, and an overlay of the fit.
 
     For each photo: _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, the head upright),

@@ -145,14 +145,10 @@ def _by_verb(path: Path, above: str, tables: Mapping[str, Any], group: Any) -> d
         if command is None:
             known = ", ".join(sorted([*group.commands, *(() if above else (GLOBAL,))]))
             raise UsageError(f"--config {path}: [{above}{name}] is no verb; give one of {known}")
-        if not isinstance(table, Mapping):
-            raise UsageError(f"--config {path}: {above}{name} is no table; write [{above}{name}]")
-        is_group = hasattr(command, "commands")
-        found[name] = (
-            _by_verb(path, f"{name}.", table, command)
-            if is_group
-            else _checked(path, f"{above}{name}", table, command)
-        )
+        if hasattr(command, "commands") and isinstance(table, Mapping):
+            found[name] = _by_verb(path, f"{above}{name}.", table, command)
+        else:
+            found[name] = _checked(path, f"{above}{name}", table, command)
     return found
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,7 +12,7 @@ import typer
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
-from facerf_cli.option import PANELS, Only, Option, Without, flag
+from facerf_cli.option import PANELS, Only, Option, Without, attributes_of, flag
 
 EPILOG = (
     "Global options (--checkpoint, --device, --memory, --seed, -v, -q; see 'facerf --help') may stand before "
@@ -117,11 +118,12 @@ class _Group:
 
     def parameters(self) -> Iterator[inspect.Parameter]:
         """The options as typer reads them."""
+        helps = defaultdict(str, attributes_of(self.kind))
         for name, part in self.options.items():
             if isinstance(part, _Group):
                 yield from part.parameters()
             else:
-                yield _parameter(name, *part)
+                yield _parameter(name, *part, helps[name])
 
     def taken(self, values: dict[str, Any], settings: Settings) -> Any:
         """The dataclass, whose values are taken out of those of the command line."""
@@ -158,13 +160,14 @@ def _group_of(hint: Any) -> _Group | None:
     return _Group(kind, parts) if parts else None
 
 
-def _parameter(name: str, field: "dataclasses.Field[Any]", kind: Any) -> inspect.Parameter:
+def _parameter(name: str, field: "dataclasses.Field[Any]", kind: Any, help: str) -> inspect.Parameter:
     """A field of a group as typer reads it."""
     about: Option = field.metadata["option"]
+    assert about.help or help, f"{name} has no help"
     declared = typer.Option(
         *(about.flags or (flag(name),)),
         metavar=about.metavar,
-        help=about.help,
+        help=about.help or help,
         show_default=about.shown_default,
         rich_help_panel=about.panel,
         min=about.least,

@@ -1,18 +1,27 @@
 """`facerf predict-olat`: a photo's face under every light of a rig, as an OLAT stack."""
 
+from dataclasses import dataclass
+
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, Outcome
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import InputsArgument
-from facerf_cli.work.verbs import PredictOlat
+from facerf_cli.work.verbs import PredictOlat, Written
 
 
-def predict_olat(
-    inputs: InputsArgument,
-    work: PredictOlat,
-    batch: BatchOptions,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class PredictStacks(PredictOlat):
+    """`facerf predict-olat`."""
+
+    def write(self, item: Item) -> Written:
+        """Write the stack of every chosen face."""
+        from facerf_cli.work.stacks import write_stacks
+
+        return write_stacks(item, self)
+
+
+def predict_olat(inputs: InputsArgument, work: PredictStacks, batch: BatchOptions) -> None:
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
     Each photo gives an OLAT stack (an OpenEXR file with a part for each light, the person over black;
@@ -20,10 +29,4 @@ def predict_olat(
     sheet. Lights are fixed to the camera and of
     unit intensity: AZ > 0 lights the image's right side, EL > 0 comes from above.
     """
-    raise typer.Exit(work.run(inputs, batch, _process))
-
-
-def _process(options: PredictOlat, item: Item) -> Outcome:
-    from facerf_cli.work.stacks import write_stacks
-
-    return Outcome(*write_stacks(item, options))
+    raise typer.Exit(work.run(inputs, batch))

@@ -1,6 +1,6 @@
 """`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +14,17 @@ from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.output_options import NEEDS, STDOUT
 from facerf_cli.work.relight_options import Relight
 from facerf_cli.work.shots import ShotOptions, film_output
+
+
+@dataclass(frozen=True)
+class RelightItem(Relight):
+    """Relights one item under every light setup."""
+
+    def __call__(self, item: Item) -> Outcome:
+        """Relight an item."""
+        from facerf_cli.work.relight import relight_item
+
+        return relight_item(item, self.for_stale(item))
 
 
 def relight(
@@ -30,7 +41,7 @@ def relight(
         ),
     ],
     sources: LightSources,
-    work: Relight,
+    work: RelightItem,
     shots: ShotOptions,
     batch: Annotated[BatchOptions, Without("output", "name")],
 ) -> None:
@@ -56,16 +67,6 @@ def relight(
     for name, needed in NEEDS.items():
         if not set(needed) & set(formats):
             refuse_given(context, (name,), f"is for {', '.join(needed)}; add that to --format")
-    asked = work.composite == "photo" and not is_default(context, "composite")
-    work = replace(work, output=replace(work.output, formats=formats), asked_for_photo=asked)
+    work = replace(work, output=replace(work.output, formats=formats))
     batch = replace(batch, output=output, name=work.name)
-    raise typer.Exit(work.run(inputs, sources, shots, batch, film, _process))
-
-
-def _process(options: Relight, item: Item) -> Outcome:
-    from facerf_cli.work.relight import relight_item
-
-    written, facts = relight_item(item, options.for_stale(item))
-    outputs = [path.with_suffix(suffix) for path in written for suffix in options.output.suffixes]
-    exposures_ev = {path.stem: exposure_ev for path, exposure_ev in written.items()}
-    return Outcome(outputs, facts | {"exposure_ev": exposures_ev})
+    raise typer.Exit(work.run(inputs, sources, shots, batch, film))

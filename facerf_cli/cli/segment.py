@@ -1,19 +1,38 @@
 """`facerf segment`: who and what a photo shows: matte and classes of a person, as files."""
 
+from dataclasses import dataclass
+from typing import Annotated
+
 import typer
 
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import FramesArgument
+from facerf_cli.option import Only
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.shots import ShotOptions
-from facerf_cli.work.verbs import Segment
+from facerf_cli.work.verbs import PhotoWork, Written
 
 
-def segment(
-    inputs: FramesArgument,
-    work: Segment,
-    shots: ShotOptions,
-    batch: BatchOptions,
-) -> None:
+@dataclass(frozen=True, kw_only=True)
+class Segment(PhotoWork):
+    """`facerf segment`."""
+
+    photo: Annotated[
+        PhotoOptions, Only("colourspace", "face", "landmarks", "landmarks_from", "person", "matte_from")
+    ]
+    verb = "segment"
+    endings = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
+    networks = frozenset({"parsing"})
+
+    def write(self, item: Item) -> Written:
+        """Segment the person of every chosen face."""
+        from facerf_cli.work.segment_and_fit import write_segments
+
+        return write_segments(item, self.photo, self.shots)
+
+
+def segment(inputs: FramesArgument, work: Segment, shots: ShotOptions, batch: BatchOptions) -> None:
     """Cut people out of photos: matte, hair, skin, garment and other classes, and landmarks.
 
     For each photo: _segment.exr (RGBA: the person without the background's colour, premultiplied; layers
@@ -23,4 +42,4 @@ def segment(
 
     Each frame of a film, or with --sequence of numbered images, is steadied by the frames around it.
     """
-    raise typer.Exit(work.run(inputs, shots, batch))
+    raise typer.Exit(work.run(inputs, batch, shots))

@@ -20,8 +20,8 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.people import Method, Reading
 from facerf_cli.evaluation.summary import Layout, published
 from facerf_cli.face.head import Head
+from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio import StudioLight
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.pipeline import head_of
 from facerf_cli.portrait.find import FaceBox

@@ -13,7 +13,6 @@ from pathlib import Path
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_rig
-from facerf_cli.light.studio import StudioLight
 
 MOST_LIGHTS = 4096
 MOST_FRAMES = 9999
@@ -28,6 +27,32 @@ KEYS = ("at", "from", "az", "el", "rgb", "kelvin", "stops", "size", "size_deg", 
 # Limits of values.
 _KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
 _SIZE_M, _SIZE_DEG, _SPOT_DEG, _RGB = (0.0, 10.0), (0.0, 120.0), (1.0, 170.0), (0.0, 1e6)
+
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class StudioLight:
+    """A light from a direction (azimuth, elevation), or near, at a place in metres from the face's centre.
+
+    A light that has neither comes from all around, as of a room or a dull sky: every surface that nothing
+    shades receives the same.
+
+    Camera axes. At the face's centre its irradiance is that of a far light of its colour: `rgb` times the
+    colour of a blackbody of `kelvin`, times 2 to `stops`. `size_m` is the side of the square of a near light,
+    which faces the face; `size_deg` that of a far one, as seen from there. `spot_deg` is the full angle of a
+    near light's cone, which is aimed at the face.
+    """
+
+    azel_deg: tuple[float, float] | None = None
+    at_m: Triple | None = None
+    rgb: Triple = (1.0, 1.0, 1.0)
+    kelvin: float | None = None
+    stops: float = 0.0
+    size_m: float = 0.0
+    size_deg: float = 0.0
+    spot_deg: float | None = None
 
 
 def numbers(text: str, forms: tuple[str, ...], option: str) -> list[float]:

@@ -184,11 +184,15 @@ def look_up(latlong: Tensor, directions: Tensor) -> Tensor:
     return F.grid_sample(wrapped, grid, padding_mode="border", align_corners=False)[0, :, 0].T
 
 
-def mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
-    """Rotate a map and average it down to `most_rows` at most [h, 2 h, 3], against aliasing."""
-    height = min(most_rows, len(envmap))
+def resampled(envmap: Tensor, height: int, rotate_deg: float = 0.0) -> Tensor:
+    """Rotate a map and average it over the texels of another size [height, 2 height, 3] float32."""
     integrals = texel_integrals(envmap, height, 2 * height, rotate_deg)
     return (integrals / latlong_solid_angles(height, 2 * height, torch.float64)[..., None]).float()
+
+
+def mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
+    """Rotate a map and average it down to `most_rows` at most [h, 2 h, 3], against aliasing."""
+    return resampled(envmap, min(most_rows, len(envmap)), rotate_deg)
 
 
 def _irradiance(envmap: Tensor, rotate_deg: float) -> Tensor:

@@ -319,7 +319,7 @@ def refine_light(
 
     Projection keeps weights non-negative. Clipped texels have no error where they are bright enough.
     """
-    loss_of = _FeatureLoss(evidence, features)
+    loss_of = _feature_loss(evidence, features)
     unit = float(start.square().mean().sqrt()) or 1.0  # makes the size of a step the same for all photos
     scaled = (start / unit).requires_grad_()
     optimizer = torch.optim.Adadelta([scaled], lr=settings.learning_rate)
@@ -340,21 +340,19 @@ def refine_light(
     return RefinedLight(best.clone() if least < first else start, first, min(first, least), len(losses) - 1)
 
 
-class _FeatureLoss:
-    """Mean squared difference of features, summed over layers, between masked textures of one face."""
+def _feature_loss(evidence: LightEvidence, features: Features) -> Callable[[Tensor], Tensor]:
+    """The loss of weights: the squared difference of masked textures' features, a mean for each layer."""
+    photo, clipped, mask = evidence.photo, evidence.clipped, evidence.mask
+    with torch.no_grad():
+        wanted = [layer.clone() for layer in features((photo * mask)[None])]
 
-    def __init__(self, evidence: LightEvidence, features: Features) -> None:
-        self._evidence, self._features = evidence, features
-        self._clipped = evidence.clipped
-        with torch.no_grad():
-            self._wanted = [layer.clone() for layer in features((evidence.photo * evidence.mask)[None])]
+    def loss_of(weights: Tensor) -> Tensor:
+        explained = evidence.relit(weights)
+        explained = torch.where(clipped, explained.minimum(photo), explained)
+        found = features((explained * mask)[None])
+        return torch.stack([(a - b).square().mean() for a, b in zip(found, wanted, strict=True)]).sum()
 
-    def __call__(self, weights: Tensor) -> Tensor:
-        photo, explained = self._evidence.photo, self._evidence.relit(weights)
-        explained = torch.where(self._clipped, explained.minimum(photo), explained)
-        found = self._features((explained * self._evidence.mask)[None])
-        terms = [(a - b).square().mean() for a, b in zip(found, self._wanted, strict=True)]
-        return torch.stack(terms).sum()
+    return loss_of
 
 
 def _has_settled(losses: list[float], settings: RefineSettings) -> bool:

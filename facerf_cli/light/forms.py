@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix, diags
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from facerf_cli.light.envmap import cell_rows, envmap_weights, nearest_light, texel_integrals
+from facerf_cli.light.envmap import cell_rows, envmap_weights, nearest_light, resampled
 from facerf_cli.light.sh import (
     coefficients_to_rig,
     latlong_coefficients,
@@ -25,6 +25,7 @@ from facerf_cli.light.sh import (
     sh_to_latlong,
 )
 from facerf_cli.light.sphere import (
+    LUMINANCE,
     RigLight,
     golden_spiral,
     latlong_directions,
@@ -43,7 +44,6 @@ MapAxes = Literal["facerf", "blender", "mitsuba"]
 DEFAULT_ROWS = 256  # of a map whose size is not given
 DEFAULT_ORDER = 2  # which a matte surface shows
 _ROWS_BETWEEN = 512  # of the map by which one rig is converted to another
-_LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])  # of linear Rec.709
 # Azimuth to add to a map for another program. Both hold for a head that looks at the viewer:
 # - Mitsuba (src/emitters/envmap.cpp, eval: u = atan2(x, -z) / 2 pi, v = acos(y) / pi): the head looks along
 #   its +z, y up, and our map needs no change.
@@ -73,12 +73,8 @@ def rig_to_latlong(light: RigLight, height: int) -> Tensor:
     parts = np.concatenate([weights.clip(min=0), (-weights).clip(min=0)], 1)  # [L, 6]
     spread = _spread(parts, directions, points)
     radiance = spread[:, :3] - spread[:, 3:]
-    rows = cell_rows(len(directions))
-    if height >= rows:
-        return _to_map(radiance, points, height)
-    areas = latlong_solid_angles(height, 2 * height, torch.float64)[..., None]
-    fine = _to_map(radiance, points, rows)
-    return (texel_integrals(fine, height, 2 * height) / areas).float()
+    envmap = _to_map(radiance, points, max(height, cell_rows(len(directions))))
+    return envmap if len(envmap) == height else resampled(envmap, height)
 
 
 def _distinct_lights(light: RigLight) -> tuple[np.ndarray, np.ndarray]:
@@ -125,18 +121,15 @@ def _matrices(directions_bytes: bytes) -> tuple[csr_matrix, csr_matrix]:
     cell = cKDTree(directions).query(texels)[1]
     shape = (len(directions), len(texels))
     sums = csr_matrix((areas / math.pi, (cell, np.arange(len(texels)))), shape)
-    return _blur(points, points, _SMOOTHING), sums @ _texel_blur(texels, points)
+    return _blur(points, points, _SMOOTHING), sums @ _blur(texels, points, _TEXEL_BLUR)
 
 
 def _to_map(radiance: np.ndarray, points: np.ndarray, height: int) -> Tensor:
     """Resample radiance [N, 3] at the points to a map [height, 2 height, 3] float32."""
     texels = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
-    blocks = [_texel_blur(part.numpy(), points) @ radiance for part in torch.split(texels, _TEXELS_AT_ONCE)]
+    parts = torch.split(texels, _TEXELS_AT_ONCE)
+    blocks = [_blur(part.numpy(), points, _TEXEL_BLUR) @ radiance for part in parts]
     return torch.from_numpy(np.concatenate(blocks)).float().reshape(height, 2 * height, 3)
-
-
-def _texel_blur(texels: np.ndarray, points: np.ndarray) -> csr_matrix:
-    return _blur(texels, points, _TEXEL_BLUR)
 
 
 def _blur(at: np.ndarray, points: np.ndarray, width: float) -> csr_matrix:
@@ -178,19 +171,13 @@ class LightForms:
 
         A map is resized by averages over texels: a larger one keeps the edges of its pixels.
         """
-        if self.envmap is None:
-            return self._to_latlong(height or DEFAULT_ROWS)
-        if height is None or height == len(self.envmap):
-            return self.envmap
-        areas = latlong_solid_angles(height, 2 * height, torch.float64)[..., None]
-        return (texel_integrals(self.envmap, height, 2 * height) / areas).float()
-
-    def _to_latlong(self, height: int) -> Tensor:
+        if self.envmap is not None:
+            return self.envmap if height in (None, len(self.envmap)) else resampled(self.envmap, height)
+        height = height or DEFAULT_ROWS
         if self.rig is not None:
             return rig_to_latlong(self.rig, height)
         assert self.coefficients is not None
-        to_latlong = sh_to_latlong if self.signed else positive_latlong
-        return to_latlong(self.coefficients, height)
+        return (sh_to_latlong if self.signed else positive_latlong)(self.coefficients, height)
 
     def on_rig(self, directions: Tensor | None = None) -> RigLight:
         """The light as a rig of these directions [L, 3]; by default of the given rig, or of 150 lights.
@@ -233,12 +220,10 @@ def from_map_axes(envmap: Tensor, axes: MapAxes) -> Tensor:
 
 def _rotated(envmap: Tensor, azimuth_deg: float) -> Tensor:
     """Add `azimuth_deg` to every azimuth of a map: exactly, if that is a whole number of pixels."""
-    height, width = envmap.shape[:2]
-    pixels = -azimuth_deg / 360 * width  # azimuth grows to the left
+    pixels = -azimuth_deg / 360 * envmap.shape[1]  # azimuth grows to the left
     if pixels == round(pixels):
         return envmap.roll(round(pixels), dims=1)
-    areas = latlong_solid_angles(height, width, torch.float64)[..., None]
-    return (texel_integrals(envmap, height, width, azimuth_deg) / areas).to(envmap.dtype)
+    return resampled(envmap, len(envmap), azimuth_deg)
 
 
 def to_dpr(coefficients: Tensor) -> Tensor:
@@ -250,7 +235,7 @@ def to_dpr(coefficients: Tensor) -> Tensor:
     its shading is the radiance of a white surface, irradiance over pi. In its own examples the first number
     is about 0.8, so a light far from that should be scaled.
     """
-    grey = coefficients[:9] @ _LUMINANCE.to(coefficients)
+    grey = coefficients[:9] @ torch.tensor(LUMINANCE).to(coefficients)
     return rotated(grey[:, None], _CAMERA_TO_DPR)[:, 0] / math.pi
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 RIG_LIGHTS = 150  # of the paper's light stage
 _RELAX_STEPS = 200  # in which a rig's lights repel each other
 _RELAX_NEIGHBOURS = 18  # that repel a light
-_LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec.709
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec.709
 _BLUR_DEG = 12.0  # of the light whose brightest direction is sought; less than the rig's spacing, 18 degrees
 _BLUR_ROWS = 90  # of the grid of directions on which it is sought
 
@@ -36,7 +36,10 @@ class RigLight:
 def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
     """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the image's right side."""
     azimuth = torch.deg2rad(torch.as_tensor(azimuth_deg))
-    elevation = torch.deg2rad(torch.as_tensor(elevation_deg)) + torch.zeros_like(azimuth)
+    return _on_sphere(azimuth, torch.deg2rad(torch.as_tensor(elevation_deg)) + torch.zeros_like(azimuth))
+
+
+def _on_sphere(azimuth: Tensor, elevation: Tensor) -> Tensor:
     ring = elevation.cos()
     return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
 
@@ -49,9 +52,7 @@ def direction_to_azel(directions: Tensor) -> tuple[Tensor, Tensor]:
 
 def uv_to_direction(uv: Tensor) -> Tensor:
     """Unit directions [..., 3] of lat-long positions [..., 2]: azimuth 180 - 360 u, elevation 90 - 180 v."""
-    azimuth, elevation = math.pi * (1 - 2 * uv[..., 0]), math.pi * (0.5 - uv[..., 1])
-    ring = elevation.cos()
-    return torch.stack([ring * azimuth.sin(), elevation.sin(), ring * azimuth.cos()], -1)
+    return _on_sphere(math.pi * (1 - 2 * uv[..., 0]), math.pi * (0.5 - uv[..., 1]))
 
 
 def direction_to_uv(directions: Tensor) -> Tensor:
@@ -116,7 +117,7 @@ def brightest_direction(light: RigLight) -> Tensor:
     The blur, a von Mises-Fisher lobe, adds up the weights of neighbouring lights that share one light
     source.
     """
-    luminance = light.weights.double() @ torch.tensor(_LUMINANCE, dtype=torch.float64)
+    luminance = light.weights.double() @ torch.tensor(LUMINANCE, dtype=torch.float64)
     where = latlong_directions(_BLUR_ROWS, 2 * _BLUR_ROWS, torch.float64).reshape(-1, 3)
     sharpness = 1 / math.radians(_BLUR_DEG) ** 2
     blurred = torch.exp(sharpness * (where @ light.directions.double().T - 1)) @ luminance

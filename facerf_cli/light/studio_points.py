@@ -9,8 +9,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
+from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.light.studio import StudioLight
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
 _AROUND = 48  # samples of a light from all around

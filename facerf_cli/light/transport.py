@@ -86,14 +86,10 @@ def _light_visibility(
     for light, direction in enumerate(directions):
         facing = np.flatnonzero(normals @ direction.astype(np.float32) > 0)
         for _ in range(settings.light_samples):
-            rays = _within_cone(direction, settings.light_radius_deg, len(facing), random)
+            numbers = random.random((len(facing), 1)), random.random((len(facing), 1))
+            rays = on_disc(direction, places_on_disc(settings.light_radius_deg, *numbers))
             visibility[light, facing] += ~occluded(scene, origins[facing], rays)
     return visibility / settings.light_samples
-
-
-def _within_cone(axis: np.ndarray, radius_deg: float, count: int, random: np.random.Generator) -> np.ndarray:
-    """Random unit directions [count, 3], uniform over the disc of an area light; radius 0 is a point."""
-    return on_disc(axis, places_on_disc(radius_deg, random.random((count, 1)), random.random((count, 1))))
 
 
 def _one_bounce(
@@ -110,7 +106,7 @@ def _one_bounce(
     origins = positions + normals * OFFSET_M
     bounce = np.zeros_like(direct)
     for _ in range(settings.bounce_samples):
-        rays = _cosine_hemisphere(normals, random)
+        rays = over_hemisphere(normals, random.random((len(normals), 1)), random.random((len(normals), 1)))
         hits = scene.run(origins, rays, output=True)
         found = np.flatnonzero(hits["primID"] >= 0)
         triangles = corners[hits["primID"][found]]
@@ -121,11 +117,6 @@ def _one_bounce(
         front = np.einsum("nc,nc->n", rays[found], normals[texels]) < 0
         bounce[:, found[front]] += direct[:, texels[front]]
     return bounce / max(1, settings.bounce_samples)
-
-
-def _cosine_hemisphere(normals: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """One cosine-distributed unit direction about each normal [N, 3]."""
-    return over_hemisphere(normals, random.random((len(normals), 1)), random.random((len(normals), 1)))
 
 
 def build_scene(vertices: np.ndarray, triangles: np.ndarray) -> rtcore_scene.EmbreeScene:

@@ -114,11 +114,7 @@ class Basis:
 
     @staticmethod
     def of(
-        directions: np.ndarray,
-        images: np.ndarray,
-        mean: np.ndarray,
-        matte: np.ndarray,
-        samples: LightSamples,
+        directions: np.ndarray, images: np.ndarray, mean: np.ndarray, matte: np.ndarray, samples: LightSamples
     ) -> "Basis":
         """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W]."""
         dark = np.float32(_DARK * mean.sum() / max(3 * float(matte.sum()), 1.0))

@@ -2,13 +2,11 @@
 
 import base64
 import hashlib
-import html
 import io
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -16,6 +14,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull, QhullError
 
 from facerf_cli.files.documents import json_text
+from facerf_cli.files.sheets import filled_page
 from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     AUTO_EXPOSURE_TARGET_LINEAR,
@@ -26,6 +25,7 @@ from facerf_cli.image.colour import (
 from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
 _HERE = Path(__file__).parent
+SCRIPTS = ("light.js", "readers.js", "image.js", "page.js")
 _RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
 
 
@@ -72,7 +72,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "small": [basis.ratios.shape[2], basis.ratios.shape[1]],
         "head": list(head),
         "directions": _floats(basis.directions),
-        "triangles": _bytes(_triangles(basis.directions).astype("<u2").tobytes()),
+        **_triangles(basis.directions),
         "ratios": [_jpeg(ratio, _RATIO_QUALITY) for ratio in basis.ratios],
         "scales": basis.scales.tolist(),
         "guide": _webp(basis.guide),
@@ -95,12 +95,17 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
     }
 
 
-def _triangles(directions: np.ndarray) -> np.ndarray:
-    """Lights [T, 3] of the triangles between which a page interpolates; none where they surround nothing."""
+def _triangles(directions: np.ndarray) -> dict[str, str]:
+    """Lights of the triangles between which a page interpolates; none where they surround nothing.
+
+    The matrix of a triangle turns a direction into shares of its lights, up to their sum.
+    """
     try:
-        return np.asarray(ConvexHull(directions.astype(float)).simplices)
+        corners = np.asarray(ConvexHull(directions.astype(float)).simplices)
     except (QhullError, ValueError):
-        return np.zeros((0, 3), int)
+        corners = np.zeros((0, 3), int)
+    to_shares = np.linalg.inv(directions[corners].astype(float).mT)
+    return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
 
 
 def _exposure(samples: LightSamples) -> dict[str, Any]:
@@ -130,22 +135,14 @@ def _brightest(some: Brightest) -> dict[str, Any]:
 
 def page(title: str, photo: str, document: Mapping[str, Any], strip: str) -> str:
     """The page of a photo; `photo` is its path on a command line, `strip` a JPEG in base64."""
-    data = json_text({**document, "title": title, "source": shlex.quote(photo)})
-    script = '"use strict";\n' + _text("light.js") + _text("page.js")
-    return _filled("page.html", title, script, data=data.replace("<", "\\u003c"), strip=strip)
+    data = json_text({**document, "title": title, "source": shlex.quote(photo)}).replace("<", "\\u003c")
+    script = '"use strict";\n' + "".join(map(_text, SCRIPTS))
+    return _filled("page.html", script, title=title, data=data, strip=strip)
 
 
 def index_page(entries: Sequence[IndexEntry]) -> str:
     """A page of links to pages, each with its strip."""
-    item = Template(
-        '<li><a href="$address"><img src="data:image/jpeg;base64,$strip" alt="">'
-        "<span>$title</span></a></li>\n"
-    )
-    items = [
-        item.substitute(address=html.escape(e.address), strip=e.strip, title=html.escape(e.title))
-        for e in entries
-    ]
-    return _filled("index.html", f"{len(entries)} portraits", "", items="".join(items))
+    return _filled("index.html", "", entries=entries)
 
 
 def strip_of(text: str) -> str:
@@ -160,16 +157,10 @@ def strip_jpeg(images: Sequence[np.ndarray]) -> str:
     return _jpeg(np.round(whole.clip(0, 1) * 255).astype(np.uint8), _STRIP_QUALITY)
 
 
-def _filled(name: str, title: str, script: str, **parts: str) -> str:
+def _filled(name: str, script: str, **values: Any) -> str:
     style = _text("page.css")
-    return Template(_text(name)).substitute(
-        title=html.escape(title),
-        style=style,
-        script=script,
-        style_hash=_hash(style),
-        script_hash=_hash(script),
-        **parts,
-    )
+    hashes = {"style_hash": _hash(style), "script_hash": _hash(script)}
+    return filled_page(_HERE / name, style=style, script=script, **hashes, **values)
 
 
 def _hash(text: str) -> str:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
@@ -21,6 +20,7 @@ from facerf_cli.files.light_files import (
 )
 from facerf_cli.light.forms import (
     LightForms,
+    MapAxes,
     from_dpr,
     from_map_axes,
     from_sfsnet,
@@ -31,7 +31,7 @@ from facerf_cli.light.forms import (
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photos import directions_of
-from facerf_cli.work.verbs import Axes, ConvertLight, Form
+from facerf_cli.work.verbs import ConvertLight, Form
 
 Attributes = dict[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)
@@ -42,18 +42,14 @@ def write_forms(item: Item, work: ConvertLight) -> str:
     light, attributes = _read(item.input_path, work.from_axes)
     light = replace(light, signed=work.signed)
     for form, path in zip(work.forms, work.outputs_of(item), strict=True):
-        _write(path, light, form, attributes, work)
+        if form == "json" or form == "sh":
+            _write_json(path, light, form, attributes, work)
+        elif form == "dpr" or form == "sfsnet":
+            numbers = to_dpr if form == "dpr" else to_sfsnet
+            write_numbers(path, numbers(light.harmonics(2)))
+        else:
+            _write_map(path, light, "facerf" if form == "latlong" else form, attributes, work)
     return str(light)
-
-
-def _write(path: Path, light: LightForms, form: Form, attributes: Attributes, work: ConvertLight) -> None:
-    if form == "json" or form == "sh":
-        _write_json(path, light, form, attributes, work)
-    elif form == "dpr" or form == "sfsnet":
-        numbers = to_dpr if form == "dpr" else to_sfsnet
-        write_numbers(path, numbers(light.harmonics(2)))
-    else:
-        _write_map(path, light, "facerf" if form == "latlong" else form, attributes, work)
 
 
 def _write_json(
@@ -68,7 +64,9 @@ def _write_json(
     write_light(path, record)
 
 
-def _write_map(path: Path, light: LightForms, axes: Axes, attributes: Attributes, work: ConvertLight) -> None:
+def _write_map(
+    path: Path, light: LightForms, axes: MapAxes, attributes: Attributes, work: ConvertLight
+) -> None:
     envmap = light.latlong(None if work.width_px is None else work.width_px // 2)
     below = float((envmap < 0).any(-1).float().mean())
     if below:
@@ -77,18 +75,13 @@ def _write_map(path: Path, light: LightForms, axes: Axes, attributes: Attributes
     write_exr(path, to_map_axes(envmap, axes).numpy(), metadata=attributes | {"facerf:map_axes": axes})
 
 
-def _read(path: Path, from_axes: Axes) -> tuple[LightForms, Attributes]:
+def _read(path: Path, from_axes: MapAxes) -> tuple[LightForms, Attributes]:
     """The light of any file that can hold one, and metadata of its origin."""
     said: Attributes = {"Software": f"facerf {__version__}", "facerf:input": path.name}
     if path.suffix.lower() == ".json":
         light, known = read_light_file(path)
         return light, {**known, **said}
     if path.suffix.lower() == ".txt":
-        return LightForms(coefficients=_read_text(path)), said
+        numbers = read_numbers(path, (9, 27))  # DPR's, or SfSNet's
+        return LightForms(coefficients=(from_dpr if len(numbers) == 9 else from_sfsnet)(numbers)), said
     return LightForms(envmap=from_map_axes(read_map_file(path), from_axes)), said
-
-
-def _read_text(path: Path) -> Tensor:
-    """Coefficients [9, 3] from DPR's 9 or SfSNet's 27 numbers."""
-    numbers = read_numbers(path, (9, 27))
-    return from_dpr(numbers) if len(numbers) == 9 else from_sfsnet(numbers)

@@ -12,11 +12,7 @@ import torch
 
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.errors import FacerfError
-from facerf_cli.face.dlib_landmarks import (
-    PREDICTOR_LICENCE,
-    RECOGNITION_LICENCE,
-    predictor_path,
-)
+from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, RECOGNITION_LICENCE, predictor_path
 from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.files import SHIPPED, serving_files

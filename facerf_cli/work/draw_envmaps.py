@@ -20,43 +20,44 @@ from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.light.envmap import ball, mean_radiance
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.sky.skies import KINDS, MIX, draw_sky, kind_of
-from facerf_cli.work.verbs import DrawnMaps
 
 SHEET = "envmaps.png"
 Facts = dict[str, str | int | float]
 log = logging.getLogger(LOGGER_NAME)
 
 
-def write_envmaps(batch: BatchOptions, wanted: DrawnMaps, seed: int) -> None:
+def write_envmaps(
+    batch: BatchOptions, count: int, kind: Sequence[str] | None, size_px: int, seed: int
+) -> None:
     """Draw and write maps, and print their paths; skip finished ones.
 
     A map is finished if it was drawn from the same seed at the same width. At the end the contact sheet of
     all of them is written, unless there is one since the last map.
     """
-    kinds = tuple(dict.fromkeys(wanted.kind)) if wanted.kind else MIX
+    kinds = tuple(dict.fromkeys(kind)) if kind else MIX
     if unknown := [name for name in kinds if name not in KINDS]:
         raise UsageError(f"--kind {unknown[0]}: no such kind; give one of {', '.join(KINDS)}")
     maps: dict[Path, Facts] = {}
-    for index in range(wanted.count):
+    for index in range(count):
         name = kind_of(index, seed, kinds)
         path = batch.output / f"{index:05d}_{name}.exr"
         maps[path] = {"facerf:kind": name, "facerf:seed": seed, "facerf:index": index}
     if not batch.dry_run:
         sweep_leftovers(batch.output)
-    new = {path for path in maps if _is_to_be_made(path, maps[path], wanted.size_px, batch.overwrite)}
+    new = {path for path in maps if _is_to_be_made(path, maps[path], size_px, batch.overwrite)}
     for index, (path, facts) in enumerate(maps.items()):
         if path not in new:
             log.info("%s: already exists (--overwrite always makes it again)", path)
             continue
         if not batch.dry_run:
-            pixels, _ = draw_sky(index, seed, wanted.size_px, kinds)
+            pixels, _ = draw_sky(index, seed, size_px, kinds)
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
         print(path, flush=True)
     sheet = batch.output / SHEET
     if new or _is_older(sheet, maps):
         if not batch.dry_run:
             write_sheet(list(maps), sheet)
-            log.info("%s: shows %d of %d maps", sheet, min(wanted.count, MOST_MAPS), wanted.count)
+            log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
         print(sheet, flush=True)
 
 

@@ -39,7 +39,6 @@ from facerf_cli.work.photos import (
     facts_of_networks,
     fit_faces,
     load_models_once,
-    prepare_photos,
     provenance,
     read_matte,
     read_photo,
@@ -95,13 +94,6 @@ def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.n
 
 _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
 log = logging.getLogger(LOGGER_NAME)
-
-
-def prepare_light(options: LightOptions, with_networks: bool = True) -> None:
-    """Load what every photo needs; raises UsageError or InputError for what would fail all of them."""
-    prepare_photos(options.photo, options.networks, with_networks)
-    if with_networks and options.refine == "features":
-        feature_network(options)
 
 
 def write_shot_light(

@@ -8,8 +8,7 @@ from typing import Literal
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
 from facerf_cli.errors import UsageError
-from facerf_cli.light.entries import MOST_FRAMES, is_sweep, lit_images, numbers, sweep
-from facerf_cli.light.studio import StudioLight
+from facerf_cli.light.entries import MOST_FRAMES, StudioLight, is_sweep, lit_images, numbers, sweep
 from facerf_cli.option import LIGHT, option
 from facerf_cli.work.photo_options import LightOptions
 
@@ -20,45 +19,25 @@ DRAWN = "procedural:"
 
 @dataclass(frozen=True)
 class LightSources:
-    """The lights, as the command line names them."""
+    """The lights, as the command line names them.
 
-    envmap: list[str] | None = option(
-        None,
-        "Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of estimate-light "
-        "(.json), or procedural:N, maps of facerf envmap. Repeatable.",
-        "MAP|DIR",
-        shown_default=False,
-        panel=LIGHT,
-    )
-    light: list[str] | None = option(
-        None,
-        "Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig file or "
-        "a preset (rembrandt); docs/lights.md. Repeatable.",
-        "LIGHT",
-        shown_default=False,
-        panel=LIGHT,
-    )
-    light_from: list[str] | None = option(
-        None,
-        "Relight under the light of another photo, as estimate-light finds it. Repeatable.",
-        "PHOTO|DIR",
-        shown_default=False,
-        panel=LIGHT,
-    )
-    rotate: str | None = option(
-        None,
-        "Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.",
-        "DEG|FROM:TO:N",
-        shown_default="as they are",
-        panel=LIGHT,
-    )
+    Attributes:
+        envmap: Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of
+            estimate-light (.json), or procedural:N, maps of facerf envmap. Repeatable.
+        light: Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig
+            file or a preset (rembrandt); docs/lights.md. Repeatable.
+        light_from: Relight under the light of another photo, as estimate-light finds it. Repeatable.
+        rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
+        sampling: Give each light the map's integral over its cell; share it smoothly among lights; or, as in
+            the paper, one pixel.
+    """
+
+    envmap: list[str] | None = option(None, metavar="MAP|DIR", shown_default=False, panel=LIGHT)
+    light: list[str] | None = option(None, metavar="LIGHT", shown_default=False, panel=LIGHT)
+    light_from: list[str] | None = option(None, metavar="PHOTO|DIR", shown_default=False, panel=LIGHT)
+    rotate: str | None = option(None, metavar="DEG|FROM:TO:N", shown_default="as they are", panel=LIGHT)
     sampling: Sampling | None = option(
-        None,
-        "Give each light the map's integral over its cell; share it smoothly among lights; or, as in the "
-        "paper, one pixel.",
-        flags=("--envmap-sampling",),
-        shown_default="cell; smooth for --rotate FROM:TO:N",
-        panel=LIGHT,
+        None, flags=("--envmap-sampling",), shown_default="cell; smooth for --rotate FROM:TO:N", panel=LIGHT
     )
 
 

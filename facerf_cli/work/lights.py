@@ -57,16 +57,21 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
     return rig_to_latlong(light_of_photo(photo.path, photo.options), _LIGHT_WIDTH_PX // 2).half().float()
 
 
-@lru_cache(maxsize=1)
 def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
     """The lights of M setups: maps integrated over the rig's lights, and single lights."""
     single = single_lights(setups)
     if not any(setup.envmap for setup in setups):
         return single
-    every = directions_of(rig)
-    of_maps = _map_weights(setups, every, sampling)
+    every, of_maps = _maps_over_rig(setups, rig, sampling)
     directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
     return replace(single, directions=directions, weights=weights)
+
+
+@lru_cache(maxsize=1)
+def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
+    """Directions [L, 3] of a rig, and their weights [M, L, 3] under the maps of M setups."""
+    directions = directions_of(rig)
+    return directions, _map_weights(setups, directions, sampling)
 
 
 def single_lights(setups: Sequence[LightSetup]) -> Lights:

@@ -51,48 +51,33 @@ def config_of(path: Path) -> str:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """Formats and colours of written images, which can be sent to other processes."""
+    """Formats and colours of written images, which can be sent to other processes.
+
+    Attributes:
+        formats: Write each image as exr (half floats, layers), tiff (floats), png, png16 or jpg.
+        output_colourspace: Write EXR and TIFF in this space: ACEScg, lin_rec2020, any name of OCIO.
+        compression: Compress EXR files: zip, zips, piz, rle (lossless), none, pxr24, b44, b44a, dwaa, dwab.
+        view: Show PNG and JPEG by sRGB with a soft shoulder, clipped (none), by aces, or a view of OCIO.
+        display: Take --view, or the default view, from this display of OCIO.
+        config: Use this OpenColorIO configuration.
+    """
 
     formats: tuple[Format, ...] = option(
         ("exr", "png"),
-        "Write each image as exr (half floats, layers), tiff (floats), png, png16 or jpg.",
-        "NAME,...",
-        in_recipe=False,  # each image is in its own
+        metavar="NAME,...",
+        in_recipe=False,
         flags=("--format",),
         shown_default="exr,png; with -o - png",
         parse=parse_formats,
         panel=IMAGE,
     )
-    output_colourspace: str | None = option(
-        None,
-        "Write EXR and TIFF in this space: ACEScg, lin_rec2020, any name of OCIO.",
-        "NAME",
-        shown_default="linear Rec.709",
-        panel=IMAGE,
-    )
-    compression: Compression = option(
-        "zip",
-        "Compress EXR files: zip, zips, piz, rle (lossless), none, pxr24, b44, b44a, dwaa, dwab.",
-        "NAME",
-        panel=IMAGE,
-    )
-    view: str = option(
-        "soft",
-        "Show PNG and JPEG by sRGB with a soft shoulder, clipped (none), by aces, or a view of OCIO.",
-        "NAME",
-        panel=IMAGE,
-    )
-    display: str = option(
-        "",
-        "Take --view, or the default view, from this display of OCIO.",
-        "NAME",
-        shown_default="the configuration's",
-        panel=IMAGE,
-    )
+    output_colourspace: str | None = option(None, metavar="NAME", shown_default="linear Rec.709", panel=IMAGE)
+    compression: Compression = option("zip", metavar="NAME", panel=IMAGE)
+    view: str = option("soft", metavar="NAME", panel=IMAGE)
+    display: str = option("", metavar="NAME", shown_default="the configuration's", panel=IMAGE)
     config: str = option(
         "",
-        "Use this OpenColorIO configuration.",
-        "FILE",
+        metavar="FILE",
         flags=("--ocio",),
         shown_default="$OCIO, or the built-in one",
         typed=Path | None,

@@ -2,9 +2,8 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,9 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
-from facerf_cli.face.fit import fit_from_arrays
-from facerf_cli.face.head import FaceTexture, Head
-from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.face.view import photo_camera, view_face
+from facerf_cli.face.view import photo_camera
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
 from facerf_cli.image.colour import most_exposure_ev
@@ -29,13 +26,7 @@ from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, GroupComposition, Target
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import (
-    each_alone,
-    lights_over_rig,
-    lights_over_stack,
-    read_map,
-    single_lights,
-)
+from facerf_cli.work.lights import each_alone, lights_over_rig, lights_over_stack, read_map
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
@@ -63,15 +54,16 @@ from facerf_cli.work.plan import (
 from facerf_cli.work.relight_options import BackgroundChoice, Relight
 from facerf_cli.work.sequence import frame_with_face, view_of
 from facerf_cli.work.shots import shot_of
-from facerf_cli.work.stacks import PersonStack, RenderedStack, StackTextures
+from facerf_cli.work.stack_composers import (
+    StackImages,
+    StackTextures,
+    face_in_stack,
+    head_in_stack,
+)
 
 log = logging.getLogger(LOGGER_NAME)
-_of_leaders: dict[tuple[Item, Relight], dict[str, float]] = {}  # found in this process, by setup
 
-Written = dict[Path, float]  # the EXR of each image, and the exposure of the PNG in its place
-
-
-Composer = Composition | GroupComposition | PersonStack | RenderedStack
+Composer = Composition | GroupComposition | StackImages
 Behind = Callable[[LightSetup, float], Band | None]  # the image behind a person, for a setup and an exposure
 
 
@@ -123,32 +115,41 @@ def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _LitScene:
-    """People of a photo, or a stack: its composer, the lights of every setup, and what is behind."""
+    """People of a photo, or a stack: its composer, the lights of setups, and what is behind."""
 
     composer: Composer
-    lights: Lights
-    apart: Callable[[LightSetup], Lights]  # each light of a setup
+    setups: tuple[LightSetup, ...]
+    lights_of: Callable[[tuple[LightSetup, ...]], Lights]
     alpha: np.ndarray | None = None  # of the photo
     behind: Behind | None = None
+
+    @cached_property
+    def _lights(self) -> Lights:
+        return self.lights_of(self.setups)
+
+    def relit(self, part: slice) -> list[Any]:
+        """The people under some of the setups."""
+        return list(self.composer.relit(self._lights[part]))
 
 
 Scenes = Iterator[tuple[str, _LitScene]]  # each with the tag of its files
 
 
-def relight_item(item: Item, work: Relight) -> tuple[Written, dict[str, Any]]:
-    """Relight a photo or a stack under every setup; the images written, and facts for the report."""
+def relight_item(item: Item, work: Relight) -> Outcome:
+    """Relight a photo or a stack under every setup."""
     read = _scenes_of_stack if is_olat_stack(item.input_path) else _scenes_of_photo
     scenes, metadata, facts = read(item, work)
-    chosen_ev = _shared_exposures(item, work)
-    written: Written = {}
+    shared_ev = _shared_exposures(item, work)
+    written: dict[Path, float] = {}
     for tag, scene in scenes:
-        written |= _write_setups(item, tag, scene, work, metadata, chosen_ev)
-    return written, facts
+        written |= _write_setups(item, tag, scene, work, metadata, shared_ev)
+    outputs = [path.with_suffix(suffix) for path in written for suffix in work.output.suffixes]
+    return Outcome(outputs, facts | {"exposure_ev": {path.stem: ev for path, ev in written.items()}})
 
 
 def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], dict[str, Any]]:
     """All chosen people in one image, or each face alone; metadata of the images, and facts of the faces."""
-    lights_over_rig(work.setups, work.rig, work.sampling)  # maps are read before the photo, not beside it
+    _over_rig(work)(work.setups)  # maps are read before the photo, not beside it
     image, faces = _image_and_faces(item, work)
     # of faces alone, the first one's files mark the photo as finished
     parts = [("", faces)] if work.composite == "photo" else [(one.tag, [one]) for one in reversed(faces)]
@@ -176,40 +177,36 @@ def _leader_of(item: Item, work: Relight) -> Item | None:
 def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
     """The exposures of an item's group; None where it has none, or is the one that it has them of."""
     leader = _leader_of(item, work)
-    if leader is None or leader == item:
-        return None
-    if (leader, work) not in _of_leaders:  # another process has written it, or an earlier run
-        _of_leaders[leader, work] = _exposures_of(leader, work)
-    return _of_leaders[leader, work]
+    return None if leader is None or leader == item else _exposures_of(leader, work)
 
 
+@lru_cache(maxsize=4)
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of a photo or stack that others share."""
+    """Exposures of a photo or stack that others share; found once a process."""
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     if is_olat_stack(leader.input_path):
         scene = next(_scenes_of_stack(leader, work)[0])[1]
     else:
         scene = _scene(leader, *_image_and_faces(leader, work), work)
-    parts = batches(len(work.setups), scene.composer.nbytes)
-    return _exposures_ev(parts, lambda part: _relit(scene, part), scene, work)
+    return _exposures_ev(scene, batches(len(work.setups), scene.composer.nbytes), scene.relit, work)
 
 
 def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _LitScene:
     """People of one photo in one image; the nearest first."""
-    lights = lights_over_rig(work.setups, work.rig, work.sampling)
     by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
     people = [_composed(item, image, face, work) for face in by_size]
     composer = people[0] if len(people) == 1 else GroupComposition(people)
-
-    def apart(setup: LightSetup) -> Lights:
-        return single_lights(each_alone(setup))
-
+    scene = _LitScene(composer, work.setups, _over_rig(work))
     if work.composite != "photo":
-        return _LitScene(composer, lights, apart)
+        return scene
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
     alpha = image.alpha if work.background.kind == "photo" else None
-    return _LitScene(composer, lights, apart, alpha, _backdrop(work, camera))
+    return replace(scene, alpha=alpha, behind=_backdrop(work, camera))
+
+
+def _over_rig(work: Relight) -> Callable[[tuple[LightSetup, ...]], Lights]:
+    return partial(lights_over_rig, rig=work.rig, sampling=work.sampling)
 
 
 def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> Composition:
@@ -231,11 +228,11 @@ def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> 
     rotation = rotation_of(work.pose)
     posed = None if rotation is None else replace(face.fit, rotation=rotation)
     if work.composite != "photo":
-        return Target(posed, work.composite)
+        return Target(posed, "face")
     matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
     kind = work.background.kind
     alpha = None if kind == "photo" else image.alpha
-    return Target(posed, work.composite, matte, alpha, kind if kind in ("photo", "none") else "given")
+    return Target(posed, "photo", matte, alpha, kind if kind in ("photo", "none") else "given")
 
 
 def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
@@ -252,22 +249,19 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
     """A stack under its own lights, the metadata of its images, and facts of its fit."""
     _check_stack(item, work)
     header = read_olat_header(item.input_path)
-    directions = torch.from_numpy(header.directions).float()
-
-    def lights(setups: tuple[LightSetup, ...]) -> Lights:
-        return lights_over_stack(setups, directions, work.sampling)
-
-    of_setups, behind = lights(work.setups), None
+    own = torch.from_numpy(header.directions).float()
+    lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
     composer: Composer
+    behind = None
     if header.kind == "photo":
         composer, behind, facts = _person_of_stack(item, header, work)
     elif work.photo_of_stack is not None:
         raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
     elif header.kind == "image":
-        composer, facts = RenderedStack(header, item.input_path), {}
+        composer, facts = StackImages(header, item.input_path), {}
     else:
         composer, facts = _face_of_stack(item, header, work)
-    scene = _LitScene(composer, of_setups, lambda setup: lights(each_alone(setup)), behind=behind)
+    scene = _LitScene(composer, work.setups, lights_of, behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
     return iter([("", scene)]), dict(metadata), facts
 
@@ -291,14 +285,10 @@ def _check_stack(item: Item, work: Relight) -> None:
 
 def _person_of_stack(
     item: Item, header: StackHeader, work: Relight
-) -> tuple[PersonStack, Behind | None, dict[str, Any]]:
+) -> tuple[StackImages, Behind | None, dict[str, Any]]:
     """The composer of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
-    with _fit_of(item):
-        fit = fit_from_arrays(header.fit)
-    size_px = header.seen.shape
-    vertices = fit.vertices_camera(face_model(work.photo))
-    view = view_face(vertices, photo_camera(fit.crop, *size_px), fit.crop.side_px)
-    stack = PersonStack(header, item.input_path, view.full(view.mask))
+    fit, face = face_in_stack(item, header, face_model(work.photo))
+    size_px, stack = header.seen.shape, StackImages(header, item.input_path, face)
     if work.photo_of_stack is None:
         return stack, None, fit_facts(fit)
     path = companion(item, work.photo_of_stack, sorted(PHOTO_SUFFIXES), "--photo")
@@ -314,28 +304,9 @@ def _person_of_stack(
 
 def _face_of_stack(item: Item, header: StackHeader, work: Relight) -> tuple[Composition, dict[str, Any]]:
     """The composer of a stack of textures in the frame of its crop, and facts of its fit."""
-    with _fit_of(item):
-        if header.layout_version != LAYOUT_VERSION:
-            raise ValueError("it has another UV layout")
-        fit = fit_from_arrays(header.fit)
-        posed = replace(fit, rotation=torch.from_numpy(header.rotation).float())
-        texture, normals = (torch.from_numpy(x).permute(2, 0, 1) for x in (header.source, header.normals))
-        head = Head(header.source, posed, FaceTexture(texture, torch.from_numpy(header.seen), normals))
-        model, stack = face_model(work.photo), StackTextures(item.input_path)
-        return Composition(model, None, head, Target(composite="face"), stack), fit_facts(fit)
-
-
-@contextmanager
-def _fit_of(item: Item) -> Iterator[None]:
-    """Raise InputError for a fit in a stack that is damaged."""
-    try:
-        yield
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
-
-
-def _relit(scene: _LitScene, part: slice) -> list[Any]:
-    return list(scene.composer.relit(scene.lights[part]))
+    head = head_in_stack(item, header)
+    model, textures = face_model(work.photo), StackTextures(item.input_path)
+    return Composition(model, None, head, Target(composite="face"), textures), fit_facts(head.fit)
 
 
 def _write_setups(
@@ -344,31 +315,30 @@ def _write_setups(
     scene: _LitScene,
     work: Relight,
     metadata: Mapping[str, Any],
-    chosen_ev: Mapping[str, float] | None = None,
-) -> Written:
+    shared_ev: Mapping[str, float] | None,
+) -> dict[Path, float]:
     """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
 
-    Where they do not fit at once, an exposure that is to be found needs a second prediction.
+    Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
+    of each image, and the exposure of the PNG in its place.
     """
     parts = batches(len(work.setups), scene.composer.nbytes)
-    whole = _relit(scene, parts[0]) if len(parts) == 1 else None
+    whole = scene.relit(parts[0]) if len(parts) == 1 else None
 
-    def relit_by_part(part: slice) -> list[Any]:
-        return _relit(scene, part) if whole is None else whole
+    def relit_by(part: slice) -> list[Any]:
+        return scene.relit(part) if whole is None else whole
 
-    exposures_ev = chosen_ev or _exposures_ev(parts, relit_by_part, scene, work)
-    if _leader_of(item, work) == item:
-        _of_leaders[item, work] = dict(exposures_ev)
-    written: Written = {}
+    exposures_ev = shared_ev or _exposures_ev(scene, parts, relit_by, work)
+    written: dict[Path, float] = {}
     for part in parts:
-        for setup, relit in zip(work.setups[part], relit_by_part(part), strict=True):
+        for setup, relit in zip(work.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             with image_canvas(path, scene.composer.size_px, len(work.output.formats)) as empty:
                 image = _rendered(scene, setup, relit, ev, work, empty)
                 write_output(path, image, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
                 del image
-            if work.output.shown_suffix and not chosen_ev:
+            if work.output.shown_suffix and not shared_ev:
                 log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
             written[path] = ev
             del relit  # of all of its part, beside the next
@@ -389,7 +359,7 @@ def _rendered(
     keeps = "A" not in arrays and work.background.kind != "envmap"
     share = layers.get("person.A") if keeps else None
     for part in batches(len(setup.names), composer.nbytes):
-        some = scene.apart(replace(setup, lights=setup.lights[part]))
+        some = scene.lights_of(each_alone(replace(setup, lights=setup.lights[part])))
         each: Iterator[Any] = composer.relit(some)
         for name, one in zip(setup.names[part], each, strict=True):
             layers |= filled({name: composer.light_layer(one)}, *size_px, empty)
@@ -409,15 +379,15 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    parts: Iterable[slice], relit_by_part: Callable[[slice], list[Any]], scene: _LitScene, work: Relight
+    scene: _LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     found: dict[str, float] = {}
-    strengths = lights_over_rig(work.setups, work.rig, work.sampling).strengths()
+    strengths = _over_rig(work)(work.setups).strengths()
     for part in parts:
-        for setup, light, relit in zip(work.setups[part], strengths[part], relit_by_part(part), strict=True):
+        for setup, light, relit in zip(work.setups[part], strengths[part], relit_by(part), strict=True):
             most_ev = most_exposure_ev(work.exposure, light)
             chosen_ev = round(min(scene.composer.exposure_ev(relit, work.exposure), most_ev), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))

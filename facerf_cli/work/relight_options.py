@@ -3,7 +3,7 @@
 import itertools
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import partial
@@ -42,17 +42,7 @@ from facerf_cli.work.shots import (
 Composite = Literal["photo", "face"]
 ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
-_LAYERS = (
-    "albedo",
-    "normal",
-    "position",
-    "depth",
-    "shadow",
-    "specular",
-    "classes",
-    "face",
-    "uv",
-)
+_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _FORMS = "photo, envmap, none, an image file, #RRGGBB or R,G,B"
 
 
@@ -102,131 +92,78 @@ def _linear(encoded: float) -> float:
     return encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
 
 
-def image_pattern(text: str) -> NamePattern:
-    """Parse the --name of images."""
-    return NamePattern.parse(text, "--name")
-
-
-def _share_of_percent(percent: float) -> float:
-    return percent / 100
-
-
 @dataclass(frozen=True)
 class Relight:
-    """Relights one item under every light setup; the options that its images share."""
+    """The options that images share; in the verb's file a subclass relights one item under every setup.
+
+    Attributes:
+        rig: Approximate maps by a rig of N lights, or by a file of directions.
+        pose: Turn the head to a pose, in degrees; shows the face alone.
+        reflectance: Relight the whole portrait, or the face by the paper's field; or by a baseline:
+            diffuse-sh, specular-sh, prt.
+        exposure: Expose PNG and JPEG: the face as bright as in the photo (auto), well lit (face), or by EV.
+        exposure_group: Share an exposure: of each photo, or the first one's by folder or sequence of frames.
+        composite: Show the photo with its face relit, or the rendered face alone, with alpha.
+        background: Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which
+            keep their look; the envmap; or none (alpha).
+        background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
+        aov: Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the face
+            alone face and uv.
+        matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
+            matte.
+        photo_of_stack: Put an OLAT stack back on its photo, at the photo's resolution.
+        ball: Write a mirror ball and a diffuse ball under each map, too.
+        fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.
+        name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
+    """
 
     photo: PhotoOptions
     setups: tuple[LightSetup, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # each in that of its images
-    rig: str = option(
-        "150",
-        "Approximate maps by a rig of N lights, or by a file of directions.",
-        "N|FILE",
-        flags=("--lights",),
-        panel=LIGHT,
-    )
+    rig: str = option("150", metavar="N|FILE", flags=("--lights",), panel=LIGHT)
     sampling: Sampling = "cell"
-    pose: str | None = option(
-        None,
-        "Turn the head to a pose, in degrees; shows the face alone.",
-        "YAW,PITCH,ROLL",
-        shown_default="the photo's",
-        panel=IMAGE,
-    )
-    reflectance: RelightKind = option(
-        "portrait",
-        "Relight the whole portrait, or the face by the paper's field; or by a baseline: diffuse-sh, "
-        "specular-sh, prt.",
-        "KIND",
-        panel=METHOD,
-    )
+    pose: str | None = option(None, metavar="YAW,PITCH,ROLL", shown_default="the photo's", panel=IMAGE)
+    reflectance: RelightKind = option("portrait", metavar="KIND", panel=METHOD)
     exposure: Exposure = option(
-        "auto",
-        "Expose PNG and JPEG: the face as bright as in the photo (auto), well lit (face), or by EV.",
-        "auto|face|EV",
-        default_text="auto",
-        parse=parse_exposure,
-        panel=IMAGE,
+        "auto", metavar="auto|face|EV", default_text="auto", parse=parse_exposure, panel=IMAGE
     )
-    exposure_group: ExposureGroup = option(
-        "photo",
-        "Share an exposure: of each photo, or the first one's by folder or sequence of frames.",
-        "KIND",
-        panel=IMAGE,
-    )
+    exposure_group: ExposureGroup = option("photo", metavar="KIND", panel=IMAGE)
     output: OutputOptions = field(default_factory=OutputOptions)
-    composite: Composite = option(
-        "photo",
-        "Show the photo with its face relit, or the rendered face alone, with alpha.",
-        shown_default="photo; face with --pose",
-        typed=Composite | None,
-        panel=IMAGE,
-    )
+    composite: Composite | None = option(None, shown_default="photo; face with --pose", panel=IMAGE)
     background: BackgroundChoice = option(
         BackgroundChoice("photo"),
-        "Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which keep their "
-        "look; the envmap; or none (alpha).",
-        "KIND|FILE|COLOUR",
+        metavar="KIND|FILE|COLOUR",
         default_text="photo",
         parse=parse_background,
         panel=IMAGE,
     )
     background_blur: float = option(
         0.01,
-        "Blur the map behind the person as a lens does, in percent of the longer side.",
-        "PERCENT",
+        metavar="PERCENT",
         least=0.0,
         most=50.0,
         default_text=1.0,
         typed=float,
-        parse=_share_of_percent,
+        parse=lambda percent: percent / 100,
         panel=IMAGE,
     )
     aov: tuple[str, ...] = option(
-        (),
-        "Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the face "
-        "alone face and uv.",
-        "NAME,...",
-        shown_default="none",
-        default_text="",
-        parse=parse_aov,
-        panel=IMAGE,
+        (), metavar="NAME,...", shown_default="none", default_text="", parse=parse_aov, panel=IMAGE
     )
-    matte: Path | None = option(
-        None,
-        "Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the "
-        "matte.",
-        "FILE|DIR|PATTERN",
-        shown_default=False,
-        panel=IMAGE,
-    )
+    matte: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default=False, panel=IMAGE)
     photo_of_stack: Path | None = option(
-        None,
-        "Put an OLAT stack back on its photo, at the photo's resolution.",
-        "FILE|DIR|PATTERN",
-        flags=("--photo",),
-        shown_default=False,
-        panel=IMAGE,
+        None, metavar="FILE|DIR|PATTERN", flags=("--photo",), shown_default=False, panel=IMAGE
     )
-    ball: bool = option(
-        False, "Write a mirror ball and a diffuse ball under each map, too.", in_recipe=False, panel=IMAGE
-    )
+    ball: bool = option(False, in_recipe=False, panel=IMAGE)
     network_alone: bool = network_alone_option()
     fps: Fraction | None = option(
-        None,
-        "Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.",
-        "RATE",
-        in_recipe=False,
-        shown_default="24",
-        parse=film_rate,
-        panel=IMAGE,
+        None, metavar="RATE", in_recipe=False, shown_default="24", parse=film_rate, panel=IMAGE
     )
     name: NamePattern | None = option(
         None,
-        "Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.",
-        "PATTERN",
+        metavar="PATTERN",
         in_recipe=False,
         shown_default="{dir}/{stem}_{light}",
-        parse=image_pattern,
+        parse=partial(NamePattern.parse, option="--name"),
         panel=BATCH,
     )
     asked_for_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --composite photo
@@ -240,29 +177,26 @@ class Relight:
         wanted: ShotOptions,
         batch: BatchOptions,
         film: FilmOutput | None,
-        process: "Process",
     ) -> int:
-        """Relight the inputs under the sources; return the exit code.
+        """Relight photos, films and stacks under the sources; return the exit code.
 
         Args:
-            inputs: Photos, films and stacks, as the command line names them.
+            inputs: Files, as the command line names them.
             sources: The lights, as the command line names them.
             wanted: Which inputs are one shot.
             batch: Where the images go, and how; `STDOUT` for one image.
             film: The film to which they are joined.
-            process: Relights one item.
         """
         work = self._checked(sources, batch, film)
         if batch.output == STDOUT:
-            _write_to_stdout(inputs, work, process)
+            _write_to_stdout(inputs, work)
             return 0
         if work.ball and not work.maps:
             raise UsageError("--ball: shows maps; give --envmap, or leave it out")
         items, shots = collect_frames(inputs, wanted, batch, work.photo)
         if work.photo_of_stack is not None and not _holds_a_stack(items):
             raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
-        in_a_row = FRAMES_IN_A_ROW if shots else 1
-        batch = replace(batch, in_a_row=in_a_row, print_outputs=film is None)
+        batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1, print_outputs=film is None)
         work = replace(work.with_leaders(items), shots=shots)
         work.refuse_meeting(items)
         images = [path for item in items for path in work.outputs_of(item)]
@@ -275,9 +209,7 @@ class Relight:
         if not finished:
             usable = work.readable(batch.dry_run)
             index.want(usable.recipes_of)
-        relit, settings = partial(process, usable), work.photo.settings
-        recipes = usable.recipes_of
-        code = run_items("relight", items, relit, usable.outputs_of, batch, settings, recipes, index=index)
+        code = run_items("relight", items, usable, usable.outputs_of, batch, work.photo.settings, index=index)
         if film is not None:
             return film.joined(images, shots, key, code)
         if work.ball and not batch.dry_run and batch.shard.number == 1:
@@ -287,7 +219,7 @@ class Relight:
     def _checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> "Relight":
         """These options with the setups, and with what depends on other options; raises UsageError."""
         alone = self.composite == "face" or self.pose is not None
-        if self.pose is not None and self.asked_for_photo:
+        if self.pose is not None and self.composite == "photo":
             raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
         parse_pose(self.pose)
         parse_lights(self.rig)
@@ -310,6 +242,7 @@ class Relight:
             setups=collect_setups(sources, batch.output, photo.settings.seed, how),
             sampling=sources.sampling or ("smooth" if sweeps else "cell"),
             composite="face" if alone else "photo",
+            asked_for_photo=self.composite == "photo",
             reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
         )
 
@@ -320,20 +253,21 @@ class Relight:
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""
+        return [path for setup in self.setups for path in self._images(item, setup)]
+
+    def _images(self, item: Item, setup: LightSetup) -> list[Path]:
         tag = "" if self.composite == "photo" else self.photo.first_tag
-        suffixes = self.output.suffixes
-        return [setup.output(item, tag, suffix, self.name) for setup in self.setups for suffix in suffixes]
+        return [setup.output(item, tag, suffix, self.name) for suffix in self.output.suffixes]
+
+    def __call__(self, item: Item) -> Outcome:
+        """Relight an item."""
+        raise NotImplementedError
 
     def for_stale(self, item: Item) -> "Relight":
         """These settings with the lights of the item's stale images; a light has all of its frames."""
-        tag = "" if self.composite == "photo" else self.photo.first_tag
-        stale = {
-            setup.name
-            for setup in self.setups
-            for suffix in self.output.suffixes
-            if not item.stale or setup.output(item, tag, suffix, self.name) in item.stale
-        }
-        return replace(self, setups=tuple(setup for setup in self.setups if setup.name in stale))
+        stale = {setup.name for setup in self.setups if not item.stale.isdisjoint(self._images(item, setup))}
+        setups = tuple(setup for setup in self.setups if setup.name in stale)
+        return replace(self, setups=setups) if item.stale else self
 
     def with_leaders(self, items: Sequence[Item]) -> "Relight":
         """These settings with the first photo of each group of --exposure-group."""
@@ -353,13 +287,12 @@ class Relight:
     def refuse_meeting(self, items: Sequence[Item]) -> None:
         """Raise UsageError where two images would have one path, as a --name may make them."""
         paths: set[Path] = set()
-        for item in items:
-            for path in self.outputs_of(item):
-                if path in paths:
-                    raise UsageError(
-                        f"{item.input_path}: {path} would be the name of two images; give --name more fields"
-                    )
-                paths.add(path)
+        for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
+            if path in paths:
+                raise UsageError(
+                    f"{item.input_path}: {path} would be the name of two images; give --name more fields"
+                )
+            paths.add(path)
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of every output, which holds the light of its own setup alone."""
@@ -369,12 +302,6 @@ class Relight:
         shared |= recipe_of_shots(self.shots, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
-
-    @property
-    def _networks(self) -> frozenset[str]:
-        """Names of the networks that these options use."""
-        lights = [setup.envmap.options for setup in self.setups if isinstance(setup.envmap, PhotoLight)]
-        return networks_of([self.reflectance]).union(*(light.networks for light in lights))
 
     def readable(self, dry_run: bool) -> "Relight":
         """Load the models, and keep the setups whose maps can be read.
@@ -387,17 +314,17 @@ class Relight:
         from facerf_cli.work.sequence import follow_all
 
         check_output(self.output)
-        prepare_photos(self.photo, self._networks, with_networks=not dry_run)
-        follow_all(self.shots, self.photo, dry_run)
-        if dry_run and any(isinstance(setup.envmap, PhotoLight) for setup in self.setups):
+        lights = [setup.envmap.options for setup in self.setups if isinstance(setup.envmap, PhotoLight)]
+        uses = networks_of([self.reflectance]).union(*(light.networks for light in lights))
+        prepare_photos(self.photo, uses, with_networks=not dry_run)
+        if not dry_run:
+            follow_all(self.shots, self.photo)
+        elif lights:
             return self
         setups = readable(self.setups)
         if not setups:
             raise FacerfError("no map can be read; give others")
         return replace(self, setups=setups)
-
-
-Process = Callable[[Relight, Item], Outcome]  # the work on one item, which the verb's file imports
 
 
 def _holds_a_stack(items: Sequence[Item]) -> bool:
@@ -406,13 +333,13 @@ def _holds_a_stack(items: Sequence[Item]) -> bool:
     return any(is_olat_stack(item.input_path) for item in items)
 
 
-def _write_to_stdout(inputs: Sequence[str], work: Relight, process: "Process") -> None:
+def _write_to_stdout(inputs: Sequence[str], work: Relight) -> None:
     """Write the one image of one photo as bytes; raises UsageError where there are several."""
     with tempfile.TemporaryDirectory() as folder:
         items = collect_items(inputs, Path(folder), PHOTO_SUFFIXES)
         images = len(items) * len(work.setups)
         check_stdout(images if work.photo.face != "all" else 2 * images, work.output.formats)
-        (path,) = process(work.readable(False), items[0]).outputs
+        (path,) = work.readable(False)(items[0]).outputs
         sys.stdout.buffer.write(path.read_bytes())
         sys.stdout.buffer.flush()
 

@@ -68,13 +68,13 @@ class ShotFrames:
         return self.image(0).pixels.shape
 
 
-def follow_all(shots: Sequence[Shot], photo: PhotoOptions, dry_run: bool) -> None:
+def follow_all(shots: Sequence[Shot], options: PhotoOptions) -> None:
     """Follow the face through each shot; what was followed before is kept."""
-    for shot in () if dry_run else shots:
-        follow_shot(shot, photo, photo.settings)
+    for shot in shots:
+        _follow(shot, options)
 
 
-def follow_shot(shot: Shot, options: PhotoOptions, settings: Settings) -> None:
+def _follow(shot: Shot, options: PhotoOptions) -> None:
     """Follow the face through a shot, from the frame on where an earlier run stopped; say where it is lost.
 
     The landmarks of each frame are added to the shot's track at once.
@@ -89,16 +89,14 @@ def follow_shot(shot: Shot, options: PhotoOptions, settings: Settings) -> None:
         shot.track.write_text(json_line(head) + "\n", encoding="utf-8")
     if len(rows) <= len(shot.frames):
         with shot.track.open("a", encoding="utf-8") as stream:
-            for row in _followed(shot, rows[1:], options, settings):
+            for row in _followed(shot, rows[1:], options):
                 rows.append(row)
                 stream.write(json_line(row) + "\n")
                 stream.flush()
     _log_cuts_and_gaps(shot, rows[1:])
 
 
-def _followed(
-    shot: Shot, rows: Sequence[dict[str, Any]], options: PhotoOptions, settings: Settings
-) -> Iterator[dict[str, Any]]:
+def _followed(shot: Shot, rows: Sequence[dict[str, Any]], options: PhotoOptions) -> Iterator[dict[str, Any]]:
     """Rows of the frames that follow those of some rows; after a cut the face is chosen as in a new film."""
     take = rows[[0, *_cuts(rows)][-1] :]
     last = next((seen.landmarks_px for seen in map(_sighting, reversed(take)) if seen), None)
@@ -107,7 +105,7 @@ def _followed(
     frames = ShotFrames(shot, options)
     show = lru_cache(_AHEAD)(lambda number: to_display(frames.image(number).pixels))
     finder = CutFinder(len(shot.frames), show)
-    for number in _with_progress(range(len(rows), len(shot.frames)), shot, settings):
+    for number in _with_progress(range(len(rows), len(shot.frames)), shot, options.settings):
         cut = shot.cuts and finder.is_cut(number)
         if cut:
             follower = Follower(networks, options.face, options.landmarks_from)
@@ -115,11 +113,7 @@ def _followed(
 
 
 def _sight(
-    shot: Shot,
-    number: int,
-    show: Callable[[int], np.ndarray],
-    follower: Follower,
-    options: PhotoOptions,
+    shot: Shot, number: int, show: Callable[[int], np.ndarray], follower: Follower, options: PhotoOptions
 ) -> Sighting | None:
     if options.landmarks is None:
         return follower.see(show(number))

@@ -1,5 +1,6 @@
 """Shots: films, and with `--sequence` numbered images, whose frames show one person; and a film as output."""
 
+import hashlib
 import logging
 import re
 from collections.abc import Sequence
@@ -7,6 +8,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, cached_property
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from facerf_cli.batch.inputs import (
     FILM_SUFFIXES,
@@ -17,10 +19,11 @@ from facerf_cli.batch.inputs import (
     fields_of,
     split_frame,
 )
-from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf
+from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf, key_of
 from facerf_cli.batch.run import BatchOptions, folder_not_file
 from facerf_cli.batch.settings import Overwrite
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import BATCH, option
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.output_options import Format
@@ -36,14 +39,15 @@ _DIGITS = 4  # of a film's frame numbers, or more
 
 @dataclass(frozen=True)
 class ShotOptions:
-    """The inputs that are the frames of one shot."""
+    """The inputs that are the frames of one shot.
 
-    sequence: bool = option(
-        False,
-        "Take numbered images (plate.0001.exr, ...) as the frames of one shot, as a film's are.",
-        panel=BATCH,
-    )
-    no_cuts: bool = option(False, "Take a film that cuts as one shot.", panel=BATCH)
+    Attributes:
+        sequence: Take numbered images (plate.0001.exr, ...) as the frames of one shot, as a film's are.
+        no_cuts: Take a film that cuts as one shot.
+    """
+
+    sequence: bool = option(False, panel=BATCH)
+    no_cuts: bool = option(False, panel=BATCH)
 
 
 @dataclass(frozen=True, eq=False)  # as a key of caches by identity: it has thousands of frames
@@ -130,10 +134,6 @@ def shot_of(shots: Sequence[Shot], item: Item) -> tuple[Shot, int] | None:
 
 def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:
     """Entries of a recipe: the images of sequences, since a frame depends on its neighbours; --no-cuts."""
-    import hashlib
-
-    from facerf_cli.errors import InputError
-
     found: Recipe = {} if all(shot.cuts for shot in shots) else {"cuts": False}
     images = [item.input_path for shot in shots if shot.film is None for item in shot.frames]
     if not images:
@@ -184,8 +184,18 @@ class FilmOutput:
         """The format of the frames."""
         return (_FORMATS[self.path.suffix.lower()],)
 
-    def check(self, items: Sequence[Item], shots: Sequence[Shot], images: Sequence[Path]) -> None:
-        """Raise UsageError unless the images are the frames of one film."""
+    def key_of_new(
+        self,
+        items: Sequence[Item],
+        shots: Sequence[Shot],
+        images: Sequence[Path],
+        recipes_of: RecipesOf,
+        batch: BatchOptions,
+    ) -> str:
+        """Identify what a film of images is made from; empty in a dry run and if it is finished.
+
+        Raises UsageError unless the images are the frames of one film.
+        """
         photos = len(items) - sum(len(shot.frames) for shot in shots)
         one = len(items) == len(images) if shots else len(images) > 1
         if photos + len(shots) != 1 or not one:
@@ -197,38 +207,18 @@ class FilmOutput:
             raise UsageError(f"-o {self.path}: is the input; give another name")
         if self.rate and shots and shots[0].film:
             raise UsageError("--fps: a film keeps its own times; leave it out")
-
-    def key_of_new(
-        self,
-        items: Sequence[Item],
-        shots: Sequence[Shot],
-        images: Sequence[Path],
-        recipes_of: RecipesOf,
-        batch: BatchOptions,
-    ) -> str:
-        """The key of the film that is to be made of images; empty in a dry run and if it is finished."""
-        self.check(items, shots, images)
         if batch.dry_run:
             print(f"{items[0].input_path} -> {self.path}")
             return ""
-        key = self.key(items, recipes_of)
-        if self.is_finished(key, batch.overwrite):
+        digest_of = cache(file_sha256)
+        made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
+        key = key_of(made_from)
+        if self._is_finished(key, batch.overwrite):
             log.info("%s: already finished", self.path)
             return ""
         return key
 
-    def key(self, items: Sequence[Item], recipes_of: RecipesOf) -> str:
-        """Identify what the film is made from: inputs and recipes."""
-        import hashlib
-        import json
-
-        from facerf_cli.files.texts import file_sha256
-
-        digest_of = cache(file_sha256)
-        made_from = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
-        return hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()[:16]
-
-    def is_finished(self, key: str, overwrite: Overwrite) -> bool:
+    def _is_finished(self, key: str, overwrite: Overwrite) -> bool:
         """True if the film is there and need not be made again: its metadata say what it was made from."""
         from facerf_cli.files.film import comment_of
 
@@ -249,15 +239,13 @@ class FilmOutput:
         facts = Provenance(source.name if source else "").attributes()
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
         write_film(self.path, images, timing, f"Synthetic: relit by a trained model; {said}; made from {key}")
-        self._remove_frames([*images, *(shot.track for shot in shots)])
-        print(self.path)
-        return 0
-
-    def _remove_frames(self, files: Sequence[Path]) -> None:
-        for path in (*files, *self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")):
+        records = [*self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")]
+        for path in (*images, *(shot.track for shot in shots), *records):
             path.unlink(missing_ok=True)
         if not any(self.folder.iterdir()):
             self.folder.rmdir()
+        print(self.path)
+        return 0
 
 
 def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:

@@ -1,8 +1,8 @@
 """OLAT stacks: one photo's, with its contact sheet, and composers of sums of a stack's lights."""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,28 +12,21 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
 from facerf_cli.files.images import LinearImage, write_display
-from facerf_cli.files.olat_stack import StackHeader, stream_olats, write_olat_stack
+from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
-from facerf_cli.image.colour import (
-    SOFT_VIEW,
-    ExposureRule,
-    anchored_exposure_ev,
-    auto_exposure_ev,
-    encode_display,
-)
-from facerf_cli.image.strips import Band, Layer, filled, resized, resized_rows, whole
+from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
+from facerf_cli.image.strips import filled, resized, whole
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.pipeline import Person, predict_olat, reflectance_of
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.relighting.composition import Relit, Target
-from facerf_cli.relighting.field import weighted_sum
+from facerf_cli.relighting.composition import Target
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,
@@ -45,7 +38,7 @@ from facerf_cli.work.photos import (
     rotation_of,
 )
 from facerf_cli.work.plan import prediction_bytes, require_face, require_web_images
-from facerf_cli.work.verbs import PredictOlat
+from facerf_cli.work.verbs import PredictOlat, Written
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
@@ -53,14 +46,13 @@ _FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so ma
 _LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
 
 
-def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, Any]]:
-    """Predict and write the stack of each chosen face of a photo; the files, and facts for the report."""
+def write_stacks(item: Item, work: PredictOlat) -> Written:
+    """Predict and write the stack of each chosen face of a photo."""
     directions = directions_of(work.lights)
     if work.format == "relight":
         directions = _from_in_front(item, directions)
     image = read_photo(item, work.photo)
     faces = fit_faces(item, image, work.photo)
-    outputs: list[Path] = []
     for face in reversed(faces):
         stack, sheet, *pages = work.files_of(item, face.tag)
         tiles: list[np.ndarray] = []
@@ -75,8 +67,8 @@ def write_stacks(item: Item, work: PredictOlat) -> tuple[list[Path], dict[str, A
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
             write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
-        outputs += [stack, sheet, *pages]
-    return outputs, facts_of(faces, work.photo) | {"lights": len(directions)}
+    tags = [face.tag for face in reversed(faces)]
+    return tags, facts_of(faces, work.photo) | {"lights": len(directions)}
 
 
 def _from_in_front(item: Item, directions: Tensor) -> Tensor:
@@ -206,138 +198,3 @@ def _contact_sheet(tiles: list[np.ndarray], directions: np.ndarray) -> np.ndarra
     for image, direction in zip(images, directions, strict=True):
         mark_light(image, direction, white)
     return contact_sheet(images)
-
-
-_DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
-
-
-@dataclass(frozen=True, eq=False)
-class StackTextures:
-    """The OLAT textures in a stack as a `Reflectance`; the head stays in the pose of the stack."""
-
-    path: Path
-
-    def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
-        """Sums [M, 3, T, T] of the stack's lights by weights [M, L, 3]."""
-        return weighted_sum(stream_olats(self.path), weights)
-
-
-@dataclass(frozen=True, eq=False)
-class _StackImages:
-    """The images of a stack, summed light by light."""
-
-    header: StackHeader
-    path: Path
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of one sum."""
-        return 12 * self.header.seen.size
-
-    def relit(self, lights: Lights) -> Iterator[Relit]:
-        """Sums of the stack's lights."""
-        return map(Relit, weighted_sum(stream_olats(self.path), lights.weights))
-
-
-class RenderedStack(_StackImages):
-    """Composes stacks of images that are rendered already, of the face and its coverage."""
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Height and width of the images."""
-        height, width = self.header.seen.shape
-        return height, width
-
-    def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
-        """The face as relit, with its coverage as alpha."""
-        pixels = _pixels(relit)
-        return {"rgb": pixels, "A": self.header.seen}
-
-    def light_layer(self, relit: Relit) -> Band:
-        """The face under one of several lights, over black."""
-        pixels = _pixels(relit)
-        return lambda rows: pixels[rows] * self.header.seen[rows][..., None]
-
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
-        """The layer of normals; raises UsageError for others."""
-        return _only_normals(names, self.header.normals)
-
-    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        """The exposure that shows the face well, whatever the rule: there is no photo to compare with."""
-        return auto_exposure_ev(_pixels(relit), self.header.seen)
-
-
-@dataclass(frozen=True, eq=False)
-class PersonStack(_StackImages):
-    """Composes stacks of a photo's person over black, alone, or with `photo` [H, W, 3] in that photo.
-
-    The photo may be larger than the stack: then the change of light is enlarged, and the photo keeps its
-    detail. `keeps_background` shows the photo's own.
-    """
-
-    face: np.ndarray  # [H, W] coverage, by which the exposure is chosen
-    photo: np.ndarray | None = None
-    keeps_background: bool = True
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Height and width of the frame."""
-        height, width = (self.header.seen if self.photo is None else self.photo).shape[:2]
-        return height, width
-
-    def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
-        """The person before the photo's background at `ev`, before another, or with alpha."""
-        (person, matte), photo, gain = self._person(relit), self.photo, np.float32(2.0**-ev)
-        if photo is None or (behind is None and not self.keeps_background):
-            return {"rgb": person, "A": matte}
-
-        def of(rows: slice) -> np.ndarray:
-            below = behind(rows) if behind else gain * photo[rows]
-            return np.asarray(below + matte(rows)[..., None] * (person(rows) - below))
-
-        return {"rgb": of}
-
-    def light_layer(self, relit: Relit) -> Band:
-        """The person under one of several lights, over black."""
-        person, matte = self._person(relit)
-        return lambda rows: person(rows) * matte(rows)[..., None]
-
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
-        """The matte and the layer of normals; raises UsageError for others."""
-        normals = resized_rows(self.header.normals, self.size_px)
-        return {"person.A": self._matte()} | _only_normals(names, normals)
-
-    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        """The exposure in EV of the person, by a rule."""
-        person, seen = _straight(_pixels(relit), self.header.seen), self.header.seen
-        if rule == "face":
-            return auto_exposure_ev(person, seen)
-        return anchored_exposure_ev(person, self.header.source, self.face * seen, seen)
-
-    def _person(self, relit: Relit) -> tuple[Band, Band]:
-        """The person's own colours [H, W, 3], and its matte [H, W]."""
-        own, photo, seen = _straight(_pixels(relit), self.header.seen), self.photo, self.header.seen
-        if photo is None or self.size_px == seen.shape:
-            return lambda rows: own[rows], lambda rows: seen[rows]
-        source = self.header.source
-        change = resized_rows(own / (source + _DARK * source.mean()), self.size_px)
-        return lambda rows: photo[rows] * change(rows), self._matte()
-
-    def _matte(self) -> Band:
-        return resized_rows(self.header.seen, self.size_px)
-
-
-def _pixels(relit: Relit) -> np.ndarray:
-    return np.asarray(relit.texture.permute(1, 2, 0).numpy())
-
-
-def _straight(over_black: np.ndarray, matte: np.ndarray) -> np.ndarray:
-    """Colours before they were multiplied by the matte; 0 where it is."""
-    share = matte[..., None]
-    return np.divide(over_black, share, out=np.zeros_like(over_black), where=share > 1e-3)
-
-
-def _only_normals(names: Sequence[str], normals: Layer) -> dict[str, Layer]:
-    if other := [name for name in names if name != "normal"]:
-        raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
-    return {"normal": normals} if names else {}

@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.head import Head, shrunk_photo
-from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header, stream_olats
+from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, stream_olats
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
@@ -25,18 +22,10 @@ from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
-from facerf_cli.viewer.page import (
-    IndexEntry,
-    PageMap,
-    Plate,
-    index_page,
-    packed,
-    page,
-    strip_jpeg,
-    strip_of,
-)
+from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import FittedFace, face_model, facts_of, fit_faces, load_models_once, read_photo
+from facerf_cli.work.stack_composers import face_in_stack
 
 _MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
 _HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face
@@ -44,20 +33,17 @@ _STRIP_PX = 160  # longer side of an image of the strip
 _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
 
 
-def write_pages(item: Item, options: PhotoOptions, size_px: int) -> tuple[list[Path], dict[str, Any]]:
-    """Write a page for each chosen face of a photo, or for a stack; their paths, and facts for the report."""
+def write_pages(item: Item, options: PhotoOptions, size_px: int) -> tuple[list[str], dict[str, Any]]:
+    """Write a page for each chosen face of a photo, or for a stack; their tags, and facts for the report."""
     if is_olat_stack(item.input_path):
-        path = item.output(options.first_tag + ".html")
-        return [path], write_page_of_stack(path, item, options, size_px)
+        tag = options.first_tag
+        return [tag], write_page_of_stack(item.output(tag + ".html"), item, options, size_px)
     image = read_photo(item, options)
     faces = fit_faces(item, image, options)
     models = load_models_once(options)
-    paths = []
     for face in reversed(faces):  # the first one's page marks the photo as finished
-        path = item.output(face.tag + ".html")
-        write_page(path, item, models, image.pixels, face, size_px)
-        paths.append(path)
-    return paths[::-1], facts_of(faces, options)
+        write_page(item.output(face.tag + ".html"), item, models, image.pixels, face, size_px)
+    return [face.tag for face in faces], facts_of(faces, options)
 
 
 def write_page(
@@ -86,10 +72,10 @@ def of_photo(
 def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:
     """Write the page of an OLAT stack, shown with `size_px` pixels at most; facts for the report."""
     header = read_olat_header(item.input_path)
-    face: np.ndarray | None = None
-    head = (0.5, 0.5, 0.5)
+    face, head = None, (0.5, 0.5, 0.5)
     if header.kind == "photo":
-        head, face = _face_of_stack(item, header, options)
+        fit, share = face_in_stack(item, header, face_model(options))
+        face, head = share * header.seen, head_place(fit.crop, header.seen)
     basis = basis_of_stack(
         header.directions, stream_olats(item.input_path), header.seen, size_px, face, header.source
     )
@@ -97,19 +83,6 @@ def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: 
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
     _write(path, item, "", basis, plate, head)
     return {"lights": len(header.directions)}
-
-
-def _face_of_stack(
-    item: Item, header: StackHeader, options: PhotoOptions
-) -> tuple[tuple[float, float, float], np.ndarray]:
-    """The place of the head of a photo's stack, and the face's share [H, W] of it."""
-    try:
-        fit = fit_from_arrays(header.fit)
-    except (ValueError, TypeError, KeyError) as error:
-        raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
-    vertices = fit.vertices_camera(face_model(options))
-    view = view_face(vertices, photo_camera(fit.crop, *header.seen.shape), fit.crop.side_px)
-    return head_place(fit.crop, header.seen), view.full(view.mask) * header.seen
 
 
 def head_place(crop: Crop, matte: np.ndarray) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.options import with_groups
-from facerf_cli.option import Only, Without, option
+from facerf_cli.option import Only, Without, attributes_of, option
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,16 @@ class Paint:
 
 @dataclass(frozen=True)
 class Frame:
-    width_px: int = option(..., "Width of the frame, in pixels.")
-    gold: bool = option(False, "Gild it.")
+    """A frame.
+
+    Attributes:
+        width_px: Width of the frame,
+            in pixels.
+        gold: Gild it.
+    """
+
+    width_px: int = option(...)
+    gold: bool = option(False)
 
 
 def run(verb: object, *arguments: str) -> object:
@@ -43,10 +51,18 @@ def test_values_come_back_as_the_groups() -> None:
     def verb(context: typer.Context, name: str, paint: Paint, frame: Frame) -> None:
         made.append((name, paint, frame))
 
-    assert run(verb, "a", "-s", "4", "--width-px", "2", "--gold").exit_code == 0
+    assert run(verb, "a", "-s", "4", "--width", "2", "--gold").exit_code == 0
     name, paint, frame = made[0]
     assert (name, paint.side_px, paint.kind, paint.secret, paint.settings.seed) == ("a", 4, "oil", 3, 5)
     assert frame == Frame(2, True)
+
+
+def test_the_help_of_an_option_is_what_the_docstring_says_of_its_field() -> None:
+    assert attributes_of(Frame) == {"width_px": "Width of the frame, in pixels.", "gold": "Gild it."}
+
+    def verb(context: typer.Context, frame: Frame) -> None: ...
+
+    assert "Width of the frame, in pixels." in run(verb, "--help").output
 
 
 @pytest.mark.parametrize(
@@ -57,7 +73,7 @@ def test_values_come_back_as_the_groups() -> None:
 def test_limits_hold(wrong: list[str]) -> None:
     def verb(context: typer.Context, paint: Paint, frame: Frame) -> None: ...
 
-    width = ["--width-px", "2"] if wrong else []
+    width = ["--width", "2"] if wrong else []
     assert run(verb, *wrong, *width).exit_code == 2
 
 

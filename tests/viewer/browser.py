@@ -18,30 +18,7 @@ from PIL import Image
 
 _BUDGET_MS = 1_000_000_000  # of virtual time, which runs on while the page waits for another thread
 _AT_ONCE = 20  # states of a page in one run: what a run may take is limited
-_DRIVER = """
-const wanted = %s;
-async function drive() {
-  const results = [];
-  const settled = () => new Promise((done) => {
-    const look = () => (document.body.dataset.settled === "true" ? done() : setTimeout(look, 20));
-    look();
-  });
-  await settled();
-  for (const address of wanted) {
-    document.body.dataset.settled = "";
-    location.hash = `${address}&state=${results.length}`; // one that the page has not written itself
-    await settled();
-    const command = document.getElementById("command").textContent;
-    results.push({ command, png: document.getElementById("view").toDataURL("image/png") });
-  }
-  const out = document.createElement("pre");
-  out.id = "results";
-  out.textContent = JSON.stringify(results);
-  document.body.append(out);
-}
-addEventListener("load", drive);
-"""
-_WAITERS = """
+_BEGIN = """
 const waiting = setInterval(() => {}, 20); // without a timer, virtual time runs out before the next frame
 const settled = () => new Promise((done) => {
   const look = () => (document.body.dataset.settled === "true" ? done() : setTimeout(look, 20));
@@ -62,6 +39,17 @@ _END = """
   document.body.append(out);
   clearInterval(waiting);
 });
+"""
+_STATES = """
+  const results = [];
+  for (const address of %s) {
+    document.body.dataset.settled = "";
+    location.hash = `${address}&state=${results.length}`; // one that the page has not written itself
+    await settled();
+    const command = document.getElementById("command").textContent;
+    results.push({ command, png: document.getElementById("view").toDataURL("image/png") });
+  }
+  return results;
 """
 
 
@@ -105,37 +93,30 @@ def dumped(page: str, folder: Path, *options: str, timeout_s: int = 900) -> str:
     return done.stdout.decode("utf-8", "replace")
 
 
-def drawn(page: str, addresses: Sequence[str], folder: Path, *options: str) -> list[Drawn]:
-    """What a page draws at each address; skips the test where the browser cannot."""
-    found = []
-    for first in range(0, len(addresses), _AT_ONCE):
-        found += _drawn_at_once(page, addresses[first : first + _AT_ONCE], folder, *options)
-    return found
-
-
-def driven(page: str, script: str, folder: Path) -> Any:
+def driven(page: str, script: str, folder: Path, *options: str) -> Any:
     """What a script, the body of an async function, returns in a page once it has settled.
 
-    It has `settled()` and `frames(n)` to wait with.
+    It has `settled()` and `frames(n)` to wait with. Skips the test where the browser cannot.
     """
-    document = dumped(with_script(page, _WAITERS + script + _END), folder)
+    document = dumped(with_script(page, _BEGIN + script + _END), folder, *options)
     found = re.search(r'<pre id="results">(.*?)</pre>', document, re.S)
     if found is None:
+        message = re.search(r'<p id="message"[^>]*>(.*?)</p>', document, re.S)
+        assert not (message and "cannot be shown" in message[1]), message
         pytest.skip("chromium runs no page here")
     results = json.loads(html.unescape(found[1]))
     assert not (isinstance(results, dict) and "error" in results), results["error"]
     return results
 
 
-def _drawn_at_once(page: str, addresses: Sequence[str], folder: Path, *options: str) -> list[Drawn]:
-    document = dumped(with_script(page, _DRIVER % json.dumps(list(addresses))), folder, *options)
-    found = re.search(r'<pre id="results">(.*?)</pre>', document, re.S)
-    if found is None:
-        message = re.search(r'<p id="message"[^>]*>(.*?)</p>', document, re.S)
-        if message and "cannot be shown" in message[1]:
-            raise AssertionError(message[1])
-        pytest.skip("chromium runs no page here")
-    return [Drawn(_pixels(one["png"]), one["command"]) for one in json.loads(html.unescape(found[1]))]
+def drawn(page: str, addresses: Sequence[str], folder: Path, *options: str) -> list[Drawn]:
+    """What a page draws at each address."""
+    found: list[Drawn] = []
+    for first in range(0, len(addresses), _AT_ONCE):
+        script = _STATES % json.dumps(addresses[first : first + _AT_ONCE])
+        states = driven(page, script, folder, *options)
+        found += [Drawn(_pixels(one["png"]), one["command"]) for one in states]
+    return found
 
 
 def _pixels(address: str) -> np.ndarray:

@@ -1,22 +1,18 @@
 """The readers of .hdr and .exr maps find the pixels that OpenImageIO finds. Needs Chromium."""
 
 import base64
-import html
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
-import pytest
 
-from facerf_cli.viewer import page
-from tests.viewer.browser import chromium, dumped
+from facerf_cli import viewer
+from tests.viewer.browser import chromium, driven
 
-READERS = ("light.js",)
-_DRIVER = """
-(async () => {
+READERS = ("light.js", "readers.js")
+_SCRIPT = """
   const results = {};
   for (const [name, data] of Object.entries(%s)) {
     try {
@@ -26,11 +22,7 @@ _DRIVER = """
       results[name] = { error: error.message };
     }
   }
-  const out = document.createElement("pre");
-  out.id = "results";
-  out.textContent = JSON.stringify(results);
-  document.body.append(out);
-})();
+  return results;
 """
 
 
@@ -56,13 +48,9 @@ def read(folder: Path, names: list[str]) -> dict[str, Any]:
     """What the page's readers make of files."""
     chromium()
     files = {name: base64.b64encode((folder / name).read_bytes()).decode() for name in names}
-    parts = [(Path(page.__file__).parent / name).read_text(encoding="utf-8") for name in READERS]
-    script = "\n".join([*parts, _DRIVER % json.dumps(files)])
-    text = f"<!doctype html><html><body><script>{script}</script></body></html>"
-    found = re.search(r'<pre id="results">(.*?)</pre>', dumped(text, folder), re.S)
-    if found is None:
-        pytest.skip("chromium runs no page here")
-    results: dict[str, Any] = json.loads(html.unescape(found[1]))
+    parts = [(Path(viewer.__file__).parent / name).read_text(encoding="utf-8") for name in READERS]
+    page = f'<html><body data-settled="true"><script>{"".join(parts)}</script></body></html>'
+    results: dict[str, Any] = driven(page, _SCRIPT % json.dumps(files), folder)
     return results
 
 

@@ -11,7 +11,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.image.strips import filled, whole
 from facerf_cli.relighting.composition import Relit
-from facerf_cli.work.stacks import PersonStack
+from facerf_cli.work.stack_composers import StackImages
 
 SIDE = 4
 
@@ -37,7 +37,7 @@ def lit(radiance: float) -> Relit:
 
 
 def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
-    image = filled(PersonStack(header(), Path(), header().seen).bands(lit(0.6), 0.0, None), SIDE, SIDE)
+    image = filled(StackImages(header(), Path(), header().seen).bands(lit(0.6), 0.0, None), SIDE, SIDE)
     assert image["A"].mean() == 0.5
     np.testing.assert_allclose(image["rgb"][:, :2], 0.6, rtol=1e-6)
 
@@ -45,7 +45,7 @@ def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
 def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_its_detail() -> None:
     photo = np.full((8, 8, 3), 0.2, np.float32)
     photo[0, 0] = 0.4  # a detail
-    image = filled(PersonStack(header(), Path(), header().seen, photo).bands(lit(0.6), 1.0, None), 8, 8)
+    image = filled(StackImages(header(), Path(), header().seen, photo).bands(lit(0.6), 1.0, None), 8, 8)
     assert set(image) == {"rgb"}
     assert image["rgb"][4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
     assert image["rgb"][0, 0, 0] == pytest.approx(1.2, rel=2e-3)
@@ -53,7 +53,7 @@ def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_i
 
 
 def test_layers_of_lights_add_up() -> None:
-    composer = PersonStack(header(), Path(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
+    composer = StackImages(header(), Path(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
     one, other, both = (whole(composer.light_layer(lit(radiance)), 8, 8) for radiance in (0.2, 0.4, 0.6))
     np.testing.assert_allclose(one + other, both, rtol=1e-5)
 
@@ -61,7 +61,7 @@ def test_layers_of_lights_add_up() -> None:
 def test_a_large_photo_is_composed_in_rows() -> None:
     """The memory at any time is that of the rows that are read, whatever is behind the person."""
     photo = np.full((2048, 512, 3), 0.2, np.float32)
-    composer = PersonStack(header(), Path(), header().seen, photo)
+    composer = StackImages(header(), Path(), header().seen, photo)
     behind = np.full((2048, 512, 3), 3.0, np.float32)
     for given in (None, behind.__getitem__):
         image = composer.bands(lit(0.6), 1.0, given)["rgb"]
@@ -75,7 +75,7 @@ def test_a_large_photo_is_composed_in_rows() -> None:
 
 
 def test_exposure_and_layers() -> None:
-    composer = PersonStack(header(), Path(), header().seen)
+    composer = StackImages(header(), Path(), header().seen)
     assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
     assert set(composer.layers(("normal",), lit(1.0))) == {"person.A", "normal"}
     with pytest.raises(UsageError, match="--aov albedo"):
