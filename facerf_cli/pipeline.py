@@ -35,7 +35,7 @@ from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered
 from facerf_cli.portrait.person import look_at_person
-from facerf_cli.portrait.segment import segment
+from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
 from facerf_cli.relighting.field import (
     MEMORY_BYTES,
@@ -161,15 +161,18 @@ class Person:
     given_matte: np.ndarray | None = None
 
     @cached_property
+    def segmentation(self) -> Segmentation:
+        """Classes and matte of the person in the photo."""
+        assert self.photo is not None
+        if isinstance(self.reflectance, PortraitField):
+            return self.reflectance.person.segmentation
+        landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
+        return segment(self.models.networks.people, to_display(self.photo), landmarks_px)
+
+    @property
     def matte(self) -> np.ndarray:
         """The person's share [H, W] of the photo."""
-        assert self.photo is not None
-        if self.given_matte is not None:
-            return self.given_matte
-        if isinstance(self.reflectance, PortraitField):
-            return self.reflectance.person.segmentation.matte
-        landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        return segment(self.models.networks.people, to_display(self.photo), landmarks_px).matte
+        return self.segmentation.matte if self.given_matte is None else self.given_matte
 
     def composed(self, target: Target = AS_IN_PHOTO) -> Composition:
         """Prepare images of the person in a pose, before a background, that differ by their light alone.

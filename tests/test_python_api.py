@@ -1,5 +1,6 @@
 """The Python API: the page in the docs runs, and it gives what the command line gives."""
 
+import json
 import math
 import re
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 import facerf_cli as facerf
 from facerf_cli.errors import InputError
 from facerf_cli.main import main
+from facerf_cli.portrait.confidence import SCALES
 
 ROOT = Path(__file__).parents[1]
 PHOTO = ROOT / "examples/astronaut.jpg"
@@ -51,6 +53,9 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
     assert main(["relight", str(PHOTO), "--light", "60,30", "--exposure", "0", "-o", str(tmp_path)]) == 0
     written = facerf.read_image(tmp_path / "astronaut_light_60_30.exr")
     np.testing.assert_array_equal(written, page["image"].astype(np.float16).astype(np.float32))
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert set(row["factors"]) == set(SCALES)  # of the face, its fit and the matte
+    assert row["certainty"] == "sure" and set(row["touches_frame"]) == {"bottom"}
 
 
 def test_sums_of_lights(page: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""People in a photo: their faces, each with landmarks and how sure they are, and what is seen around them.
+"""People in a photo: their faces, each with landmarks, and what is seen around them.
 
 The photo is searched as a whole, then in parts and turned (`mesh.py`). The Parsing Network looks at each
 face that is found.
@@ -17,12 +17,18 @@ from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.mesh import FaceMesh, distinct, find_meshes, first_squares, mesh_near, parts_of
+from facerf_cli.portrait.mesh import (
+    FaceMesh,
+    distinct,
+    find_meshes,
+    first_squares,
+    mesh_near,
+    parts_of,
+    unsteadiness,
+)
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
 
 LandmarksFrom = Literal["facerf", "dlib"]
-Word = Literal["sure", "unsure", "doubtful"]
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
@@ -30,13 +36,6 @@ _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
 _BEYOND = 2.5  # side of a square around a face that is larger than the photo, in sides of the photo
 _DARK = 100  # of 255: brightest percentile of a photo that is brightened before it is searched
 _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
-_SURE, _UNSURE = 0.6, 0.35  # least scores of the words
-_SMALL_PX, _LARGE_PX = 40.0, 160.0  # extents of a face that is too small, and large enough
-_NARROW, _FRONTAL = 0.15, 0.4  # distance of the eyes over the face's extent, in profile and from the front
-_OFF = 0.05  # expected error of the landmarks, in extents, at which they are worthless
-_BLURRED, _SHARP = 0.12, 0.24  # sharpness of a face without detail, and with enough of it
-SUPPORTED_YAW_DEG, _LOST_YAW_DEG = 45.0, 75.0  # turn of a head that the fit supports, and that it loses
-_COVERING = ("glasses", "hand", "headwear")
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,6 +169,7 @@ def _as_face(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face 
         view,
         landmarks_px=np.concatenate([landmarks_px, view.landmarks_px[68:]]),
         error_px=np.concatenate([np.maximum(view.error_px[:68], apart_px / 2), view.error_px[68:]]),
+        unsteadiness=unsteadiness(people.face_mesh, image, mesh),
     )
     return Face(box_of(from_landmarks(landmarks_px, 1)), mesh.score, landmarks_px, view=view)
 
@@ -180,53 +180,3 @@ def _around(face: np.ndarray) -> Square:
     turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
     upright = Square.around(face, _FACE_SIDES)
     return replace(upright, side_px=max(upright.side_px, 1.0), turn_rad=turn_rad)
-
-
-@dataclass(frozen=True)
-class Confidence:
-    """A score in 0..1, a product of factors by name; `word` and `reason` say it in words."""
-
-    factors: dict[str, float]
-
-    @property
-    def score(self) -> float:
-        """The score."""
-        return float(np.prod(list(self.factors.values())))
-
-    @property
-    def word(self) -> Word:
-        """The score in one word."""
-        return "sure" if self.score >= _SURE else "unsure" if self.score >= _UNSURE else "doubtful"
-
-    @property
-    def reason(self) -> str:
-        """The factor that weighs most."""
-        return min(self.factors, key=lambda name: self.factors[name])
-
-
-def confidence_in(view: SquareView, yaw_deg: float = 0.0) -> Confidence:
-    """Rate a view of a face: how sure its landmarks are, its size and sharpness, its turn and what covers it.
-
-    `yaw_deg` is the turn of the head that was fitted to it.
-    """
-    extent_px = view.extent_px
-    left, right = view.landmarks_px[list(OUTER_EYE_CORNERS)]
-    eyes = float(np.linalg.norm(right - left)) / max(extent_px, 1e-6)
-    middle = view.classes[:, view.classes.shape[1] // 4 : -(view.classes.shape[1] // 4)]
-    middle = middle[..., middle.shape[-1] // 4 : -(middle.shape[-1] // 4)]
-    covered = float(middle[[class_index(name) for name in _COVERING]].sum(0).mean())
-    return Confidence(
-        {
-            "unclear": view.presence * _ramp(view.relative_error, _OFF, 0.3 * _OFF),
-            "small": _ramp(extent_px, _SMALL_PX, _LARGE_PX),
-            "blurred": _ramp(view.sharpness, _BLURRED, _SHARP),
-            "profile": _ramp(eyes, _NARROW, _FRONTAL),
-            "covered": _ramp(covered, 0.6, 0.1),
-            "turned": _ramp(abs(yaw_deg), _LOST_YAW_DEG, SUPPORTED_YAW_DEG),
-        }
-    )
-
-
-def _ramp(value: float, worst: float, best: float) -> float:
-    """From 0.1 at the worst value to 1 at the best."""
-    return 0.1 + 0.9 * float(np.clip((value - worst) / (best - worst), 0, 1))

@@ -6,11 +6,12 @@ finds a mesh (Grishchenko et al., *Attention Mesh*, 2020), twice; it also says i
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
 
+from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.parse import Square, whole_photo
 
@@ -116,6 +117,15 @@ def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) ->
         mesh = mesh_in(people.face_mesh, image_srgb, face_square(mesh.points_px))
     extent_px = float(np.ptp(mesh.landmarks_px, axis=0).max())
     return mesh if mesh.score > _LEAST_MESH_SCORE and extent_px > _LEAST_PX else None
+
+
+def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -> float:
+    """Mean distance of a mesh's landmarks from those that the mirrored image shows, in their extent."""
+    square, width = mesh.square, image_srgb.shape[1]
+    mirrored = replace(square, x_px=width - square.x_px, turn_rad=-square.turn_rad)
+    other_px = mesh_in(network, image_srgb[:, ::-1], mirrored).landmarks_px[MIRROR_68]
+    apart_px = np.linalg.norm(mesh.landmarks_px - other_px * (-1, 1) - (width, 0), axis=-1)
+    return float(apart_px.mean() / np.ptp(mesh.landmarks_px, axis=0).max())
 
 
 def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[_Box]:

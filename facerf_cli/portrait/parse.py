@@ -117,7 +117,7 @@ class SquareView:
     """View of a square by the network: logits [K, C, S, S] of the classes; landmarks [N, 2] in the photo.
 
     The logits are those of K looks at the square. error_px [N] are the landmarks' expected errors; presence,
-    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`.
+    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `mesh.py`.
     """
 
     square: Square
@@ -126,6 +126,7 @@ class SquareView:
     error_px: np.ndarray
     presence: float
     sharpness: float = 1.0
+    unsteadiness: float = 0.0
 
     @cached_property
     def classes(self) -> Tensor:
@@ -205,7 +206,7 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
 
 def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Band:
     """The same share [H, W] of the photo's own pixels, by the classes [C, h, w] of the whole photo."""
-    covered = _covering(classes)[None].numpy()
+    covered = covering(classes)[None].numpy()
     return lambda rows: _share_bare(enlarged(covered, size_px, rows)[0])
 
 
@@ -223,11 +224,11 @@ def _places(crop: Crop) -> np.ndarray:
 def _bare(classes: Tensor, shares: np.ndarray) -> np.ndarray:
     """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
     grid = torch.from_numpy(2 * shares - 1).float()[None]
-    sampled = F.grid_sample(_covering(classes)[None, None], grid, align_corners=False)[0, 0]
+    sampled = F.grid_sample(covering(classes)[None, None], grid, align_corners=False)[0, 0]
     return _share_bare(sampled.numpy())
 
 
-def _covering(classes: Tensor) -> Tensor:
+def covering(classes: Tensor) -> Tensor:
     """Share [h, w] of what is not of the face, by classes [C, h, w]."""
     own = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
     return classes[~own].sum(0).float()

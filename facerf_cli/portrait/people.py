@@ -66,21 +66,29 @@ class HeadPlace:
         return np.hypot(x - self.x_px, y - self.y_px + above * self.height_px) / self.height_px
 
 
+@dataclass(frozen=True, eq=False)
+class PersonShares:
+    """Shares [h, w] of a person: as all networks say together, and of anybody as the person network says."""
+
+    person: np.ndarray
+    anybody: np.ndarray
+
+
 def person_among(
     people: PeopleNetworks, image: np.ndarray, heads: Sequence[HeadPlace], parsed: np.ndarray
-) -> np.ndarray:
-    """Share [h, w] of the person with the first of several heads in a small image [h, w, 3] in 0..1.
+) -> PersonShares:
+    """The person with the first of several heads in a small image [h, w, 3] in 0..1.
 
     `parsed` [h, w] is the share that the Parsing Network sees.
     """
     head, *others = heads
-    share, body = person_share(people.person, image, head), body_share(people.body, image, head)
-    share = np.maximum(share, body * (1 - _below_eyes(share, head)) * _near(share, head))  # hats
+    anybody, body = person_share(people.person, image, head), body_share(people.body, image, head)
+    share = np.maximum(anybody, body * (1 - _below_eyes(body, head)) * _near(body, head))  # hats
     if others:
         bodies = [body, *(body_share(people.body, image, one) for one in others)]
-        anybody = np.maximum.reduce([share, *(person_share(people.person, image, one) for one in others)])
-        share = share * part_of_first(bodies, [head, *others], anybody, image)
-    return _vetoed(share, parsed, head)
+        anybody = np.maximum.reduce([anybody, *(person_share(people.person, image, one) for one in others)])
+        share = share * part_of_first(bodies, [head, *others], np.maximum(share, anybody), image)
+    return PersonShares(_vetoed(share, parsed, head), anybody)
 
 
 def matte_of(share: np.ndarray, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:

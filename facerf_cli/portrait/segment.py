@@ -4,8 +4,8 @@ The matte is that of `people.py`; the Parsing Network says what its pixels are. 
 and, for detail, at head and chest and at squares of several sizes around the head.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -18,10 +18,11 @@ from facerf_cli.image.strips import Band, enlarged, fitted
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
+from facerf_cli.portrait.confidence import matte_facts
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.portrait.mesh import find_meshes, first_squares
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look
-from facerf_cli.portrait.people import HeadPlace, matte_of, person_among
+from facerf_cli.portrait.people import HeadPlace, PersonShares, matte_of, person_among
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 # Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
@@ -51,10 +52,14 @@ _EAR_LINES = [
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Shares [C, h, w] of the classes at a small size, and the matte [H, W] at the photo's."""
+    """Shares [C, h, w] of the classes at a small size, and the matte [H, W] at the photo's.
+
+    `facts` of the matte say how far it can be relied on; a frame of a shot has none.
+    """
 
     classes: Tensor
     matte: np.ndarray
+    facts: Mapping[str, float] = field(default_factory=dict)
 
     def cut(self, alpha: np.ndarray | None) -> "Segmentation":
         """The person without what the photo's own alpha [H, W] leaves out; None leaves out nothing."""
@@ -88,20 +93,31 @@ def segment(
     small = small_image(image_srgb)
     if matte is not None:
         return within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
-    classes = seen_classes(people, image_srgb, landmarks_px, small)
-    return segmentation_of(classes, image_srgb, landmarks_px)
+    classes, shares, head = _look(people, image_srgb, landmarks_px, small)
+    found = segmentation_of(_within_share(classes, shares.person), image_srgb, landmarks_px)
+    places = _places((small.shape[1], small.shape[2]), found.matte.shape).astype(int)
+    small_matte = found.matte[places[..., 1], places[..., 0]]
+    return replace(found, facts=matte_facts(shares, 1 - classes[0].numpy(), small_matte, head))
 
 
 def seen_classes(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
     """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
+    classes, shares, _ = _look(people, image_srgb, landmarks_px, small)
+    return _within_share(classes, shares.person)
+
+
+def _look(
+    people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
+) -> tuple[Tensor, PersonShares, HeadPlace]:
+    """Shares of the classes as the Parsing Network sees them, those of the person, and the head's place."""
     classes = parsed(people.parsing, image_srgb, landmarks_px, small)
     scale = small.shape[2] / image_srgb.shape[1]
     everyone = [landmarks_px, *_neighbours(people, image_srgb, landmarks_px)]
     heads = [HeadPlace.of(points * scale) for points in everyone]
-    share = person_among(people, small.permute(1, 2, 0).numpy(), heads, 1 - classes[0].numpy())
-    return _within_share(classes, torch.from_numpy(share).float())
+    shares = person_among(people, small.permute(1, 2, 0).numpy(), heads, 1 - classes[0].numpy())
+    return classes, shares, heads[0]
 
 
 def _neighbours(
@@ -123,7 +139,7 @@ def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.nd
 
 def within_matte(classes: Tensor, matte: np.ndarray) -> Segmentation:
     """The person that a matte [H, W] shows; what the classes [C, h, w] leave open in it is completed."""
-    share = torch.from_numpy(shrunk(matte, (classes.shape[1], classes.shape[2])))
+    share = shrunk(matte, (classes.shape[1], classes.shape[2]))
     return Segmentation(_within_share(classes, share), matte)
 
 
@@ -152,13 +168,13 @@ def parsed(
     return classes / classes.sum(0).clamp_min(1e-6)
 
 
-def _within_share(classes: Tensor, share: Tensor) -> Tensor:
+def _within_share(classes: Tensor, person: np.ndarray) -> Tensor:
     """Classes [C, h, w] of a person with a share [h, w] of each pixel.
 
     Where the Parsing Network sees nobody, a pixel has the classes of the nearest one where it does.
     """
-    person = 1 - classes[0]
-    nearest = distance_transform_edt(person < _CLASSLESS, return_distances=False, return_indices=True)
+    share = torch.from_numpy(person).float()
+    nearest = distance_transform_edt(1 - classes[0] < _CLASSLESS, return_distances=False, return_indices=True)
     rows, columns = torch.from_numpy(nearest).long()
     of_person = classes[1:, rows, columns]
     of_person = of_person / of_person.sum(0).clamp_min(1e-6)

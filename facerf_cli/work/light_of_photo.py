@@ -232,7 +232,7 @@ def _write(
     write_light(base.with_name(base.name + ".json"), record)
     shown = draw_estimate(face.head, models.face, estimate.explained, envmap)
     write_display(base.with_name(base.name + ".png"), shown, metadata=metadata)
-    return face.facts() | facts
+    return face.described() | facts
 
 
 def _as_metadata(value: Any) -> str | int | float:

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -26,8 +26,10 @@ from facerf_cli.light.entries import parse_lights
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
-from facerf_cli.portrait.find import SUPPORTED_YAW_DEG, Face, FaceBox, confidence_in, face_at
+from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_of, face_facts, touched_sides
+from facerf_cli.portrait.find import Face, FaceBox, face_at
 from facerf_cli.portrait.parse import uncovered_by
+from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
@@ -65,24 +67,55 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
-class FittedFace:
-    """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'."""
+class PhotoFace:
+    """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'.
+
+    `name` is for messages. `facts` say how far it can be relied on; there are none of a face that was given,
+    or found by dlib.
+    """
 
     tag: str
+    name: str
     found: FaceBox
-    head: Head
-    steady: SteadyFrame | None = None  # of a frame of a shot
-    matte: np.ndarray | None = None  # of the person, [H, W]; None: to be found
+    facts: dict[str, float] = field(default_factory=dict)
+    touches: dict[str, list[float]] = field(default_factory=dict)
+
+    def see(self, segmentation: Segmentation) -> None:
+        """Learn the facts of its person's matte, and where that touches the frame."""
+        if self.facts:
+            self.facts.update(segmentation.facts)
+            self.touches.update(touched_sides(segmentation.matte))
+
+    def rated(self) -> dict[str, Any]:
+        """The confidence for the report, said in a line, too."""
+        if not self.facts:
+            return {}
+        confidence = confidence_of(self.facts)
+        touches = [f"touches the frame: {', '.join(self.touches)}"] if self.touches else []
+        why = ", ".join([*confidence.reasons, *touches])
+        log.info("%s: %s%s", self.name, confidence.word, f" ({why})" if why else "")
+        factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
+        rated = {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
+        return rated | ({"touches_frame": self.touches} if self.touches else {})
+
+
+@dataclass(frozen=True, eq=False)
+class FittedFace(PhotoFace):
+    """A face with its head; `steady` is of a frame of a shot, `matte` [H, W] is the person's if given."""
+
+    head: Head = field(kw_only=True)
+    steady: SteadyFrame | None = None
+    matte: np.ndarray | None = None
 
     @property
     def fit(self) -> FaceFit:
         """The fitted face model."""
         return self.head.fit
 
-    def facts(self) -> dict[str, Any]:
-        """The face's entries in the report."""
+    def described(self) -> dict[str, Any]:
+        """The face's entries in the report; its confidence is said in a line, too."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
-        return {**fit_facts(self.fit), "pose_deg": pose_deg, **confidence_facts(self.found, pose_deg[0])}
+        return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated()}
 
 
 def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: bool = True) -> None:
@@ -130,42 +163,21 @@ def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> Lin
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
     """Fit the faces of a photo that the options choose, from left to right."""
     models = load_models_once(options)
-    found = _find(item, image, options, options.geometry or models.default_geometry)
     matte = person_matte(item, image.pixels, options)
-    return [
-        FittedFace(tag, face, _fit_one(name, image, face, options, matte), matte=matte)
-        for tag, name, face in found
-    ]
+    found = find_people(item, image, options, options.geometry or models.default_geometry)
+    return [_fitted(face, image, options, matte) for face in found]
 
 
-def find_people(item: Item, image: LinearImage, options: PhotoOptions) -> list[tuple[str, Face]]:
-    """Find the faces that the options choose, from left to right, with the tags of their outputs."""
-    found = _find(item, image, options, "landmarks")
-    return [(tag, face) for tag, _, face in found if isinstance(face, Face)]
-
-
-def facts_of_found(faces: Sequence[FaceBox], options: PhotoOptions) -> dict[str, Any]:
+def facts_of_found(faces: Sequence[PhotoFace], options: PhotoOptions) -> dict[str, Any]:
     """The report's entries of a photo whose faces were only found."""
-    facts = [confidence_facts(face) for face in faces]
+    facts = [face.rated() for face in faces]
     return (facts[0] if len(facts) == 1 else {"faces": facts}) | facts_of_networks(options)
 
 
-def confidence_facts(face: FaceBox, yaw_deg: float = 0.0) -> dict[str, Any]:
-    """A face's confidence for the report; nothing where it was given, or found by dlib."""
-    if face.view is None:
-        return {}
-    confidence = confidence_in(face.view, yaw_deg)
-    factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
-    return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
-
-
-def _find(
-    item: Item, image: LinearImage, options: PhotoOptions, geometry: Geometry
-) -> list[tuple[str, str, FaceBox]]:
-    """Find the faces that the options choose, and say how sure they are.
-
-    Of each: the tag of its outputs, its name for messages, and what its geometry needs, landmarks or a box.
-    """
+def find_people(
+    item: Item, image: LinearImage, options: PhotoOptions, geometry: Geometry = "landmarks"
+) -> list[PhotoFace]:
+    """Find the faces that the options choose, from left to right, with what a geometry needs."""
     faces: Sequence[FaceBox]
     if options.landmarks is not None:
         faces = [_given(item, image, options.landmarks)]
@@ -178,11 +190,8 @@ def _find(
         if len(faces) > 1:
             x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
             name += f": face {number} from the left, at x {x_px}, y {y_px} px"
-        if face.view is not None:
-            confidence = confidence_in(face.view)
-            why = "" if confidence.word == "sure" else f" ({confidence.reason})"
-            log.info("%s: %s%s", name, confidence.word, why)
-        found.append((f"_face{number}" if options.face == "all" else "", name, face))
+        facts = {} if face.view is None else face_facts(face.view, image.pixels)
+        found.append(PhotoFace(f"_face{number}" if options.face == "all" else "", name, face, facts))
     return found
 
 
@@ -194,7 +203,7 @@ def fit_facts(fit: FaceFit) -> dict[str, Any]:
 
 def facts_of(faces: list[FittedFace], options: PhotoOptions) -> dict[str, Any]:
     """The report's entries of a photo: of its one face, or of each in a list."""
-    facts = faces[0].facts() if len(faces) == 1 else {"faces": [face.facts() for face in faces]}
+    facts = faces[0].described() if len(faces) == 1 else {"faces": [face.described() for face in faces]}
     return facts | facts_of_networks(options)
 
 
@@ -224,21 +233,21 @@ def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
         raise InputError(f"{path}: {error}") from None
 
 
-def _fit_one(
-    name: str, image: LinearImage, face: FaceBox, options: PhotoOptions, matte: np.ndarray | None
-) -> Head:
+def _fitted(
+    face: PhotoFace, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
+) -> FittedFace:
     try:
         models = load_models_once(options)
-        head = head_of(models, image.pixels, face, models.sides(options.texture_side))
+        head = head_of(models, image.pixels, face.found, models.sides(options.texture_side))
         if matte is not None:
             head = head.without(models.face, uncovered_by(matte, head.fit.crop))
     except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+        raise InputError(f"{face.name}: {error}") from None
     if head.fit.quality == "poor":
         log.warning(
             "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "
             "`facerf fit-geometry`, or give --landmarks",
-            name,
+            face.name,
             100 * head.fit.error_iod,
         )
     yaw_deg = rotation_to_pose(head.fit.rotation)[0]
@@ -246,11 +255,12 @@ def _fit_one(
         log.warning(
             "%s: the head is turned by %.0f degrees, and %.0f are supported; look at it with "
             "`facerf fit-geometry`",
-            name,
+            face.name,
             abs(yaw_deg),
             SUPPORTED_YAW_DEG,
         )
-    return head
+    facts = face.facts | ({"turned": abs(yaw_deg)} if face.facts else {})
+    return FittedFace(face.tag, face.name, face.found, facts, head=head, matte=matte)
 
 
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:

@@ -133,28 +133,32 @@ class _LitScene:
 
 
 Scenes = Iterator[tuple[str, _LitScene]]  # each with the tag of its files
+Describe = Callable[[], dict[str, Any]]  # facts for the report
 
 
 def relight_item(item: Item, work: Relight) -> Outcome:
     """Relight a photo or a stack under every setup."""
     read = _scenes_of_stack if is_olat_stack(item.input_path) else _scenes_of_photo
-    scenes, metadata, facts = read(item, work)
+    scenes, metadata, describe = read(item, work)
     shared_ev = _shared_exposures(item, work)
     written: dict[Path, float] = {}
     for tag, scene in scenes:
         written |= _write_setups(item, tag, scene, work, metadata, shared_ev)
     outputs = [path.with_suffix(suffix) for path in written for suffix in work.output.suffixes]
-    return Outcome(outputs, facts | {"exposure_ev": {path.stem: ev for path, ev in written.items()}})
+    return Outcome(outputs, describe() | {"exposure_ev": {path.stem: ev for path, ev in written.items()}})
 
 
-def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], dict[str, Any]]:
-    """All chosen people in one image, or each face alone; metadata of the images, and facts of the faces."""
+def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
+    """All chosen people in one image, or each face alone; metadata of the images, and facts of the faces.
+
+    Facts of the mattes are known once the scenes are made.
+    """
     _over_rig(work)(work.setups)  # maps are read before the photo, not beside it
     image, faces = _image_and_faces(item, work)
     # of faces alone, the first one's files mark the photo as finished
     parts = [("", faces)] if work.composite == "photo" else [(one.tag, [one]) for one in reversed(faces)]
     scenes = ((tag, _scene(item, image, some, work)) for tag, some in parts)
-    return scenes, _metadata(item, work), facts_of(faces, work.photo)
+    return scenes, _metadata(item, work), partial(facts_of, faces, work.photo)
 
 
 def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
@@ -218,7 +222,10 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
         reflectance = reflectance_of(
             models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte
         )
-        return Person(models, photo, face.head, reflectance, face.matte).composed(target)
+        person = Person(models, photo, face.head, reflectance, face.matte)
+        if target.composite == "photo" and face.matte is None:
+            face.see(person.segmentation)
+        return person.composed(target)
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None
 
@@ -245,7 +252,7 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
     return metadata
 
 
-def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], dict[str, Any]]:
+def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
     """A stack under its own lights, the metadata of its images, and facts of its fit."""
     _check_stack(item, work)
     header = read_olat_header(item.input_path)
@@ -263,7 +270,7 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
         composer, facts = _face_of_stack(item, header, work)
     scene = _LitScene(composer, work.setups, lights_of, behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
-    return iter([("", scene)]), dict(metadata), facts
+    return iter([("", scene)]), dict(metadata), lambda: facts
 
 
 def _check_stack(item: Item, work: Relight) -> None:

@@ -64,10 +64,12 @@ def write_segments(
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     networks, matte = load_models_once(options).networks.people, person_matte(item, image.pixels, options)
-    for tag, face in reversed(people):
-        found = segment(networks, display, face.landmarks_px, matte)
-        _write_segment(item, tag, image, display, face, found)
-    return [tag for tag, _ in people], facts_of_found([face for _, face in people], options)
+    for person in reversed(people):
+        assert isinstance(person.found, Face)
+        found = segment(networks, display, person.found.landmarks_px, matte)
+        person.see(found)
+        _write_segment(item, person.tag, image, display, person.found, found)
+    return [person.tag for person in people], facts_of_found(people, options)
 
 
 def _write_segment(

@@ -269,5 +269,6 @@ def frame_with_face(
     with _named(shot, number):
         head, steady = view.head(number), view.steady(number, portrait)
     landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
-    image, matte = _opened(shot, options).image(number), steady.segmentation.matte
-    return image, FittedFace("", face_at(landmarks_px), head, steady, matte)
+    found, matte = face_at(landmarks_px), steady.segmentation.matte
+    face = FittedFace("", f"frame {number}", found, head=head, steady=steady, matte=matte)
+    return _opened(shot, options).image(number), face

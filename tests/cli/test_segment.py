@@ -11,6 +11,7 @@ from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
 from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.portrait.confidence import SCALES
 from tests.exr_layers import exr_layers
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -34,7 +35,8 @@ def test_every_file_is_there_and_in_the_report(cut: Path) -> None:
     assert row["outputs"] == [f"astronaut{ending}" for ending in ENDINGS]
     assert all((cut / name).is_file() for name in row["outputs"])
     assert 0 < row["confidence"] <= 1 and row["certainty"] in ("sure", "unsure", "doubtful")
-    assert set(row["factors"]) == {"unclear", "small", "profile", "covered", "turned", "blurred"}
+    assert set(row["factors"]) == set(SCALES) - {"turned"}  # no head was fitted
+    assert set(row["touches_frame"]) == {"bottom"}
 
 
 def test_classes_sum_to_the_matte_over_the_whole_frame(layers: dict[str, np.ndarray]) -> None:
@@ -72,6 +74,21 @@ def test_the_landmarks_serve_as_input(cut: Path, tmp_path: Path) -> None:
     assert main(["segment", str(PHOTO), "-o", str(tmp_path), "--landmarks", given]) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert "confidence" not in row  # they are the user's
+
+
+def test_a_person_before_another_is_not_sure_and_the_line_says_why(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same photo twice, one over the other: the second head touches the first's."""
+    photo = read_image(PHOTO).pixels
+    right = np.roll(photo, 80, 1)
+    both = np.where(np.arange(photo.shape[1])[:, None] < 225, photo, right)
+    write_display(tmp_path / "both.png", both)
+    assert main(["segment", str(tmp_path / "both.png"), "-o", str(tmp_path), "--face", "0"]) == 0
+    row = json.loads((tmp_path / "report.jsonl").read_text())
+    assert row["certainty"] != "sure" and row["factors"]["disputed"] < 0.6
+    line = capsys.readouterr().err
+    assert row["certainty"] in line and "disputed, crowded" in line and "touches the frame: bottom" in line
 
 
 def test_a_photos_own_alpha_cuts_its_person_out(layers: dict[str, np.ndarray], tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_two_people_are_divided_where_they_touch() -> None:
 
 def test_the_parsing_network_takes_away_below_the_eyes_alone() -> None:
     image = np.where(disc(160, 70, 55)[..., None], 1.0, 0.3).repeat(3, -1).astype(np.float32)
-    share = person_among(white_people(), image, [HEAD], np.zeros(image.shape[:2]))
+    share = person_among(white_people(), image, [HEAD], np.zeros(image.shape[:2])).person
     assert share[30, 160] > 0.9 and share[100, 160] < 0.3
 
 

@@ -1,0 +1,165 @@
+"""Confidence in a person of a photo: facts that cost little to measure, and words for them.
+
+Facts of the face need its view and the photo; those of the matte need what each network saw. A fact becomes a
+factor in 0..1 by its scale in `SCALES`; the product of the factors is the score.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import binary_dilation
+from scipy.spatial import Delaunay
+
+from facerf_cli.face.landmarks import display_ev, to_display
+from facerf_cli.face.topology import OUTER_EYE_CORNERS
+from facerf_cli.portrait.parse import SquareView, covering
+from facerf_cli.portrait.people import HeadPlace, PersonShares
+from facerf_cli.raster.camera import PIXEL_CENTRE
+
+Word = Literal["sure", "unsure", "doubtful"]
+
+_SURE, _UNSURE = 0.6, 0.35  # least scores of the words
+_LOSES = 0.9  # a factor below it is named as a reason
+_GRID = 64  # samples along a side of the square around a face
+_WHITE = 0.95  # of the brightest value of a photo, from which on a channel is clipped
+_AROUND_PX = (2, 6)  # of a small image: how far from a person its neighbours are looked for
+_NEAR = 1.5  # heights of the head from its middle, where all networks know a person well
+SUPPORTED_YAW_DEG = 45.0
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Values of a fact at which nothing can be relied on, and from which on nothing is lost."""
+
+    worst: float
+    best: float
+
+    def factor(self, value: float) -> float:
+        """From 0.1 at the worst value to 1 at the best."""
+        return 0.1 + 0.9 * float(np.clip((value - self.worst) / (self.best - self.worst), 0, 1))
+
+
+# Set on the scenes of SETTING in benchmarks/confidence.py, which says how often the words are right.
+SCALES = {
+    # Landmarks: presence of a head to the Parsing Network; median of their expected errors, in extents;
+    # distance of the mesh from that of the mirrored photo, in extents: .007 to .012 where all is well.
+    "faint": Scale(0.3, 0.95),
+    "unclear": Scale(0.05, 0.018),
+    "unsteady": Scale(0.04, 0.018),
+    # Extent of the face in pixels; its sharpness (`sharpness_of`); eyes' distance over the extent; turn of
+    # the fitted head in degrees, of which 45 are supported.
+    "small": Scale(20.0, 44.0),
+    "blurred": Scale(0.1, 0.18),
+    "profile": Scale(0.15, 0.4),
+    "turned": Scale(75.0, SUPPORTED_YAW_DEG),
+    # Share of the face that something covers, that lies beyond the frame, that is clipped in two channels;
+    # number of its levels of green.
+    "covered": Scale(0.4, 0.1),
+    "cropped": Scale(0.5, 0.2),
+    "overexposed": Scale(1.0, 0.6),
+    "dark": Scale(4.0, 14.0),
+    # Matte: overlap of what the networks see of a person around the head; share of the outline behind which
+    # another person begins; share of the person that is not joined to the face.
+    "disputed": Scale(0.8, 0.9),
+    "crowded": Scale(0.6, 0.25),
+    "severed": Scale(0.5, 0.2),
+}
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Factors in 0..1 by name, as in `SCALES`; their product in words."""
+
+    factors: dict[str, float]
+
+    @property
+    def score(self) -> float:
+        """The product."""
+        return float(np.prod(list(self.factors.values())))
+
+    @property
+    def word(self) -> Word:
+        """The score in one word."""
+        return "sure" if self.score >= _SURE else "unsure" if self.score >= _UNSURE else "doubtful"
+
+    @property
+    def reasons(self) -> list[str]:
+        """The factors that weigh, the worst first."""
+        names = sorted(self.factors, key=lambda name: self.factors[name])
+        return [name for name in names if self.factors[name] < _LOSES]
+
+
+def confidence_of(facts: Mapping[str, float]) -> Confidence:
+    """Rate facts by name, each by its scale."""
+    return Confidence({name: SCALES[name].factor(value) for name, value in facts.items()})
+
+
+def face_facts(view: SquareView, photo: np.ndarray) -> dict[str, float]:
+    """Measure a face in a scene-linear photo [H, W, 3]."""
+    left, right = view.landmarks_px[list(OUTER_EYE_CORNERS)]
+    extent_px = max(view.extent_px, 1e-6)
+    return {
+        "faint": view.presence,
+        "unclear": view.relative_error,
+        "unsteady": view.unsteadiness,
+        "small": extent_px,
+        "blurred": view.sharpness,
+        "profile": float(np.linalg.norm(right - left)) / extent_px,
+        **_facts_of_pixels(view, photo),
+    }
+
+
+def _facts_of_pixels(view: SquareView, photo: np.ndarray) -> dict[str, float]:
+    """Facts of the pixels between the landmarks."""
+    at = (np.arange(_GRID) + PIXEL_CENTRE) / _GRID
+    shares = np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
+    shares = shares[Delaunay(view.square.to_share(view.landmarks_px[:68])).find_simplex(shares) >= 0]
+    columns, rows = np.floor(view.square.to_photo(shares)).astype(int).T
+    height, width = photo.shape[:2]
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    right, down = (shares * view.classes.shape[-1]).astype(int).T
+    pixels = photo[rows[inside], columns[inside]]
+    step = max(1, max(height, width) // 512)
+    white = _WHITE * float(photo[::step, ::step].max())
+    levels = to_display(pixels[None], display_ev(photo))[..., 1]
+    return {
+        "covered": float(covering(view.classes)[down[inside], right[inside]].mean()),
+        "cropped": 1 - float(inside.mean()),
+        "overexposed": float(((pixels >= white).sum(-1) >= 2).mean()),
+        "dark": float(len(np.unique(levels))),
+    }
+
+
+def matte_facts(
+    shares: PersonShares, parsed: np.ndarray, matte: np.ndarray, head: HeadPlace
+) -> dict[str, float]:
+    """Measure a matte [h, w] against what was seen: `parsed` [h, w] is the Parsing Network's share."""
+    person = matte > 0.5
+    near = head.distance(matte.shape) < _NEAR
+    lost = (shares.person > 0.5) & ~person
+    next_to, beyond = (binary_dilation(person, iterations=reach) for reach in _AROUND_PX)
+    around = beyond & ~next_to
+    pairs = combinations((shares.anybody[near], parsed[near], matte[near]), 2)
+    return {
+        "disputed": min(_overlap(*pair) for pair in pairs),
+        "crowded": float((shares.anybody[around] > 0.5).sum() / max(around.sum(), 1)),
+        "severed": float(lost.sum() / max(person.sum(), 1)),
+    }
+
+
+def _overlap(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.minimum(one, other).sum() / max(float(np.maximum(one, other).sum()), 1e-6))
+
+
+def touched_sides(matte: np.ndarray) -> dict[str, list[float]]:
+    """The sides of the frame that the person of a matte [H, W] touches: from where to where, in sides."""
+    sides = {"left": matte[:, 0], "top": matte[0], "right": matte[:, -1], "bottom": matte[-1]}
+    found = {}
+    for name, values in sides.items():
+        at = np.flatnonzero(values > 0.5)
+        if len(at):
+            found[name] = [round(float(end) / len(values), 3) for end in (at[0], at[-1] + 1)]
+    return found

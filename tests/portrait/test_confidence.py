@@ -1,0 +1,155 @@
+"""Confidence of a person in a photo: what spoils it is measured, named, and takes the word down."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import skimage.data
+import torch
+from scipy.ndimage import gaussian_filter
+
+from facerf_cli.face.landmarks import to_display
+from facerf_cli.face.topology import LANDMARKS_M
+from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.portrait.confidence import (
+    SCALES,
+    Confidence,
+    confidence_of,
+    face_facts,
+    matte_facts,
+    touched_sides,
+)
+from facerf_cli.portrait.find import detect_faces
+from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
+from facerf_cli.portrait.people import HeadPlace, PersonShares
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from tests.portrait.seen import places, seen_of
+
+SIDE_PX = 400
+HEAD = HeadPlace(100, 60, 40, 80)
+# A photo with all levels everywhere.
+PHOTO = np.random.default_rng(0).uniform(0, 1, (SIDE_PX, SIDE_PX + 50, 3)).astype(np.float32)
+
+
+def view_of_face(
+    size_px: float = 200.0,
+    error: float = 0.01,
+    turned: float = 1.0,
+    covered: bool = False,
+    presence: float = 1.0,
+) -> SquareView:
+    """A view of a face seen well, but for what a test changes; `turned` narrows it."""
+    everywhere = torch.ones_like(places()[0], dtype=torch.bool)
+    middle_px = np.array([SIDE_PX / 2, SIDE_PX / 2])
+    square = Square(*middle_px, 1.7 * size_px)
+    seen = seen_of(square, {"hand" if covered else "skin": everywhere}, presence)
+    flat = LANDMARKS_M[:, :2] * [turned, -1]
+    points = np.zeros((LANDMARKS, 2))
+    points[:68] = size_px * (flat - flat.mean(0)) / np.ptp(flat, axis=0).max() + middle_px
+    return replace(seen, landmarks_px=points, error_px=np.full(LANDMARKS, error * size_px))
+
+
+def test_a_good_face_is_sure() -> None:
+    confidence = confidence_of(face_facts(view_of_face(), PHOTO))
+    assert confidence.word == "sure" and confidence.score > 0.9 and not confidence.reasons
+
+
+@pytest.mark.parametrize(
+    "reason, hard",
+    [
+        ("small", view_of_face(size_px=24)),
+        ("unclear", view_of_face(error=0.05)),
+        ("faint", view_of_face(presence=0.3)),
+        ("profile", view_of_face(turned=0.2)),
+        ("covered", view_of_face(covered=True)),
+        ("blurred", replace(view_of_face(), sharpness=0.11)),
+        ("unsteady", replace(view_of_face(), unsteadiness=0.08)),
+    ],
+)
+def test_what_makes_a_face_hard_is_named(reason: str, hard: SquareView) -> None:
+    confidence = confidence_of(face_facts(hard, PHOTO))
+    assert confidence.word == "doubtful" and confidence.reasons[0] == reason
+
+
+@pytest.mark.parametrize(
+    "reason, photo",
+    [
+        ("overexposed", np.minimum(20 * PHOTO, 1)),
+        ("dark", np.round(4 * PHOTO) / 4),
+        ("cropped", PHOTO[: SIDE_PX // 2]),
+    ],
+)
+def test_what_makes_a_photo_hard_is_named(reason: str, photo: np.ndarray) -> None:
+    confidence = confidence_of(face_facts(view_of_face(), photo))
+    assert confidence.word != "sure" and confidence.reasons[0] == reason
+
+
+def test_bright_values_of_a_photo_that_holds_brighter_ones_are_not_clipped() -> None:
+    photo = 0.5 + PHOTO
+    photo[:20] = 100  # a window
+    assert face_facts(view_of_face(), photo)["overexposed"] == 0
+
+
+def test_the_words_follow_the_score() -> None:
+    words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
+    assert words == ["sure", "unsure", "doubtful"]
+    both = Confidence({"small": 0.5, "profile": 0.4, "dark": 1.0})
+    assert both.score == pytest.approx(0.2) and both.reasons == ["profile", "small"]
+
+
+def test_a_head_that_is_turned_too_far_is_doubtful() -> None:
+    assert SCALES["turned"].factor(45) == 1
+    assert confidence_of({"turned": 72.0}).word == "doubtful"
+
+
+def disc(x: float, y: float, radius: float) -> np.ndarray:
+    """A person's share [150, 220]: 1 in a disc."""
+    down, right = np.mgrid[:150, :220]
+    return (np.hypot(right - x, down - y) < radius).astype(np.float32)
+
+
+def test_a_matte_that_all_see_alike_loses_nothing() -> None:
+    person = disc(100, 70, 40)
+    assert matte_facts(PersonShares(person, person), person, person, HEAD) == {
+        "disputed": 1,
+        "crowded": 0,
+        "severed": 0,
+    }
+
+
+def test_what_spoils_a_matte_is_measured() -> None:
+    person, other, arm = disc(100, 70, 40), disc(160, 70, 35), disc(20, 100, 15)
+    crowded = matte_facts(PersonShares(person, np.maximum(person, other)), person, person, HEAD)
+    assert crowded["crowded"] > 0.15 and crowded["disputed"] < 0.9
+    disputed = matte_facts(PersonShares(person, person), disc(100, 70, 25), person, HEAD)
+    assert disputed["disputed"] < 0.5
+    severed = matte_facts(PersonShares(person + arm, person + arm), person, person, HEAD)
+    assert severed["severed"] == pytest.approx(arm.sum() / person.sum())
+
+
+def test_the_frame_is_touched_where_the_person_ends_at_it() -> None:
+    person = np.zeros((50, 80))
+    person[20:, 30:60] = 1
+    person[40:, :60] = 1
+    assert touched_sides(person) == {"left": [0.8, 1.0], "bottom": [0.0, 0.75]}
+
+
+def facts_in(photo_srgb: np.ndarray) -> dict[str, float]:
+    """Facts of the face in an sRGB image [H, W, 3] with values of 0 to 255."""
+    linear = srgb_to_linear(np.round(photo_srgb).astype(np.float32) / 255)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, to_display(linear))
+    assert face.view is not None
+    return face_facts(face.view, linear)
+
+
+def test_a_photo_that_is_spoiled_is_not_sure_and_says_why() -> None:
+    photo = skimage.data.astronaut()[:300, 60:360].astype(np.float32)
+    sound = facts_in(photo)
+    assert confidence_of(sound).word == "sure"
+    blurred = confidence_of(facts_in(gaussian_filter(photo, (1.9, 1.9, 0))))
+    assert blurred.word != "sure" and blurred.reasons[0] == "blurred"
+    clipped = 255 * np.minimum(4 * srgb_to_linear(photo / 255), 1) ** (1 / 2.2)
+    assert confidence_of(facts_in(clipped)).reasons[0] == "overexposed"
+    covered = photo.copy()
+    covered[110:150, 140:190] = 128
+    assert sound["unsteady"] < 0.012 and facts_in(covered)["unsteady"] > 1.5 * sound["unsteady"]
