@@ -102,8 +102,17 @@ def _the_same_photo_costs_once() -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def _the_command_line_is_built_once() -> None:
-    """Otherwise each call of `main` builds all verbs."""
-    typer.main.get_command = cache(typer.main.get_command)
+    """Otherwise each call of `main` builds all verbs. A verb that a test adds builds it anew."""
+    build = typer.main.get_command
+    built = cache(lambda app, verbs: build(app))
+    typer.main.get_command = lambda app: built(app, len(app.registered_commands))
+    typer.main.build_command = build
+
+
+@pytest.fixture
+def fresh_command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command line as no call has used it: a used one remembers how its help was shown."""
+    monkeypatch.setattr(typer.main, "get_command", typer.main.build_command)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -114,6 +114,7 @@ def test_a_wrong_line_is_one_line_and_code_2(capsys: Capture, line: list[str]) -
     assert out == "" and err.startswith("facerf: error: ") and err.count("\n") == 1
 
 
+@pytest.mark.usefixtures("fresh_command_line")
 def test_version_and_help(capsys: Capture) -> None:
     assert main.main(["--version"]) == 0
     assert capsys.readouterr().out == f"facerf {__version__}\n"

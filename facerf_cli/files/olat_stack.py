@@ -11,7 +11,6 @@ import json
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -67,12 +66,15 @@ class StackHeader:
 
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
     """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive."""
-    source = np.concatenate([header.source, header.seen[..., None], header.normals], -1)
-    images = (image for batch in _apart(olats) for image in batch.permute(0, 2, 3, 1).cpu().numpy())
+
+    def parts() -> Iterator[np.ndarray]:
+        for batch in _apart(olats):
+            yield from batch.permute(0, 2, 3, 1).cpu().numpy()
+        # Last, since it may be summed as the lights arrive.
+        yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
+
     with _one_thread():
-        write_parts(
-            path, _specs(header), (half_floats(path, part)[0].__getitem__ for part in chain(images, [source]))
-        )
+        write_parts(path, _specs(header), (half_floats(path, part)[0].__getitem__ for part in parts()))
 
 
 def _apart(olats: Iterable[Tensor]) -> Iterator[Tensor]:

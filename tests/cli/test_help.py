@@ -78,6 +78,7 @@ def test_the_longest_help_is_under_170_lines(
     assert 60 < len(capsys.readouterr().out.splitlines()) < 170
 
 
+@pytest.mark.usefixtures("fresh_command_line")
 def test_man_is_in_step_with_the_app() -> None:
     assert {path.name: path.read_text() for path in MAN.glob("*.1")} == manual.pages(), "run `make man`"
 
