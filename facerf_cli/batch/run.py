@@ -138,12 +138,23 @@ def folder_not_file(output: Path) -> Path:
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """The options of the contract."""
+    """The options of the contract.
+
+    Attributes:
+        output: Write the results to this folder.
+        overwrite: Make again results that exist: never; those that were made from other inputs, options or
+            networks (changed); or always.
+        dry_run: List what would be read and written; write nothing.
+        jobs: Process this many items at a time.
+        shard: Process every Nth item only, from the Kth on; other machines take the rest.
+        ray: Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).
+        name: Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is
+            follows it.
+    """
 
     output: Path = option(
         Path(),
-        "Write the results to this folder.",
-        "DIR",
+        metavar="DIR",
         in_recipe=False,
         flags=("--output", "-o"),
         shown_default=False,
@@ -151,47 +162,18 @@ class BatchOptions:
         typed=Path,
         parse=folder_not_file,
     )
-    overwrite: Overwrite = option(
-        "changed",
-        "Make again results that exist: never; those that were made from other inputs, options or networks "
-        "(changed); or always.",
-        in_recipe=False,
-        panel=BATCH,
-    )
-    dry_run: bool = option(
-        False, "List what would be read and written; write nothing.", in_recipe=False, panel=BATCH
-    )
+    overwrite: Overwrite = option("changed", in_recipe=False, panel=BATCH)
+    dry_run: bool = option(False, in_recipe=False, panel=BATCH)
     jobs: int | None = option(
-        None,
-        "Process this many items at a time.",
-        in_recipe=False,
-        flags=("--jobs", "-j"),
-        shown_default="1",
-        least=1,
-        panel=BATCH,
+        None, in_recipe=False, flags=("--jobs", "-j"), shown_default="1", least=1, panel=BATCH
     )
     shard: Shard = option(
-        Shard(),
-        "Process every Nth item only, from the Kth on; other machines take the rest.",
-        "K/N",
-        in_recipe=False,
-        shown_default="all items",
-        parse=Shard.parse,
-        panel=BATCH,
+        Shard(), metavar="K/N", in_recipe=False, shown_default="all items", parse=Shard.parse, panel=BATCH
     )
-    ray: str | None = option(
-        None,
-        "Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).",
-        "ADDRESS",
-        in_recipe=False,
-        shown_default=False,
-        panel=BATCH,
-    )
+    ray: str | None = option(None, metavar="ADDRESS", in_recipe=False, shown_default=False, panel=BATCH)
     name: NamePattern | None = option(
         None,
-        "Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is "
-        "follows it.",
-        "PATTERN",
+        metavar="PATTERN",
         in_recipe=False,
         shown_default="{dir}/{stem}.{frame}",
         parse=file_pattern,
@@ -320,9 +302,7 @@ def all_finished(
 
 
 def sums_up(
-    items: Sequence[Item],
-    outputs_of: Callable[[Item], Sequence[Path]],
-    options: BatchOptions,
+    items: Sequence[Item], outputs_of: Callable[[Item], Sequence[Path]], options: BatchOptions
 ) -> bool:
     """True if a verb may now write what depends on all items.
 

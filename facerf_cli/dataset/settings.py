@@ -9,42 +9,33 @@ _DATASET, _PAIRS = "Dataset", "Pairs"  # panels of the help
 
 @dataclass(frozen=True)
 class DatasetSettings:
-    """Settings of the contents of a dataset."""
+    """Settings of the contents of a dataset.
 
-    split: str = option(
-        "0.8/0.1/0.1",
-        "Split the subjects into training, validation and test: counts (300/10/40) or shares, drawn by "
-        "--seed.",
-        "T/V/T",
-        panel=_DATASET,
-    )
+    Attributes:
+        split: Split the subjects into training, validation and test: counts (300/10/40) or shares, drawn by
+            --seed.
+        crop: Write crops of this side, a multiple of 8.
+        face_model: Fit this morphable model: builtin, or a .npz of `face-model import`.
+    """
+
+    split: str = option("0.8/0.1/0.1", metavar="T/V/T", panel=_DATASET)
     crop: int | None = option(
-        None,
-        "Write crops of this side, a multiple of 8.",
-        "PX",
-        shown_default="256, or less where the face has fewer pixels",
-        panel=_DATASET,
+        None, metavar="PX", shown_default="256, or less where the face has fewer pixels", panel=_DATASET
     )
-    face_model: str = option(
-        "builtin",
-        "Fit this morphable model: builtin, or a .npz of `face-model import`.",
-        "NAME|PATH",
-        panel=FACE,
-    )
+    face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
 
 
 @dataclass(frozen=True)
 class PairSettings:
-    """Which pairs to draw from a dataset."""
+    """Which pairs to draw from a dataset.
 
-    envmaps: str = option(
-        ...,
-        "Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), a file, "
-        "or N maps drawn from --seed.",
-        "DIR|FILE|procedural:N",
-        shown_default=False,
-    )
-    per_subject: int = option(
-        1000, "Make so many images of each subject.", "N", panel=_PAIRS, least=1, most=100_000
-    )
-    lazy: bool = option(False, "Write the recipes alone; training relights when it needs them.", panel=_PAIRS)
+    Attributes:
+        envmaps: Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), a
+            file, or N maps drawn from --seed.
+        per_subject: Make so many images of each subject.
+        lazy: Write the recipes alone; training relights when it needs them.
+    """
+
+    envmaps: str = option(..., metavar="DIR|FILE|procedural:N", shown_default=False)
+    per_subject: int = option(1000, metavar="N", panel=_PAIRS, least=1, most=100_000)
+    lazy: bool = option(False, panel=_PAIRS)

@@ -12,27 +12,20 @@ _STAGE, _IMAGE = "People and stage", "Image"
 
 @dataclass(frozen=True)
 class StageSettings:
-    """Settings of a capture; `size_px` is the side of an image."""
+    """Settings of a capture; `size_px` is the side of an image.
 
-    size_px: int = option(
-        256, "Write square images of this side.", "PX", panel=_IMAGE, flags=("--size",), least=64, most=1024
-    )
-    face_model: str = option(
-        "builtin",
-        "Draw people from this face model: builtin, or a .npz of `face-model import`.",
-        "NAME|PATH",
-        panel=_STAGE,
-    )
-    renderer: Renderer = option(
-        "bake",
-        "Render with light transport baked once a person (bake), or by path tracing, slow and accurate "
-        "(mitsuba).",
-        panel=_IMAGE,
-    )
-    lights: int = option(
-        150, "Use so many lights, uniform on the sphere.", "N", panel=_STAGE, least=4, most=1000
-    )
+    Attributes:
+        size_px: Write square images of this side.
+        face_model: Draw people from this face model: builtin, or a .npz of `face-model import`.
+        renderer: Render with light transport baked once a person (bake), or by path tracing, slow and
+            accurate (mitsuba).
+        lights: Use so many lights, uniform on the sphere.
+        frame: Show the head down to the collar, or a bust down to the chest.
+    """
+
+    size_px: int = option(256, metavar="PX", panel=_IMAGE, flags=("--size",), least=64, most=1024)
+    face_model: str = option("builtin", metavar="NAME|PATH", panel=_STAGE)
+    renderer: Renderer = option("bake", panel=_IMAGE)
+    lights: int = option(150, metavar="N", panel=_STAGE, least=4, most=1000)
     seed: int = 0
-    frame: Frame = option(
-        "head", "Show the head down to the collar, or a bust down to the chest.", panel=_IMAGE
-    )
+    frame: Frame = option("head", panel=_IMAGE)

@@ -31,22 +31,43 @@ def _seconds(text: str) -> float:
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """The networks that are trained, their data and losses."""
+    """The networks that are trained, their data and losses.
+
+    Attributes:
+        output: Write the run to this folder.
+        preset: Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or
+            small ones for trials (tiny).
+        form: Train this form of the Reflectance Network: default, paper, or a form of your own
+            (docs/design.md).
+        resume: Continue the run in DIR from its last save; give the same options.
+        start_from: Start from a checkpoint; networks that the stage does not train are copied.
+        dataset: Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.
+        texture_size: Unwrap a dataset to textures of this side; the stages joint and appearance-features
+            read its crops at this side, too.
+        photos: Train on photos of faces, too, in a fifth of the batches of the stage joint.
+        heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
+        fit_with: Fit this face model to the heads; a dataset's own model.
+        heads: Bake so many synthetic heads.
+        views: Fit so many views of each head.
+        bank: Keep baked heads in this folder.
+        jobs: Bake or unwrap in so many processes.
+        vgg_weights: Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a
+            file.
+        appearance_features: Use a checkpoint of the stage appearance-features in place of --vgg-weights.
+        light_features: Add the feature loss on textures, with a checkpoint of the stage light-features.
+        without_normals: Train the Reflectance Network without normal maps (ablation).
+        mean_face: Fit poses alone, with the mean face for everyone (ablation).
+        geometry: Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train
+            the Reflectance Network alone.
+        workers: Draw samples ahead in so many processes.
+    """
 
     settings: Settings
-    output: Path = option(
-        Path(), "Write the run to this folder.", "DIR", flags=("--output", "-o"), panel=RUN, required=True
-    )
-    preset: Preset = option(
-        "default",
-        "Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or small ones "
-        "for trials (tiny).",
-        panel=RUN,
-    )
+    output: Path = option(Path(), metavar="DIR", flags=("--output", "-o"), panel=RUN, required=True)
+    preset: Preset = option("default", panel=RUN)
     form: str = option(
         "default",
-        "Train this form of the Reflectance Network: default, paper, or a form of your own (docs/design.md).",
-        "NAME",
+        metavar="NAME",
         shown_default="paper with --preset paper, else default",
         typed=str | None,
         panel=RUN,
@@ -59,149 +80,87 @@ class TrainOptions:
         typed=Stage | None,
         panel=RUN,
     )
-    resume: bool = option(
-        False, "Continue the run in DIR from its last save; give the same options.", panel=RUN
-    )
-    start_from: Path | None = option(
-        None,
-        "Start from a checkpoint; networks that the stage does not train are copied.",
-        "FILE",
-        shown_default="none",
-        panel=RUN,
-    )
-    dataset: Path | None = option(
-        None,
-        "Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.",
-        "DIR",
-        shown_default="synthetic heads",
-        panel=DATA,
-    )
+    resume: bool = option(False, panel=RUN)
+    start_from: Path | None = option(None, metavar="FILE", shown_default="none", panel=RUN)
+    dataset: Path | None = option(None, metavar="DIR", shown_default="synthetic heads", panel=DATA)
     texture_size: int | None = option(
         None,
-        "Unwrap a dataset to textures of this side; the stages joint and appearance-features read its crops "
-        "at this side, too.",
-        "PX",
+        metavar="PX",
         shown_default="128, joint 256; with --preset paper 512",
         least=32,
         most=1024,
         panel=DATA,
     )
-    photos: Path | None = option(
-        None,
-        "Train on photos of faces, too, in a fifth of the batches of the stage joint.",
-        "DIR",
-        shown_default="none",
-        panel=DATA,
-    )
-    heads_from: str = option(
-        "builtin",
-        "Draw synthetic heads from this face model; of whole people, from several with commas.",
-        "NAME|PATH",
-        panel=DATA,
-    )
-    fit_with: str = option(
-        "builtin", "Fit this face model to the heads; a dataset's own model.", "NAME|PATH", panel=DATA
-    )
-    heads: int | None = option(
-        None, "Bake so many synthetic heads.", shown_default="240; tiny 16", least=2, panel=DATA
-    )
-    views: int | None = option(
-        None, "Fit so many views of each head.", shown_default="8; tiny 2", least=1, panel=DATA
-    )
-    bank: Path | None = option(
-        None, "Keep baked heads in this folder.", "DIR", shown_default="DIR/bank", panel=DATA
-    )
-    jobs: int = option(2, "Bake or unwrap in so many processes.", flags=("--jobs", "-j"), least=1, panel=DATA)
+    photos: Path | None = option(None, metavar="DIR", shown_default="none", panel=DATA)
+    heads_from: str = option("builtin", metavar="NAME|PATH", panel=DATA)
+    fit_with: str = option("builtin", metavar="NAME|PATH", panel=DATA)
+    heads: int | None = option(None, shown_default="240; tiny 16", least=2, panel=DATA)
+    views: int | None = option(None, shown_default="8; tiny 2", least=1, panel=DATA)
+    bank: Path | None = option(None, metavar="DIR", shown_default="DIR/bank", panel=DATA)
+    jobs: int = option(2, flags=("--jobs", "-j"), least=1, panel=DATA)
     vgg_weights: str | None = option(
-        None,
-        "Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a file.",
-        "imagenet|PATH",
-        shown_default="without this loss",
-        panel=LOSSES,
+        None, metavar="imagenet|PATH", shown_default="without this loss", panel=LOSSES
     )
     appearance_features: Path | None = option(
-        None,
-        "Use a checkpoint of the stage appearance-features in place of --vgg-weights.",
-        "FILE",
-        shown_default="without this loss",
-        panel=LOSSES,
+        None, metavar="FILE", shown_default="without this loss", panel=LOSSES
     )
     light_features: Path | None = option(
-        None,
-        "Add the feature loss on textures, with a checkpoint of the stage light-features.",
-        "FILE",
-        shown_default="without this loss",
-        panel=LOSSES,
+        None, metavar="FILE", shown_default="without this loss", panel=LOSSES
     )
-    without_normals: bool = option(
-        False, "Train the Reflectance Network without normal maps (ablation).", panel=LOSSES
-    )
-    mean_face: bool = option(
-        False, "Fit poses alone, with the mean face for everyone (ablation).", panel=LOSSES
-    )
-    geometry: Geometry = option(
-        "network",
-        "Train the Geometry Network, too, in the stage joint; or fit heads to landmarks and train the "
-        "Reflectance Network alone.",
-        panel=LOSSES,
-    )
+    without_normals: bool = option(False, panel=LOSSES)
+    mean_face: bool = option(False, panel=LOSSES)
+    geometry: Geometry = option("network", panel=LOSSES)
     workers: int | None = option(
-        None,
-        "Draw samples ahead in so many processes.",
-        shown_default="1 on a CPU of more than one core, 4 on a GPU",
-        least=0,
-        panel=SPEED,
+        None, shown_default="1 on a CPU of more than one core, 4 on a GPU", least=0, panel=SPEED
     )
     training: TrainSettings = field(default_factory=TrainSettings)
 
 
 @dataclass(frozen=True)
 class PaceOptions:
-    """Length and speed of a run; None is the preset's."""
+    """Length and speed of a run; None is the preset's.
+
+    Attributes:
+        learning_rate: Set the highest learning rate.
+        steps: Stop after so many steps.
+        max_time: Stop after a time, such as 90s, 45m or 2h, summed over all resumptions.
+        validate_every: Validate on held-out people, and save, every so many steps.
+        batch: Use so many samples a step, of all processes together.
+        bf16: Train in mixed precision (bfloat16), where the device has instructions for it.
+        compile: Compile the networks with torch; the first steps take minutes.
+    """
 
     learning_rate: float | None = option(
         None,
-        "Set the highest learning rate.",
         shown_default=_by_preset(lambda settings: settings.optimizer.learning_rate),
         least=1e-9,
         panel=RUN,
     )
-    steps: int | None = option(
-        None, "Stop after so many steps.", shown_default="no limit", least=1, panel=LENGTH
-    )
+    steps: int | None = option(None, shown_default="no limit", least=1, panel=LENGTH)
     max_time: float | None = option(
         None,
-        "Stop after a time, such as 90s, 45m or 2h, summed over all resumptions.",
-        "TIME",
+        metavar="TIME",
         shown_default=f"{_DEFAULT_TIME}; no limit with --steps",
         parse=_seconds,
         panel=LENGTH,
     )
     validate_every: int | None = option(
         None,
-        "Validate on held-out people, and save, every so many steps.",
-        "STEPS",
+        metavar="STEPS",
         shown_default=_by_preset(lambda settings: settings.validate_every),
         least=1,
         panel=LENGTH,
     )
     batch: int | None = option(
-        None,
-        "Use so many samples a step, of all processes together.",
-        shown_default=_by_preset(lambda settings: settings.batch),
-        least=1,
-        panel=SPEED,
+        None, shown_default=_by_preset(lambda settings: settings.batch), least=1, panel=SPEED
     )
     bf16: bool | None = option(
         None,
-        "Train in mixed precision (bfloat16), where the device has instructions for it.",
         flags=("--bf16/--no-bf16",),
         shown_default="on; presets paper and tiny, and --form paper, off",
         panel=SPEED,
     )
-    compile: bool = option(
-        False, "Compile the networks with torch; the first steps take minutes.", panel=SPEED
-    )
+    compile: bool = option(False, panel=SPEED)
 
     def of_run(self, options: TrainOptions) -> TrainSettings:
         """The preset's settings with these."""
