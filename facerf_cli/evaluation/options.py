@@ -22,132 +22,101 @@ def folder_name(folder: Path) -> str:
 
 @dataclass(frozen=True)
 class SplitOptions:
-    """The images of a prepared dataset that are measured."""
+    """The images of a prepared dataset that are measured.
 
-    split: Literal["train", "validation", "test", "all"] = option(
-        "test", "Measure this split of DATASET; all if no network was trained on it.", panel=DATA
-    )
-    every: int = option(1, "Measure every Nth pair of DATASET's split only.", "N", least=1, panel=DATA)
-    joint_fit: bool = option(
-        False,
-        "Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once, instead "
-        "of each image alone.",
-        panel=DATA,
-    )
+    Attributes:
+        split: Measure this split of DATASET; all if no network was trained on it.
+        every: Measure every Nth pair of DATASET's split only.
+        joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
+            instead of each image alone.
+    """
+
+    split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA)
+    every: int = option(1, metavar="N", least=1, panel=DATA)
+    joint_fit: bool = option(False, panel=DATA)
 
 
 @dataclass(frozen=True)
 class YaleOptions:
-    """The images of Extended Yale B that are measured."""
+    """The images of Extended Yale B that are measured.
 
-    shifts: Path | None = option(
-        None,
-        "Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its "
-        "subject's frontal one.",
-        "CSV",
-        shown_default="no alignment",
-        panel=DATA,
-    )
+    Attributes:
+        shifts: Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its
+            subject's frontal one.
+        subjects: Measure these subjects only, such as yaleB05,yaleB15. Repeatable.
+        room: Light from all around that comes with each flash, as a room sends it back: a share of it.
+    """
+
+    shifts: Path | None = option(None, metavar="CSV", shown_default="no alignment", panel=DATA)
     subjects: list[str] | None = option(
-        None,
-        "Measure these subjects only, such as yaleB05,yaleB15. Repeatable.",
-        "NAME,...",
-        in_recipe=False,  # an item is a subject
-        shown_default="all",
-        panel=DATA,
+        None, metavar="NAME,...", in_recipe=False, shown_default="all", panel=DATA
     )
-    room: float = option(
-        0.0,
-        "Light from all around that comes with each flash, as a room sends it back: a share of it.",
-        "SHARE",
-        least=0.0,
-        most=1.0,
-        panel=DATA,
-    )
+    room: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
 
 
 @dataclass(frozen=True)
 class PairsOptions:
-    """The images that predictions are compared with."""
+    """The images that predictions are compared with.
 
-    truth: Path = option(
-        ...,
-        "Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...",
-        "DIR",
-        in_recipe=False,  # an item's input
-        shown_default=False,
-    )
+    Attributes:
+        truth: Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...
+        masks: Compare inside masks: images with the truths' names, white inside.
+        facts: Read a row for each image: name, person, and columns for the tables (text) or for the list of
+            images (numbers).
+        face_distance: Detect the truths' faces and measure Face dis, too.
+    """
+
+    truth: Path = option(..., metavar="DIR", in_recipe=False, shown_default=False)
     masks: Path | None = option(
-        None,
-        "Compare inside masks: images with the truths' names, white inside.",
-        "DIR",
-        shown_default="the truths' alpha, else everything",
-        panel=DATA,
+        None, metavar="DIR", shown_default="the truths' alpha, else everything", panel=DATA
     )
     facts: Path | None = option(
-        None,
-        "Read a row for each image: name, person, and columns for the tables (text) or for the list of "
-        "images (numbers).",
-        "CSV",
-        shown_default="a person is a truth's topmost folder",
-        panel=DATA,
+        None, metavar="CSV", shown_default="a person is a truth's topmost folder", panel=DATA
     )
-    face_distance: bool = option(False, "Detect the truths' faces and measure Face dis, too.", panel=MEASURES)
+    face_distance: bool = option(False, panel=MEASURES)
     predictions: tuple[Path, ...] = ()
     names: tuple[str, ...] = ()  # of the predictions' methods
 
 
 @dataclass(frozen=True)
 class GeometryOptions:
-    """The mean face of Table 4."""
+    """The mean face of Table 4.
+
+    Attributes:
+        mean_checkpoint: Use a checkpoint of `facerf train --mean-face` for the mean face.
+    """
 
     mean_checkpoint: Path | None = option(
-        None,
-        "Use a checkpoint of `facerf train --mean-face` for the mean face.",
-        "FILE",
-        shown_default="that of the fitted face",
-        panel=METHODS,
+        None, metavar="FILE", shown_default="that of the fitted face", panel=METHODS
     )
 
 
 @dataclass(frozen=True)
 class TransferOptions:
-    """The images of a person whose reflectances are exchanged, and how these are read."""
+    """The images of a person whose reflectances are exchanged, and how these are read.
 
-    photos: bool = option(
-        False,
-        "Read photos, two of each person or in folders.",
-        in_recipe=False,
-        flags=("--photos",),
-        panel=DATA,
-    )
-    held_to_photo: bool = option(
-        False,
-        "Correct the field by the quotient of its photo, as `relight` does.",
-        flags=("--held-to-photo",),
-        panel=METHODS,
-    )
+    Attributes:
+        photos: Read photos, two of each person or in folders.
+        held_to_photo: Correct the field by the quotient of its photo, as `relight` does.
+    """
+
+    photos: bool = option(False, in_recipe=False, flags=("--photos",), panel=DATA)
+    held_to_photo: bool = option(False, flags=("--held-to-photo",), panel=METHODS)
 
 
 @dataclass(frozen=True)
 class Measures:
-    """The values and metrics of images; LPIPS is measured if VGG-16's weights are given."""
+    """The values and metrics of images; LPIPS is measured if VGG-16's weights are given.
 
-    space: Space = option("linear", "Measure scene-linear values, or values encoded by sRGB.", panel=MEASURES)
-    lpips: Path | None = option(
-        None,
-        "Read the linear heads of LPIPS (v0.1, VGG) from a file.",
-        "FILE",
-        shown_default="where installed",
-        panel=MEASURES,
-    )
-    vgg_weights: str | None = option(
-        None,
-        "Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.",
-        "imagenet|PATH",
-        shown_default="no LPIPS",
-        panel=MEASURES,
-    )
+    Attributes:
+        space: Measure scene-linear values, or values encoded by sRGB.
+        lpips: Read the linear heads of LPIPS (v0.1, VGG) from a file.
+        vgg_weights: Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.
+    """
+
+    space: Space = option("linear", panel=MEASURES)
+    lpips: Path | None = option(None, metavar="FILE", shown_default="where installed", panel=MEASURES)
+    vgg_weights: str | None = option(None, metavar="imagenet|PATH", shown_default="no LPIPS", panel=MEASURES)
 
     def check(self) -> None:
         """Raise UsageError for heads without the network that they belong to."""
@@ -164,47 +133,37 @@ def _parse_kinds(names: Sequence[str]) -> tuple[RelightKind, ...]:
 
 @dataclass(frozen=True)
 class EvaluateOptions(BatchOptions):
-    """Settings of what is measured, by which methods, and where it goes, for other processes too."""
+    """Settings of what is measured, by which methods, and where it goes, for other processes too.
+
+    Attributes:
+        reflectance: Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait;
+            repeatable, and the others are compared with the first.
+        against: Measure another checkpoint of the field, named by its stem. Repeatable.
+        compare: Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name.
+            Repeatable.
+        pictures: Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.
+        keep_eyes: Compare open eyes, too (default: not, as in the paper).
+        preset: Measure as many images as the paper did.
+    """
 
     reflectance: tuple[RelightKind, ...] = option(
         ("field",),
-        "Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait; repeatable, and the "
-        "others are compared with the first.",
-        "KIND",
+        metavar="KIND",
         shown_default="field; of yale-b portrait",
         typed=list[str] | None,
         parse=_parse_kinds,
         panel=METHODS,
     )
     against: tuple[Path, ...] = option(
-        (),
-        "Measure another checkpoint of the field, named by its stem. Repeatable.",
-        "FILE",
-        shown_default="none",
-        typed=list[Path] | None,
-        parse=tuple,
-        panel=METHODS,
+        (), metavar="FILE", shown_default="none", typed=list[Path] | None, parse=tuple, panel=METHODS
     )
     compare: tuple[Path, ...] = option(
-        (),
-        "Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name. "
-        "Repeatable.",
-        "DIR",
-        shown_default="none",
-        typed=list[Path] | None,
-        parse=tuple,
-        panel=METHODS,
+        (), metavar="DIR", shown_default="none", typed=list[Path] | None, parse=tuple, panel=METHODS
     )
-    pictures: bool = option(
-        False,
-        "Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.",
-        panel=MEASURES,
-    )
-    keep_eyes: bool = option(False, "Compare open eyes, too (default: not, as in the paper).", panel=MEASURES)
+    pictures: bool = option(False, panel=MEASURES)
+    keep_eyes: bool = option(False, panel=MEASURES)
     measures: Measures = Measures()
-    preset: Literal["paper"] | None = option(
-        None, "Measure as many images as the paper did.", shown_default="none", panel=MEASURES
-    )
+    preset: Literal["paper"] | None = option(None, shown_default="none", panel=MEASURES)
 
     @property
     def methods(self) -> tuple[str, ...]:

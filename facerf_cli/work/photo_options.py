@@ -51,72 +51,44 @@ class FieldOptions:
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """Settings of reading and fitting photos, which can be sent to other processes."""
+    """Settings of reading and fitting photos, which can be sent to other processes.
+
+    Attributes:
+        colourspace: Read the input in this colour space: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or
+            any name of the OCIO configuration.
+        face_model: Fit this morphable model: builtin, or a .npz of `face-model import`.
+        face: Choose the face of a photo with several; INDEX counts from the left, from 0.
+        landmarks: Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a
+            pattern (points/{stem}.pts).
+        geometry: Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.
+        texture_side: Side of the UV texture; a multiple of 256.
+        landmarks_from: Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence
+            excludes commercial use).
+        person: Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies
+            it.
+        matte_from: Replace it by that of a model in rembg's folder (an extra); the model's licence is
+            reported.
+    """
 
     settings: Settings
     colourspace: str | None = option(
-        None,
-        "Read the input in this colour space: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or any name of "
-        "the OCIO configuration.",
-        "NAME",
-        flags=("--input-colourspace",),
-        shown_default="the file's",
-        panel=IMAGE,
+        None, metavar="NAME", flags=("--input-colourspace",), shown_default="the file's", panel=IMAGE
     )
-    face_model: str = option(
-        "builtin",
-        "Fit this morphable model: builtin, or a .npz of `face-model import`.",
-        "NAME|PATH",
-        panel=FACE,
-    )
-    face: str = option(
-        "largest",
-        "Choose the face of a photo with several; INDEX counts from the left, from 0.",
-        "largest|all|INDEX",
-        panel=FACE,
-    )
-    landmarks: Path | None = option(
-        None,
-        "Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a pattern "
-        "(points/{stem}.pts).",
-        "FILE|DIR|PATTERN",
-        shown_default="detect them",
-        panel=FACE,
-    )
-    geometry: Geometry | None = option(
-        None,
-        "Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.",
-        shown_default="as the checkpoint was trained",
-        panel=FACE,
-    )
+    face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
+    face: str = option("largest", metavar="largest|all|INDEX", panel=FACE)
+    landmarks: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default="detect them", panel=FACE)
+    geometry: Geometry | None = option(None, shown_default="as the checkpoint was trained", panel=FACE)
     texture_side: int | None = option(
         None,
-        "Side of the UV texture; a multiple of 256.",
-        "T",
+        metavar="T",
         flags=("--texture-size",),
         shown_default="the checkpoint's; 256 for the shipped one",
         panel=METHOD,
     )
-    landmarks_from: LandmarksFrom = option(
-        "facerf",
-        "Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence excludes "
-        "commercial use).",
-        panel=FACE,
-    )
-    person: Path | None = option(
-        None,
-        "Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies it.",
-        "FILE|DIR|PATTERN",
-        shown_default=False,
-        panel=FACE,
-    )
+    landmarks_from: LandmarksFrom = option("facerf", panel=FACE)
+    person: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default=False, panel=FACE)
     matte_from: MatteModel | None = option(
-        None,
-        "Replace it by that of a model in rembg's folder (an extra); the model's licence is reported.",
-        "rembg:NAME",
-        shown_default=False,
-        parse=parse_matte_from,
-        panel=FACE,
+        None, metavar="rembg:NAME", shown_default=False, parse=parse_matte_from, panel=FACE
     )
     ocio_config: str = ""  # that knows the colour space; '' is $OCIO, or the built-in one
 
@@ -155,49 +127,43 @@ class PhotoOptions:
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """The solution for the light."""
+    """The solution for the light.
 
-    non_negative: bool = option(
-        True,
-        "Solve for weights from 0 up, robust to hair and glasses; or for the paper's least squares, with "
-        "negative ones.",
-        flags=("--non-negative/--signed",),
-        panel=METHOD,
-    )
-    refine: Refine = option(
-        "none", "Refine the least squares by comparing features of the texture.", panel=METHOD
-    )
+    Attributes:
+        non_negative: Solve for weights from 0 up, robust to hair and glasses; or for the paper's least
+            squares, with negative ones.
+        refine: Refine the least squares by comparing features of the texture.
+    """
+
+    non_negative: bool = option(True, flags=("--non-negative/--signed",), panel=METHOD)
+    refine: Refine = option("none", panel=METHOD)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LightOptions(SolveOptions):
-    """Settings of estimating the light of a photo, which can be sent to other processes."""
+    """Settings of estimating the light of a photo, which can be sent to other processes.
+
+    Attributes:
+        reflectance: Choose the reflectance model; each baseline estimates its own light.
+        rig: Solve for the light of a rig of N lights, or of a file of directions.
+        vgg_weights: Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.
+        keep_eyes: Use the eyes, too (the paper leaves them out).
+        matte: Use only what a grey image, or its alpha, shows, such as skin alone; --person replaces the
+            matte.
+    """
 
     photo: PhotoOptions
-    reflectance: Kind = option(
-        "field", "Choose the reflectance model; each baseline estimates its own light.", panel=METHOD
-    )
-    rig: str = option(
-        "150",
-        "Solve for the light of a rig of N lights, or of a file of directions.",
-        "N|FILE",
-        flags=("--lights",),
-        panel=LIGHT,
-    )
+    reflectance: Kind = option("field", panel=METHOD)
+    rig: str = option("150", metavar="N|FILE", flags=("--lights",), panel=LIGHT)
     vgg_weights: str | None = option(
         None,
-        "Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.",
-        "imagenet|PATH",
+        metavar="imagenet|PATH",
         shown_default="S_f, the shipped network trained to find the light",
         panel=METHOD,
     )
-    keep_eyes: bool = option(False, "Use the eyes, too (the paper leaves them out).", panel=FACE)
+    keep_eyes: bool = option(False, panel=FACE)
     matte: Path | None = option(
-        None,
-        "Use only what a grey image, or its alpha, shows, such as skin alone; --person replaces the matte.",
-        "FILE|DIR|PATTERN",
-        shown_default="the photo's alpha",
-        panel=FACE,
+        None, metavar="FILE|DIR|PATTERN", shown_default="the photo's alpha", panel=FACE
     )
 
     @property
