@@ -33,7 +33,6 @@ LandmarksFrom = Literal["facerf", "dlib"]
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
-_BEYOND = 2.5  # side of a square around a face that is larger than the photo, in sides of the photo
 _DARK = 100  # of 255: brightest percentile of a photo that is brightened before it is searched
 _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
 
@@ -153,7 +152,7 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
     side_px = float(max(image.shape[:2]))
     yield first_squares(image)
     yield [whole_photo(image, turn_rad) for turn_rad in _TURNS]
-    yield [replace(whole_photo(image), side_px=_BEYOND * side_px), *parts_of(image, side_px / 3)]
+    yield parts_of(image, side_px / 3)
     if side_px / 3 > _FINEST_PX:
         yield parts_of(image, _FINEST_PX)
 

@@ -17,6 +17,7 @@ from facerf_cli.portrait.parse import Square, whole_photo
 
 _MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
 _MESH_PX = 192
+_AFAR = 2.5  # side of the square that shows a photo from afar, in sides of the photo
 _OVERLAP = 1.5  # how many parts along a side cover the photo, over those that just would
 _LEAST_MESH_SCORE, _LEAST_PX = 0.5, 8.0  # of a face; noise has smaller ones
 _SAME = 0.5  # distance of the middles of two boxes below which they hold one face, in sides of the larger
@@ -84,8 +85,13 @@ _Proposed = TypeVar("_Proposed", _Box, FaceMesh)
 
 
 def first_squares(image_srgb: np.ndarray) -> list[Square]:
-    """The whole of an image [H, W, 3] and its parts of two thirds, where faces are searched first."""
-    return [whole_photo(image_srgb), *parts_of(image_srgb, max(image_srgb.shape[:2]) / 1.5)]
+    """Where faces are searched first: an image [H, W, 3] as a whole, from afar, and its parts of two thirds.
+
+    A face that fills the photo is known from afar alone; nearer its eyes look like faces.
+    """
+    side_px = float(max(image_srgb.shape[:2]))
+    whole = whole_photo(image_srgb)
+    return [whole, replace(whole, side_px=_AFAR * side_px), *parts_of(image_srgb, side_px / 1.5)]
 
 
 def parts_of(image: np.ndarray, side_px: float) -> list[Square]:

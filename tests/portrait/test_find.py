@@ -151,6 +151,14 @@ def test_a_face_that_is_larger_than_the_photo():
     assert off[INNER].mean() < 0.12 * iod_px(face)
 
 
+@pytest.mark.parametrize("subject", ["yaleB06", "yaleB12"])
+def test_eyes_of_a_face_that_fills_the_photo_are_no_faces(shared_data, subject):
+    (path,) = (shared_data / "extended_yale_b" / subject).glob("*A+000E+00.pgm")
+    grey = np.asarray(Image.open(path), np.float32) / 255
+    (face,) = find_faces(SHIPPED_NETWORKS.people, np.repeat(grey[..., None], 3, -1), subject)
+    assert np.ptp(face.landmarks_px, axis=0).min() > 0.9 * grey.shape[1]
+
+
 @pytest.mark.parametrize("turn", [40, 90, 180, 250])
 def test_heads_in_any_turn_are_found_among_others(landmarks_px, turn):
     lying = skimage.transform.rotate(PHOTO, turn, resize=True)
