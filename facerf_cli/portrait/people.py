@@ -79,9 +79,11 @@ def person_among(
 ) -> PersonShares:
     """The person with the first of several heads in a small image [h, w, 3] in 0..1.
 
-    `parsed` [h, w] is the share that the Parsing Network sees.
+    `parsed` [h, w] is the share that the Parsing Network sees; it alone knows faces that fill the photo.
     """
     head, *others = heads
+    if not _squares_around(head, image.shape):
+        return PersonShares(parsed, parsed)
     anybody, body = person_share(people.person, image, head), body_share(people.body, image, head)
     share = np.maximum(anybody, body * (1 - _below_eyes(body, head)) * _near(body, head))  # hats
     if others:
@@ -111,11 +113,7 @@ def person_share(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np
     Squares that reach beyond the photo show a close-up from further away, as the network knows people.
     """
     height, width = image.shape[:2]
-    squares = [
-        Square(head.x_px, head.y_px + _BELOW * side * head.height_px, side * head.height_px)
-        for side in _SIDES
-    ]
-    squares = [square for square in squares if _filled(square, image.shape) >= _FILLED]
+    squares = _squares_around(head, image.shape)
     photo = torch.from_numpy(image).permute(2, 0, 1)
     whole = F.interpolate(photo[None], (_NETWORK_PX, _NETWORK_PX), mode="area")[0]
     views = torch.stack([whole, *(square.cut(image, _NETWORK_PX) for square in squares)])
@@ -219,6 +217,15 @@ def _one_piece(person: np.ndarray, head: HeadPlace) -> np.ndarray:
     small = np.bincount(holes.ravel()) < (_HOLE * head.height_px) ** 2
     small[0] = False
     return np.asarray(mine | small[holes])
+
+
+def _squares_around(head: HeadPlace, shape: tuple[int, ...]) -> list[Square]:
+    """The squares around a head that show enough of a photo."""
+    squares = [
+        Square(head.x_px, head.y_px + _BELOW * side * head.height_px, side * head.height_px)
+        for side in _SIDES
+    ]
+    return [square for square in squares if _filled(square, shape) >= _FILLED]
 
 
 def _filled(square: Square, shape: tuple[int, ...]) -> float:

@@ -52,6 +52,13 @@ def test_two_people_are_divided_where_they_touch() -> None:
     assert part[120, 60] > 0.9 and part[120, 150] > 0.9 and part[120, 175] < 0.1 and part[120, 260] < 0.1
 
 
+def test_a_face_that_fills_the_photo_is_what_the_parsing_network_sees() -> None:
+    parsed = disc(160, 120, 100).astype(np.float32)
+    head = HeadPlace(160, 120, 320, 280)
+    share = person_among(white_people(), np.zeros((240, 320, 3), np.float32), [head], parsed).person
+    assert (share == parsed).all()
+
+
 def test_the_parsing_network_takes_away_below_the_eyes_alone() -> None:
     image = np.where(disc(160, 70, 55)[..., None], 1.0, 0.3).repeat(3, -1).astype(np.float32)
     share = person_among(white_people(), image, [HEAD], np.zeros(image.shape[:2])).person
