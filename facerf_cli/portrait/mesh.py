@@ -85,7 +85,7 @@ _Proposed = TypeVar("_Proposed", _Box, FaceMesh)
 
 
 def first_squares(image_srgb: np.ndarray) -> list[Square]:
-    """Where faces are searched first: an image [H, W, 3] as a whole, from afar, and its parts of two thirds.
+    """Squares of an image [H, W, 3] to search first: all of it, it from afar, and parts of two thirds.
 
     A face that fills the photo is known from afar alone; nearer its eyes look like faces.
     """
