@@ -36,9 +36,7 @@ _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
-_CLASSLESS = (
-    0.3  # share of the person that the Parsing Network sees, below which a pixel takes others' classes
-)
+_CLASSLESS = 0.3  # share of the person to the Parsing Network, below which a pixel takes others' classes
 # Of ears, which the network's own landmarks place.
 _EAR_LIFT = 1.25  # logarithm of the largest factor of the odds
 _EAR_WIDTH = 0.045  # standard deviation of the distance from the line, in extents of the landmarks
