@@ -1,14 +1,17 @@
+import gc
 import json
 import os
 import signal
 import subprocess
 import sys
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import torch.distributed as dist
 import torch.multiprocessing as mp
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
@@ -240,7 +243,10 @@ def _one_of_two(rank: int, folder: Path, settings: TrainSettings) -> None:
     os.environ |= {"RANK": str(rank), "LOCAL_RANK": str(rank)}
     torch.set_num_threads(1)
     with joined_processes():
+        group = weakref.ref(dist.group.WORLD)
         train(toy_objective(), folder, settings)
+    gc.collect()
+    assert group() is None  # or its threads outlive the interpreter, and abort the process
 
 
 def test_two_processes_learn_what_one_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
