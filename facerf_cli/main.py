@@ -80,6 +80,8 @@ SEVERAL = {"--envmap": (".exr", ".hdr")}
 _SPINS = (
     "20000"  # turns of a waiting thread of torch's before it sleeps; with more, other programs wait for it
 )
+_LONGEST_PATH = 4096  # bytes, of Linux
+_MOST_SEED = 2**63 - 1  # torch's
 _PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
 log = logging.getLogger(LOGGER_NAME)
 app = typer.Typer(
@@ -120,7 +122,9 @@ def _global_options(
             show_default="the shipped ones",
         ),
     ] = [],  # noqa: B006 (typer copies it)
-    seed: Annotated[int, typer.Option(min=0, help="Seed of everything that is random.")] = Settings.seed,
+    seed: Annotated[
+        int, typer.Option(min=0, max=_MOST_SEED, help="Seed of everything that is random.")
+    ] = Settings.seed,
     memory_gb: Annotated[
         float | None,
         typer.Option(
@@ -208,7 +212,11 @@ def run() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="surrogateescape")
     memory.collect_seldom()
-    _leave(main(sys.argv[1:]))
+    try:
+        code = main(sys.argv[1:])
+    except SystemExit as stop:  # of a signal; the interpreter's own end would name what libraries hold
+        code = stop.code if isinstance(stop.code, int) else 1
+    _leave(code)
 
 
 def _leave(code: int) -> NoReturn:
@@ -224,6 +232,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run one command line and return its exit code; an error becomes one line on stderr."""
     configure_logging()
     try:
+        _check_surroundings()
         line = repeat_options(global_options_first(arguments or ["--help"]))
         try:
             code = app(args=line, prog_name="facerf", standalone_mode=False)
@@ -257,6 +266,14 @@ def main(arguments: Sequence[str]) -> int:
             message = error.format_message().replace("Value error, ", "")  # pydantic's prefix
             return _fail(None, f"{message} {_see_help(error)}", error.exit_code)
         return _fail(error, unexpected(error), 1)
+
+
+def _check_surroundings() -> None:
+    """Raise UsageError for a working folder or an environment that libraries fail on when they are loaded."""
+    if len(os.fsencode(os.getcwd())) >= _LONGEST_PATH:
+        raise UsageError(f"working folder: its path is longer than {_LONGEST_PATH} bytes; use another one")
+    if not (epoch := os.environ.get("SOURCE_DATE_EPOCH", "0")).isdecimal():
+        raise UsageError(f"SOURCE_DATE_EPOCH {epoch!r}: not a number of seconds; unset it")
 
 
 def global_options_first(arguments: Sequence[str]) -> list[str]:

@@ -26,6 +26,7 @@ from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import FitStart, Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
+from facerf_cli.image.colour import without_fireflies
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
@@ -58,7 +59,7 @@ def fit_photo(
     """
     sides = sides or models.sides()
     crop = from_landmarks(landmarks_px, sides.crop_px)
-    cropped = crop.apply(photo)
+    cropped = without_fireflies(crop.apply(photo))
     in_crop = crop.to_crop(landmarks_px)
     trust = trust_inside(in_crop, crop, *photo.shape[:2])
     fit = fit_landmarks(models.face, in_crop, crop, trust=trust, start=regress_head(models, cropped))
@@ -73,7 +74,7 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
     """
     sides = sides or models.sides()
     crop = from_box(box_px, sides.crop_px)
-    cropped = crop.apply(photo)
+    cropped = without_fireflies(crop.apply(photo))
     fit = regressed_fit(models.face, regress_head(models, cropped), crop)
     return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
 

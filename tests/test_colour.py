@@ -322,3 +322,14 @@ def test_a_light_that_hardly_reaches_the_face_is_not_made_hundreds_of_times_as_b
     assert ours.most_exposure_ev("auto", 1.0) == 3.0
     assert ours.most_exposure_ev("auto", 4.0) == 1.0
     assert ours.most_exposure_ev("auto", 0.0) == math.inf == ours.most_exposure_ev("face", 1.0)
+
+
+def test_one_broken_pixel_sets_no_mean_and_ordinary_photos_stay() -> None:
+    photo = np.random.default_rng(0).random((40, 60, 3)).astype(np.float32)
+    assert ours.without_fireflies(photo) is photo
+    broken = photo.copy()
+    broken[7, 9] = 1e6
+    limited = ours.without_fireflies(broken)
+    assert limited.dtype == np.float32 and abs(limited.mean() / photo.mean() - 1) < 0.01
+    assert (limited == broken)[broken < 1].all()
+    assert (ours.without_fireflies(photo * 1000) == photo * 1000).all()  # in other units

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -69,3 +70,12 @@ def test_workers_import_none(
     ended = run(script, "segment", "a.png", "b.png", "-o", "out", *workers)
     assert ended.returncode == 1 and ended.stderr.count("a.png") and ended.stderr.count("b.png"), ended.stderr
     assert not imported(folder)
+
+
+def test_processes_start_in_known_files() -> None:
+    """`run` sets PYTHONSAFEPATH for all that multiprocessing starts; another way needs its test here."""
+    package = Path(__file__).parents[1] / "facerf_cli"
+    starts = re.compile(r"\bsubprocess\.|get_context|Popen|num_workers=|os\.(system|fork|exec)")
+    files = {file for file in package.rglob("*.py") if starts.search(file.read_text())}
+    known = {"cli/manual.py", "files/apart.py", "run/workers.py", "training/loop.py"}
+    assert {file.relative_to(package).as_posix() for file in files} == known

@@ -219,3 +219,36 @@ def test_ctrl_c_outside_of_a_verb_is_one_line(
     monkeypatch.setattr(main, "repeat_options", pressed)
     assert main.main(["doctor"]) == 130
     assert "interrupted" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("change", "said"), [
+    ({"argument": "9" * 26}, "'--seed'"),
+    ({"SOURCE_DATE_EPOCH": "yesterday"}, "SOURCE_DATE_EPOCH 'yesterday': not a number of seconds"),
+    ({"folder": "/d" * 2048}, "working folder: its path is longer than 4096 bytes"),
+])  # fmt: skip
+def test_what_libraries_fail_on_is_one_line(
+    verb: Verb, capsys: Capture, monkeypatch: pytest.MonkeyPatch, change: dict[str, str], said: str
+) -> None:
+    if folder := change.pop("folder", None):
+        monkeypatch.setattr(main.os, "getcwd", lambda: folder)
+    seed = change.pop("argument", "0")
+    for name, value in change.items():
+        monkeypatch.setenv(name, value)
+    assert verb("probe", "--seed", seed) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
+
+
+def test_a_signal_ends_the_process_without_what_libraries_say_at_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def ended_by_a_signal(line: list[str]) -> int:
+        sys.exit(143)
+
+    left: list[int] = []
+    monkeypatch.setattr(main, "main", ended_by_a_signal)
+    monkeypatch.setattr(main, "end_on_signals", lambda patience_s: None)
+    monkeypatch.setattr(main, "_leave", left.append)
+    monkeypatch.setattr(main.memory, "collect_seldom", lambda: None)
+    main.run()
+    assert left == [143]

@@ -6,6 +6,7 @@ Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an
 import os
 import re
 import sys
+import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -171,8 +172,10 @@ def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
     """Raise UsageError for two items with one name; case counts only where one folder holds both."""
     by_name: dict[str, Item] = {}
     for item in items:
-        other = by_name.setdefault(item.name.casefold(), item)
-        apart = other.name != item.name and other.input_path.parent == item.input_path.parent
+        plain = unicodedata.normalize("NFC", item.name)
+        other = by_name.setdefault(plain.casefold(), item)
+        same = plain == unicodedata.normalize("NFC", other.name)  # in some file systems, and to the eye
+        apart = not same and other.input_path.parent == item.input_path.parent
         if other is not item and not apart:
             alike = "--name names them alike; give it more fields, such as {stem} and {ext}"
             by_path = (

@@ -95,6 +95,8 @@ def add_row(report: Path, verb: str, result: ItemResult) -> None:
 def unusable(folder: Path, error: BaseException) -> UsageError:
     """The error of an output folder that cannot be written to."""
     reason = error.strerror if isinstance(error, OSError) else error
+    if folder.is_symlink() and not folder.exists():
+        reason = "a link that leads nowhere"
     return UsageError(f"-o {folder}: cannot be written to ({reason}); give another folder")
 
 

@@ -18,7 +18,7 @@ _MESHES = ("_mesh.glb", "_mesh.mtl", "_mesh.obj")
 class FitGeometry(PhotoWork):
     """`facerf fit-geometry`."""
 
-    verb, endings, networks = "fit-geometry", (*_TEXTURES, *_MESHES, "_overlay.jpg", "_fit.npz"), FITTING
+    verb, endings, networks = "fit-geometry", (*_TEXTURES, *_MESHES, "_fit.jpg", "_fit.npz"), FITTING
 
     def write(self, item: Item) -> Written:
         """Fit every chosen face."""
@@ -32,7 +32,7 @@ def fit_geometry(inputs: InputsArgument, work: FitGeometry, batch: BatchOptions)
 
     For each photo: _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, the head upright),
     _texture.exr and .png (in UV space; the EXR's layer 'visible' marks what the photo shows), _normals.exr
-    (camera space) and .png, and _overlay.jpg, the mesh over the photo. The report holds each fit's error (a
+    (camera space) and .png, and _fit.jpg, the mesh over the photo. The report holds each fit's error (a
     share of the distance between the outer eye corners), its quality (good, fair, poor) and the pose.
     """
     raise typer.Exit(work.run(inputs, batch))

@@ -24,7 +24,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from facerf_cli.errors import FacerfError
+from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by, end_again
 
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 _ABANDONED_S = 24 * 3600  # without a write: then another machine's temporary folder counts as abandoned
 _MARK = ".part-"
 _LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, that its temporary folder repeats
+# Errors of one output's name or folder, which cost its item; others, as of a full disk, end the run.
+_OF_ONE_PATH = {errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EILSEQ}
 _open: set[Path] = set()  # temporary folders of this process
 _watched: list[list[Path]] = []  # what was written since each `all_or_none` began
 _swept: set[Path] = set()  # folders whose leftovers this process has removed
@@ -51,6 +53,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     try:
         with hidden_folder(path) as room:
             temporary = room / path.name
+            with suppress(FileNotFoundError):
+                temporary.lstat()  # says that a name is too long, which libraries do not
             yield temporary
             end_again()  # what was written may lack what a library left out
             if not temporary.exists():
@@ -63,7 +67,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
                 written.append(path)
             _sync_folder(path.parent)
     except OSError as error:
-        raise FacerfError(f"{path}: cannot write: {error.strerror or error}") from error
+        kind = InputError if error.errno in _OF_ONE_PATH else FacerfError
+        raise kind(f"{path}: cannot write: {error.strerror or error}") from error
 
 
 @contextmanager
@@ -172,7 +177,8 @@ def _sync_all(path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    follow = 0 if path.is_dir() else getattr(os, "O_NOFOLLOW", 0)  # a folder may be a link of the user's
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | follow)
     try:
         os.fsync(descriptor)
     finally:

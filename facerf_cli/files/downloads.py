@@ -7,6 +7,7 @@ import http.client
 import logging
 import os
 import ssl
+import time
 import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.run.logs import LOGGER_NAME, one_line, progress_bar
 
 TIMEOUT_S = 30.0  # without any data on a connection
+DEADLINE_S = 2 * 3600.0  # of a download in all; the next one continues it
 _TRIES = 5  # connections to a server; each continues where the last one broke
 _BLOCK = 2**20  # bytes read at a time
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")  # where http is safe
@@ -76,7 +78,7 @@ def fetch(published: PublishedFile, option: str, cache: Path | None = None) -> P
         raise FacerfError(
             f"{published.url}: {error}; put the right file at {path}, or give {option}"
         ) from None
-    except _NO_NETWORK as error:
+    except (_Late, *_NO_NETWORK) as error:
         raise FacerfError(
             f"{published.url}: cannot be fetched ({_reason(error)}); run again with a network, "
             f"put the file at {path}, or give {option}"
@@ -86,6 +88,10 @@ def fetch(published: PublishedFile, option: str, cache: Path | None = None) -> P
             f"{path}: cannot be kept in the cache ({_reason(error)}); make room there, or give {option}"
         ) from None
     return path
+
+
+class _Late(Exception):
+    """A download reached its deadline."""
 
 
 class _Refused(Exception):
@@ -111,10 +117,11 @@ def _fetch(published: PublishedFile, path: Path) -> None:
 
 def _download(published: PublishedFile, part: Path) -> None:
     """Download the rest of `part`; connect again as long as each connection delivers some data."""
+    end_s = time.monotonic() + DEADLINE_S
     for attempt in range(1, _TRIES + 1):
         before = _size(part)
         try:
-            if _one_connection(published, part):
+            if _one_connection(published, part, end_s):
                 return
             raise ConnectionError("the connection broke off")
         except _NO_NETWORK:
@@ -122,8 +129,11 @@ def _download(published: PublishedFile, part: Path) -> None:
                 raise
 
 
-def _one_connection(published: PublishedFile, part: Path) -> bool:
-    """Append one connection's data to `part`; return whether the file is complete."""
+def _one_connection(published: PublishedFile, part: Path, end_s: float) -> bool:
+    """Append one connection's data to `part`; return whether the file is complete.
+
+    Raises _Late at the deadline.
+    """
     begin = _size(part)
     try:
         response = _open(published.url, begin)
@@ -144,6 +154,8 @@ def _one_connection(published: PublishedFile, part: Path) -> bool:
                 _refuse_beyond(published, file.tell() + len(block))
                 file.write(block)
                 progress.advance(task, len(block))
+                if time.monotonic() > end_s:
+                    raise _Late(f"not whole within {DEADLINE_S / 3600:g} h; the next run continues it")
             return total is None or file.tell() >= total
 
 

@@ -314,9 +314,8 @@ def write_exr(
         return data
 
     write_parts(path, specs, [partial(band, part) for part in parts], metadata)
-    if count := sum(beyond):
-        log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
-    return count
+    warn_of_clamped(path, sum(beyond))
+    return sum(beyond)
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,6 +373,12 @@ def half_floats(path: Path, values: np.ndarray) -> tuple[np.ndarray, int]:
         return data, 0
     _require_finite(path, values)
     return values.clip(-HALF_MAX, HALF_MAX).astype(np.float16), int(np.sum(np.abs(values) > HALF_MAX))
+
+
+def warn_of_clamped(path: Path, count: int) -> None:
+    """Say that values were beyond the range of half floats, if some were."""
+    if count:
+        log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
 
 
 def _require_finite(path: Path, values: np.ndarray) -> None:

@@ -23,9 +23,10 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.image_metadata import Attributes, oiio_error, utf8_path
-from facerf_cli.files.images import half_floats, write_parts
+from facerf_cli.files.images import half_floats, warn_of_clamped, write_parts
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
 from facerf_cli.image.colour import REC709_CHROMATICITIES
+from facerf_cli.image.strips import Band
 from facerf_cli.run import memory
 from facerf_cli.run.logs import one_line
 
@@ -73,8 +74,16 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
         # Last, since it may be summed as the lights arrive.
         yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
 
+    beyond: list[int] = []
+
+    def band(part: np.ndarray) -> Band:
+        data, count = half_floats(path, part)
+        beyond.append(count)
+        return data.__getitem__
+
     with _one_thread():
-        write_parts(path, _specs(header), (half_floats(path, part)[0].__getitem__ for part in parts()))
+        write_parts(path, _specs(header), map(band, parts()))
+    warn_of_clamped(path, sum(beyond))
 
 
 def _apart(olats: Iterable[Tensor]) -> Iterator[Tensor]:

@@ -39,6 +39,7 @@ _BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
 _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
+_FIREFLY = 8.0  # times the 99th percentile: brighter than any highlight of skin
 ExposureRule = Literal["auto", "face"]
 FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
 MOST_OVER_FRONT_EV = 3.0  # that a face which sees little of the light gets more than one that sees it all
@@ -298,6 +299,13 @@ def lab_d65(linear: np.ndarray) -> np.ndarray:
     root = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative / (3 * (6 / 29) ** 2) + 4 / 29)
     x, y, z = np.moveaxis(root, -1, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
+def without_fireflies(linear: np.ndarray) -> np.ndarray:
+    """Limit [H, W, 3] to 8 times its 99th percentile, so that a broken pixel sets no mean; 1 is never cut."""
+    if linear.max() <= 1:
+        return linear
+    return np.minimum(linear, max(1.0, _FIREFLY * float(np.percentile(linear, 99))), dtype=linear.dtype)
 
 
 def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> float:

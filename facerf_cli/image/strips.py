@@ -1,5 +1,6 @@
 """Images at another size, and in strips of rows, so that a large photo takes little memory at a time."""
 
+import logging
 import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -8,6 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.run.logs import LOGGER_NAME
+
+log = logging.getLogger(LOGGER_NAME)
 STRIP_PX = 1 << 18  # pixels of a strip, about
 _HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
@@ -43,15 +47,19 @@ def filled(
     """
     found = {name: layer for name, layer in layers.items() if isinstance(layer, np.ndarray)}
     bands = {name: layer for name, layer in layers.items() if not isinstance(layer, np.ndarray)}
+    beyond = 0
     for rows in strips((height_px, width_px)):
         for name, band in bands.items():
             values = band(rows)
             if name not in found:
                 found[name] = empty(name, (height_px, *values.shape[1:]))
             if found[name].dtype == np.float16:
+                beyond += int(np.count_nonzero(np.abs(values) > _HALF_MAX))
                 values = values.clip(-_HALF_MAX, _HALF_MAX)
             found[name][rows] = values
             release(found[name])
+    if beyond:
+        log.warning("%d values of layers beyond the range of half floats are set to %g", beyond, _HALF_MAX)
     return {name: found[name] for name in layers}
 
 

@@ -13,6 +13,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.image.colour import without_fireflies
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import class_index
@@ -109,7 +110,7 @@ def look_at_person(
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or give --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
-    image = torch.from_numpy(square.apply(photo)).permute(2, 0, 1)
+    image = torch.from_numpy(without_fireflies(square.apply(photo))).permute(2, 0, 1)
     maps = proxy_maps(proxy, square_camera(fit, square))
     return SeenPerson(square, image, classes, proxy, maps, fit, segmentation)
 

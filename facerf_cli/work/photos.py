@@ -2,7 +2,8 @@
 
 import logging
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -160,6 +161,15 @@ def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> Lin
     return image
 
 
+@contextmanager
+def naming(name: object) -> Iterator[None]:
+    """Let errors of the block begin with the name of the input."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
     """Fit the faces of a photo that the options choose, from left to right."""
     models = load_models_once(options)
@@ -227,22 +237,18 @@ def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
     path = companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")
     landmarks_px = read_landmarks(path)
-    try:
+    with naming(path):
         return face_at(check_in_photo(landmarks_px, *image.pixels.shape[:2]))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _fitted(
     face: PhotoFace, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
 ) -> FittedFace:
-    try:
+    with naming(face.name):
         models = load_models_once(options)
         head = head_of(models, image.pixels, face.found, models.sides(options.texture_side))
         if matte is not None:
             head = head.without(models.face, uncovered_by(matte, head.fit.crop))
-    except InputError as error:
-        raise InputError(f"{face.name}: {error}") from None
     if head.fit.quality == "poor":
         log.warning(
             "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "

@@ -36,6 +36,7 @@ from facerf_cli.work.photos import (
     fit_faces,
     fit_facts,
     load_models_once,
+    naming,
     provenance,
     read_matte,
     read_photo,
@@ -217,7 +218,7 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
     """A person, fitted and with its reflectance read, in the pose and place that the options choose."""
     models, photo, target = load_models_once(work.photo), image.pixels, _target(item, face, image, work)
     kind, alone = work.reflectance, work.network_alone
-    try:
+    with naming(item.input_path):
         require_face(models.face, target.fit or face.fit, photo.shape[:2])
         reflectance = reflectance_of(
             models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte
@@ -226,8 +227,6 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
         if target.composite == "photo" and face.matte is None:
             face.see(person.segmentation)
         return person.composed(target)
-    except InputError as error:
-        raise InputError(f"{item.input_path}: {error}") from None
 
 
 def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> Target:

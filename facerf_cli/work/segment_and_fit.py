@@ -141,7 +141,7 @@ def _write_fit(item: Item, image: LinearImage, face: FittedFace, options: PhotoO
     write_display(path("_normals.png"), srgb_to_linear(0.5 + 0.5 * normals), metadata=metadata)
     _write_mesh(path, _mesh(face, to_display(texture), options, metadata))
     overlay = draw_fit(image.pixels, face.fit, face_model(options))
-    write_display(path("_overlay.jpg"), overlay, metadata=metadata)
+    write_display(path("_fit.jpg"), overlay, metadata=metadata)
     with atomic_path(path("_fit.npz")) as temporary:
         save_fit(temporary, face.fit, metadata)
 

@@ -33,6 +33,7 @@ from facerf_cli.work.photos import (
     facts_of,
     fit_faces,
     load_models_once,
+    naming,
     provenance,
     read_photo,
     rotation_of,
@@ -115,7 +116,8 @@ def _of_person(
         None if one is None else resized(one, *photo.shape[:2]) for one in (image.alpha, face.matte)
     )
     memory = prediction_bytes()
-    field = reflectance_of(models, head, "portrait", work.network_alone, memory, photo, matte=matte)
+    with naming(item.input_path):
+        field = reflectance_of(models, head, "portrait", work.network_alone, memory, photo, matte=matte)
     composition = Person(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
     size = composition.size_px
 

@@ -2,6 +2,7 @@
 
 import logging
 import os
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.atomic import alone_in
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.checkpoint import load_networks, load_vgg, new_network
@@ -103,8 +105,10 @@ _SIZES: dict[Preset, _PresetSizes] = {
 
 def run_training(options: TrainOptions) -> None:
     """Train in this process or, under torchrun, in several, and print the path of the last checkpoint."""
-    with joined_processes():
+    with joined_processes(), ExitStack() as stack:
         device, first = torch_device(options.settings), process_rank() == 0
+        if first:
+            stack.enter_context(alone_in(options.output, ".facerf-lock"))
         workers = options.workers
         if workers is None:
             workers = _WORKERS_ON_GPU if device.type == "cuda" else int((os.cpu_count() or 1) > 1)

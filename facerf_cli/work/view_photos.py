@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -24,7 +25,15 @@ from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.photos import FittedFace, face_model, facts_of, fit_faces, load_models_once, read_photo
+from facerf_cli.work.photos import (
+    FittedFace,
+    face_model,
+    facts_of,
+    fit_faces,
+    load_models_once,
+    naming,
+    read_photo,
+)
 from facerf_cli.work.stack_composers import face_in_stack
 
 _MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
@@ -52,7 +61,8 @@ def write_page(
     """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
     photo, head = shrunk_photo(photo, face.head, size_px)
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
-    basis, plate = of_photo(models, photo, head, matte)
+    with naming(item.input_path):
+        basis, plate = of_photo(models, photo, head, matte)
     _write(path, item, face.tag.replace("_", " "), basis, plate, head_place(head.fit.crop, plate.matte))
 
 
@@ -108,7 +118,7 @@ def write_index(path: Path, items: Sequence[Item], options: PhotoOptions) -> Non
         for made in sorted(item.output_base.parent.glob(f"{glob.escape(item.output_base.name)}*.html")):
             tag = made.stem.removeprefix(item.output_base.name)
             if tag == "" if options.face != "all" else tag.startswith("_face"):
-                address = made.relative_to(path.parent).as_posix()
+                address = quote(made.relative_to(path.parent).as_posix().encode("utf-8", "surrogateescape"))
                 strip = strip_of(made.read_text(encoding="utf-8"))
                 entries.append(IndexEntry(item.name + tag.replace("_", " "), address, strip))
     with atomic_path(path) as temporary:

@@ -19,7 +19,7 @@ from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
 
 NAMES = ("texture.exr", "texture.png", "normals.exr", "normals.png", "mesh.glb", "mesh.obj", "mesh.mtl")
-ENDINGS = {f"_{name}" for name in (*NAMES, "overlay.jpg", "fit.npz")}
+ENDINGS = {f"_{name}" for name in (*NAMES, "fit.jpg", "fit.npz")}
 Capture = pytest.CaptureFixture[str]
 
 
@@ -81,7 +81,7 @@ def test_texture_says_what_was_seen_and_normals_are_of_unit_length(fitted: Path)
 
 
 def test_the_overlay_is_the_photo_but_for_the_face(fitted: Path) -> None:
-    photo, overlay = (read_image(path).pixels for path in (PHOTO, fitted / "astronaut_overlay.jpg"))
+    photo, overlay = (read_image(path).pixels for path in (PHOTO, fitted / "astronaut_fit.jpg"))
     assert overlay.shape == photo.shape
     fit = fit_of(fitted)
     x, y = fit.crop.to_photo(fit.landmarks_px[30].numpy()).round().astype(int)

@@ -2,6 +2,7 @@
 
 import io
 import sys
+import unicodedata
 from pathlib import Path
 
 import numpy as np
@@ -191,3 +192,11 @@ def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: pytest.Ca
     assert main([*line, "--name", "{stem}_{light}"]) == 2
     assert "{light} is no field" in capsys.readouterr().err
     assert main([*line, "--name", "../{stem}"]) == 2
+
+
+def test_names_that_differ_by_their_unicode_form_alone_are_refused(tmp_path: Path) -> None:
+    for form in ("NFC", "NFD"):
+        (tmp_path / unicodedata.normalize(form, "né.png")).touch()
+    if len(list(tmp_path.iterdir())) == 2:  # not on every file system
+        with pytest.raises(UsageError, match="would both be written"):
+            names(tmp_path, tmp_path)

@@ -1,5 +1,6 @@
 """Groups of options: fields of dataclasses become a verb's options, and come back as the dataclass."""
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -8,8 +9,13 @@ import typer
 from typer.testing import CliRunner
 
 from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.estimate_light import EstimateLight
+from facerf_cli.cli.fit_geometry import FitGeometry
 from facerf_cli.cli.options import with_groups
+from facerf_cli.cli.predict_olat import PredictStacks
+from facerf_cli.cli.segment import Segment
 from facerf_cli.option import Only, Without, attributes_of, option
+from facerf_cli.work.photo_options import PhotoOptions
 
 
 @dataclass(frozen=True)
@@ -105,3 +111,10 @@ def test_groups_hold_groups_and_parse_what_is_typed() -> None:
     assert plain == Picture(Paint(Settings(seed=5)))
     assert given == Picture(Paint(Settings(seed=5), side_px=3), 0.2, ("a", "b"), "square")
     assert run(verb, "--kind", "ink").exit_code == run(verb, "--shape", "flat").exit_code == 2
+
+
+def test_no_two_verbs_on_photos_write_one_name() -> None:
+    photo = PhotoOptions(Settings())
+    verbs = [kind(photo=photo) for kind in (Segment, FitGeometry, EstimateLight, PredictStacks)]
+    endings = Counter(ending for verb in verbs for ending in verb.endings)
+    assert max(endings.values()) == 1

@@ -1,5 +1,7 @@
 import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,19 @@ from tests.dataset.dataset_fixture import write_small_dataset
 from tests.training.joint_dataset import write_joint_dataset
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
+
+
+def test_a_run_has_its_folder_to_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held: list[Path] = []
+
+    @contextmanager
+    def alone(folder: Path, name: str) -> Iterator[None]:
+        held.append(folder)
+        yield
+
+    monkeypatch.setattr(train_work, "alone_in", alone)
+    assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "nobody.npz"]) == 1
+    assert held == [tmp_path / "run"]
 
 
 @pytest.mark.parametrize("time", ["soon", "5", "-3m", "2d"])

@@ -8,10 +8,14 @@ import pytest
 import torch
 from PIL import Image
 
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.settings import Settings
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.work.output_options import parse_exposure
+from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.view_photos import write_index
 
 
 @pytest.fixture
@@ -72,3 +76,10 @@ def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
     data = json.loads(made.partition('id="data">')[2].partition("</script>")[0])
     assert len(data["ratios"]) == 12 and data["size"] == [32, 24] and not data["background"]
     assert data["exposure"]["plate"] is None and data["source"].endswith("captured.exr")
+
+
+def test_links_of_an_index_are_addresses(tmp_path: Path) -> None:
+    item = Item(tmp_path / "a.jpg", tmp_path / "50% #1?", "50% #1?")
+    (tmp_path / "50% #1?.html").write_text('<meta name="facerf:strip" content="AA==">')
+    write_index(tmp_path / "index.html", [item], PhotoOptions(Settings()))
+    assert 'href="50%25%20%231%3F.html"' in (tmp_path / "index.html").read_text()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.errors import FacerfError
+from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files import atomic
 from facerf_cli.files.atomic import _machine, alone_in, atomic_path
 from tests.processes import wait_until
@@ -204,3 +204,19 @@ def test_a_link_at_the_lock_s_name_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OSError), alone_in(tmp_path, ".lock"):
         pass
     assert (tmp_path / "theirs").read_text() == "theirs"
+
+
+def test_an_output_folder_may_be_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with atomic_path(tmp_path / "link" / "a.txt") as temporary:
+        temporary.write_text("whole")
+    assert (tmp_path / "real" / "a.txt").read_text() == "whole"
+
+
+@pytest.mark.parametrize("name", ["n" * 256, "taken/a.txt", "nowhere/a.txt"])
+def test_a_name_that_cannot_be_costs_its_own_item(tmp_path: Path, name: str) -> None:
+    (tmp_path / "taken").write_text("a file")
+    (tmp_path / "nowhere").symlink_to(tmp_path / "not there")
+    with pytest.raises(InputError, match="cannot write"), atomic_path(tmp_path / name):
+        pass

@@ -221,3 +221,12 @@ def test_two_at_once_fetch_it_once(server: Server, tmp_path: Path) -> None:
     for thread in threads:
         thread.join()
     assert len(server.asked) == 1 and (tmp_path / "a file.pth").read_bytes() == CONTENT
+
+
+def test_a_server_that_drips_is_given_up_and_what_came_is_kept(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(downloads, "DEADLINE_S", -1.0)
+    with pytest.raises(FacerfError, match="the next run continues it"):
+        fetch(server.published(), OPTION, tmp_path)
+    assert len(server.asked) == 1 and (tmp_path / ".a file.pth.part").stat().st_size

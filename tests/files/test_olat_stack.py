@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.files import olat_stack
+from facerf_cli.files import images, olat_stack
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import (
     StackHeader,
@@ -104,8 +104,12 @@ def test_oiiotool_opens_it(path: Path) -> None:
     assert f"({LIGHTS + 1} subimages)" in said
 
 
-def test_values_beyond_half_are_held_and_nan_is_our_bug(tmp_path: Path) -> None:
+def test_values_beyond_half_are_held_and_nan_is_our_bug(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(images.log, "propagate", True)
     write_olat_stack(tmp_path / "a.exr", header(), iter([OLATS * 1e6]))
+    assert "beyond the range of half floats" in caplog.text
     assert read_olat_stack(tmp_path / "a.exr").olats.isfinite().all()
     with pytest.raises(InputError, match="NaN"):
         write_olat_stack(tmp_path / "b.exr", header(), iter([OLATS * torch.nan]))
