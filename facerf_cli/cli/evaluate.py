@@ -241,7 +241,9 @@ def _check(context: typer.Context, settings: FaceSettings, photos: bool) -> None
     if photos:
         refuse_given(context, ("split", "every", "joint_fit"), "is for a prepared dataset; leave it out here")
     else:
-        refuse_given(context, ("face", "landmarks", "colourspace"), "is for photos; leave it out here")
+        refuse_given(
+            context, ("face", "landmarks", "colourspace", "layer"), "is for photos; leave it out here"
+        )
     if not settings.options.has_field:
         why = "is for the field; give --reflectance field too, or leave it out"
         refuse_given(context, _MADE_BY_FIELD, why)

@@ -19,7 +19,8 @@ class Segment(PhotoWork):
     """`facerf segment`."""
 
     photo: Annotated[
-        PhotoOptions, Only("colourspace", "face", "landmarks", "landmarks_from", "person", "matte_from")
+        PhotoOptions,
+        Only("colourspace", "layer", "face", "landmarks", "landmarks_from", "person", "matte_from"),
     ]
     verb = "segment"
     endings = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")

@@ -17,7 +17,8 @@ import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import PHOTO_LIMIT_PX, decode
+from facerf_cli.files.decoding import decode
+from facerf_cli.files.images import PHOTO_LIMIT_PX
 from facerf_cli.image.colour import unit_floats
 
 _LARGEST_PX = 8192 * 4320

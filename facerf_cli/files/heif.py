@@ -15,8 +15,7 @@ from facerf_cli.run import memory
 
 HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
-# Colour spaces by the code points of primaries and transfer function (ITU-T H.273), where no ICC profile is.
-_SPACES = {(1, 13): "sRGB", (1, 1): "sRGB", (12, 13): "Display P3", (2, 2): "sRGB"}
+_FULL_RANGE = 1  # to which pi-heif decodes
 PIXELS, PROFILE, CODES, SIZE = "pixels", "profile", "codes", "size"
 
 
@@ -74,6 +73,5 @@ def decode_heif(path: Path, limit_px: int, bytes_px: int = HEIF_BYTES) -> tuple[
         content = arrays[PROFILE]
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(content)}]"), content)
     elif CODES in arrays:
-        key = tuple(arrays[CODES].tolist())
-        spec.attribute("oiio:ColorSpace", _SPACES.get(key, f"CICP {key[0]}-{key[1]}"))
+        spec.attribute("CICP", oiio.TypeDesc("int[4]"), (*arrays[CODES].tolist(), 0, _FULL_RANGE))
     return values, spec

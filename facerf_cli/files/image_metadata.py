@@ -20,28 +20,14 @@ import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.heif import decode_heif, is_heif
-from facerf_cli.files.icc import space_of_profile
-from facerf_cli.image.colour import (
-    ADOBE_RGB,
-    CINEON,
-    DISPLAY_P3,
-    LINEAR,
-    REC2020,
-    SRGB,
-    ColourSpace,
-    find_space,
-    linear_space,
-)
-from facerf_cli.run.logs import LOGGER_NAME, one_line
+from facerf_cli.files.image_parts import is_floating, open_image, shown_size, utf8_path
+from facerf_cli.files.stated_space import default_space, stated_space
+from facerf_cli.image.colour import ColourSpace
+from facerf_cli.run.logs import LOGGER_NAME
 
 Attributes = Mapping[str, str | int | float]
 
-# Colour spaces by a part of the description, in lower case, of ICC profiles that hold tables; the first match
-# counts.
-_ICC_SPACES = {"display p3": DISPLAY_P3, "adobe rgb": ADOBE_RGB, "2020": REC2020, "srgb": SRGB}
 _HEIF_LIMIT_PX = 100_000_000  # of a photo that is decoded for its header alone
-OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
-_SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
 _JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
@@ -68,53 +54,34 @@ class Header:
     metadata: dict[str, Any]
 
 
-def oiio_error(stream: Any = oiio) -> str:
-    """Take the pending error of OpenImageIO, or of one of its streams, which need not be UTF-8.
-
-    OpenImageIO prints an error that nobody took when the program ends.
-    """
-    try:
-        return str(stream.geterror())
-    except UnicodeDecodeError as error:
-        return error.object.decode(errors="replace")
-
-
 def read_header(path: Path) -> Header | None:
-    """Read the header of an image's first part; return None if the file is not a readable image."""
-    spec = _spec_of(path) if path.is_file() else None
+    """Read the header of the layer that is read; return None if the file is not a readable image."""
+    utf8_path(path)
+    try:
+        spec = _spec_of(path) if path.is_file() else None
+    except InputError:  # no image, damaged, or pi-heif is not there
+        spec = None
     if spec is None:
         return None
-    width, height = spec.full_width, spec.full_height
-    if spec.get_int_attribute("Orientation", 1) >= 5:  # rotated by 90 degrees
-        width, height = height, width
-    space = stated_space(path, spec) or default_space(spec)
-    return Header(width, height, is_floating(spec), 8 * spec.format.size(), space, metadata_of(spec))
+    height, width = shown_size(spec)
+    return Header(
+        width, height, is_floating(spec), 8 * spec.format.size(), _space(path, spec), metadata_of(spec)
+    )
 
 
-def _spec_of(path: Path) -> oiio.ImageSpec | None:
+def _spec_of(path: Path) -> oiio.ImageSpec:
     if is_heif(path):
-        try:
-            return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
-        except InputError:  # damaged, or pi-heif is not there
-            return None
-    stream = oiio.ImageInput.open(utf8_path(path))
-    if stream is None:
-        oiio_error()
-        return None
-    spec = stream.spec()
-    stream.close()
-    return spec
+        return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
+    opened = open_image(path)
+    opened.stream.close()
+    return opened.spec
 
 
-def utf8_path(path: Path) -> str:
-    """Return the path for OpenImageIO, which takes only UTF-8; raise an InputError for any other name."""
+def _space(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     try:
-        path.as_posix().encode()
-    except UnicodeEncodeError:
-        raise InputError(
-            f"{str(path)!a}: the name is not UTF-8; rename the file, or the folder that it is in"
-        ) from None
-    return str(path)
+        return stated_space(path, spec) or default_space(spec)
+    except InputError:  # an HDR image, whose pixels are not read
+        return default_space(spec)
 
 
 def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
@@ -127,83 +94,6 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
                 attributes[entry.name] = entry.value
     attributes.pop("Orientation", None)  # `read_image` turns the image upright
     return attributes
-
-
-def default_space(spec: oiio.ImageSpec) -> ColourSpace:
-    """Return the colour space of a file that states none: linear Rec.709 for floats, sRGB for integers."""
-    return LINEAR if is_floating(spec) else SRGB
-
-
-def stated_space(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
-    """Return the colour space that the file states; None where it says nothing."""
-    if is_ultra_hdr(path, spec):
-        return _space_of_ultra_hdr(path, spec)
-    default = default_space(spec)
-    description = spec.get_string_attribute("ICCProfile:profile_description")
-    profile = spec.getattribute("ICCProfile")
-    if profile is not None or description:
-        return _space_of_icc(path, b"" if profile is None else bytes(profile), description, default)
-    name = spec.get_string_attribute("oiio:ColorSpace") or spec.get_string_attribute(OCIO_SPACE)
-    chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
-    if name == "" and spec.get_string_attribute("dpx:Transfer") == "Printing density":
-        return CINEON
-    if name in _SAYS_NOTHING and not chromaticities:
-        return None
-    named = default if name in _SAYS_NOTHING else find_space(name)
-    if named is None:
-        log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
-        named = default
-    if not chromaticities or not named.is_linear:
-        return named
-    by_primaries = linear_space(chromaticities)
-    if by_primaries is None:
-        log.warning("%s: impossible primaries in the header; those of %s are used", path, named.name)
-    return named if by_primaries in (None, LINEAR) else by_primaries
-
-
-def _space_of_icc(path: Path, profile: bytes, description: str, default: ColourSpace) -> ColourSpace:
-    """Return the space of an embedded profile; of one that is not understood, by its name."""
-    found = space_of_profile(profile, description)
-    if found is None:
-        lower = description.lower()
-        found = next((space for part, space in _ICC_SPACES.items() if part in lower), None)
-    if found is None:
-        kind = f"embedded profile '{one_line(description)}' is not understood"
-        log.warning("%s: the %s; taken for %s", path, kind, default.name)
-    return found or default
-
-
-def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
-    """Return whether a file is a JPEG with a gain map, which OpenImageIO applies: its values are linear."""
-    if not is_floating(spec):
-        return False
-    with path.open("rb") as stream:
-        return stream.read(2) == _JPEG_START
-
-
-def _space_of_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
-    """Return the linear space of a JPEG with a gain map, with the primaries of the map, else of the image."""
-    stored = spec.getattribute("ICCProfile")
-    profile = _gain_map_profile(path) or (b"" if stored is None else bytes(stored))
-    space = space_of_profile(profile, "") or SRGB
-    return (space.chromaticities and linear_space(space.chromaticities)) or LINEAR
-
-
-def _gain_map_profile(path: Path) -> bytes:
-    """Return the ICC profile of the gain map (ISO 21496-1), the file's second image; empty without one."""
-    from PIL import Image  # few files need it
-
-    try:
-        with Image.open(path, formats=["JPEG"]) as image:
-            image.seek(1)
-            return bytes(image.info.get("icc_profile", b""))
-    except Exception:  # whatever damage makes Pillow raise
-        return b""
-
-
-def is_floating(spec: oiio.ImageSpec) -> bool:
-    """Return whether values are half, single or double precision floats."""
-    return spec.format.basetype in (oiio.HALF, oiio.FLOAT, oiio.DOUBLE)
 
 
 def require_whole_png(path: Path) -> None:

@@ -194,7 +194,7 @@ def read_map_file(path: Path | str) -> Tensor:
     """Read a lat-long map [H, W, 3], linear Rec.709; a JSON light is converted to one."""
     if Path(path).suffix.lower() == ".json":
         return _latlong(Path(path))
-    envmap = torch.from_numpy(read_image(path, limit_px=ENVMAP_LIMIT_PX).pixels)
+    envmap = torch.from_numpy(read_image(path, limit_px=ENVMAP_LIMIT_PX, with_alpha=False).pixels)
     try:
         check_envmap(envmap)
     except InputError as error:

@@ -88,6 +88,15 @@ def _without(name: str) -> Iterator[None]:
             modules[name] = hidden
 
 
+def power_curve(gamma: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the decoding curve value^gamma; negative values are mirrored."""
+
+    def decode(encoded: np.ndarray) -> np.ndarray:
+        return np.copysign(np.abs(encoded) ** gamma, encoded).astype(np.float32)
+
+    return decode
+
+
 def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Invert ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
     decoded = colour_science().models.oetf_inverse_BT2020(np.abs(encoded), is_12_bits_system=True)
@@ -160,6 +169,20 @@ def find_space(name: str, config: str = "") -> ColourSpace | None:
     if plain in _BY_ALIAS:
         return _BY_ALIAS[plain]
     return ColourSpace(name, None, None, config) if name.casefold() in ocio.names(config) else None
+
+
+def known_space(space: ColourSpace) -> ColourSpace:
+    """Return the space of a usual name that has the same primaries and curve, else the space itself."""
+    alike = (known for known in _ALIASES if known.decode is space.decode)
+    return next((known for known in alike if known.chromaticities == space.chromaticities), space)
+
+
+def encoded_space(name: str, chromaticities: tuple[float, ...], decode: Any) -> ColourSpace | None:
+    """Return the space of these primaries and white and a decoding curve; None if they are impossible."""
+    linear = linear_space(chromaticities)
+    if linear is None:
+        return None
+    return linear if decode is None else known_space(ColourSpace(name, linear.chromaticities, decode))
 
 
 def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:

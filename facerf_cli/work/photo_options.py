@@ -56,6 +56,7 @@ class PhotoOptions:
     Attributes:
         colourspace: Read the input in this colour space: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or
             any name of the OCIO configuration.
+        layer: Read this layer of an EXR, such as beauty, in place of its image.
         face_model: Fit this morphable model: builtin, or a .npz of `face-model import`.
         face: Choose the face of a photo with several; INDEX counts from the left, from 0.
         landmarks: Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a
@@ -74,6 +75,7 @@ class PhotoOptions:
     colourspace: str | None = option(
         None, metavar="NAME", flags=("--input-colourspace",), shown_default="the file's", panel=IMAGE
     )
+    layer: str | None = option(None, metavar="NAME", shown_default="the image", panel=IMAGE)
     face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
     face: str = option("largest", metavar="largest|all|INDEX", panel=FACE)
     landmarks: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default="detect them", panel=FACE)
@@ -194,7 +196,8 @@ class LightOptions(SolveOptions):
 def for_other_photos(photo: PhotoOptions) -> PhotoOptions:
     """Options for photos of which only the light is used: those of the inputs that describe one file go."""
     folder = photo.landmarks if photo.landmarks is not None and not photo.landmarks.is_file() else None
-    return replace(photo, colourspace=None, face="largest", landmarks=folder, person=None, matte_from=None)
+    alone = replace(photo, colourspace=None, layer=None, person=None, matte_from=None)
+    return replace(alone, face="largest", landmarks=folder)
 
 
 def networks_of(kinds: Iterable[str]) -> frozenset[str]:

@@ -152,7 +152,7 @@ def face_model(options: PhotoOptions) -> MorphableModel:
 def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> LinearImage:
     """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel."""
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
-    image = read_image(item.input_path, space, kept_px=kept_px)
+    image = read_image(item.input_path, space, kept_px=kept_px, layer=options.layer)
     if (most := float(image.pixels.max())) > _MOST_RADIANCE:
         raise InputError(
             f"{item.input_path}: its brightest value is {most:.3g}, and {_MOST_RADIANCE:.0e} is the most; "

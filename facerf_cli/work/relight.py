@@ -299,7 +299,7 @@ def _person_of_stack(
         return stack, None, fit_facts(fit)
     path = companion(item, work.photo_of_stack, sorted(PHOTO_SUFFIXES), "--photo")
     with beside_stack(size_px):
-        photo = read_image(path, work.photo.colourspace, kept_px=KEPT_PX).pixels
+        photo = read_image(path, work.photo.colourspace, kept_px=KEPT_PX, layer=work.photo.layer).pixels
     scale = photo.shape[0] / size_px[0]
     if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):
         raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")

@@ -132,6 +132,7 @@ def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
         "landmarks_from": options.landmarks_from,
         "landmarks": options.landmarks,
         "colourspace": options.colourspace,
+        "layer": options.layer,
         "parsing": described_file(load_models_once(options).networks.files["parsing"])["sha256"],
     }
 
