@@ -5,7 +5,9 @@
 
 The shapes are CC0 (github makehumancommunity/makehuman-assets and makehuman). MakeHuman's unit is the
 decimetre. The packed meshes are in metres with the middle of the neck at the origin, x to the image's right,
-y up, z forward, arms lowered, cut below the chest, and stored as whole numbers of `STEP_M`.
+y up, z forward, arms lowered, cut below the chest, and stored as whole numbers of `STEP_M`. Those whose
+names begin with `WHOLE` reach to the hips and have whole arms, as MakeHuman holds them:
+`synth/head/arms.py` bends them.
 """
 
 import sys
@@ -15,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import save_file
 
-from facerf_cli.synth.head.mesh import STEP_M
+from facerf_cli.synth.head.arms import NECK_DM
+from facerf_cli.synth.head.mesh import GARMENTS, STEP_M, WHOLE
 
 MESHES = {
     "body": "base/3dobjs/base.obj",
@@ -32,14 +35,15 @@ MESHES = {
     "jacket": "base/clothes/male_casualsuit05/male_casualsuit05.obj",
     "suit": "base/clothes/male_elegantsuit01/male_elegantsuit01.obj",
 }
-NECK_DM = np.array([0.0, 5.95, 0.22])
 LOWEST_DM, WIDEST_DM = 1.9, 3.4  # of what is kept of body and garments
+LOWEST_WHOLE_DM = -0.5  # of whole ones: the hips
 HEAD_DM = 6.0  # height above which the body's own head begins, in front and at the nape
 SHOULDER_DM = np.array([1.55, 5.0])  # x and y of the joint of the left shoulder
 LOWERED_DEG, BEGIN_DM, END_DM = 32.0, 1.2, 2.6  # the arms turn fully beyond END_DM
 SHOULDER_TOP_DM = (1.3, 1.7)  # range of |x| in which the tops of the shoulders are compared
 BODY_TOP_DM, CLOTH_DM = 5.74, 0.08  # height of the body's shoulders there, and of cloth over them
-CROPPED_DM, STRETCHED = 4.6, 1.8  # the v-neck ends at the waist: it is stretched below this height
+# The v-neck ends at the waist: it is stretched below this height, a whole one further.
+CROPPED_DM, STRETCHED, STRETCHED_WHOLE = 4.6, 1.8, 3.0
 HAND_DM = 4.15  # |x| beyond which the left arm is the hand
 NOTICE = "MakeHuman base mesh, clothes and hat (CC0 1.0): Data Collection AB, Joel Palmius, Jonas Hauquier"
 
@@ -86,12 +90,18 @@ def chosen(name: str, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.n
         return vertices - origin, triangles[kept]
     if name == "fedora":
         return vertices - NECK_DM, triangles
-    bent = lowered(vertices if name == "body" else hung(vertices))
-    if name == "v-neck":
-        bent[:, 1] -= (STRETCHED - 1) * np.maximum(CROPPED_DM - bent[:, 1], 0)
+    whole, kind = name.startswith(WHOLE), name.removeprefix(WHOLE)
+    bent = vertices if kind == "body" else hung(vertices)
+    bent = bent if whole else lowered(bent)
+    if kind == "v-neck":
+        stretched = STRETCHED_WHOLE if whole else STRETCHED
+        bent[:, 1] -= (stretched - 1) * np.maximum(CROPPED_DM - bent[:, 1], 0)
     centre = bent[triangles].mean(1)
-    kept = (centre[:, 1] > LOWEST_DM) & (np.abs(centre[:, 0]) < WIDEST_DM)
-    if name == "body":
+    if whole:
+        kept = bent[triangles, 1].min(1) > LOWEST_WHOLE_DM
+    else:
+        kept = (centre[:, 1] > LOWEST_DM) & (np.abs(centre[:, 0]) < WIDEST_DM)
+    if kind == "body":
         nape = HEAD_DM - 0.25 * (centre[:, 2] - NECK_DM[2])  # the cut rises toward the nape
         kept &= centre[:, 1] < nape
     return bent - NECK_DM, triangles[kept]
@@ -100,9 +110,10 @@ def chosen(name: str, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.n
 def main(archive: Path, out: Path) -> None:
     """Write the packed meshes."""
     tensors = {}
+    names = [*MESHES, *(WHOLE + name for name in ("body", *GARMENTS))]
     with tarfile.open(archive) as files:
-        for name, path in MESHES.items():
-            stream = files.extractfile(path)
+        for name in names:
+            stream = files.extractfile(MESHES[name.removeprefix(WHOLE)])
             assert stream is not None
             vertices, triangles = chosen(name, *read_obj(stream.read().decode("utf-8", "replace")))
             used, corners = np.unique(triangles, return_inverse=True)

@@ -50,8 +50,11 @@ def subject_model(name_or_path: str) -> MorphableModel:
     return load_face_model(name_or_path)
 
 
-def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> Subject:
-    """Draw subject number `index`, a function of (model, seed, index); `size_px` sets only its resolution."""
+def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int, arms: bool = False) -> Subject:
+    """Draw subject number `index`, a function of (model, seed, index); `size_px` sets only its resolution.
+
+    It reaches to the chest, or with whole `arms` to the hips.
+    """
     random, generator = generators(seed, index)
     alpha, beta = draw_coefficients(model, random, HeadBakeSettings())
     closed = random.random() < _CLOSED_SHARE
@@ -64,7 +67,8 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int) -> 
     bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
     face_vertices = model.vertices(alpha[None], beta[None])[0]
     landmarks_m = model.landmarks(face_vertices[None])[0].numpy()
-    dressed, garment = draw_body(bare, random, _BODY_EDGE_M if size_px > _SMALL_PX else 3 * _BODY_EDGE_M)
+    edge_m = _BODY_EDGE_M if size_px > _SMALL_PX else 3 * _BODY_EDGE_M
+    dressed, garment = draw_body(bare, random, edge_m, arms)
     headwear = draw_headwear(bare, chin_height_m(bare), random) if random.random() < _HEADWEAR_SHARE else None
     hair, style = draw_hair(dressed, random, headwear)
     cover = torch.from_numpy(scalp_cover(canvas_uv(side).numpy(), style))

@@ -11,8 +11,10 @@ from scipy.spatial import cKDTree
 from facerf_cli.face.topology import LANDMARK_UV, cylinder_uv
 from facerf_cli.light.transport import build_scene, hits_within
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.synth.head.arms import bend_arms
 from facerf_cli.synth.head.mesh import (
     GARMENTS,
+    WHOLE,
     HeadMesh,
     cloth_like,
     joined,
@@ -43,28 +45,33 @@ _NECKWEAR_SHARE = 0.15  # of people
 _SKIN_V = (1.02, 1.45)  # rows of the skin's texture, from the neck, that the body repeats
 
 
-def draw_body(head: HeadMesh, random: Random, edge_m: float = 0.008) -> tuple[HeadMesh, str]:
+def draw_body(
+    head: HeadMesh, random: Random, edge_m: float = 0.008, arms: bool = False
+) -> tuple[HeadMesh, str]:
     """Draw the upper body and a garment for a bare head; return all as one mesh, and the garment's name.
 
-    The meshes are subdivided until their edges are shorter than `edge_m` on average.
+    The meshes are subdivided until their edges are shorter than `edge_m` on average. They reach to the chest,
+    or with whole `arms` to the hips.
     """
+    packed = WHOLE if arms else ""
     chin = chin_height_m(head)
     grown = random.uniform(0.93, 1.06) * random.uniform([0.96, 1.0, 0.96], [1.08, 1.0, 1.06])
     origin = np.array([0, chin - _NECK_M, _neck_depth_m(head, chin - _NECK_M)])
-    skin, faces = packed_mesh("body")
+    skin, faces = packed_mesh(packed + "body")
     skin = skin * grown + origin
     low = (head.is_part("skin")) & (head.vertices[:, 1] < chin - _LOW_M)
     drawn = _drawn_to(skin, head.vertices[low].astype(float))
     body = _body_skin(*_refined(skin + drawn, faces, edge_m), head, low)
     strapless = random.random() < _STRAPLESS_SHARE
     name = "tee" if strapless else str(random.choice(GARMENTS))
-    cloth, cloth_faces = packed_mesh(name)
+    cloth, cloth_faces = packed_mesh(packed + name)
     if strapless:
         cloth_faces = cloth_faces[(cloth[cloth_faces, 1] < -_STRAPLESS_M).all(-1)]
     cloth = cloth * grown + origin
     cloth = cloth + _carried(cloth, skin, drawn)
     garment = _garment(*_refined(cloth, cloth_faces, edge_m), body, head, low, chin)
     dressed = joined(_without_hidden(joined(head, body), garment, chin), garment)
+    dressed = bend_arms(dressed, origin, grown, random) if arms else dressed
     if random.random() < _NECKWEAR_SHARE and not strapless:
         dressed = joined(dressed, draw_neckwear(head, chin, random))
     return dressed, "strapless" if strapless else name

@@ -372,6 +372,7 @@ def _filled(radius: np.ndarray) -> np.ndarray:
 
 MAKEHUMAN_LICENCE = "bodies and clothes: CC0 1.0 (MakeHuman)"
 STEP_M = 2e-5  # unit of the stored coordinates
+WHOLE = "whole "  # before the names of body and garments that reach to hips and hands
 GARMENTS = (
     "tee",
     "loose tee",
