@@ -47,7 +47,6 @@ _OPTIONS = {
     "results": "facerf's version of results",
     "pattern": "the pattern of the capture",
     "rig": "--lights",
-    "rotate_deg": "--rotate",
     "sampling": "--envmap-sampling",
     "size_px": "--size",
     "stage_cameras": "the cameras of the capture",

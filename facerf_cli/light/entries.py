@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Protocol
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_rig
@@ -23,26 +24,39 @@ _FORMS = ("AZ,EL", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 _AROUND = "around"  # as a direction: from all of them
-KEYS = ("at", "from", "az", "el", "rgb", "kelvin", "stops", "size", "size_deg", "spot")
+_PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has those of one
+# Keys of one kind of light.
+_NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=, az=, el=)", "maps (map=)"
+_OF_KIND = {"size": _NEAR, "spot": _NEAR, "size_deg": _FAR, "rotate": _MAP}
+KEYS = ("at", "from", "az", "el", "map", "rgb", "kelvin", "stops", *_OF_KIND)
 # Limits of values.
 _KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
 _SIZE_M, _SIZE_DEG, _SPOT_DEG, _RGB = (0.0, 10.0), (0.0, 120.0), (1.0, 170.0), (0.0, 1e6)
+_TURN_DEG = (-3600.0, 3600.0)
 
 
 Triple = tuple[float, float, float]
+
+
+class MapSource(Protocol):
+    """The source of a lat-long map: the path of a file, or what `work` draws or estimates."""
+
+    @property
+    def name(self) -> str:
+        """The name of the map."""
 
 
 @dataclass(frozen=True)
 class StudioLight:
     """A light from a direction (azimuth, elevation), or near, at a place in metres from the face's centre.
 
-    A light that has neither comes from all around, as of a room or a dull sky: every surface that nothing
-    shades receives the same.
+    Or a lat-long map, with `rotate_deg` added to every azimuth. A light that has none of these comes from all
+    around, as of a room or a dull sky: every surface that nothing shades receives the same.
 
     Camera axes. At the face's centre its irradiance is that of a far light of its colour: `rgb` times the
-    colour of a blackbody of `kelvin`, times 2 to `stops`. `size_m` is the side of the square of a near light,
-    which faces the face; `size_deg` that of a far one, as seen from there. `spot_deg` is the full angle of a
-    near light's cone, which is aimed at the face.
+    colour of a blackbody of `kelvin`, times 2 to `stops`; a map's radiance is multiplied by these. `size_m`
+    is the side of the square of a near light, which faces the face; `size_deg` that of a far one, as seen
+    from there. `spot_deg` is the full angle of a near light's cone, which is aimed at the face.
     """
 
     azel_deg: tuple[float, float] | None = None
@@ -53,6 +67,13 @@ class StudioLight:
     size_m: float = 0.0
     size_deg: float = 0.0
     spot_deg: float | None = None
+    envmap: MapSource | None = None
+    rotate_deg: float = 0.0
+
+    @property
+    def is_around(self) -> bool:
+        """True of a light from all around."""
+        return self.azel_deg is None and self.at_m is None and self.envmap is None
 
 
 def numbers(text: str, forms: tuple[str, ...], option: str) -> list[float]:
@@ -152,14 +173,13 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
     """Check the settings of a light and make it; raises UsageError that begins with `where`."""
     if wrong := [key for key in given if key not in KEYS]:
         raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
-    is_far = bool(given.keys() & {"from", "az", "el"})
-    if is_far == ("at" in given) or ("from" in given and given.keys() & {"az", "el"}):
-        raise UsageError(f"{where} {_typed(given)}: give one of at=X,Y,Z, from=AZ,EL, or az and el")
+    if sum(bool(given.keys() & keys) for keys in _PLACES) != 1:
+        raise UsageError(f"{where} {_typed(given)}: give one of at=X,Y,Z, from=AZ,EL, map=FILE, or az and el")
     if "size_deg" in given and given.get("from") == _AROUND:
         raise UsageError(f"{where} {_typed(given)}: a light from all around has no size; leave size_deg out")
-    if wrong := sorted(given.keys() & ({"size", "spot"} if is_far else {"size_deg"})):
-        right = "is of near lights (at=); a far one has size_deg" if is_far else "is of far lights; give size"
-        raise UsageError(f"{where} {_typed(given)}: {wrong[0]} {right}")
+    kind = _NEAR if "at" in given else _MAP if "map" in given else _FAR
+    if wrong := [key for key in given if _OF_KIND.get(key, kind) != kind]:
+        raise UsageError(f"{where} {_typed(given)}: {wrong[0]} is of {_OF_KIND[wrong[0]]}; leave it out")
 
     def number(key: str, form: str, limits: tuple[float, float]) -> float | None:
         return _numbers(given[key], form, limits, f"{where} {key}")[0] if key in given else None
@@ -174,7 +194,10 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
         spot_deg=number("spot", "DEG", _SPOT_DEG),
     )
     names = () if name is None else (name,)
-    if is_far:
+    if kind == _MAP:
+        rotate_deg = number("rotate", "DEG", _TURN_DEG) or 0.0
+        return LitImage(((replace(common, envmap=Path(given["map"]), rotate_deg=rotate_deg),),), names=names)
+    if kind == _FAR:
         sweeps = any(is_sweep(given.get(key, "")) for key in ("az", "el"))
         frames = tuple((replace(common, azel_deg=azel_deg),) for azel_deg in _directions(given, where))
         return LitImage(frames, sweeps, names)
@@ -224,10 +247,10 @@ def _angles(text: str, option: str) -> list[float]:
     return sweep(text, option) if is_sweep(text) else numbers(text, ("DEG or FROM:TO:N",), option)
 
 
-def lit_images(entries: Sequence[str]) -> list[LitImage]:
-    """Parse all `--light` entries; lights with names share one image, the last."""
+def lit_images(entries: Sequence[str], maps: Sequence[LitImage] = ()) -> list[LitImage]:
+    """Parse all `--light` entries; lights with names share the last image, with `maps` that have them."""
     images: list[LitImage] = []
-    named: list[LitImage] = []
+    named = list(maps)
     for text in entries:
         if (path := _rig_path(text)) is not None:
             images.append(_rig(path))
@@ -272,10 +295,16 @@ def _rig(path: Path) -> LitImage:
     """The lights of a rig file, whose image has its name."""
     tables = read_rig(path)
     try:
-        lights = [light_by_keys(table, f"{path}: {name}:", name) for name, table in tables.items()]
+        lights = [_light_of_rig(path, name, table) for name, table in tables.items()]
         return _together(path.stem, lights, f"{path}:")
     except UsageError as error:  # of a value: the file is at fault, not the command line
         raise InputError(str(error)) from None
+
+
+def _light_of_rig(path: Path, name: str, table: Mapping[str, str]) -> LitImage:
+    """A light of a rig file, whose map's path begins at the file's folder."""
+    beside = {"map": str(path.parent / table["map"])} if "map" in table else {}
+    return light_by_keys({**table, **beside}, f"{path}: {name}:", name)
 
 
 def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
@@ -292,6 +321,15 @@ def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
         for number in range(max(counts))
     )
     return LitImage(frames, any(light.is_numbered for light in lights), names, image)
+
+
+def named_map(entry: str, turns: Sequence[float], is_numbered: bool) -> LitImage | None:
+    """Parse `NAME=FILE`, a map that shines with the lights that have names; None for a path alone."""
+    name, equals, path = entry.partition("=")
+    if not equals or not _NAME.fullmatch(name) or Path(entry).exists():
+        return None
+    frames = tuple((StudioLight(envmap=Path(path), rotate_deg=degrees),) for degrees in turns)
+    return LitImage(frames, is_numbered, (name,))
 
 
 def _short(text: str) -> LitImage:

@@ -13,7 +13,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
-_AROUND = 48  # samples of a light from all around
+_AROUND = 24  # samples of a light from all around
 _NEAREST_M = 0.05  # distance below which a light does not grow any more
 _FULL_CONE = 0.8  # share of a spot's cone in which it has its full strength; from there it falls to 0
 WHITE_K = 6504.0  # the correlated colour temperature of D65

@@ -2,19 +2,31 @@
 
 import glob
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
 from facerf_cli.errors import UsageError
-from facerf_cli.light.entries import MOST_FRAMES, StudioLight, is_sweep, lit_images, numbers, sweep
+from facerf_cli.light.entries import (
+    MOST_FRAMES,
+    MapSource,
+    StudioLight,
+    is_sweep,
+    lit_images,
+    named_map,
+    numbers,
+    sweep,
+)
 from facerf_cli.option import LIGHT, option
 from facerf_cli.work.photo_options import LightOptions
 
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
+ROOM = "room"  # the name of a room's light, and of its layer
+ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of the light that others send
+_MOST_ROOM = 1.0
 
 
 @dataclass(frozen=True)
@@ -23,10 +35,12 @@ class LightSources:
 
     Attributes:
         envmap: Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of
-            estimate-light (.json), or procedural:N, maps of facerf envmap. Repeatable.
+            estimate-light (.json), or procedural:N, maps of facerf envmap; NAME=MAP together with lights that
+            have names. Repeatable.
         light: Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig
             file or a preset (rembrandt); docs/lights.md. Repeatable.
         light_from: Relight under the light of another photo, as estimate-light finds it. Repeatable.
+        room: Add what a room sends back to lights: a share of them, from all around; a map; or none.
         rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
         sampling: Give each light the map's integral over its cell; share it smoothly among lights; or, as in
             the paper, one pixel.
@@ -35,6 +49,9 @@ class LightSources:
     envmap: list[str] | None = option(None, metavar="MAP|DIR", shown_default=False, panel=LIGHT)
     light: list[str] | None = option(None, metavar="LIGHT", shown_default=False, panel=LIGHT)
     light_from: list[str] | None = option(None, metavar="PHOTO|DIR", shown_default=False, panel=LIGHT)
+    room: str | None = option(
+        None, metavar="SHARE|MAP|none", shown_default="0.06; 0.03 before black", panel=LIGHT
+    )
     rotate: str | None = option(None, metavar="DEG|FROM:TO:N", shown_default="as they are", panel=LIGHT)
     sampling: Sampling | None = option(
         None, flags=("--envmap-sampling",), shown_default="cell; smooth for --rotate FROM:TO:N", panel=LIGHT
@@ -61,17 +78,27 @@ class PhotoLight:
 
 @dataclass(frozen=True)
 class LightSetup:
-    """The light of one image of every photo: a map, rotated, or single lights.
+    """The lights of one image of every photo: a map, rotated, or single lights, or both.
 
-    Lights with `names` are layers of the image, too.
+    Lights with `names` are layers of the image, too. `room` is the share of the lights, without maps, that
+    comes from all around besides.
     """
 
     name: str
     frame: str = ""  # '.0001': frame numbers, which end a file's name
-    envmap: Path | DrawnMap | PhotoLight | None = None
-    rotate_deg: float = 0.0
     lights: tuple[StudioLight, ...] = ()
     names: tuple[str, ...] = ()
+    room: float = 0.0
+
+    @property
+    def envmap(self) -> StudioLight | None:
+        """The map among the lights, the first of several."""
+        return next((light for light in self.lights if light.envmap is not None), None)
+
+    @property
+    def has_single(self) -> bool:
+        """True where some light is not a map."""
+        return any(light.envmap is None for light in self.lights)
 
     def output(self, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None) -> Path:
         """The image's file, by a pattern of --name or the default: the photo's own frame number goes last."""
@@ -96,24 +123,27 @@ def collect_setups(
     envmaps, rotate = sources.envmap or (), sources.rotate
     lit = photo_lights(sources.light_from, output, how) if sources.light_from and how else []
     rotations = parse_rotations(rotate)
+    turns, is_numbered = [degrees for _, _, degrees in rotations], is_sweep(rotate or "")
+    together = {entry: named for entry in envmaps if (named := named_map(entry, turns, is_numbered))}
+    envmaps = [entry for entry in envmaps if entry not in together]
     words = [entry for entry in envmaps if entry.startswith(DRAWN)]
     paths = [path for entry in envmaps if entry not in words for path in _expand_glob(entry)]
     files = collect_items(paths, output, MAP_SUFFIXES) if paths else []
     short = map(split_frame, _short_names(files))
-    maps: list[tuple[str, str, Path | DrawnMap | PhotoLight]] = [
+    maps: list[tuple[str, str, MapSource]] = [
         *((drawn.name, "", drawn) for drawn in drawn_maps(words, seed)),
         *((name, frame, file.input_path) for (name, frame), file in zip(short, files, strict=True)),
         *((photo.name, "", photo) for photo in lit),
     ]
     setups = [
-        LightSetup(name + turn, frame + number, envmap, degrees)
+        LightSetup(name + turn, frame + number, (StudioLight(envmap=envmap, rotate_deg=degrees),))
         for name, frame, envmap in maps
         for turn, number, degrees in rotations
     ]
-    for image in lit_images(sources.light or ()):
+    for image in lit_images(sources.light or (), [*together.values()]):
         for number, shining in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
-            setups.append(LightSetup(image.name, frame, lights=shining, names=image.names))
+            setups.append(LightSetup(image.name, frame, shining, image.names))
     if not setups:
         raise UsageError("no light given; add --envmap, --light, or --light-from with a photo")
     if rotate is not None and not any(setup.envmap for setup in setups):
@@ -122,6 +152,33 @@ def collect_setups(
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two images would be named {min(twice)}; give each light once")
     return tuple(setups)
+
+
+def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightSetup:
+    """Add the light of a room to a setup's lights, by `--room` or by default.
+
+    Raises UsageError where `room` is neither `none` nor a share nor a map, or where two lights have its name.
+    """
+    if not setup.has_single:
+        return setup
+    if room is None:
+        has_one = ROOM in setup.names or any(light.is_around for light in setup.lights)
+        default = ROOM_BEFORE_DARK if is_before_dark else ROOM_BEFORE_BRIGHT
+        return replace(setup, room=0.0 if has_one else default)
+    if room == "none":
+        return setup
+    if ROOM in setup.names:
+        raise UsageError(
+            f"--room {room}: a light has the name {ROOM}, too; give another name, or leave it out"
+        )
+    if Path(room).suffix.lower() in (*MAP_SUFFIXES, ".json"):
+        light = StudioLight(envmap=Path(room))
+        names = (*setup.names, ROOM) if setup.names else ()
+        return replace(setup, lights=(*setup.lights, light), names=names)
+    (share,) = numbers(room, ("SHARE or MAP or none",), "--room")
+    if not 0 <= share <= _MOST_ROOM:
+        raise UsageError(f"--room {room}: out of range; give 0 to {_MOST_ROOM:g}, a map, or none")
+    return replace(setup, room=share)
 
 
 def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:

@@ -1,7 +1,7 @@
 """The lights of setups: maps read, drawn or estimated from a photo, and single lights; and their balls."""
 
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from itertools import groupby
@@ -12,13 +12,14 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
+from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import ball, rotated_weights
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.light_of_photo import light_of_photo
-from facerf_cli.work.light_setups import DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
 from facerf_cli.work.photos import directions_of, face_model
@@ -29,25 +30,33 @@ _BALL_PX = 256
 log = logging.getLogger(LOGGER_NAME)
 
 
-def readable(setups: Iterable[LightSetup]) -> tuple[LightSetup, ...]:
+def readable(setups: Sequence[LightSetup]) -> tuple[LightSetup, ...]:
     """The setups whose maps can be read; each map that cannot is logged in one line."""
-    good: list[LightSetup] = []
-    for envmap, group in groupby(setups, lambda setup: setup.envmap):
-        try:
-            if isinstance(envmap, (Path, PhotoLight)):
-                read_map(envmap)
-            good += group
-        except InputError as error:
-            log.error("%s", error)
-    return tuple(good)
+    good = {envmap: _is_readable(envmap) for envmap in dict.fromkeys(_maps_of(setups))}
+    return tuple(setup for setup in setups if all(good[envmap] for envmap in _maps_of([setup])))
 
 
-def read_map(envmap: Path | DrawnMap | PhotoLight) -> Tensor:
+def _maps_of(setups: Sequence[LightSetup]) -> list[MapSource]:
+    return [light.envmap for setup in setups for light in setup.lights if light.envmap is not None]
+
+
+def _is_readable(envmap: MapSource) -> bool:
+    try:
+        if not isinstance(envmap, DrawnMap):
+            read_map(envmap)
+    except InputError as error:
+        log.error("%s", error)
+        return False
+    return True
+
+
+def read_map(envmap: MapSource) -> Tensor:
     """A lat-long map [H, W, 3], scene-linear; raises InputError that names what is wrong with it."""
     if isinstance(envmap, PhotoLight):
         return _map_of_photo(envmap)
     if isinstance(envmap, DrawnMap):
         return torch.from_numpy(draw_sky(envmap.index, envmap.seed, _DRAWN_WIDTH_PX)[0])
+    assert isinstance(envmap, Path)
     return read_map_file(envmap)
 
 
@@ -60,7 +69,7 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
 def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
     """The lights of M setups: maps integrated over the rig's lights, and single lights."""
     single = single_lights(setups)
-    if not any(setup.envmap for setup in setups):
+    if not _maps_of(setups):
         return single
     every, of_maps = _maps_over_rig(setups, rig, sampling)
     directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
@@ -98,6 +107,16 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
     return replace(far, near=lights, near_weights=near_weights)
 
 
+def with_room(setup: LightSetup) -> LightSetup:
+    """A setup with the light of its room as one of its lights."""
+    if not setup.room:
+        return setup
+    sent = torch.stack([intensity_of(light) for light in setup.lights if light.envmap is None]).sum(0)
+    red, green, blue = (setup.room * float(value) for value in sent)
+    names = (*setup.names, ROOM) if setup.names else ()
+    return replace(setup, lights=(*setup.lights, StudioLight(rgb=(red, green, blue))), names=names)
+
+
 def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
     """A setup for each light of a setup."""
     return tuple(replace(setup, lights=(light,)) for light in setup.lights)
@@ -116,7 +135,7 @@ def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Ten
     """For each far light its setup, directions [n, 3] and rgb weights [n, 3]."""
     for row, setup in enumerate(setups):
         for light in setup.lights:
-            if light.at_m is None:
+            if light.azel_deg is not None or light.is_around:
                 towards, shares = far_samples(light)
                 yield row, towards, shares[:, None] * intensity_of(light)
 
@@ -124,13 +143,14 @@ def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Ten
 def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
     """[M, L, 3], zero for setups without a map; a map is read once for all its rotations."""
     weights = torch.zeros(len(setups), len(directions), 3)
-    for envmap, group in groupby(enumerate(setups), lambda row: row[1].envmap):
-        rows = list(group)
-        if envmap is not None:
-            angles = [setup.rotate_deg for _, setup in rows]
-            weights[[row for row, _ in rows]] = rotated_weights(
-                read_map(envmap), directions, angles, sampling
-            )
+    maps = [(row, light) for row, setup in enumerate(setups) for light in setup.lights if light.envmap]
+    for envmap, group in groupby(maps, lambda one: one[1].envmap):
+        rows, lights = zip(*group, strict=True)
+        assert envmap is not None
+        angles = [light.rotate_deg for light in lights]
+        of_map = rotated_weights(read_map(envmap), directions, angles, sampling)
+        colours = torch.stack([intensity_of(light) for light in lights])
+        weights.index_add_(0, torch.tensor(rows), of_map * colours[:, None])
     return weights
 
 
@@ -139,17 +159,18 @@ def write_balls(
 ) -> None:
     """Write, in every format, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
     for setup, path in zip(setups, paths, strict=True):
-        assert setup.envmap is not None
-        envmap = read_map(setup.envmap)
-        both = [ball(envmap, _BALL_PX, kind, setup.rotate_deg) for kind in ("mirror", "diffuse")]
-        pixels = torch.cat(both, 1).numpy()
+        light = setup.envmap
+        assert light is not None and light.envmap is not None
+        envmap = read_map(light.envmap)
+        both = [ball(envmap, _BALL_PX, kind, light.rotate_deg) for kind in ("mirror", "diffuse")]
+        pixels = (torch.cat(both, 1) * intensity_of(light)).numpy()
         chosen: Exposure = exposure if isinstance(exposure, float) else "auto"
-        write_output(path, OutputImage(pixels), chosen, output, _metadata_of(setup.envmap))
+        write_output(path, OutputImage(pixels), chosen, output, _metadata_of(light.envmap))
 
 
-def _metadata_of(envmap: Path | DrawnMap | PhotoLight) -> dict[str, str | int]:
+def _metadata_of(envmap: MapSource) -> dict[str, str | int]:
     """Metadata of an image that shows a light; an estimated light depends on the face model."""
     if isinstance(envmap, PhotoLight):
         return Provenance(envmap.name, **face_model(envmap.options.photo).stamp).attributes()
     made = Provenance(envmap.name).attributes()
-    return made if isinstance(envmap, DrawnMap) else {**made, **face_model_of_map(envmap)}
+    return {**made, **face_model_of_map(envmap)} if isinstance(envmap, Path) else made

@@ -20,13 +20,13 @@ from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_he
 from facerf_cli.image.colour import most_exposure_ev
 from facerf_cli.image.strips import Band, filled
 from facerf_cli.light.envmap import backdrop
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, GroupComposition, Target
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import each_alone, lights_over_rig, lights_over_stack, read_map
+from facerf_cli.work.lights import each_alone, lights_over_rig, lights_over_stack, read_map, with_room
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
@@ -80,12 +80,13 @@ def _backdrop(work: Relight, camera: Camera) -> Behind:
         gain = np.float32(2.0**-ev)
         if work.background.kind != "envmap":
             return None if fixed is None else lambda rows: fixed[rows] * gain
-        if setup.envmap is None:
+        if (light := setup.envmap) is None or light.envmap is None:
             return lambda rows: np.zeros((rows.stop - rows.start, camera.width_px, 3), np.float32)
         with beside_person(size_px):
-            envmap = read_map(setup.envmap)
-        rays = partial(rays_of_rows, camera)
-        return backdrop(envmap, size_px, rays, setup.rotate_deg, work.background_blur)
+            envmap = read_map(light.envmap)
+        rays, colour = partial(rays_of_rows, camera), intensity_of(light).numpy()
+        around = backdrop(envmap, size_px, rays, light.rotate_deg, work.background_blur)
+        return lambda rows: around(rows) * colour
 
     return behind
 
@@ -125,12 +126,13 @@ class _LitScene:
     behind: Behind | None = None
 
     @cached_property
-    def _lights(self) -> Lights:
+    def lights(self) -> Lights:
+        """The lights of all setups."""
         return self.lights_of(self.setups)
 
     def relit(self, part: slice) -> list[Any]:
         """The people under some of the setups."""
-        return list(self.composer.relit(self._lights[part]))
+        return list(self.composer.relit(self.lights[part]))
 
 
 Scenes = Iterator[tuple[str, _LitScene]]  # each with the tag of its files
@@ -154,7 +156,7 @@ def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
 
     Facts of the mattes are known once the scenes are made.
     """
-    _over_rig(work)(work.setups)  # maps are read before the photo, not beside it
+    _over_rig(work)(_in_rooms(work))  # maps are read before the photo, not beside it
     image, faces = _image_and_faces(item, work)
     # of faces alone, the first one's files mark the photo as finished
     parts = [("", faces)] if work.composite == "photo" else [(one.tag, [one]) for one in reversed(faces)]
@@ -194,7 +196,7 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
         scene = next(_scenes_of_stack(leader, work)[0])[1]
     else:
         scene = _scene(leader, *_image_and_faces(leader, work), work)
-    return _exposures_ev(scene, batches(len(work.setups), scene.composer.nbytes), scene.relit, work)
+    return _exposures_ev(scene, batches(len(scene.setups), scene.composer.nbytes), scene.relit, work)
 
 
 def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _LitScene:
@@ -202,12 +204,16 @@ def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Re
     by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
     people = [_composed(item, image, face, work) for face in by_size]
     composer = people[0] if len(people) == 1 else GroupComposition(people)
-    scene = _LitScene(composer, work.setups, _over_rig(work))
+    scene = _LitScene(composer, _in_rooms(work), _over_rig(work))
     if work.composite != "photo":
         return scene
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
     alpha = image.alpha if work.background.kind == "photo" else None
     return replace(scene, alpha=alpha, behind=_backdrop(work, camera))
+
+
+def _in_rooms(work: Relight) -> tuple[LightSetup, ...]:
+    return tuple(with_room(setup) for setup in work.setups)
 
 
 def _over_rig(work: Relight) -> Callable[[tuple[LightSetup, ...]], Lights]:
@@ -267,7 +273,8 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
         composer, facts = StackImages(header, item.input_path), {}
     else:
         composer, facts = _face_of_stack(item, header, work)
-    scene = _LitScene(composer, work.setups, lights_of, behind=behind)
+    rooms = _in_rooms(work) if work.asked_for_room else tuple(replace(one, room=0.0) for one in work.setups)
+    scene = _LitScene(composer, rooms, lights_of, behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
     return iter([("", scene)]), dict(metadata), lambda: facts
 
@@ -328,7 +335,7 @@ def _write_setups(
     Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
     of each image, and the exposure of the PNG in its place.
     """
-    parts = batches(len(work.setups), scene.composer.nbytes)
+    parts = batches(len(scene.setups), scene.composer.nbytes)
     whole = scene.relit(parts[0]) if len(parts) == 1 else None
 
     def relit_by(part: slice) -> list[Any]:
@@ -337,15 +344,17 @@ def _write_setups(
     exposures_ev = shared_ev or _exposures_ev(scene, parts, relit_by, work)
     written: dict[Path, float] = {}
     for part in parts:
-        for setup, relit in zip(work.setups[part], relit_by(part), strict=True):
+        for setup, relit in zip(scene.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             with image_canvas(path, scene.composer.size_px, len(work.output.formats)) as empty:
                 image = _rendered(scene, setup, relit, ev, work, empty)
                 write_output(path, image, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
                 del image
-            if work.output.shown_suffix and not shared_ev:
-                log.info("%s under %s: exposure %+.2f EV", item.input_path, setup.name + setup.frame, ev)
+            said = [f"exposure {ev:+.2f} EV"] if work.output.shown_suffix else []
+            said += [f"in a room that sends {setup.room:g} back"] if setup.room else []
+            if said and not shared_ev:
+                log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
             written[path] = ev
             del relit  # of all of its part, beside the next
     return written
@@ -391,9 +400,9 @@ def _exposures_ev(
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     found: dict[str, float] = {}
-    strengths = _over_rig(work)(work.setups).strengths()
+    strengths = scene.lights.strengths()
     for part in parts:
-        for setup, light, relit in zip(work.setups[part], strengths[part], relit_by(part), strict=True):
+        for setup, light, relit in zip(scene.setups[part], strengths[part], relit_by(part), strict=True):
             most_ev = most_exposure_ev(work.exposure, light)
             chosen_ev = round(min(scene.composer.exposure_ev(relit, work.exposure), most_ev), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))

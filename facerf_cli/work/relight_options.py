@@ -18,7 +18,14 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.light.entries import is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
-from facerf_cli.work.light_setups import LightSetup, LightSources, PhotoLight, Sampling, collect_setups
+from facerf_cli.work.light_setups import (
+    LightSetup,
+    LightSources,
+    PhotoLight,
+    Sampling,
+    collect_setups,
+    in_room,
+)
 from facerf_cli.work.output_options import STDOUT, Exposure, OutputOptions, check_stdout, parse_exposure
 from facerf_cli.work.photo_options import (
     LightOptions,
@@ -43,6 +50,7 @@ Composite = Literal["photo", "face"]
 ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
 _LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
+_LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
 _FORMS = "photo, envmap, none, an image file, #RRGGBB or R,G,B"
 
 
@@ -53,6 +61,13 @@ class BackgroundChoice:
     kind: BackgroundKind
     path: Path | None = None
     colour: tuple[float, float, float] | None = None
+
+    def is_dark(self, setup: LightSetup) -> bool:
+        """True where nothing bright is behind the person: nothing, black, or a dark colour."""
+        if self.kind == "envmap":
+            return setup.envmap is None
+        luminance = sum(k * c for k, c in zip(_LUMINANCE, self.colour or (1.0, 1.0, 1.0), strict=True))
+        return self.kind == "none" or luminance < _DARK
 
 
 def parse_background(text: str) -> BackgroundChoice:
@@ -167,6 +182,7 @@ class Relight:
         panel=BATCH,
     )
     asked_for_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --composite photo
+    asked_for_room: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --room; a stack has none else
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
     shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
@@ -235,14 +251,18 @@ class Relight:
         check_companion(self.photo_of_stack, "--photo")
         of_light: Kind = "field" if self.reflectance == "portrait" else self.reflectance
         how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
+        setups = collect_setups(sources, batch.output, photo.settings.seed, how)
+        if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
+            raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
         sweeps = sources.rotate is not None and is_sweep(sources.rotate)
         return replace(
             self,
             photo=photo,
-            setups=collect_setups(sources, batch.output, photo.settings.seed, how),
+            setups=tuple(in_room(one, sources.room, alone or self.background.is_dark(one)) for one in setups),
             sampling=sources.sampling or ("smooth" if sweeps else "cell"),
             composite="face" if alone else "photo",
             asked_for_photo=self.composite == "photo",
+            asked_for_room=sources.room is not None,
             reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
         )
 
@@ -314,7 +334,8 @@ class Relight:
         from facerf_cli.work.sequence import follow_all
 
         check_output(self.output)
-        lights = [setup.envmap.options for setup in self.setups if isinstance(setup.envmap, PhotoLight)]
+        maps = [setup.envmap.envmap for setup in self.setups if setup.envmap]
+        lights = [envmap.options for envmap in maps if isinstance(envmap, PhotoLight)]
         uses = networks_of([self.reflectance]).union(*(light.networks for light in lights))
         prepare_photos(self.photo, uses, with_networks=not dry_run)
         if not dry_run:

@@ -98,7 +98,8 @@ def test_a_folder_of_maps_is_read_without_its_sheet(tmp_path: Path) -> None:
     maps = tmp_path / "maps"
     assert main(["envmap", "-o", str(maps), "--count", "2", "--size", "32"]) == 0
     setups = collect_setups(LightSources(envmap=[str(maps)]), tmp_path / "out", 0)
-    assert [setup.envmap for setup in setups] == sorted(maps.glob("*.exr")) and len(setups) == 2
+    found = [light.envmap for setup in setups for light in setup.lights]
+    assert found == sorted(maps.glob("*.exr")) and len(setups) == 2
 
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

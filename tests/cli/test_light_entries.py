@@ -77,7 +77,7 @@ def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
         ("kelvin=3200", "give one of at=X,Y,Z"),
         ("at=0,0,1;kelvin=50", "kelvin '50': out of range; give 1667 to 25000"),
         ("at=0,0,1;rgb=1,-1,1", "rgb '1,-1,1': out of range"),
-        ("at=0,0,1;size_deg=3", "size_deg is of far lights; give size"),
+        ("at=0,0,1;size_deg=3", "size_deg is of far lights"),
         ("from=0,0;size=1", "size is of near lights"),
         ("at=0,0,1;at=0,0,2", "at is given twice"),
         ("az=60,el=10", "give ; between keys, as in 'az=60;el=10'"),

@@ -140,9 +140,10 @@ def test_lights_with_names_are_layers_that_add_up(given: Path, tmp_path: Path) -
         f"astronaut_{name}{suffix}" for name in ("light_5_6", "light_key+rim") for suffix in (".exr", ".png")
     ]
     path = tmp_path / "astronaut_light_key+rim.exr"
-    names = [f"{layer}{letter}" for letter in "RGB" for layer in ("", "key.", "rim.")]
-    layers = np.stack(layers_of(path, *names)).reshape(3, 3, 512, 512)
-    np.testing.assert_allclose(layers[:, 1] + layers[:, 2], layers[:, 0], rtol=5e-3, atol=2e-3)  # half floats
+    names = [f"{layer}{letter}" for letter in "RGB" for layer in ("", "key.", "rim.", "room.")]
+    layers = np.stack(layers_of(path, *names)).reshape(3, 4, 512, 512)
+    np.testing.assert_allclose(layers[:, 1:].sum(1), layers[:, 0], rtol=5e-3, atol=2e-3)  # half floats
+    assert layers[:, 3].max() > 0.01  # of the room
     assert layers[:, 1].max() > 0.1 and layers[2, 2].mean() > 1.5 * layers[0, 2].mean()
     for wrong in (["key=1,2", "key=3,4"], ["=1,2"], ["a b=1,2"], ["key=1"]):
         line = [word for text in wrong for word in ("--light", text)]
@@ -354,11 +355,16 @@ def test_near_lights_sweeps_and_rigs_from_the_command_line(
     ev = json.loads((tmp_path / "out/report.jsonl").read_text())["exposure_ev"]
     assert ev[f"astronaut_{names[0]}"] == ev[f"astronaut_{names[1]}"]
     layers = layers_of(
-        tmp_path / "out/astronaut_studio.exr", *(f"key.{c}" for c in "RGB"), "rim.R", "R", "shadow.R"
+        tmp_path / "out/astronaut_studio.exr",
+        *(f"key.{c}" for c in "RGB"),
+        "rim.R",
+        "room.R",
+        "R",
+        "shadow.R",
     )
-    red, green, blue, rim, whole, shadow = layers
+    red, green, blue, rim, room, whole, shadow = layers
     (matte,) = layers_of(tmp_path / "out/astronaut_studio.exr", "person.A")
-    np.testing.assert_allclose(red + rim, whole, rtol=5e-3, atol=2e-3)  # half floats
+    np.testing.assert_allclose(red + rim + room, whole, rtol=5e-3, atol=2e-3)  # half floats
     assert red.mean() > green.mean() > blue.mean() and 0.2 < shadow[matte > 0.9].mean() < 1
     left, right = (face_sides_of(tmp_path / f"out/astronaut_{name}.exr") for name in names[:2])
     assert left > 1.5 and right > 0  # lit from the image's left; the second frame from ahead
@@ -388,7 +394,7 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
 
 
 def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -> None:
-    lights = ["--light", "180,20", "--light", "180,20,4,4,4"]
+    lights = ["--light", "180,20", "--light", "180,20,4,4,4", "--room", "none"]
     assert relight(given, tmp_path, *lights, "--format", "png") == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image

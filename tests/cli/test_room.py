@@ -1,0 +1,147 @@
+"""The light of a room that comes with lights by default, and maps that shine together with lights."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.errors import UsageError
+from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, in_room
+from facerf_cli.work.lights import lights_over_rig, with_room
+from facerf_cli.work.relight_options import parse_background
+from tests.cli.test_relight import relight
+
+KEY, RIM = "name=key;az=40;el=20;kelvin=3200", "name=rim;az=160;stops=-1;rgb=0.5,1,1"
+
+
+@pytest.fixture
+def sky(tmp_path: Path) -> Path:
+    path = tmp_path / "sky.exr"
+    write_exr(path, np.random.default_rng(1).uniform(0, 2, (16, 32, 3)).astype(np.float32))
+    return path
+
+
+def setups_of(
+    light: list[str], envmap: list[str] | None = None, rotate: str | None = None
+) -> list[LightSetup]:
+    return list(collect_setups(LightSources(envmap=envmap, light=light, rotate=rotate), Path("out")))
+
+
+def lights_of(*setups: LightSetup) -> Lights:
+    return lights_over_rig(tuple(with_room(setup) for setup in setups), "150", "cell")
+
+
+@pytest.mark.parametrize(
+    ("background", "share"),
+    [
+        ("photo", 0.06),
+        ("#b0b0b0", 0.06),
+        ("0.5,0.5,0.5", 0.06),
+        ("none", 0.03),
+        ("envmap", 0.03),  # black behind lights
+        ("#000000", 0.03),
+        ("#202830", 0.03),
+    ],
+)
+def test_the_default_share_follows_the_background(background: str, share: float) -> None:
+    (setup,) = setups_of([KEY])
+    assert in_room(setup, None, parse_background(background).is_dark(setup)).room == share
+
+
+def test_a_map_has_no_room_and_a_light_of_a_room_turns_the_default_off(sky: Path) -> None:
+    (mapped,) = setups_of([], [str(sky)])
+    assert in_room(mapped, None, False) == in_room(mapped, "0.5", False) == mapped
+    for entry in ("name=fill;from=around", "room=90,0"):
+        (setup,) = setups_of([KEY, entry])
+        assert in_room(setup, None, False) == setup
+    with pytest.raises(UsageError, match=r"--room 0\.1: a light has the name room"):
+        in_room(setup, "0.1", False)
+
+
+def test_none_leaves_the_lights_to_the_last_bit() -> None:
+    (setup,) = setups_of([KEY, RIM])
+    assert in_room(setup, "none", False) == setup == with_room(setup)
+    assert in_room(setup, "0", False) == setup
+
+
+def test_a_rooms_light_is_a_share_of_the_sum_of_the_lights() -> None:
+    red, near = "name=a;az=90;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
+    (setup,) = setups_of([red, near])
+    lit = with_room(in_room(setup, "0.1", False))
+    assert lit.names == ("a", "b", "room") and lit.lights[:2] == setup.lights
+    assert lit.lights[2] == StudioLight(rgb=pytest.approx((0.1, 0.4, 0.0)))
+
+
+def test_sums_of_images_stay_sums(sky: Path) -> None:
+    """Of lights by themselves, and of a map with them: weights of all that shines add up."""
+    key, rim, together, alone = (
+        in_room(setup, None, False)
+        for setup in (
+            *setups_of([KEY]),
+            *setups_of([RIM]),
+            *setups_of([KEY, RIM], [f"sky={sky}"]),
+            *setups_of([], [str(sky)]),
+        )
+    )
+    assert together.names == ("sky", "key", "rim") and together.name == "light_sky+key+rim"
+    every = lights_of(key, rim, alone, together)
+    arriving = torch.einsum("mlc,ld->mcd", every.weights, every.directions.abs())  # of each sum, by direction
+    torch.testing.assert_close(arriving[:3].sum(0), arriving[3], rtol=1e-5, atol=1e-6)
+    assert every.strengths()[3] == pytest.approx(sum(every.strengths()[:3]), rel=1e-5)
+
+
+def test_a_map_with_a_name_turns_in_every_frame_and_has_an_intensity(sky: Path) -> None:
+    frames = setups_of(["key=40,20"], [f"sky={sky}"], rotate="0:90:3")
+    assert [setup.frame for setup in frames] == [".0000", ".0001", ".0002"]
+    assert [setup.lights[0].rotate_deg for setup in frames] == [0, 30, 60]
+    dim, turned = setups_of([f"name=sky;map={sky};stops=-1;rotate=30"]), setups_of([], [str(sky)], "30")
+    weights = lights_of(*dim, *turned).weights
+    torch.testing.assert_close(2 * weights[0], weights[1])
+
+
+def test_a_rig_file_names_its_map_from_its_own_folder(sky: Path) -> None:
+    rig = sky.with_name("studio.toml")
+    rig.write_text("[sky]\nmap = 'sky.exr'\nstops = -1\n[key]\nfrom = [40, 20]\n")
+    (setup,) = setups_of([str(rig)])
+    assert setup.lights[0] == StudioLight(envmap=sky, stops=-1.0) and setup.names == ("sky", "key")
+
+
+def test_a_map_may_be_the_room(sky: Path) -> None:
+    (setup,) = setups_of([KEY])
+    lit = in_room(setup, str(sky), False)
+    assert lit.names == ("key", "room") and lit.lights[1] == StudioLight(envmap=sky)
+
+
+@pytest.mark.parametrize("room", ["2", "-0.1", "walls", "", "0.1,0.1"])
+def test_a_wrong_room_is_refused(
+    room: str, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert relight(given, tmp_path / "x", "--light", "0,0", f"--room={room}") == 2
+    assert "--room" in capsys.readouterr().err
+
+
+def test_a_room_without_lights_is_refused(
+    sky: Path, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert relight(given, tmp_path / "x", "--envmap", str(sky), "--room", "0.1") == 2
+    assert "--room 0.1: is added to lights; add --light" in capsys.readouterr().err
+
+
+def test_the_line_says_which_room_was_taken_and_a_stack_has_none(
+    given: Path, stack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["--light", "70,0", "--composite", "face"]
+    assert relight(given, tmp_path / "a", *line) == 0
+    assert "in a room that sends 0.03 back" in capsys.readouterr().err
+    for name, more in (("default", []), ("none", ["--room", "none"]), ("wide", ["--room", "0.5"])):
+        assert relight(given, tmp_path / name, "--light", "70,0", *more, photo=stack) == 0
+    assert capsys.readouterr().err.count("in a room") == 1
+    images = {
+        name: read_image(next((tmp_path / name).glob("*.exr"))).pixels for name in ("default", "none", "wide")
+    }
+    np.testing.assert_array_equal(images["default"], images["none"])
+    assert images["wide"].mean() > 1.2 * images["none"].mean()
