@@ -18,7 +18,7 @@ import numpy as np
 from safetensors.numpy import save_file
 
 from facerf_cli.synth.head.arms import NECK_DM
-from facerf_cli.synth.head.mesh import GARMENTS, STEP_M, WHOLE
+from facerf_cli.synth.head.mesh import STEP_M, WHOLE, WHOLE_GARMENTS
 
 MESHES = {
     "body": "base/3dobjs/base.obj",
@@ -42,8 +42,7 @@ SHOULDER_DM = np.array([1.55, 5.0])  # x and y of the joint of the left shoulder
 LOWERED_DEG, BEGIN_DM, END_DM = 32.0, 1.2, 2.6  # the arms turn fully beyond END_DM
 SHOULDER_TOP_DM = (1.3, 1.7)  # range of |x| in which the tops of the shoulders are compared
 BODY_TOP_DM, CLOTH_DM = 5.74, 0.08  # height of the body's shoulders there, and of cloth over them
-# The v-neck ends at the waist: it is stretched below this height, a whole one further.
-CROPPED_DM, STRETCHED, STRETCHED_WHOLE = 4.6, 1.8, 3.0
+CROPPED_DM, STRETCHED = 4.6, 1.8  # the v-neck ends at the waist: it is stretched below this height
 HAND_DM = 4.15  # |x| beyond which the left arm is the hand
 NOTICE = "MakeHuman base mesh, clothes and hat (CC0 1.0): Data Collection AB, Joel Palmius, Jonas Hauquier"
 
@@ -94,8 +93,7 @@ def chosen(name: str, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.n
     bent = vertices if kind == "body" else hung(vertices)
     bent = bent if whole else lowered(bent)
     if kind == "v-neck":
-        stretched = STRETCHED_WHOLE if whole else STRETCHED
-        bent[:, 1] -= (stretched - 1) * np.maximum(CROPPED_DM - bent[:, 1], 0)
+        bent[:, 1] -= (STRETCHED - 1) * np.maximum(CROPPED_DM - bent[:, 1], 0)
     centre = bent[triangles].mean(1)
     if whole:
         kept = bent[triangles, 1].min(1) > LOWEST_WHOLE_DM
@@ -110,7 +108,7 @@ def chosen(name: str, vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.n
 def main(archive: Path, out: Path) -> None:
     """Write the packed meshes."""
     tensors = {}
-    names = [*MESHES, *(WHOLE + name for name in ("body", *GARMENTS))]
+    names = [*MESHES, *(WHOLE + name for name in ("body", *WHOLE_GARMENTS))]
     with tarfile.open(archive) as files:
         for name in names:
             stream = files.extractfile(MESHES[name.removeprefix(WHOLE)])

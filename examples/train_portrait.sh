@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# The shipped Portrait Network: synthetic people from head to chest, nothing else. Two processor cores, about four hours:
-# one to bake the people, one for a first leg of training, two for a second one that starts from it.
-# Run it again after an interruption: it goes on. The shipped one's first two legs saw layers of a faulty bank, and a third
-# of 67 minutes mended ones (docs/measurements.md); with a mended bank two legs are meant to do.
+# A Portrait Network: synthetic people from face to hips, nothing else. Two processor cores, about seven hours: two to bake
+# the people, two for a first leg of training, three for a second one that starts from it.
+# Run it again after an interruption: it goes on. The shipped one is of an earlier recipe, whose squares were of three faces
+# alone. To go on from it, give only the second command, with --start-from facerf_cli/assets/portrait.safetensors.
 # Usage: [PEOPLE=340] examples/train_portrait.sh ICT-FaceKit.tar.xz RUN [TIME OF THE FIRST LEG] [OF THE SECOND]
 set -euo pipefail
-archive=$1 run=$2 first=${3:-60m} second=${4:-125m}
+archive=$1 run=$2 first=${3:-120m} second=${4:-180m}
 export OMP_NUM_THREADS=2
 export MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296  # else much of the time is the kernel's
 mkdir -p "$run"

@@ -28,6 +28,8 @@ _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
 _STRAND_SHARPNESS = 30.0
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
+_NEAR_FACES = 0.15  # around the proxy, where hair and cloth may be that it lacks
+_SIDES = 3.0  # faces: the square's side for which the scale is 0
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
 _COARSE = {  # maps at half the side
     "lit": (LIT_ORDER + 1) ** 2,
@@ -45,6 +47,7 @@ class PortraitSettings:
     blocks: Blocks = (1, 1, 2, 2, 2)
     classes: Classes = 14
     side: Side = 192
+    scaled: bool = False  # sees the square's scale, and nothing of the proxy where that has no surface near
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class PortraitInputs(Batch):
     image [B, 3, S, S] scene-linear, exposed so that the mean of the skin is `MEAN_RADIANCE`; classes
     [B, C, S, S]; normals [B, 3, S, S], depth [B, 1, S, S] (0.1 m) and covered [B, 1, S, S] of the proxy;
     reached [B, K, S, S]: spherical harmonics of the proxy's visibility; own [B, 1, S, S]: its shading under
-    the photo's light, 1 on average over the skin.
+    the photo's light, 1 on average over the skin; sides [B, 1, 1, 1]: of the square, in faces.
     """
 
     image: Tensor
@@ -64,6 +67,18 @@ class PortraitInputs(Batch):
     covered: Tensor
     reached: Tensor
     own: Tensor
+    sides: Tensor
+
+    @property
+    def near_proxy(self) -> Tensor:
+        """Flags [B, 1, S, S] of what lies on the proxy or near it."""
+        return torch.cat([_grown(*one) for one in zip(self.covered, self.sides.flatten(), strict=True)])
+
+    def emptied(self) -> "PortraitInputs":
+        """The same without what the proxy does not show."""
+        near = self.near_proxy
+        shown = {name: getattr(self, name) * near for name in ("normals", "depth", "reached")}
+        return replace(self, **shown, own=1 + (self.own - 1) * near)
 
     def mirrored(self) -> "PortraitInputs":
         """The people as a mirror shows them."""
@@ -77,6 +92,13 @@ class PortraitInputs(Batch):
         own = (self.own.clamp(0, 4) + 0.02).sqrt() - 1
         layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached, own)
         return torch.cat(layers, 1)
+
+
+def _grown(covered: Tensor, sides: Tensor) -> Tensor:
+    """Flags [1, 1, S, S] of pixels within `_NEAR_FACES` of covered ones [1, S, S] in a square of `sides`."""
+    reach = round(float(_NEAR_FACES * covered.shape[-1] / sides))
+    row = F.max_pool2d(covered[None], (1, 2 * reach + 1), 1, (0, reach))
+    return F.max_pool2d(row, (2 * reach + 1, 1), 1, (reach, 0))
 
 
 def mirrored_x(vectors: Tensor) -> Tensor:
@@ -194,7 +216,8 @@ class PortraitNetwork(UNet):
     kind_of_settings = PortraitSettings
 
     def __init__(self, settings: PortraitSettings = PortraitSettings()) -> None:
-        super().__init__(settings, 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1)
+        inputs = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1
+        super().__init__(settings, inputs + 2 * settings.scaled)
         widths = settings.widths
         self.last = Residual(widths[0])
         self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
@@ -202,17 +225,36 @@ class PortraitNetwork(UNet):
 
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
         """Predict maps; sides are multiples of 32."""
-        predicted = self.predict(self.last(self.doubled(self.halved(inputs.stacked()))[-1]))
+        stacked, shown = inputs.stacked(), torch.ones_like(inputs.covered)
+        if self.settings.scaled:
+            inputs, shown = inputs.emptied(), inputs.near_proxy
+            scale = (inputs.sides / _SIDES).log().expand_as(shown)
+            stacked = torch.cat([inputs.stacked(), shown, scale], 1)
+        predicted = self.predict(self.last(self.doubled(self.halved(stacked))[-1]))
         fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
         parts = [
             *torch.split(shuffled, list(_FINE.values()), 1),
             *torch.split(coarse.float(), list(_COARSE.values()), 1),
         ]
-        return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs)
+        return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs, shown)
+
+    def at_every_scale(self, side: int) -> "PortraitNetwork":
+        """The same network for squares of any scale, to be trained at a side.
+
+        Its new weights are 0: where the proxy is near it begins with the same maps.
+        """
+        if self.settings.scaled:
+            return self
+        wider = PortraitNetwork(replace(self.settings, scaled=True, side=side))
+        weights = self.state_dict()
+        weights["stem.enter.weight"] = F.pad(weights["stem.enter.weight"], (0, 0, 0, 0, 0, 2))
+        wider.load_state_dict(weights)
+        return wider
 
 
-def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:
+def _maps(raw: dict[str, Tensor], inputs: PortraitInputs, shown: Tensor) -> PortraitMaps:
+    """Maps of the last layer's channels; where the proxy is not `shown`, its shadows count nothing."""
     gain = torch.exp(raw["gain"].clamp(-4, 4)) * (1 + _DIM) / (inputs.own + _DIM)
     bias = 0.1 * F.softplus(raw["bias"] - 3)
     return PortraitMaps(
@@ -224,6 +266,6 @@ def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:
         gloss=0.1 * F.softplus(raw["gloss"] - 2),
         lit=0.3 * raw["lit"],
         around=torch.cat([0.3 * raw["around"][:, :1] + 0.05, 0.3 * raw["around"][:, 1:]], 1),
-        trust=4 * F.softplus(raw["trust"] + 0.5),
+        trust=4 * F.softplus(raw["trust"] + 0.5) * shown,
         shadow=raw["shadow"] * 3,
     )

@@ -1,6 +1,6 @@
 """A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -31,7 +31,6 @@ from facerf_cli.raster.camera import PIXEL_CENTRE
 
 SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network sees
 SIDES = 3.0  # its side in extents of the landmarks: the larger side of their bounds
-VISIBILITY_PX = SIDE_PX // 2  # side at which shadow rays are cast
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,25 +51,43 @@ class SeenPerson:
         return float(skin_exposure(self.image[None], self.classes[None]))
 
     def visibility(self, directions: Tensor) -> Tensor:
-        """Share [L, s, s] of lights [L, 3] that reaches the person, on `VISIBILITY_PX`."""
+        """Share [L, s, s] of lights [L, 3] that reaches the person, at half the square's side."""
         return self.shadows.along(directions)
 
     def visibility_of_points(self, places_m: Tensor) -> Tensor:
         """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
         return self.shadows.toward(places_m)
 
+    @property
+    def sides(self) -> float:
+        """Side of the square in faces, the larger sides of the bounds of landmarks."""
+        low, high = _bounds(self.fit.crop.to_photo(self.fit.landmarks_px.numpy()))
+        return self.square.side_px / float((high - low).max())
+
+    def within(self, square: Crop, photo: np.ndarray) -> "SeenPerson":
+        """The same person in another square of the photo [H, W, 3]."""
+        return replace(
+            self,
+            square=square,
+            image=_image_in(photo, square),
+            classes=_classes_in(self.segmentation, square),
+            maps=proxy_maps(self.proxy, square_camera(self.fit, square)),
+        )
+
     @cached_property
     def shadows(self) -> Shadows:
-        """The lights that reach each pixel, on `VISIBILITY_PX`."""
-        square = Crop(self.square.x0_px, self.square.y0_px, self.square.side_px, VISIBILITY_PX)
-        return Shadows(self.proxy, square_camera(self.fit, square))
+        """The lights that reach each pixel, at half the square's side."""
+        half = replace(self.square, size_px=self.square.size_px // 2)
+        return Shadows(self.proxy, square_camera(self.fit, half))
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible)
         exposed = self.image[None] / self.exposure
-        reached = reached_by(rig, visible, SIDE_PX)
-        return PortraitInputs(exposed, self.classes[None], *surface_of(self.maps), reached[None], own[None])
+        reached = reached_by(rig, visible, self.square.size_px)
+        sides = torch.full((1, 1, 1, 1), self.sides)
+        surface = surface_of(self.maps)
+        return PortraitInputs(exposed, self.classes[None], *surface, reached[None], own[None], sides)
 
 
 def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
@@ -82,10 +99,15 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
 
 def portrait_square(landmarks_px: np.ndarray, size_px: int = SIDE_PX) -> Crop:
     """The square of a photo around landmarks [68, 2] in its pixels."""
-    low, high = landmarks_px.min(0), landmarks_px.max(0)
+    low, high = _bounds(landmarks_px)
     side_px = SIDES * float((high - low).max())
     x_px, y_px = (low + high) / 2
     return Crop(float(x_px) - side_px / 2, float(y_px) - side_px / 2, side_px, size_px)
+
+
+def _bounds(landmarks_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Upper left and lower right corner of landmarks [68, 2]."""
+    return landmarks_px.min(0), landmarks_px.max(0)
 
 
 def look_at_person(
@@ -110,9 +132,13 @@ def look_at_person(
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or give --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
-    image = torch.from_numpy(without_fireflies(square.apply(photo))).permute(2, 0, 1)
     maps = proxy_maps(proxy, square_camera(fit, square))
-    return SeenPerson(square, image, classes, proxy, maps, fit, segmentation)
+    return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation)
+
+
+def _image_in(photo: np.ndarray, square: Crop) -> Tensor:
+    """A square [3, S, S] of a photo [H, W, 3]."""
+    return torch.from_numpy(without_fireflies(square.apply(photo))).permute(2, 0, 1)
 
 
 def _classes_in(segmentation: Segmentation, square: Crop) -> Tensor:

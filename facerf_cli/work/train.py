@@ -39,6 +39,8 @@ from facerf_cli.synth.bank.portraits import (
 )
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.synth.bank.transport import (
+    SIDE_PX,
+    TINY_BANK,
     PortraitSource,
     StoredTransport,
     TransportBankSettings,
@@ -229,20 +231,21 @@ class _TrainedStage:
         """The Portrait Network on a dataset, or on synthetic people."""
         options, targets = self.options, 2 if self.options.preset == "tiny" else 4
         source: PortraitSource
+        network = self._network("portrait")
         if options.dataset:
             backgrounds = self._backgrounds(options.output)
             source = open_dataset_portraits(options.dataset, backgrounds, self.networks, options.jobs)
         else:
-            source = self._stored_transport()
+            source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
         settings = PortraitObjectiveSettings(held_out_people=self._sizes.held_out_heads, targets=targets)
-        return PortraitObjective(source, self._network("portrait"), settings)
+        return PortraitObjective(source, network, settings)
 
     def _stored_transport(self) -> StoredTransport:
         """Synthetic people; those that are missing in the bank are baked and looked at first."""
         options, folder = self.options, self._bank / "transport"
         people, models, provenance = self._whole_people()
         tiny, seed = options.preset == "tiny", options.settings.seed
-        settings = TransportBankSettings(views=1, looks=1, lights=12) if tiny else TransportBankSettings()
+        settings = TINY_BANK if tiny else TransportBankSettings()
         add_transport(folder, models, people, options.jobs, seed, settings)
         backgrounds = self._backgrounds(self._bank)
         add_proxies(folder, backgrounds, self.networks, options.jobs, seed)

@@ -24,6 +24,7 @@ from facerf_cli.network.portrait import (
 )
 
 SIDE = 32
+SIDES = torch.full((1, 1, 1, 1), 3.0)
 TINY = PortraitSettings((8, 8, 12), (0, 1, 1), side=SIDE)
 
 
@@ -34,7 +35,7 @@ def inputs() -> PortraitInputs:
     normals = F.normalize(torch.randn(1, 3, SIDE, SIDE, generator=random), dim=1)
     one = torch.ones(1, 1, SIDE, SIDE)
     image = torch.rand(1, 3, SIDE, SIDE, generator=random)
-    return PortraitInputs(image, classes, normals, 0 * one, one, one.expand(-1, 16, -1, -1), 2 * one)
+    return PortraitInputs(image, classes, normals, 0 * one, one, one.expand(-1, 16, -1, -1), 2 * one, SIDES)
 
 
 def plain_maps() -> PortraitMaps:
@@ -192,11 +193,36 @@ def test_the_gain_starts_from_the_quotient_of_the_proxys_own_shading() -> None:
 
 
 def test_every_input_matters() -> None:
-    network, given = PortraitNetwork(TINY), inputs()
+    network, given = PortraitNetwork(replace(TINY, scaled=True)), inputs()
     before = network(given).gain
     for name in PortraitInputs.__dataclass_fields__:
         changed = replace(given, **{name: getattr(given, name) * 0.5 + 0.1})
         assert not torch.allclose(network(changed).gain, before, atol=1e-4), name
+
+
+def test_at_every_scale_a_network_begins_with_the_same_maps() -> None:
+    network, given = PortraitNetwork(TINY), inputs()
+    wider = network.at_every_scale(SIDE)
+    assert wider.settings == replace(TINY, scaled=True) and wider.at_every_scale(64) is wider
+    for sides in (1.5, 3.0):
+        for own, other in zip(network(given), wider(replace(given, sides=0 * SIDES + sides)), strict=True):
+            torch.testing.assert_close(own, other)
+
+
+def test_far_from_the_proxy_nothing_of_it_is_seen() -> None:
+    """A square of 3 faces; the proxy covers its left quarter, and with .15 of a face 2 pixels more."""
+    network, given = PortraitNetwork(replace(TINY, scaled=True)), inputs()
+    edge = SIDE // 4 + 2
+    given.covered[..., SIDE // 4 :] = 0
+    other = replace(given, **{n: getattr(given, n).clone() for n in ("normals", "depth", "reached", "own")})
+    for values in (other.normals, other.depth, other.reached, other.own):
+        values[..., edge:] = torch.rand(values[..., edge:].shape, generator=torch.Generator().manual_seed(1))
+    maps, changed = network(given), network(other)
+    for one, two in zip(maps, changed, strict=True):
+        assert torch.equal(one, two)
+    assert maps.trust[..., edge:].max() == 0 < maps.trust[..., :edge].min()
+    given.own[..., edge - 1] += 1
+    assert not torch.equal(network(given).gain, maps.gain)
 
 
 def test_exposure_is_that_of_the_skin() -> None:

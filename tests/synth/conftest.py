@@ -12,7 +12,7 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth import bank as bank_room
 from facerf_cli.synth.bank.heads import Bank, HeadBakeSettings, add_views, bake_heads, load_bank
-from facerf_cli.synth.bank.transport import TransportBankSettings, look_at_views, transport_of
+from facerf_cli.synth.bank.transport import TransportBankSettings, look_at_photos, transport_of
 
 TINY = HeadBakeSettings(side=32, lights=20, bake=BakeSettings(light_samples=1, bounce_samples=2))
 
@@ -36,7 +36,7 @@ def bank(bank_folder: Path) -> Bank:
     )
 
 
-SMALL = TransportBankSettings(views=2, looks=2, lights=14)
+SMALL = TransportBankSettings(cameras=1, squares=2, looks=2, lights=14, side_px=192)
 
 
 def backgrounds() -> Tensor:
@@ -46,13 +46,12 @@ def backgrounds() -> Tensor:
 
 @pytest.fixture(scope="session")
 def transport_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bank of one person, whom two views show; all processes of a run have the same."""
+    """A bank of one person, whom two squares of a photo show; all processes of a run have the same."""
 
     def fill(folder: Path) -> None:
-        for view, tensors in enumerate(transport_of("builtin", 1, 3, SMALL)):
-            save_file(tensors, folder / f"00001_{view}.safetensors")
-        for stored in sorted(folder.iterdir()):
-            look_at_views(backgrounds(), SHIPPED_NETWORKS, 0, [stored])
+        for name, tensors in transport_of("builtin", 1, 3, SMALL).items():
+            save_file(tensors, folder / f"{name}.safetensors")
+        look_at_photos(backgrounds(), SHIPPED_NETWORKS, 0, list(folder.glob("photo_*")))
 
     return made_once(tmp_path_factory, "transport", fill)
 

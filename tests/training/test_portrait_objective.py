@@ -60,6 +60,7 @@ def truth() -> PortraitSample:
             covered=whole(1, 1),
             reached=whole(0, 16),
             own=whole(1, 1),
+            sides=torch.full((1, 1, 1, 1), 3.0),
         ),
         lights=lights,
         visible=torch.ones(1, 2, SIDE // 2, SIDE // 2),

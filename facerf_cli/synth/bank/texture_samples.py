@@ -97,8 +97,12 @@ def _tint(spread: float, generator: torch.Generator) -> Tensor:
 
 def draw_target_lights(in_camera: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Draw indices [count] of lights at directions [L, 3], mostly in front of the face, as in photos."""
-    preference = torch.sigmoid(6 * (in_camera[:, 2] + 0.1)) + 0.05
-    return torch.multinomial(preference, count, generator=generator)
+    return torch.multinomial(in_front(in_camera), count, generator=generator)
+
+
+def in_front(in_camera: Tensor) -> Tensor:
+    """Weights [L] of lights at directions [L, 3] as photos have them: mostly in front of the face."""
+    return torch.sigmoid(6 * (in_camera[:, 2] + 0.1)) + 0.05
 
 
 def simulate_camera(

@@ -1,8 +1,9 @@
 """Bank of portraits that the Portrait Network is trained on: what cameras see of synthetic people; samples.
 
 A portrait is kept without light: the facets of the image, how much of each light reaches them, and what they
-are made of in several looks. The squares lie around the head as those that the Portrait Network sees of
-photos (`portrait.proxy`). A sample is a photo in a random light, and the same person under single lights.
+are made of in several looks. A person's light is baked once, at the vertices of the mesh; each camera takes a
+photo of it, in which the person is found, and squares of several scales, as the Portrait Network sees them of
+photos (`portrait.proxy`). A sample is a square in a random light, and the same under single lights.
 """
 
 import math
@@ -11,10 +12,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -24,17 +26,19 @@ from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.light.sphere import direction_to_azel
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_x, reached_by
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.portrait.person import SIDE_PX, SIDES, SeenPerson, look_at_person, surface_of
+from facerf_cli.portrait.person import SIDES, SeenPerson, look_at_person, surface_of
 from facerf_cli.portrait.proxy import own_shading
 from facerf_cli.raster.camera import Camera, project
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.workers import in_shards, one_thread
-from facerf_cli.synth.bank import Files, files_in, fill, split_people
+from facerf_cli.synth.appearance.materials import Appearance
+from facerf_cli.synth.bank import Files, file_of, files_in, fill, split_people
 from facerf_cli.synth.bank.face_crops import gaussian_blurred
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.bank.portraits import (
@@ -45,28 +49,42 @@ from facerf_cli.synth.bank.portraits import (
     draw_turn,
     seen_by,
 )
-from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
+from facerf_cli.synth.bank.texture_samples import draw_light, in_front
 from facerf_cli.synth.portraits import BakedPortrait, albedo_of, images_under, materials_of, portrait_tensors
 from facerf_cli.synth.random_fields import Random, Uniform, generators
 from facerf_cli.synth.shading import Material
 from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
 from facerf_cli.synth.views import StageCamera
 
-_BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=6)
+# Bounced light is smoothed over more than an edge of cloth, where few rays would leave spots.
+_BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=10, bounce_blur_m=0.012)
 # Standard deviations of the camera's yaw, pitch and roll, and their largest values, in degrees.
 _POSE_STD_DEG, _POSE_MAX_DEG = (24.0, 9.0, 5.0), (65.0, 28.0, 18.0)
-_DISTANCE_M = (0.5, 3.0)
+_NEAREST, _FARTHEST_M = 0.17, 3.0  # of the camera: metres for each face that its squares show, and metres
+SIDE_PX, PHOTO_PX = 256, 448  # of the squares, and of the photo in which the person is found
+SCALES = (1.5, 7.0)  # sides of the squares in faces, the extents of the landmarks
+_PHOTO_SIDES = (1.0, 1.25)  # of the photo, in sides of what its squares take; it is no smaller than `SIDES`
+_PHOTO = "photo_"  # before the names of photos
 _TRIES, _CROP_PX = 3, 256  # lights in which a face is looked for; side of the crop that it is fitted in
-_SIZE_STD, _SHIFT_STD = 0.06, 0.03  # of the square: logarithm of its side, and its place in sides
+_SHIFT_STD = 0.03  # of the square's place, in its sides
+_ABOVE, _BELOW = 1.3, 4.4  # faces: least of a low square that is above the face, and most that is below it
+# Lights from behind: elevation and least azimuth, and how much likelier a target they are than one in front.
+_BACK_EL_DEG, _BACK_AZ_DEG, _BACK = (0.0, 40.0), 120.0, 2.0
 
 
 @dataclass(frozen=True)
 class TransportBankSettings:
-    """Numbers of views, looks and lights of a person."""
+    """Numbers of cameras, squares of each of them, looks and lights of a person; sides in pixels."""
 
-    views: int = 4
+    cameras: int = 2
+    squares: int = 3
     looks: int = 3
     lights: int = 48
+    side_px: int = SIDE_PX
+    photo_px: int = PHOTO_PX
+
+
+TINY_BANK = TransportBankSettings(cameras=1, squares=1, looks=1, lights=12, side_px=128)
 
 
 def add_transport(
@@ -79,31 +97,48 @@ def add_transport(
 ) -> None:
     """Bake synthetic people into `folder`; keep finished ones. The face models take turns."""
     baked = partial(_baked, face_models, seed, settings)
-    fill(folder, baked, people, jobs, last=f"_{settings.views - 1}")
+    fill(folder, baked, people, jobs, last=f"_{settings.cameras * settings.squares - 1}")
 
 
 def _baked(face_models: list[str], seed: int, settings: TransportBankSettings, index: int) -> Files:
-    views = transport_of(face_models[index % len(face_models)], index, seed, settings)
-    return {f"{index:05d}_{view}": tensors for view, tensors in enumerate(views)}
+    return transport_of(face_models[index % len(face_models)], index, seed, settings)
 
 
 @torch.no_grad()
-def transport_of(
-    face_model: str, index: int, seed: int, settings: TransportBankSettings
-) -> list[dict[str, Tensor]]:
-    """Bake one person: for each view the fields of `BakedPortrait`, and its facets' materials in K looks.
+def transport_of(face_model: str, index: int, seed: int, settings: TransportBankSettings) -> Files:
+    """Bake one person, by the names of files.
 
-    look_albedo [K, N, 3], look_specular and look_roughness [K, N]: float16, see `Material`.
+    A square has the fields of `BakedPortrait`, and its facets' materials in K looks: look_albedo [K, N, 3],
+    look_specular and look_roughness [K, N], float16, see `Material`. The squares of a camera lie in its photo
+    of side P: lit [T, 3, P, P] float16 over black, in the first look and T lights; alpha [P, P] uint8, of
+    255; squares [Q, 4], the fields of a `Crop` of the photo; directions [L, 3] of the lights.
     """
     random, generator = generators(seed, index, 5)
-    subject = draw_subject(subject_model(face_model), index, seed, SIDE_PX)
-    cameras = [_draw_camera(subject, random) for _ in range(settings.views)]
-    views = seen_by(cameras, subject, settings.lights, _BAKE, index, random)
+    subject = draw_subject(subject_model(face_model), index, seed, settings.side_px, arms=True)
+    drawn = _draw_cameras(subject, random, settings)
+    cameras = [camera for one in drawn for camera in (one.photo, *one.squares)]
+    views = iter(seen_by(cameras, subject, settings.lights, _BAKE, index, random))
     looks = draw_looks(subject, settings.looks, generator)
-    return [
-        {**portrait_tensors(view), **_materials([materials_of(view, look) for look in looks])}
-        for view in views
-    ]
+    files: Files = {}
+    for number, one in enumerate(drawn):
+        first = number * settings.squares
+        files[f"{_PHOTO}{index:05d}_{first}"] = _photo(next(views), looks[0], one.crops, generator)
+        for k in range(first, first + settings.squares):
+            view = next(views)
+            materials = _materials([materials_of(view, look) for look in looks])
+            files[f"{index:05d}_{k}"] = {**portrait_tensors(view), **materials}
+    return files
+
+
+def _photo(
+    view: BakedPortrait, look: Appearance, crops: Tensor, generator: torch.Generator
+) -> dict[str, Tensor]:
+    """The person in a photo, in several lights; see `transport_of`."""
+    weights = torch.stack([draw_light(view.directions, generator) for _ in range(_TRIES)])
+    images = images_under(view, materials_of(view, look), weights)
+    images = images / images.mean((1, 2, 3), keepdim=True).clamp_min(1e-6)
+    alpha = 255 - view.classes[..., 0]
+    return {"lit": images.half(), "alpha": alpha, "squares": crops, "directions": view.directions}
 
 
 def _materials(looks: list[Material]) -> dict[str, Tensor]:
@@ -113,25 +148,64 @@ def _materials(looks: list[Material]) -> dict[str, Tensor]:
     }
 
 
-def _draw_camera(subject: Subject, random: Random) -> StageCamera:
-    """Draw a camera whose image is the square around the head, a little off."""
+class _Views(NamedTuple):
+    """A camera's photo and its squares, also [Q, 4] as the fields of a `Crop` of the photo."""
+
+    photo: StageCamera
+    squares: list[StageCamera]
+    crops: Tensor
+
+
+def _draw_cameras(subject: Subject, random: Random, settings: TransportBankSettings) -> list[_Views]:
+    """Draw cameras; the scales of all their squares are spread over `SCALES`."""
+    count = settings.cameras * settings.squares
+    low, high = np.log(SCALES)
+    scales = np.exp(low + (high - low) * (random.permutation(count) + random.uniform(size=count)) / count)
+    return [_draw_views(subject, sides, random, settings) for sides in scales.reshape(settings.cameras, -1)]
+
+
+def _draw_views(
+    subject: Subject, scales: np.ndarray, random: Random, settings: TransportBankSettings
+) -> _Views:
+    """Draw a camera that takes squares of these sides [K] in faces, a little off."""
     rotation = draw_turn(random, _POSE_STD_DEG, _POSE_MAX_DEG)
-    distance_m = math.exp(random.uniform(*np.log(_DISTANCE_M)))
+    distance_m = math.exp(random.uniform(*np.log((_NEAREST * scales.max(), _FARTHEST_M))))
     towards = torch.tensor([*random.normal(0, 0.05, 2), -distance_m]).float()  # off the axis of the lens
     landmarks = torch.from_numpy(subject.landmarks_world).float() @ rotation.T.float() + towards
-    seen = project(landmarks, Camera(1.0, 1, 1, 0.0, 0.0))
+    seen = project(landmarks, Camera(1.0, 1, 1, 0.0, 0.0)).double()
     low, high = seen.amin(0), seen.amax(0)
-    side = SIDES * float((high - low).max()) * math.exp(random.normal(0, _SIZE_STD))
-    x, y = (-SIDE_PX * ((low + high) / 2 / side + torch.from_numpy(random.normal(0, _SHIFT_STD, 2)))).tolist()
-    lens = Camera(SIDE_PX / side, SIDE_PX, SIDE_PX, SIDE_PX / 2 + x, SIDE_PX / 2 + y)
-    return StageCamera(lens, rotation, towards)
+    middle, face = ((low + high) / 2).numpy(), float((high - low).max())
+
+    def window(sides: float) -> np.ndarray:
+        """Left, top and side of a square, at distance 1."""
+        down = random.uniform(0, max(0.0, min(sides / 2 - _ABOVE, _BELOW - sides / 2)))
+        off = random.normal(0, _SHIFT_STD, 2) * sides + [0, down]
+        return np.array([*(middle + (off - sides / 2) * face), sides * face])
+
+    def camera(square: np.ndarray, size_px: int) -> StageCamera:
+        x, y = (size_px / square[2] * square[:2]).tolist()
+        return StageCamera(Camera(size_px / square[2], size_px, size_px, -x, -y), rotation, towards)
+
+    squares = [window(sides) for sides in scales]
+    corners = np.array([square[:2] for square in squares])
+    ends = corners + np.array([square[2:] for square in squares])
+    side = max(float((ends.max(0) - corners.min(0)).max()) * random.uniform(*_PHOTO_SIDES), SIDES * face)
+    whole = np.array([*((ends.max(0) + corners.min(0)) / 2 - side / 2), side])
+    px = settings.photo_px / side
+    crops = [[*((square[:2] - whole[:2]) * px), square[2] * px, settings.side_px] for square in squares]
+    return _Views(
+        camera(whole, settings.photo_px),
+        [camera(square, settings.side_px) for square in squares],
+        torch.tensor(np.array(crops)),
+    )
 
 
 def add_proxies(folder: Path, backgrounds: Tensor, networks: Networks, jobs: int, seed: int) -> None:
     """Add to each portrait of a bank what the networks see of it (`seen_in`); keep finished ones."""
     sha256 = networks.sha256("parsing")
-    missing = [path for path in files_in(folder) if not is_made_from(seen_path(path), sha256)]
-    in_shards(partial(look_at_views, backgrounds, networks, seed), missing, jobs)
+    photos = sorted(folder.glob(f"{_PHOTO}[0-9]*.safetensors"))
+    missing = [path for path in photos if not all(is_made_from(seen, sha256) for seen in _seen_paths(path))]
+    in_shards(partial(look_at_photos, backgrounds, networks, seed), missing, jobs)
 
 
 def seen_path(path: Path) -> Path:
@@ -139,53 +213,66 @@ def seen_path(path: Path) -> Path:
     return path.with_name(f"seen_{path.name}")
 
 
-def look_at_views(backgrounds: Tensor, networks: Networks, seed: int, paths: list[Path]) -> None:
-    """Write what is seen of views, on one thread."""
+def _seen_paths(photo: Path) -> list[Path]:
+    """The files for what is seen of the squares of a photo."""
+    person, first = photo.stem.removeprefix(_PHOTO).split("_")
+    with safe_open(photo, framework="pt") as file:
+        count = len(file.get_tensor("squares"))
+    return [seen_path(file_of(photo.parent, f"{person}_{k}")) for k in range(int(first), int(first) + count)]
+
+
+def look_at_photos(backgrounds: Tensor, networks: Networks, seed: int, photos: list[Path]) -> None:
+    """Write what is seen of the squares of photos, on one thread."""
     made_from = {"of": networks.sha256("parsing")}
     with one_thread():
-        for path in paths:
-            number = int(path.stem.replace("_", ""))
-            seen = seen_in(load_view(path), backgrounds, networks.people, seed + number)
-            with atomic_path(seen_path(path)) as temporary:
-                save_file(seen, temporary, made_from)
+        for path in photos:
+            number = int(path.stem.removeprefix(_PHOTO).replace("_", ""))
+            paths = _seen_paths(path)
+            found = seen_in(load_file(path), backgrounds, networks.people, seed + number)
+            for seen, layers in zip(paths, found or [{}] * len(paths), strict=True):
+                with atomic_path(seen) as temporary:
+                    save_file(layers, temporary, made_from)
 
 
 @torch.no_grad()
-def seen_in(view: "StoredView", backgrounds: Tensor, people: PeopleNetworks, seed: int) -> dict[str, Tensor]:
-    """Fit and segment a photo of a view as those of users are; empty where no face is found in it.
+def seen_in(
+    photo: dict[str, Tensor], backgrounds: Tensor, people: PeopleNetworks, seed: int
+) -> list[dict[str, Tensor]]:
+    """Fit and segment a photo as those of users are, and look at its squares, each as `layers_of`.
 
-    All is seen in the view's own frame, so that it lies on the view's images; see `layers_of`.
+    Nothing where no face is found in it.
     """
     generator = torch.Generator().manual_seed(seed)
-    portrait, frame = view.portrait, Crop(0.0, 0.0, float(SIDE_PX), SIDE_PX)
     chosen = backgrounds[int(torch.randint(len(backgrounds), (), generator=generator))]
-    for _ in range(_TRIES):
-        weights = draw_light(portrait.directions, generator)
-        background = background_of(chosen, SIDE_PX, generator)
-        image = images_under(portrait, view.looks[0], weights[None])[0]
-        image = image / image.mean().clamp_min(1e-6) * 0.1 + (1 - view.alpha) * background
-        exposed = (image / image.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
+    behind = 1 - photo["alpha"].float() / 255
+    squares = [Crop(x, y, side, int(size)) for x, y, side, size in photo["squares"].tolist()]
+    for image in photo["lit"].float():
+        scene = image * 0.1 + behind * background_of(chosen, len(behind), generator)
+        exposed = (scene / scene.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
         with suppress(InputError):
-            return layers_of(person_in(people, exposed, frame), portrait.directions)
-    return {}
+            person = person_in(people, exposed)
+            found = [person.within(square, exposed) for square in squares]
+            if all(float(one.classes[SKIN].sum()) > 1 for one in found):
+                return [layers_of(one, photo["directions"]) for one in found]
+    return []
 
 
-def person_in(people: PeopleNetworks, photo: np.ndarray, square: Crop | None = None) -> SeenPerson:
+def person_in(people: PeopleNetworks, photo: np.ndarray) -> SeenPerson:
     """Find the largest face of a scene-linear photo [H, W, 3], fit it, and look at the person.
 
-    All is seen in the square around the landmarks, or in a given one. Raises InputError without a face.
+    Raises InputError without a face.
     """
     face = find_faces(people, photo, "portrait")[0]
     crop = from_landmarks(face.landmarks_px, _CROP_PX)
     fit = fit_landmarks(cached_face_model(BUILTIN), crop.to_crop(face.landmarks_px), crop)
-    return look_at_person(people, cached_face_model(BUILTIN), photo, fit, square)
+    return look_at_person(people, cached_face_model(BUILTIN), photo, fit)
 
 
 def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:
     """Return the layers that are kept of a person, and the shadows of lights [L, 3].
 
     classes [C, S, S], covered [1, S, S] and visible [L, s, s] of the lights: uint8, of 255; normals
-    [3, S, S], depth [1, S, S]: float16.
+    [3, S, S], depth [1, S, S]: float16; sides []: of the square, in faces.
     """
     normals, depth, covered = surface_of(person.maps)
     return {
@@ -194,6 +281,7 @@ def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:
         "normals": normals[0].half().contiguous(),
         "depth": depth[0].half(),
         "visible": (255 * person.visibility(directions)).round().byte(),
+        "sides": torch.tensor(person.sides),
     }
 
 
@@ -289,7 +377,7 @@ class StoredTransport:
         surface = view.looks[_below(len(view.looks), generator)]
         rig = view.portrait.directions
         weights = source_light(rig, generator)
-        chosen = draw_target_lights(rig, targets, generator)
+        chosen = draw_targets(rig, targets, generator)
         single = torch.eye(len(rig))[chosen, :, None].expand(-1, -1, 3)
         albedo, normals = albedo_of(view.portrait, surface)
         lit = LitPerson(
@@ -346,6 +434,7 @@ def sample_of(
         covered=seen["covered"].float() / 255,
         reached=reached_by(directions, around, side),
         own=own_shading(photo, classes, normals, directions, around),
+        sides=seen.get("sides", torch.tensor(SIDES)).view(1, 1, 1),
     )
     sample = PortraitSample(
         inputs=inputs,
@@ -376,6 +465,14 @@ def _balanced(images: Tensor, albedo: Tensor, generator: torch.Generator) -> tup
 
 def _below(count: int, generator: torch.Generator) -> int:
     return int(torch.randint(count, (), generator=generator))
+
+
+def draw_targets(rig: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Draw indices [count] of lights of a rig [L, 3]: as in photos, and many that make rims."""
+    azimuth, elevation = direction_to_azel(rig)
+    low, high = _BACK_EL_DEG
+    behind = (azimuth.abs() > _BACK_AZ_DEG) & (elevation > low) & (elevation < high)
+    return torch.multinomial(in_front(rig) + _BACK * behind, count, generator=generator)
 
 
 def source_light(rig: Tensor, generator: torch.Generator) -> Tensor:

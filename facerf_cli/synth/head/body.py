@@ -15,6 +15,7 @@ from facerf_cli.synth.head.arms import bend_arms
 from facerf_cli.synth.head.mesh import (
     GARMENTS,
     WHOLE,
+    WHOLE_GARMENTS,
     HeadMesh,
     cloth_like,
     joined,
@@ -63,7 +64,7 @@ def draw_body(
     drawn = _drawn_to(skin, head.vertices[low].astype(float))
     body = _body_skin(*_refined(skin + drawn, faces, edge_m), head, low)
     strapless = random.random() < _STRAPLESS_SHARE
-    name = "tee" if strapless else str(random.choice(GARMENTS))
+    name = "tee" if strapless else str(random.choice(WHOLE_GARMENTS if arms else GARMENTS))
     cloth, cloth_faces = packed_mesh(packed + name)
     if strapless:
         cloth_faces = cloth_faces[(cloth[cloth_faces, 1] < -_STRAPLESS_M).all(-1)]

@@ -385,6 +385,7 @@ GARMENTS = (
     "jacket",
     "suit",
 )
+WHOLE_GARMENTS = tuple(name for name in GARMENTS if name != "v-neck")  # which ends at the waist
 
 
 def packed_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:

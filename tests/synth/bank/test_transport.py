@@ -1,7 +1,10 @@
 """People of the portrait bank: baked once, seen as users' photos are, and lit by any light."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -9,23 +12,30 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop
 from facerf_cli.light.sh import sh_basis
+from facerf_cli.light.sphere import direction_to_azel, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
-from facerf_cli.portrait.person import SIDE_PX
+from facerf_cli.raster.camera import project
 from facerf_cli.synth import bank
-from facerf_cli.synth.bank import transport
+from facerf_cli.synth.bank import Files, transport
 from facerf_cli.synth.bank.transport import (
+    SCALES,
     PortraitSample,
     StoredTransport,
     StoredView,
     TransportBankSettings,
     add_transport,
+    draw_targets,
     load_view,
     seen_path,
 )
 from facerf_cli.synth.portraits import albedo_of, images_under
+from facerf_cli.synth.subjects import Subject
 from tests.synth.conftest import SMALL, backgrounds
+
+SIDE_PX = SMALL.side_px
 
 
 @pytest.fixture(scope="module")
@@ -60,10 +70,36 @@ def test_looks_differ_and_albedo_is_theirs(view: StoredView) -> None:
     assert first[:, view.alpha == 0].max() < 0.05  # alpha is in 256 steps
 
 
+def test_squares_are_parts_of_the_photo_and_as_wide_as_drawn() -> None:
+    """Landmarks in a square lie where its crop of the photo has them."""
+    landmarks = np.random.default_rng(0).uniform(-0.07, 0.07, (68, 3))
+    subject = cast(Subject, SimpleNamespace(landmarks_world=landmarks))
+    scales = np.array([1.6, 3.0, 6.5])
+    drawn = transport._draw_views(subject, scales, np.random.default_rng(1), TransportBankSettings())
+    points = torch.from_numpy(landmarks).float()
+    in_photo = project(drawn.photo.to_camera(points), drawn.photo.camera).numpy()
+    for sides, camera, (x0, y0, side, size) in zip(scales, drawn.squares, drawn.crops.tolist(), strict=True):
+        seen = project(camera.to_camera(points), camera.camera).numpy()
+        np.testing.assert_allclose(Crop(x0, y0, side, int(size)).to_crop(in_photo), seen, atol=0.02)
+        assert np.ptp(seen, 0).max() == pytest.approx(size / sides, rel=1e-4)
+        assert min(x0, y0) > -1e-6 and max(x0, y0) + side < drawn.photo.camera.width_px + 1e-6
+
+
+def test_many_targets_are_lit_from_behind() -> None:
+    """Rims: a tenth of all directions, of which none but these and those in front count much."""
+    rig = rig_directions(150)
+    generator = torch.Generator().manual_seed(0)
+    chosen = torch.cat([draw_targets(rig, 4, generator) for _ in range(500)])
+    azimuth, elevation = direction_to_azel(rig[chosen])
+    rims = (azimuth.abs() > 120) & (elevation > 0) & (elevation < 40)
+    assert 0.2 < rims.float().mean() < 0.35 and (rig[chosen, 2] > -0.2).float().mean() > 0.6
+
+
 def test_the_square_shows_head_and_shoulders(view: StoredView) -> None:
     landmarks = view.portrait.landmarks_px[:68]
     extent = float((landmarks.amax(0) - landmarks.amin(0)).max())
-    assert SIDE_PX / 3.8 < extent < SIDE_PX / 2.4
+    low, high = SCALES
+    assert SIDE_PX / high < extent < SIDE_PX / low
     assert 0.15 < view.alpha.mean() < 0.9
 
 
@@ -81,7 +117,7 @@ def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:
 
 @pytest.mark.parametrize("view", ["00001_0", "00001_1"])
 def test_what_is_seen_lies_where_the_truth_does(folder: Path, view: str) -> None:
-    """In the view's own frame, not in a square of its own: moved by 3 pixels the classes fit worse."""
+    """In the view's own square, not in one of its own: moved by 3 pixels the classes fit worse."""
     path = folder / f"{view}.safetensors"
     truth = load_view(path).portrait.classes[..., SKIN].float() / 255
     seen = load_file(seen_path(path))["classes"][SKIN].float() / 255
@@ -132,9 +168,9 @@ def test_a_bank_without_portraits(tmp_path: Path) -> None:
 def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[int] = []
 
-    def draw(model: str, index: int, seed: int, settings: TransportBankSettings) -> list[dict[str, Tensor]]:
+    def draw(model: str, index: int, seed: int, settings: TransportBankSettings) -> Files:
         made.append(index)
-        return [{"of": torch.tensor([index])}] * settings.views
+        return {f"{index:05d}_{k}": {"of": torch.tensor([index])} for k in range(settings.squares)}
 
     monkeypatch.setattr(transport, "transport_of", draw)
     monkeypatch.setattr(bank, "in_shards", lambda work, items, jobs: work(items))
