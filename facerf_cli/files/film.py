@@ -5,6 +5,7 @@ H.264 is written in .mp4 and ProRes in .mov, from numbered images, with another 
 The wheel of PyAV holds FFmpeg with x264 and x265, which are under the GPL; facerf does not bundle it.
 """
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -19,11 +20,13 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode
 from facerf_cli.files.images import PHOTO_LIMIT_PX
-from facerf_cli.image.colour import unit_floats
+from facerf_cli.image.cicp import HDR_CURVES, space_of_codes
+from facerf_cli.image.colour import SRGB, ColourSpace, unit_floats
+from facerf_cli.run.logs import LOGGER_NAME
 
+log = logging.getLogger(LOGGER_NAME)
 _LARGEST_PX = 8192 * 4320
 _MOST_FRAMES = 1_000_000
-_BRIGHTER = {16: "PQ", 18: "HLG"}  # transfer functions of HDR, by their code points (ITU-T H.273)
 _BT601, _BT709, _UNKNOWN = 5, 1, 2
 _HD_LINES = 720  # films without a stated matrix have BT.709 from here on
 _LIMITED = 1  # range (ITU-T H.273)
@@ -109,8 +112,18 @@ class Film:
             rate = (len(times_s) - 1) / length_s if length_s else Fraction(24)
         return Timing(times_s, rate, self._path if self._container.streams.audio else None)
 
+    @property
+    def space(self) -> ColourSpace:
+        """The colour space that the film's codes state; sRGB where they say nothing that is known."""
+        coded = self._stream.codec_context
+        codes = int(coded.color_primaries), int(coded.color_trc)
+        found = space_of_codes(*codes)
+        if found is None:
+            log.warning("%s: colour codes %d and %d are not known; taken for sRGB", self._path, *codes)
+        return found or SRGB
+
     def read(self, number: int) -> np.ndarray:
-        """Frame `number` [H, W, 3], upright, display-encoded R'G'B', uint8 or, of deeper films, uint16."""
+        """Frame `number` [H, W, 3], square pixels, upright, in `space`: uint8, or uint16 of deeper films."""
         try:
             return self._read(number)
         except self._av.error.FFmpegError as error:
@@ -132,9 +145,10 @@ class Film:
                 yield frame.pts, frame
 
     def _pixels(self, frame: Any) -> np.ndarray:
-        if frame.width * frame.height > _LARGEST_PX:
-            raise InputError(f"{self._path}: {frame.width} x {frame.height} are too many pixels; scale it")
-        if name := _BRIGHTER.get(int(frame.color_trc)):
+        width, height = self._square_size(frame)
+        if width * height > _LARGEST_PX:
+            raise InputError(f"{self._path}: {width} x {height} are too many pixels; scale it")
+        if name := HDR_CURVES.get(int(frame.color_trc)):
             raise InputError(
                 f"{self._path}: is an HDR film ({name}); convert it to Rec.709 (SDR), or give its frames as "
                 "EXR with --sequence"
@@ -146,8 +160,30 @@ class Film:
         form = "rgb48le" if deep else "rgb24"
         is_rgb = frame.format.name.startswith(("rgb", "gbr", "bgr"))
         colours = {} if is_rgb else {"src_colorspace": matrix, "interpolation": exact(self._av)}
-        values = frame.to_ndarray(format=form, **colours)
-        return np.ascontiguousarray(np.rot90(values, round(frame.rotation / 90) % 4))
+        values = frame.to_ndarray(format=form, width=width, height=height, **colours)
+        return _upright(values, frame.side_data.get("DISPLAYMATRIX"))
+
+    def _square_size(self, frame: Any) -> tuple[int, int]:
+        """Width and height of a frame whose samples are made square; none is lost."""
+        aspect = Fraction(self._stream.sample_aspect_ratio or 1)
+        if aspect <= 0:
+            return frame.width, frame.height
+        return round(frame.width * max(aspect, 1)), round(frame.height / min(aspect, 1))
+
+
+def _upright(values: np.ndarray, matrix: Any) -> np.ndarray:
+    """Turn and mirror a frame [H, W, 3] by a film's display matrix, to quarters.
+
+    Its first two columns are a, b, of x, and c, d, of y: (x, y) is shown at (a x + c y, b x + d y).
+    """
+    if matrix is None:
+        return np.ascontiguousarray(values)
+    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    if abs(a) < abs(b):
+        values, to_right, to_bottom = values.swapaxes(0, 1), c, b
+    else:
+        to_right, to_bottom = a, d
+    return np.ascontiguousarray(values[:: -1 if to_bottom < 0 else 1, :: -1 if to_right < 0 else 1])
 
 
 def film_timing(path: Path) -> Timing:

@@ -43,17 +43,16 @@ class ShotFrames:
     def __init__(self, shot: Shot, options: PhotoOptions) -> None:
         self._shot, self._options = shot, options
         space = options.colourspace
-        self._space = SRGB if space is None else named_space(space, options.ocio_config)
         self._film = Film(shot.film) if shot.film else None
+        stated = self._film.space if self._film else SRGB
+        self._space = stated if space is None else named_space(space, options.ocio_config)
         self._decoded = lru_cache(_DECODED)(self._film.read) if self._film else None
 
     def image(self, number: int) -> LinearImage:
         """Frame `number`."""
         if self._decoded is None:
             return read_photo(self._shot.frames[number], self._options)
-        values = self._decoded(number)
-        shown = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
-        pixels = np.ascontiguousarray(to_linear_rec709(shown, self._space), np.float32)
+        pixels = np.ascontiguousarray(to_linear_rec709(self._decoded(number), self._space), np.float32)
         return LinearImage(pixels, None, self._space.name)
 
     def pixels(self, number: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Films read by frame, and written with times, sound and metadata."""
 
+import struct
 import sys
 from contextlib import closing
 from fractions import Fraction
@@ -11,7 +12,9 @@ import pytest
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.film import Film, Timing, comment_of, film_timing, write_film
-from facerf_cli.files.images import write_display
+from facerf_cli.files.images import read_image, write_display
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
+from tests.files.test_stated_by_files import bt2020_of, write_png
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 COLOURS = np.array([[0.8, 0.3, 0.2], [0.2, 0.6, 0.3], [0.3, 0.3, 0.7], [0.5, 0.5, 0.5], [0.9, 0.8, 0.4]])
@@ -142,6 +145,78 @@ def test_a_film_in_hdr_is_refused(tmp_path: Path) -> None:
         container.mux(stream.encode(None))
     with pytest.raises(InputError, match="is an HDR film"):
         film_timing(path)
+
+
+def coded_film(
+    path: Path, levels: np.ndarray, sar: str = "1", turn: tuple[int, ...] = (), **codes: int
+) -> Path:
+    """Two frames of levels [H, W, 3]; `turn` is a, b, c, d of the display matrix."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=24, options={"crf": "4"})
+        stream.height, stream.width, stream.pix_fmt = *levels.shape[:2], "yuv444p"
+        stream.codec_context.sample_aspect_ratio = Fraction(sar)
+        for name, code in codes.items():
+            setattr(stream.codec_context, name, code)
+        for _ in range(2):
+            frame = av.VideoFrame.from_ndarray(levels)
+            container.mux(stream.encode(frame.reformat(format="yuv444p", dst_colorspace=5)))
+        container.mux(stream.encode(None))
+    if turn:
+        data, (a, b, c, d) = bytearray(path.read_bytes()), (value << 16 for value in turn)
+        matrix = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+        at = data.index(b"tkhd") + 44  # of the matrix in the track's header
+        data[at : at + 36] = matrix
+        path.write_bytes(data)
+    return path
+
+
+QUARTERS = np.uint8([[200, 60, 40], [40, 180, 60], [50, 70, 200], [128, 128, 128]]).reshape(2, 2, 3)
+SHOWN = QUARTERS.repeat(32, 0).repeat(48, 1)
+
+
+def quarters_of(path: Path) -> tuple[np.ndarray, tuple[int, ...]]:
+    """The levels of the quarters, decoded by the film's space and encoded as sRGB; and the frame's shape."""
+    with closing(Film(path)) as film:
+        frame = film.read(0)
+        linear = to_linear_rec709(frame, film.space)
+    height, width = frame.shape[:2]
+    at = np.s_[height // 4 :: height // 2, width // 4 :: width // 2]
+    return 255 * linear_to_srgb(linear[at]), frame.shape[:2]
+
+
+@pytest.mark.parametrize(("sar", "size"), [("2", (64, 192)), ("1/2", (128, 96)), ("4/3", (64, 128))])
+def test_samples_become_square(tmp_path: Path, sar: str, size: tuple[int, int]) -> None:
+    found, shape = quarters_of(coded_film(tmp_path / "a.mp4", SHOWN, sar))
+    assert shape == size
+    np.testing.assert_allclose(found, QUARTERS, atol=4)
+
+
+@pytest.mark.parametrize(
+    ("turn", "expected"),
+    [
+        ((-1, 0, 0, 1), QUARTERS[:, ::-1]),
+        ((1, 0, 0, -1), QUARTERS[::-1]),
+        ((0, 1, -1, 0), np.rot90(QUARTERS, -1)),
+        ((0, -1, 1, 0), np.rot90(QUARTERS)),
+        ((0, 1, 1, 0), QUARTERS.swapaxes(0, 1)),
+    ],
+)
+def test_display_matrices(tmp_path: Path, turn: tuple[int, ...], expected: np.ndarray) -> None:
+    """Mirrored either way, turned either way, and both."""
+    found, shape = quarters_of(coded_film(tmp_path / "a.mp4", SHOWN, turn=turn))
+    np.testing.assert_allclose(found, expected, atol=4)
+    assert shape == ((96, 64) if turn[0] == 0 else (64, 96))
+
+
+def test_codes_of_a_film(tmp_path: Path) -> None:
+    """BT.709 holds display values, as frames of it with cICP do; BT.2020 has its primaries and its curve."""
+    plain = coded_film(tmp_path / "a.mp4", SHOWN, color_primaries=1, color_trc=1)
+    np.testing.assert_allclose(quarters_of(plain)[0], QUARTERS, atol=4)
+    stored = np.round(255 * bt2020_of(srgb_to_linear(SHOWN / np.float32(255)))).astype(np.uint8)
+    wide = coded_film(tmp_path / "b.mp4", stored, color_primaries=9, color_trc=14)
+    np.testing.assert_allclose(quarters_of(wide)[0], QUARTERS, atol=7)
+    frame = write_png(tmp_path / "frame.png", SHOWN, (b"cICP", bytes([1, 1, 0, 1])))
+    assert read_image(frame).pixels == pytest.approx(srgb_to_linear(SHOWN / np.float32(255)), abs=1e-6)
 
 
 def test_without_av_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
