@@ -208,9 +208,7 @@ def run() -> None:
     end_on_signals(_PATIENCE_S)
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
-    for stream in (sys.stdout, sys.stderr):  # names go out as the bytes that they are
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="surrogateescape")
+    _prepare_streams()
     memory.collect_seldom()
     try:
         code = main(sys.argv[1:])
@@ -219,10 +217,19 @@ def run() -> None:
     _leave(code)
 
 
+def _prepare_streams() -> None:
+    """Open streams that are closed; and let names come and go as the bytes that they are in any encoding."""
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:  # else the next file would take its number, and what libraries print
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
+        if isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+            stream.reconfigure(encoding=sys.getfilesystemencoding(), errors="surrogateescape")
+
+
 def _leave(code: int) -> NoReturn:
     """End the process without taking torch's modules apart, which takes it half a second."""
     atexit._run_exitfuncs()
-    for stream in filter(None, (sys.stdout, sys.stderr)):
+    for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):  # `main` has said that it cannot be written
             stream.flush()
     os._exit(code)
@@ -238,8 +245,7 @@ def main(arguments: Sequence[str]) -> int:
             code = app(args=line, prog_name="facerf", standalone_mode=False)
         finally:
             end_again()
-        if sys.stdout is not None:  # it was closed from the beginning
-            sys.stdout.flush()
+        sys.stdout.flush()
         if code == 130:  # typer turns Ctrl-C into this exit code
             return _fail(None, "interrupted", 130)
         return code if isinstance(code, int) else 0

@@ -174,6 +174,25 @@ def test_a_stdout_that_takes_nothing(stdout: str, code: int, said: str) -> None:
     assert (result.returncode, result.stderr) == (code, said)
 
 
+@pytest.mark.parametrize(
+    ("closed", "code", "said"),
+    [("", 0, ""), (">&-", 0, ""), ("2>&-", 0, ""), ("<&-", 2, "-: no inputs found")],
+)
+def test_names_in_any_encoding_and_streams_that_are_closed(
+    tmp_path: Path, closed: str, code: int, said: str
+) -> None:
+    """A list with a byte order mark, and a name that the encoding of the streams lacks."""
+    (tmp_path / "日本.jpg").touch()
+    dry_run = f'exec "$0" -m facerf_cli segment - -o {tmp_path}/out --dry-run {closed}'
+    command, listed = ["sh", "-c", dry_run, sys.executable], f"\ufeff{tmp_path}/日本.jpg\r\n"
+    environment = os.environ | {"PYTHONIOENCODING": "cp1252"}
+    result = subprocess.run(command, input=listed.encode(), capture_output=True, cwd=ROOT, env=environment)
+    assert result.returncode == code and said in result.stderr.decode()
+    outputs = result.stdout.decode().splitlines()
+    assert len(outputs) == (4 if closed in ("", "2>&-") else 0)
+    assert all(f"{tmp_path}/日本.jpg -> {tmp_path}/out/日本_" in line for line in outputs)
+
+
 @pytest.mark.parametrize(("given", "spins"), [({}, "20000"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "")])
 def test_threads_wait_asleep_unless_the_user_says_otherwise(given: dict[str, str], spins: str) -> None:
     """A thread that waits by turning in circles takes another program's processor, or this one's own."""

@@ -3,16 +3,19 @@
 Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an input fills.
 """
 
+import logging
 import os
 import re
 import sys
 import unicodedata
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from string import Formatter
 
 from facerf_cli.errors import UsageError
+from facerf_cli.run.logs import LOGGER_NAME, printable_line
 
 OF_PHOTOS = ("dir", "parent", "stem", "ext")
 OF_FILES = (*OF_PHOTOS, "frame")
@@ -21,15 +24,18 @@ _SEPARATORS = "._-"  # one of these before an empty field goes with it
 _WIDTH = re.compile(r"0?[1-9]?")
 _FRAME = re.compile(r"(.+?)((?:\.\d+)*)", re.DOTALL)  # a name, and the frame numbers that it ends in
 PHOTO_SUFFIXES = frozenset(
-    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".jxl", ".heic", ".heif", ".jp2"}
-    | {".psd", ".tga", ".dpx", ".cin", ".pgm", ".ppm"}
+    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".webp", ".jxl", ".heic"}
+    | {".heif", ".jp2", ".psd", ".tga", ".bmp", ".gif", ".dpx", ".cin", ".pgm", ".ppm"}
 )
 FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
 _NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
 _MOST_FRAMES = 100_000
+_MOST_NAMED = 8  # kinds of files, or folders, that a line names
 _LONGEST_PATH = 4096  # characters
+
+log = logging.getLogger(LOGGER_NAME)
 
 
 def split_frame(name: str) -> tuple[str, str]:
@@ -179,8 +185,8 @@ def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
         if other is not item and not apart:
             alike = "--name names them alike; give it more fields, such as {stem} and {ext}"
             by_path = (
-                f"would both be written as {item.name}; rename one, name the folder that holds both, or give "
-                "--name, such as '{dir}/{stem}_{ext}'"
+                f"would both be written as {item.name}; rename one, name the folder that holds both, or, of "
+                "a verb that has it, give --name, such as '{dir}/{stem}_{ext}'"
             )
             raise UsageError(f"{other.input_path} and {item.input_path}: {alike if pattern else by_path}")
 
@@ -201,9 +207,8 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
 
 
 def _stdin_names(null_separated: bool) -> list[str]:
-    if null_separated:
-        return sys.stdin.read().split("\0")
-    return [line.rstrip("\r\n") for line in sys.stdin]
+    text = sys.stdin.read().removeprefix("\ufeff")
+    return text.split("\0") if null_separated else [line.rstrip("\r") for line in text.split("\n")]
 
 
 def _range(entry: str, before: str, first: str, last: str, after: str) -> list[str]:
@@ -227,13 +232,34 @@ def _numbered(entry: str, before: str, after: str) -> list[str]:
 
 
 def _walk(folder: Path, output_real: str, suffixes: frozenset[str]) -> Iterator[Path]:
+    """Yield the files to read; then say in a line what was passed over that is not hidden."""
+    passed, linked = Counter[str](), list[str]()
     for here, folders, files in os.walk(folder):
         folders[:] = [
             name
             for name in folders
             if name[0] != "." and os.path.realpath(os.path.join(here, name)) != output_real
         ]
+        linked += filter(os.path.islink, (os.path.join(here, name) for name in folders))
         for name in files:
             sheet = name.endswith(_SHEET) and name.removesuffix(_SHEET) + _STACK in files
-            if name[0] != "." and Path(name).suffix.lower() in suffixes and not sheet:
+            if name[0] == "." or sheet:
+                continue
+            suffix = Path(name).suffix.lower()
+            if suffix in suffixes:
                 yield Path(here) / name
+            else:
+                passed[suffix or "without suffix"] += 1
+    _say_passed_over(folder, passed, sorted(linked))
+
+
+def _say_passed_over(folder: Path, passed: Counter[str], linked: Sequence[str]) -> None:
+    """Count files by suffix, and name linked folders, of which neither is read."""
+    kinds = [f"{count} {suffix}" for suffix, count in passed.most_common(_MOST_NAMED)]
+    more = len(linked) - _MOST_NAMED
+    folders = [f"linked folder {path}" for path in linked[:_MOST_NAMED]]
+    folders += [f"{more} more linked folders"] if more > 0 else []
+    if kinds or folders:
+        files = [f"{passed.total()} files ({', '.join(kinds)})"] if kinds else []
+        said = printable_line(", ".join([*files, *folders]))
+        log.info("%s: passed over: %s; what is named itself is read", folder, said)

@@ -36,7 +36,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import checked, digest
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import read_olat_header
-from facerf_cli.files.texts import parse_json
+from facerf_cli.files.texts import parse_json, text_of
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
@@ -117,7 +117,7 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
     pairs: list[Pair] = []
     if not path.is_file():
         return []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(text_of(path.read_bytes(), "replace").splitlines(), 1):
         try:
             pair = checked(Pair, parse_json(line), f"line {number}")
             _check_pair(dataset, pair)

@@ -161,7 +161,7 @@ def read_facts(path: Path) -> dict[str, Facts]:
     A column whose cells are all numbers holds numbers; an empty cell is no fact.
     """
     try:
-        text = read_text(path, _LARGEST_BYTES, _CSV_ADVICE).removeprefix("\ufeff")
+        text = read_text(path, _LARGEST_BYTES, _CSV_ADVICE)
         lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(text)) if any(line)]
     except csv.Error as error:
         raise InputError(f"{path}: not CSV ({error}); save it in that format") from None

@@ -224,7 +224,7 @@ def _acquire(lock: "FileLock", path: Path) -> None:
     """Wait for a lock; its folder is made again where the last owner has removed it."""
     from filelock import Timeout
 
-    wait = "%s: another facerf (process %s) writes there; waiting for it (--jobs and --shard share work)"
+    wait = "%s: another facerf (process %s) writes there; waiting for it"
     waits = False
     while not lock.is_locked:
         path.parent.mkdir(parents=True, exist_ok=True)

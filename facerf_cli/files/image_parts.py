@@ -132,9 +132,7 @@ def _require_developed(path: Path, is_raw: bool) -> None:
     """Raise InputError for a raw file of a camera, of which OpenImageIO reads the thumbnail."""
     if is_raw:
         advice = "develop it to EXR, TIFF or JPEG, as with darktable or RawTherapee"
-        raise InputError(
-            f"{path}: a raw file of a camera (its first image is no photo) is not read; {advice}"
-        )
+        raise InputError(f"{path}: a raw file of a camera, or a thumbnail first, is not read; {advice}")
 
 
 def _is_raw(path: Path, spec: oiio.ImageSpec) -> bool:

@@ -22,7 +22,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
-from facerf_cli.files.texts import read_bytes
+from facerf_cli.files.texts import read_bytes, text_of
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION
@@ -182,7 +182,7 @@ def read_numbers(path: Path, counts: tuple[int, ...]) -> Tensor:
     wanted = " or ".join(map(str, counts))
     content = read_bytes(path, _TEXT_LIMIT_BYTES, f"give a text file of {wanted} numbers")
     try:
-        values = [float(word) for word in content.decode("ascii").split()]
+        values = [float(word) for word in text_of(content).split()]
     except ValueError:
         raise InputError(f"{path}: not a text file of numbers; a light has {wanted}") from None
     if len(values) not in counts or not all(abs(value) < _LARGEST for value in values):

@@ -5,6 +5,7 @@ twice and a number that is not finite are errors. The module imports nothing hea
 finished folder is read with it.
 """
 
+import codecs
 import hashlib
 import json
 import math
@@ -71,9 +72,15 @@ def read_bytes(path: Path, limit_bytes: int, advice: str) -> bytes:
     return content
 
 
+def text_of(content: bytes, errors: str = "strict") -> str:
+    """Decode a text in UTF-8, or in UTF-16 with a byte order mark; the mark is no part of it."""
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return content.decode("utf-16" if is_utf16 else "utf-8-sig", errors)
+
+
 def read_text(path: Path, limit_bytes: int, advice: str) -> str:
-    """Read a text file of at most `limit_bytes`, in UTF-8; other bytes are replaced."""
-    return read_bytes(path, limit_bytes, advice).decode(errors="replace")
+    """Read a text file of at most `limit_bytes`; bytes that are no text are replaced."""
+    return text_of(read_bytes(path, limit_bytes, advice), "replace")
 
 
 def file_sha256(path: Path) -> str:
@@ -83,8 +90,8 @@ def file_sha256(path: Path) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text in UTF-8; raises ValueError for anything else and beyond the limits."""
-    text = text.decode() if isinstance(text, bytes) else text
+    """Return the value of a JSON text; raises ValueError for anything else and beyond the limits."""
+    text = text_of(text) if isinstance(text, bytes) else text
     if sum(map(text.count, _OPENING)) >= _MOST_VALUES:
         raise ValueError(f"more than {_MOST_VALUES} values")
     try:
@@ -141,7 +148,7 @@ def read_toml(path: Path, limit_bytes: int, advice: str) -> dict[str, Any]:
     """Read the tables of a TOML file; an InputError for any other gives the advice."""
     content = read_bytes(path, limit_bytes, advice)
     try:
-        return tomllib.loads(content.decode())
+        return tomllib.loads(text_of(content))
     except (ValueError, RecursionError) as error:  # also of the decoding
         raise InputError(f"{path}: not TOML ({error}); {advice}") from None
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.texts import read_rig
+from facerf_cli.files.texts import read_bytes, read_rig, text_of
 
 MOST_LIGHTS = 4096
 MOST_FRAMES = 9999
@@ -136,9 +136,10 @@ def parse_lights(text: str) -> int | list[tuple[float, float]]:
 def _lines(path: Path) -> list[str]:
     """Read the lines of a text file that are neither empty nor comments."""
     try:
-        with path.open(encoding="utf-8") as stream:
-            text = stream.read(_LIGHTS_FILE_LIMIT_BYTES)
-    except (OSError, UnicodeDecodeError) as error:
+        text = text_of(read_bytes(path, _LIGHTS_FILE_LIMIT_BYTES, "give a text file"))
+    except InputError as error:
+        raise UsageError(f"--lights {error}") from None
+    except UnicodeDecodeError as error:
         raise UsageError(f"--lights {path}: cannot be read as text ({error}); give a text file") from None
     lines = (line.partition("#")[0].strip() for line in text.splitlines())
     return [",".join(line.replace(",", " ").split()) for line in lines if line]

@@ -130,7 +130,7 @@ def look_at_person(
     segmentation = segmentation or segment(people, to_display(photo), landmarks_px, matte)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
-        raise InputError("no skin is seen around the landmarks; check them, or give --reflectance field")
+        raise InputError("no skin is seen around the landmarks; check them, or relight the face alone")
     proxy = proxy_of(model, fit, classes, square)
     maps = proxy_maps(proxy, square_camera(fit, square))
     return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation)

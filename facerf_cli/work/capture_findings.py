@@ -15,7 +15,7 @@ from rich.text import Text
 from facerf_cli.capture.findings import CONSEQUENCES, Finding, stopping
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.texts import parse_json
+from facerf_cli.files.texts import parse_json, text_of
 from facerf_cli.run.logs import STDERR, counted, json_line, one_line
 
 FINDINGS_FILE, _FOLDER = "findings.jsonl", "findings"
@@ -59,7 +59,7 @@ def collect_findings(folder: Path, subjects: Iterable[str]) -> dict[str, list[Fi
 def _read_findings(path: Path) -> list[Finding]:
     if not path.is_file():
         return []
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = text_of(path.read_bytes(), "replace").splitlines()
     try:
         return [Finding.of_row(parse_json(line)) for line in lines]
     except (ValueError, TypeError, KeyError):

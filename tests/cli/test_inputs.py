@@ -1,6 +1,7 @@
 """The items of a command line: which files, under which names."""
 
 import io
+import logging
 import sys
 import unicodedata
 from pathlib import Path
@@ -39,6 +40,26 @@ def names(tmp_path: Path, *inputs: Path, pattern: str | None = None) -> list[str
 
 def test_a_folder_is_mirrored(photos: Path, tmp_path: Path) -> None:
     assert names(tmp_path, photos) == ["Z", "a", "b", "x/a", "x/c"]
+
+
+def test_what_a_folder_passes_over_is_counted_and_named(
+    photos: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "facerf")
+    for name in ("a.nef", "x/b.NEF", "film.mp4", "LICENCE", "d.bmp", "e.gif", "f.jfif", "g.jpe"):
+        (photos / name).touch()
+    (tmp_path / "others").mkdir()
+    (photos / "x" / "linked").symlink_to(tmp_path / "others")
+    (photos / "out").symlink_to(tmp_path / "out")
+    (tmp_path / "out").mkdir()
+    assert names(tmp_path, photos) == ["Z", "a", "b", "d", "e", "f", "g", "x/a", "x/c"]
+    (line,) = [record.getMessage() for record in caplog.records]
+    kinds = "2 .nef, 1 .mp4, 1 without suffix, 1 .txt"
+    assert sorted(line.partition("(")[2].partition(")")[0].split(", ")) == sorted(kinds.split(", "))
+    assert "passed over: 5 files (" in line and f"linked folder {photos}/x/linked; what is named" in line
+    caplog.clear()
+    names(tmp_path, photos / "b.jpg")
+    assert not caplog.records
 
 
 def test_a_file_that_is_named_alone_has_its_name_only(photos: Path, tmp_path: Path) -> None:

@@ -25,7 +25,11 @@ QUADS = Path(__file__).with_name("quads.heic")  # 600 x 400: its pixels outgrow 
 HEIC = Path(__file__).with_name("phone.heic")  # upright: green above red on the left, blue below right
 LEVELS = np.random.default_rng(2).integers(0, 256, (24, 40, 3), np.uint8)
 BLOCKS = np.repeat(np.repeat(LEVELS[::8, ::8], 8, 0), 8, 1)  # which lossy formats keep roughly
-LOSSY = {".jpg": 3, ".jpeg": 3, ".webp": 12}  # largest error inside a block, of 255
+LOSSY = {
+    **dict.fromkeys((".jpg", ".jpeg", ".jpe", ".jfif"), 3),
+    ".gif": 1,
+    ".webp": 12,
+}  # largest error inside a block, of 255
 
 
 def save_by_oiio(path: Path, values: np.ndarray, kind: str = "uint8", **attributes: object) -> Path:

@@ -149,10 +149,7 @@ def test_the_alpha_of_a_map_is_no_light(tmp_path: Path) -> None:
 COLOURS = ("R", "G", "B")
 
 
-def test_the_image_of_an_exr_is_chosen_by_its_name(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(logging.getLogger("facerf"), "propagate", True)
+def test_the_image_of_an_exr_is_chosen_by_its_name(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "facerf")
     other, depth = 1 - LINEAR, LINEAR[..., :1]
     in_layers = [f"V.{layer}.{letter}" for layer in ("AO", "Combined") for letter in "RGB"]
@@ -359,7 +356,7 @@ def test_a_raw_file_is_never_read_as_its_thumbnail(tmp_path: Path) -> None:
     )
     (tmp_path / "a.cr3").write_bytes(b"\0\0\0\x18ftypcrx \0\0\0\1crx isom" + bytes(100))
     for path in sorted(tmp_path.iterdir()):
-        with pytest.raises(InputError, match=r"a raw file of a camera .* is not read; develop it to EXR"):
+        with pytest.raises(InputError, match=r"a raw file of a camera.* is not read; develop it to EXR"):
             read_image(path)
         assert read_header(path) is None
 

@@ -32,7 +32,7 @@ from facerf_cli.face.topology import (
     grid_uv,
     landmark_weights,
 )
-from facerf_cli.files.texts import require_regular
+from facerf_cli.files.texts import read_bytes, text_of
 from facerf_cli.run.logs import one_line
 
 _MAX_LETTERS = 10_000  # of a list of vertex numbers
@@ -75,13 +75,11 @@ def _read(kind: str, path: Path, landmarks: Path | None) -> SourceModel:
 
 def _listed(path: Path, mean: np.ndarray) -> dict[int, np.ndarray]:
     """The landmarks on a mean [N, 3] by number, from a text file of 68 vertex numbers."""
-    require_regular(path, "give a .txt of 68 vertex numbers")
+    advice = "give a .txt of 68 vertex numbers"
     try:
-        numbers = [int(word) for word in path.read_text(encoding="utf-8")[:_MAX_LETTERS].split()]
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be read ({one_line(str(error))}); give a .txt of 68 vertex numbers"
-        ) from None
+        numbers = [int(word) for word in text_of(read_bytes(path, _MAX_LETTERS, advice)).split()]
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read ({one_line(str(error))}); {advice}") from None
     if len(numbers) != 68 or not 0 <= min(numbers) <= max(numbers) < len(mean):
         raise InputError(f"{path}: holds {len(numbers)} numbers; give 68 from 0 to {len(mean) - 1}")
     return dict(enumerate(mean[numbers]))
