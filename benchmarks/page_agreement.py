@@ -2,9 +2,9 @@
 
     python benchmarks/page_agreement.py [PHOTO ...] [--lights N] [--size PX]
 
-N lights of the rig, N between its lights and three procedural maps, at the automatic exposure of each side
-and the default view, over the pixels of which the person has more than half. Needs Chromium; WebGL2 is drawn
-by software.
+N lights of the rig and N between its lights, each in the room that it stands in by default, three procedural
+maps, and these together with a light, at the automatic exposure of each side and the default view, over the
+pixels of which the person has more than half. Needs Chromium; WebGL2 is drawn by software.
 """
 
 import sys
@@ -20,34 +20,46 @@ from facerf_cli.face.head import shrunk_photo
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, golden_spiral, rig_directions
+from facerf_cli.light.sphere import direction_to_azel, golden_spiral, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.pipeline import Person, find_for, head_of, reflectance_of
 from facerf_cli.relighting.models import load_models
 from facerf_cli.viewer.page import packed, page
+from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
+from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.view_photos import head_place, of_photo, page_maps
 
 sys.path.insert(0, str(ROOT))
 from tests.viewer.browser import drawn
 
 MAPS = ("sun", "windows", "studio")
-Setup = tuple[str, str, torch.Tensor, torch.Tensor]
+KEY = "70,30"
+Setup = tuple[str, str, Lights]
 
 
 def setups(count: int) -> list[Setup]:
-    """Kind, address, directions [L, 3] and weights [L, 3] of all lights."""
+    """Kind, address and lights of every state."""
     rig, found = rig_directions(), []
     between = torch.from_numpy(golden_spiral(count)).float()
     for kind, some in (("on the rig", rig[:: len(rig) // count][:count]), ("between", between)):
         for toward in some:
             azimuth, elevation = (round(float(x), 3) for x in direction_to_azel(toward))
-            exact = azel_to_direction(azimuth, elevation)[None].float()
-            found.append((kind, f"light={azimuth},{elevation}", exact, torch.ones(1, 3)))
+            found.append((kind, f"light={azimuth},{elevation}", in_default_room(f"{azimuth},{elevation}")))
+    key = in_default_room(KEY)
     for sky in page_maps():
         if sky.name in MAPS:
             pixels = torch.from_numpy(sky.pixels.astype(np.float32))
-            found.append(("map", f"env={sky.name}", rig, envmap_weights(pixels, rig)))
+            of_map = envmap_weights(pixels, rig)[None]
+            both = torch.cat([rig, key.directions]), torch.cat([of_map, key.weights], 1)
+            found.append(("map", f"env={sky.name}", Lights(rig, of_map)))
+            found.append(("map and light", f"env={sky.name}&light={KEY}", Lights(*both)))
     return found
+
+
+def in_default_room(light: str) -> Lights:
+    """A light as `facerf relight --light` has it."""
+    (setup,) = collect_setups(LightSources(light=[light]), Path("out"))
+    return lights_over_rig((with_room(in_room(setup, None, False)),), "150", "cell")
 
 
 def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
@@ -62,16 +74,16 @@ def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
     print(f"{path.name}: {photo.shape[1]} x {photo.shape[0]}, {len(text) / 2**20:.1f} MiB")
     begun = time.perf_counter()
     given = setups(count)
-    shown = drawn(text, [address for _, address, *_ in given], folder)
+    shown = drawn(text, [address for _, address, _ in given], folder)
     print(f"{time.perf_counter() - begun:.0f} s for {len(shown)} states in software")
     field = reflectance_of(models, head, "portrait", photo=photo)
     whole = Person(models, photo, head, field).composed()
     seen = whole.matte > 0.5
     print("light                    EV relight   page    mean   95 %   99 %    most")
     errors: dict[str, list[np.ndarray]] = {}
-    for (kind, name, directions, weights), one in zip(given, shown, strict=True):
-        relit = next(whole.relit(Lights(directions, weights[None])))
-        strength = float(weights.sum(0) @ torch.tensor([0.2126, 0.7152, 0.0722]))
+    for (kind, name, lights), one in zip(given, shown, strict=True):
+        relit = next(whole.relit(lights))
+        (strength,) = lights.strengths()
         ev = min(whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", strength))
         exposed = whole.image(relit, ev).pixels * np.float32(2.0**ev)
         truth = np.round(255 * encode_display(exposed, SOFT_VIEW, whole.matte))

@@ -295,8 +295,7 @@ def test_the_anchored_exposure_keeps_the_order_and_ratio_of_six_skins() -> None:
     for albedo in (0.02, 0.05, 0.1, 0.2, 0.35, 0.6):
         plate, relit = albedo * first.repeat(3, -1), 7 * albedo * second.repeat(3, -1)
         shown = relit * 2 ** ours.anchored_exposure_ev(relit, plate, face)
-        tenth = [np.percentile(image[face > 0], 90) for image in (shown, plate)]
-        ratios.append(tenth[0] / tenth[1])
+        ratios.append(shown[face > 0].mean() / plate[face > 0].mean())
     assert ratios == pytest.approx(np.ones(6), rel=0.005)  # exposures have two decimals
 
 

@@ -50,7 +50,8 @@ def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
 
 
 def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Path) -> None:
-    assert main(["relight", str(PHOTO), "--light", "60,30", "--exposure", "0", "-o", str(tmp_path)]) == 0
+    line = ["relight", str(PHOTO), "--light", "60,30", "--room", "none", "--exposure", "0"]
+    assert main([*line, "-o", str(tmp_path)]) == 0
     written = facerf.read_image(tmp_path / "astronaut_light_60_30.exr")
     np.testing.assert_array_equal(written, page["image"].astype(np.float16).astype(np.float32))
     row = json.loads((tmp_path / "report.jsonl").read_text())

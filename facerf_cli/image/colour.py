@@ -41,7 +41,6 @@ _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 AUTO_EXPOSURE_PERCENTILE = 99.0
 _FIREFLY = 8.0  # times the 99th percentile: brighter than any highlight of skin
 ExposureRule = Literal["auto", "face"]
-FACE_PERCENTILE = 90  # of the luminance of a face, which stays as it was
 MOST_OVER_FRONT_EV = 3.0  # that a face which sees little of the light gets more than one that sees it all
 _BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
@@ -346,12 +345,12 @@ def anchored_exposure_ev(
 ) -> float:
     """Return the exposure in EV, to two decimals, that leaves a face as bright in `relit` as in its plate.
 
-    Images [H, W, 3] and masks [H, W], of which what exceeds one half counts. As bright: by the luminance
-    that a tenth of the face exceeds, for a light from the side leaves much of it in shadow. So a dark skin
-    stays as dark beside a light one as it was. No more than lets the brightest hundredth of the person
-    exceed white, or the plate's own, by one EV, as in a light from behind. A black face gives 0 EV.
+    Images [H, W, 3] and masks [H, W], of which what exceeds one half counts. As bright: of the same mean
+    luminance, so that the person fits a background that stays, and a dark skin stays as dark beside a light
+    one as it was. No more than lets the brightest hundredth of the person exceed white, or the plate's own,
+    by one EV, as in a light from behind. A black face gives 0 EV.
     """
-    bright, wanted = (_brighter_than(image, face, FACE_PERCENTILE) for image in (relit, plate))
+    bright, wanted = (_mean_luminance(image, face) for image in (relit, plate))
     if min(bright, wanted) <= _BLACK:
         return 0.0
     whole = face if person is None else person
@@ -377,6 +376,11 @@ def most_exposure_ev(rule: ExposureRule, strength: float) -> float:
     """
     limited = rule == "auto" and strength > _BLACK
     return MOST_OVER_FRONT_EV - math.log2(strength) if limited else math.inf
+
+
+def _mean_luminance(linear: np.ndarray, mask: np.ndarray) -> float:
+    values = luminance(linear)[mask > 0.5]
+    return float(values.mean()) if values.size else 0.0
 
 
 def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> float:

@@ -23,6 +23,7 @@ _MOST_DIGITS = 9  # of a count; Python refuses to read thousands
 _FORMS = ("AZ,EL", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
+ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of lights: what a room sends back, by the background
 _AROUND = "around"  # as a direction: from all of them
 _PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has those of one
 # Keys of one kind of light.

@@ -17,7 +17,6 @@ from torch import Tensor
 from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
-    FACE_PERCENTILE,
     linear_to_srgb,
     luminance,
     srgb_to_linear,
@@ -72,11 +71,12 @@ class Brightest:
 class LightSamples:
     """Pixels by which the exposure is chosen, as `relight` chooses it.
 
-    With a `face` it is left as bright as in its photo: `plate` is the luminance of face and person there.
+    With a `face` it is left as bright as in its photo. `face` [L, 3] is its mean luminance under each light,
+    by the light's primaries; `plate` is that in the photo, and the person's brightest there.
     """
 
     person: Brightest
-    face: Brightest | None = None
+    face: np.ndarray | None = None
     plate: tuple[float, float] | None = None
 
     @staticmethod
@@ -92,17 +92,19 @@ class LightSamples:
             return LightSamples(body)
         plate = luminance(photo)
         bright = (
-            float(np.percentile(plate[face > _SURE], FACE_PERCENTILE)),
+            float(plate[face > _SURE].mean()),
             float(np.percentile(plate[person > _SURE], AUTO_EXPOSURE_PERCENTILE)),
         )
-        return LightSamples(body, Brightest.of(images, face > _SURE, FACE_PERCENTILE), bright)
+        means = np.stack([image[face > _SURE].mean(0, dtype=np.float32) for image in images])
+        return LightSamples(body, means * luminance(np.eye(3, dtype=np.float32)), bright)
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
     """A person over black under lights [L, 3], as ratios [L, h, w, 3] to a guide [H, W, 3], in bytes.
 
-    The linear guide is that of sRGB times `white`; a linear ratio (byte / 255)^2 times `scales` [L].
+    A last ratio more, if there is one, is that under the mean of lights all around, as of a room. The linear
+    guide is that of sRGB times `white`; a linear ratio (byte / 255)^2 times `scales` [L].
     """
 
     directions: np.ndarray
@@ -149,7 +151,8 @@ def basis_of_photo(
 ) -> Basis:
     """The basis of a photo's person under the lights over which `facerf relight` integrates maps.
 
-    The images of single lights are composed small; their mean is composed as large as the photo [H, W, 3].
+    The images of single lights and of their mean, the last, are composed small; the mean is composed as
+    large as the photo [H, W, 3], too.
     """
     small_photo, small_head = shrunk_photo(photo, head, RATIO_PX)
     small_field = _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
@@ -157,15 +160,20 @@ def basis_of_photo(
     rig = rig_directions()
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []
-    mean: Relit | None = None
-    for relit in _single(composition, rig):
+
+    def add(relit: Relit) -> None:
         assert relit.surround is not None
         images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
         part = field.maps.albedo[0] * relit.surround[:3] + relit.surround[3:6]
         coarse.append((part * field.exposure).permute(1, 2, 0).numpy().astype(np.float16))
+
+    mean: Relit | None = None
+    for relit in _single(composition, rig):
+        add(relit)
         mean = relit if mean is None else mean.plus(torch.ones(1), relit.texture, relit.surround)
     assert mean is not None and mean.surround is not None
     mean = Relit(mean.texture / len(rig), mean.surround / len(rig))
+    add(mean)
     shown = whole(composition.light_layer(mean), *composition.size_px)
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
     samples = LightSamples.of(np.stack(coarse), 1 - classes[0], classes[class_index("skin")], source)

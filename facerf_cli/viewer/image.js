@@ -206,9 +206,9 @@ function percentileOf({ roots, scales, shares, total }, weights, percent) {
 }
 
 // EV to two decimals under weights [lights * 3], as of `facerf relight --exposure auto`: the face as in the photo.
-function automaticEv({ face, person, plate, target, mostOverFront, facePercentile, personPercentile }, weights) {
+function automaticEv({ face, person, plate, target, mostOverFront, personPercentile }, weights) {
   const body = percentileOf(person, weights, personPercentile);
-  const skin = plate ? percentileOf(face, weights, facePercentile) : target;
+  const skin = plate ? face.reduce((sum, value, i) => sum + value * weights[i], 0) : target;
   if (Math.min(skin, body, plate ? plate[0] : 1) < 1e-9) return 0;
   const gain = plate ? Math.min(plate[0] / skin, (2 * Math.max(1, plate[1])) / body) : target / body;
   const strength = groups(weights, 3).reduce((sum, rgb) => sum + luminance(rgb), 0);

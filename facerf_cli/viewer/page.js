@@ -10,8 +10,9 @@ const rounded = (value, digits) => Number(value.toFixed(digits));
 const inDegrees = (value) => `${Math.round(value)}°`;
 const signed = (value, digits, unit) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)} ${unit}`;
 const inStops = (value) => signed(value, 1, "stops");
-// What the controls change: of the light that is chosen, of the map and of the image; and its value in words.
+// What the controls change: of the light that is chosen, of all lights, of the map and of the image; in words.
 const LIGHT = { azimuth: inDegrees, elevation: inDegrees, stops: inStops, colour: (text) => text };
+const ROOM = { room: (share) => `${Math.round(100 * share)} %` };
 const MAP = { rotate: inDegrees, mapStops: inStops };
 const IMAGE = { exposure: (value) => signed(value, 2, "EV") };
 
@@ -40,7 +41,7 @@ function lightText(light) {
   return (rgb.every((value) => value === 1) ? where : [...where, ...rgb]).join(",");
 }
 
-// Read ?light=... or #light=75,20;-120,10&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
+// Read ?light=... or #light=75,20;-120,10&room=0.1&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
 function stateOf(address, maps) {
   const given = new URLSearchParams(address.hash.length > 1 ? address.hash.slice(1) : address.search);
   const number = (name, low, high) => {
@@ -51,6 +52,7 @@ function stateOf(address, maps) {
   return {
     lights: lightsOf(given.get("light")) ?? (map ? [] : [newLight(40, 25)]),
     selected: 0,
+    room: number("room", 0, 1), // what it sends back; null: by the background
     map,
     rotate: turned(number("rotate", -3600, 3600) ?? 0),
     mapStops: number("mapstops", -6, 6) ?? 0,
@@ -60,8 +62,9 @@ function stateOf(address, maps) {
   };
 }
 
-function addressOf({ lights, map, rotate, mapStops, exposure, background, compare }) {
+function addressOf({ lights, room, map, rotate, mapStops, exposure, background, compare }) {
   const parts = lights.length ? ["light=" + lights.map(lightText).join(";")] : [];
+  if (room !== null) parts.push("room=" + room);
   if (map?.command) {
     parts.push("env=" + map.name);
     if (rotate) parts.push("rotate=" + rotate);
@@ -73,19 +76,27 @@ function addressOf({ lights, map, rotate, mapStops, exposure, background, compar
   return "#" + parts.join("&");
 }
 
-// The command lines that make the same image.
-function commandOf({ map, lights, rotate, mapStops, background }, data, ev) {
+// The share of the lights that comes from all around, too, as `facerf relight` has it.
+function roomOf({ room, background }, data) {
+  if (!data.room) return 0;
+  return room ?? (background && data.background ? data.room.bright : data.room.dark);
+}
+
+// The command lines that make the same image; a map shines together with lights where all have names.
+function commandOf({ map, lights, room, rotate, mapStops, background }, data, ev) {
   if (!map && !lights.length) return "# add a light, or choose an environment";
   const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : "'" + text.replaceAll("'", `'"'"'`) + "'");
   const both = Boolean(map) && lights.length > 0;
+  const texts = lights.map((light, i) => (both ? `light${i + 1}=` : "") + lightText(light));
   let line = `facerf relight ${data.source}`;
-  if (map) line += ` --envmap ${quoted(map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
-  if (lights.length) line += ` --light '${lights.map(lightText).join(";")}'`;
+  const keys = [`map=${map?.path}`, rotate && `rotate=${rotate}`, mapStops && `stops=${mapStops}`];
+  if (both) line += ` --light ${quoted(["name=map", ...keys.filter(Boolean)].join(";"))}`;
+  else if (map) line += ` --envmap ${quoted(map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
+  if (lights.length) line += ` --light '${texts.join(";")}'`;
+  if (lights.length && data.room && room !== null) line += ` --room ${room || "none"}`;
   line += ` --exposure ${rounded(ev + (map && !both ? mapStops : 0), 2)}`; // stops of a map alone are exposure
   if (data.background && !background) line += " --background none";
-  const scale = mapStops ? `, that of the map times ${Number((2 ** mapStops).toPrecision(3))}` : "";
-  const note = both ? `\n# the map and the lights are two images: add their EXRs${scale}` : "";
-  return (map?.command ? map.command + "\n" : "") + line + " -o out" + note;
+  return (map?.command ? map.command + "\n" : "") + line + " -o out";
 }
 
 class Page {
@@ -98,6 +109,7 @@ class Page {
     byId("before").src = images.photo.src;
     byId("frame").style.setProperty("--sides", data.size[0] / data.size[1]);
     byId("background").hidden = !data.background;
+    byId("room").parentElement.hidden = !data.room;
     this.state = stateOf(location, this.maps);
     this.connect();
     this.fillMaps();
@@ -130,16 +142,18 @@ class Page {
     this.change({});
   }
 
-  // Weights [lights * 3] of all that shines.
+  // Weights [images * 3] of all that shines; the last image is that of a room, whose directions send 4 times as much.
   weights() {
     const { lights, map, rotate, mapStops } = this.state;
     const key = map && `${this.maps.indexOf(map)} ${rotate}`;
     if (map && key !== this.mapKey) [this.mapKey, this.mapWeights] = [key, this.rig.mapWeights(map, rotate)];
-    const dark = new Float64Array(3 * this.rig.lights.length);
-    const weights = map ? this.mapWeights.map((value) => value * 2 ** mapStops) : dark;
+    const weights = new Float64Array(3 * this.data.scales.length);
+    if (map) this.mapWeights.forEach((value, i) => (weights[i] = value * 2 ** mapStops));
+    const [room, last] = [4 * roomOf(this.state, this.data), weights.length - 3];
     for (const light of lights) {
       const [rgb, around] = [rgbOf(light), this.rig.around(directionOf(light.azimuth, light.elevation))];
       for (const [i, share] of around) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
+      rgb.forEach((value, c) => (weights[last + c] += room * value));
     }
     return weights;
   }
@@ -161,6 +175,7 @@ class Page {
   update() {
     const { state, light, data } = this;
     this.show(LIGHT, light ?? newLight(0, 0), !light);
+    this.show(ROOM, { room: roomOf(state, data) }, !light);
     this.show(MAP, state, !state.map);
     this.show(IMAGE, { exposure: this.ev }, false);
     byId("envmap").value = this.maps.indexOf(state.map);
@@ -200,7 +215,7 @@ class Page {
 
   connect() {
     const on = (id, apply) => byId(id).addEventListener("input", (event) => apply(event.target.value));
-    for (const id of Object.keys({ ...MAP, ...IMAGE })) on(id, (value) => this.change({ [id]: Number(value) }));
+    for (const id of Object.keys({ ...ROOM, ...MAP, ...IMAGE })) on(id, (value) => this.change({ [id]: Number(value) }));
     for (const id of ["azimuth", "elevation", "stops"]) on(id, (value) => this.changeLight({ [id]: Number(value) }));
     on("colour", (colour) => this.changeLight({ colour, rgb: undefined }));
     on("split", (percent) => this.change({ compare: Number(percent) }));
@@ -305,9 +320,8 @@ async function start() {
   const data = JSON.parse(byId("data").textContent);
   const images = { photo: await imageOf(data.photo, "jpeg") };
   for (const name of ["guide", "plate", "matte"]) images[name] = await imageOf(data[name], "webp");
-  for (const name of ["face", "person"]) {
-    if (data.exposure[name]) data.exposure[name] = await brightestOf(data.exposure[name]);
-  }
+  data.exposure.person = await brightestOf(data.exposure.person);
+  if (data.exposure.face) data.exposure.face = floatsOf(data.exposure.face);
   const ratios = await Promise.all(data.ratios.map((ratio) => imageOf(ratio, "jpeg")));
   byId("message").textContent = "";
   new Page(data, images, ratios);

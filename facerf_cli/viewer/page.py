@@ -18,10 +18,10 @@ from facerf_cli.files.sheets import filled_page
 from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     AUTO_EXPOSURE_TARGET_LINEAR,
-    FACE_PERCENTILE,
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
+from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK
 from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
 _HERE = Path(__file__).parent
@@ -80,6 +80,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "photo": _jpeg(_encoded(plate.before), _PHOTO_QUALITY),
         "plate": _webp(_encoded(background)),
         "background": plate.background is not None,
+        "room": _room(basis),
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
         "envmaps": [
@@ -108,13 +109,18 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
     return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
 
 
+def _room(basis: Basis) -> dict[str, float] | None:
+    """Shares of a room's light, before a bright background and before a dark one; None for an OLAT stack."""
+    has_one = len(basis.ratios) > len(basis.directions)
+    return {"bright": ROOM_BEFORE_BRIGHT, "dark": ROOM_BEFORE_DARK} if has_one else None
+
+
 def _exposure(samples: LightSamples) -> dict[str, Any]:
     """Pixels by which a page chooses its exposure, and what it compares them with."""
     return {
-        "face": samples.face and _brightest(samples.face),
+        "face": None if samples.face is None else _floats(samples.face),
         "person": _brightest(samples.person),
         "plate": samples.plate,
-        "facePercentile": FACE_PERCENTILE,
         "personPercentile": AUTO_EXPOSURE_PERCENTILE,
         "target": AUTO_EXPOSURE_TARGET_LINEAR,
         "mostOverFront": MOST_OVER_FRONT_EV,

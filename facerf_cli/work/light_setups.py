@@ -10,6 +10,8 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_i
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import (
     MOST_FRAMES,
+    ROOM_BEFORE_BRIGHT,
+    ROOM_BEFORE_DARK,
     MapSource,
     StudioLight,
     is_sweep,
@@ -25,7 +27,6 @@ MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
 ROOM = "room"  # the name of a room's light, and of its layer
-ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of the light that others send
 _MOST_ROOM = 1.0
 
 
