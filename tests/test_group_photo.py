@@ -1,12 +1,24 @@
 """Several people in one image, by compositions with known answers."""
 
 from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.settings import Settings
+from facerf_cli.errors import InputError
+from facerf_cli.files.images import LinearImage
 from facerf_cli.image.strips import Band, Layer, filled, whole
+from facerf_cli.portrait.find import FaceBox
 from facerf_cli.relighting.composition import GroupComposition
+from facerf_cli.run import memory
+from facerf_cli.work import photos
+from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photos import PhotoFace
 
 SIZE = (4, 6)
 
@@ -81,3 +93,20 @@ def test_layers_hold_all_people() -> None:
 
 def test_the_exposure_is_the_first_ones() -> None:
     assert group().exposure_ev([2.0, 8.0], "auto") == 2.0
+
+
+def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    faces = [PhotoFace(f"_face{k}", "a.png", FaceBox((k, 0, k + 1, 1), 1.0)) for k in range(3)]
+    fitted: list[str] = []
+    monkeypatch.setattr(photos, "find_people", lambda *_: list(faces))
+    monkeypatch.setattr(photos, "load_models_once", lambda _: SimpleNamespace(default_geometry="landmarks"))
+    monkeypatch.setattr(photos, "_fitted", lambda face, *_: fitted.append(face.tag) or face)
+    item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
+    options = PhotoOptions(Settings(), face="all")
+    each = photos.fit_each(item, image, options)
+    assert next(each).tag == "_face2" and fitted == ["_face2"]
+    memory.set_limit(100 << 20)
+    with pytest.raises(InputError, match=r"a\.png: 3 people in one image: needs .* --composite face"):
+        photos.fit_each(item, image, options, together=True)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -128,9 +127,9 @@ class SquareView:
     sharpness: float = 1.0
     unsteadiness: float = 0.0
 
-    @cached_property
+    @property
     def classes(self) -> Tensor:
-        """Shares [C, S, S] of the classes, which sum to 1; the mean of all looks."""
+        """Shares [C, S, S] of the classes, which sum to 1: the mean of all looks; computed again each time."""
         return self.logits.softmax(1).mean(0)
 
     @property

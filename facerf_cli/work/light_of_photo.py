@@ -42,6 +42,7 @@ from facerf_cli.work.photos import (
     provenance,
     read_matte,
     read_photo,
+    write_each,
 )
 from facerf_cli.work.sequence import frame_with_face, takes_with_face, view_of
 from facerf_cli.work.shots import Shot
@@ -120,10 +121,11 @@ def write_shot_light(
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
     """Estimate and write the light of each chosen face of a photo; their tags, and facts for the report."""
     image = read_photo(item, options.photo)
-    faces = fit_faces(item, image, options.photo)
-    facts = [_write(item, image, face, options, width_px, sh_order) for face in reversed(faces)][::-1]
-    found = facts[0] if len(facts) == 1 else {"faces": facts}
-    return [face.tag for face in faces], found | facts_of_networks(options.photo)
+
+    def write(face: FittedFace) -> dict[str, Any]:
+        return _write(item, image, face, options, width_px, sh_order)
+
+    return write_each(item, image, options.photo, write)
 
 
 @cache

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -36,7 +36,7 @@ from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
-from facerf_cli.work.plan import KEPT_PX, beside_photo
+from facerf_cli.work.plan import KEPT_PX, beside_photo, require_people
 from facerf_cli.work.rembg_matte import matte_by_rembg, require_rembg
 
 
@@ -170,18 +170,39 @@ def naming(name: object) -> Iterator[None]:
         raise InputError(f"{name}: {error}") from None
 
 
-def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
-    """Fit the faces of a photo that the options choose, from left to right."""
+def fit_each(
+    item: Item, image: LinearImage, options: PhotoOptions, together: bool = False
+) -> Iterator[FittedFace]:
+    """Find the faces of a photo that the options choose; fit one after the other, from right to left.
+
+    So the first one's files are written last, and mark the photo as finished. Raises InputError where so many
+    people do not fit in one image `together`.
+    """
     models = load_models_once(options)
     matte = person_matte(item, image.pixels, options)
     found = find_people(item, image, options, options.geometry or models.default_geometry)
-    return [_fitted(face, image, options, matte) for face in found]
+    if together:
+        with naming(item.input_path):
+            require_people(len(found), image.pixels.shape[:2])
+    return (_fitted(found.pop(), image, options, matte) for _ in range(len(found)))
+
+
+def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
+    """Fit the faces of a photo that the options choose, from left to right."""
+    return list(fit_each(item, image, options))[::-1]
+
+
+def write_each(
+    item: Item, image: LinearImage, options: PhotoOptions, write: Callable[[FittedFace], dict[str, Any]]
+) -> tuple[list[str], dict[str, Any]]:
+    """Fit and write one face after the other; return their tags, and the entries that `write` gives."""
+    made = [(face.tag, write(face)) for face in fit_each(item, image, options)][::-1]
+    return [tag for tag, _ in made], facts_of([facts for _, facts in made], options)
 
 
 def facts_of_found(faces: Sequence[PhotoFace], options: PhotoOptions) -> dict[str, Any]:
     """The report's entries of a photo whose faces were only found."""
-    facts = [face.rated() for face in faces]
-    return (facts[0] if len(facts) == 1 else {"faces": facts}) | facts_of_networks(options)
+    return facts_of([face.rated() for face in faces], options)
 
 
 def find_people(
@@ -211,10 +232,9 @@ def fit_facts(fit: FaceFit) -> dict[str, Any]:
     return {**error, "quality": fit.quality}
 
 
-def facts_of(faces: list[FittedFace], options: PhotoOptions) -> dict[str, Any]:
-    """The report's entries of a photo: of its one face, or of each in a list."""
-    facts = faces[0].described() if len(faces) == 1 else {"faces": [face.described() for face in faces]}
-    return facts | facts_of_networks(options)
+def facts_of(faces: list[dict[str, Any]], options: PhotoOptions) -> dict[str, Any]:
+    """The report's entries of a photo: those of its one face, or of each in a list."""
+    return (faces[0] if len(faces) == 1 else {"faces": faces}) | facts_of_networks(options)
 
 
 def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:

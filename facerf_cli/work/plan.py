@@ -28,6 +28,7 @@ _STACK_PX = 130
 _SEGMENTS_PX = _PHOTO_PX + KEPT_OF_SEGMENTS_PX
 _IMAGE_PX = 12
 _FACE_PX, _BESIDE_FACE_PX = 32, 16  # of a face drawn in its photo, and of the photo with its matte around it
+_COMPOSED_BYTES, _COMPOSED_PX = 64 << 20, 4  # of a person that waits to be composed: transport, matte
 _STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _WEB_PX = 9  # of an image for web viewers: half floats, then bytes
 _RELIT_HELD = 4  # relit textures are held this many times while lights are added to them
@@ -68,6 +69,12 @@ def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) 
     needed = height * width * _BESIDE_FACE_PX + window.height_px * window.width_px * _FACE_PX
     needed += needed // _BETWEEN + _STRIP_BYTES
     memory.require(f"a face of {window.width_px} x {window.height_px} pixels", needed, "a smaller photo")
+
+
+def require_people(count: int, size_px: tuple[int, ...]) -> None:
+    """Raise InputError where so many people of a photo [H, W], composed into one image, do not fit."""
+    needed = count * (_COMPOSED_BYTES + _COMPOSED_PX * math.prod(size_px)) if count > 1 else 0
+    memory.require(f"{count} people in one image", needed, "--composite face or --face INDEX")
 
 
 def require_web_images(lights: int, size_px: tuple[int, int]) -> None:

@@ -33,7 +33,7 @@ from facerf_cli.work.photos import (
     companion,
     face_model,
     facts_of,
-    fit_faces,
+    fit_each,
     fit_facts,
     load_models_once,
     naming,
@@ -158,19 +158,27 @@ def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
     """
     _over_rig(work)(_in_rooms(work))  # maps are read before the photo, not beside it
     image, faces = _image_and_faces(item, work)
-    # of faces alone, the first one's files mark the photo as finished
-    parts = [("", faces)] if work.composite == "photo" else [(one.tag, [one]) for one in reversed(faces)]
-    scenes = ((tag, _scene(item, image, some, work)) for tag, some in parts)
-    return scenes, _metadata(item, work), partial(facts_of, faces, work.photo)
+    facts: list[dict[str, Any]] = []
+
+    def scenes() -> Scenes:
+        parts = [list(faces)[::-1]] if work.composite == "photo" else ([face] for face in faces)
+        for some in parts:
+            yield "" if work.composite == "photo" else some[0].tag, _scene(item, image, some, work)
+            facts[:0] = [face.described() for face in some]
+
+    return scenes(), _metadata(item, work), lambda: facts_of(facts, work.photo)
 
 
-def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, list[FittedFace]]:
-    """The image of an item and its faces; those of a frame of a shot steadied by the frames around it."""
+def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, Iterator[FittedFace]]:
+    """The image of an item and its faces, the last first, as they are fitted.
+
+    Those of a frame of a shot are steadied by the frames around it.
+    """
     if place := shot_of(work.shots, item):
         image, face = frame_with_face(*place, work.photo, work.reflectance == "portrait")
-        return image, [face]
+        return image, iter([face])
     image = read_photo(item, work.photo)
-    return image, fit_faces(item, image, work.photo)
+    return image, fit_each(item, image, work.photo, together=work.composite == "photo")
 
 
 def _leader_of(item: Item, work: Relight) -> Item | None:
@@ -195,7 +203,8 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     if is_olat_stack(leader.input_path):
         scene = next(_scenes_of_stack(leader, work)[0])[1]
     else:
-        scene = _scene(leader, *_image_and_faces(leader, work), work)
+        image, faces = _image_and_faces(leader, work)
+        scene = _scene(leader, image, list(faces)[::-1], work)
     return _exposures_ev(scene, batches(len(scene.setups), scene.composer.nbytes), scene.relit, work)
 
 

@@ -27,16 +27,15 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
-    facts_of,
     facts_of_found,
     facts_of_networks,
     find_people,
-    fit_faces,
     load_models_once,
     person_matte,
     provenance,
     read_photo,
     stamp,
+    write_each,
 )
 from facerf_cli.work.plan import KEPT_OF_SEGMENTS_PX, segments_canvas
 from facerf_cli.work.sequence import segmented_frame
@@ -123,10 +122,12 @@ def _landmarks(face: Face) -> dict[str, Any]:
 def write_fits(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, Any]]:
     """Fit and write each chosen face of a photo; their tags, and facts for the report."""
     image = read_photo(item, options)
-    faces = fit_faces(item, image, options)
-    for face in reversed(faces):
+
+    def write(face: FittedFace) -> dict[str, Any]:
         _write_fit(item, image, face, options)
-    return [face.tag for face in faces], facts_of(faces, options)
+        return face.described()
+
+    return write_each(item, image, options, write)
 
 
 def _write_fit(item: Item, image: LinearImage, face: FittedFace, options: PhotoOptions) -> None:

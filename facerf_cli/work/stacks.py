@@ -30,13 +30,12 @@ from facerf_cli.relighting.composition import Target
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,
-    facts_of,
-    fit_faces,
     load_models_once,
     naming,
     provenance,
     read_photo,
     rotation_of,
+    write_each,
 )
 from facerf_cli.work.plan import prediction_bytes, require_face, require_web_images
 from facerf_cli.work.verbs import PredictOlat, Written
@@ -53,8 +52,8 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
     if work.format == "relight":
         directions = _from_in_front(item, directions)
     image = read_photo(item, work.photo)
-    faces = fit_faces(item, image, work.photo)
-    for face in reversed(faces):
+
+    def write(face: FittedFace) -> dict[str, Any]:
         stack, sheet, *pages = work.files_of(item, face.tag)
         tiles: list[np.ndarray] = []
         if work.frame == "photo":
@@ -68,8 +67,10 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
             write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
-    tags = [face.tag for face in reversed(faces)]
-    return tags, facts_of(faces, work.photo) | {"lights": len(directions)}
+        return face.described()
+
+    tags, facts = write_each(item, image, work.photo, write)
+    return tags, facts | {"lights": len(directions)}
 
 
 def _from_in_front(item: Item, directions: Tensor) -> Tensor:

@@ -28,11 +28,10 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
-    facts_of,
-    fit_faces,
     load_models_once,
     naming,
     read_photo,
+    write_each,
 )
 from facerf_cli.work.stack_composers import face_in_stack
 
@@ -47,12 +46,13 @@ def write_pages(item: Item, options: PhotoOptions, size_px: int) -> tuple[list[s
     if is_olat_stack(item.input_path):
         tag = options.first_tag
         return [tag], write_page_of_stack(item.output(tag + ".html"), item, options, size_px)
-    image = read_photo(item, options)
-    faces = fit_faces(item, image, options)
-    models = load_models_once(options)
-    for face in reversed(faces):  # the first one's page marks the photo as finished
+    image, models = read_photo(item, options), load_models_once(options)
+
+    def write(face: FittedFace) -> dict[str, Any]:
         write_page(item.output(face.tag + ".html"), item, models, image.pixels, face, size_px)
-    return [face.tag for face in faces], facts_of(faces, options)
+        return face.described()
+
+    return write_each(item, image, options, write)
 
 
 def write_page(
