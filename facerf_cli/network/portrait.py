@@ -28,7 +28,7 @@ _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
 _STRAND_SHARPNESS = 30.0
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
-_NEAR_FACES = 0.15  # around the proxy, where hair and cloth may be that it lacks
+_NEAR_FACES = 0.1  # around the proxy, where hair and cloth may be that it lacks; so far on its layers fade
 _SIDES = 3.0  # faces: the square's side for which the scale is 0
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
 _COARSE = {  # maps at half the side
@@ -71,8 +71,8 @@ class PortraitInputs(Batch):
 
     @property
     def near_proxy(self) -> Tensor:
-        """Flags [B, 1, S, S] of what lies on the proxy or near it."""
-        return torch.cat([_grown(*one) for one in zip(self.covered, self.sides.flatten(), strict=True)])
+        """Share [B, 1, S, S] that the proxy's layers have: 1 near the proxy, 0 far from it."""
+        return torch.cat([_around(*one) for one in zip(self.covered, self.sides.flatten(), strict=True)])
 
     def emptied(self) -> "PortraitInputs":
         """The same without what the proxy does not show."""
@@ -94,11 +94,13 @@ class PortraitInputs(Batch):
         return torch.cat(layers, 1)
 
 
-def _grown(covered: Tensor, sides: Tensor) -> Tensor:
-    """Flags [1, 1, S, S] of pixels within `_NEAR_FACES` of covered ones [1, S, S] in a square of `sides`."""
-    reach = round(float(_NEAR_FACES * covered.shape[-1] / sides))
-    row = F.max_pool2d(covered[None], (1, 2 * reach + 1), 1, (0, reach))
-    return F.max_pool2d(row, (2 * reach + 1, 1), 1, (reach, 0))
+def _around(covered: Tensor, sides: Tensor) -> Tensor:
+    """1 within `_NEAR_FACES` of covered pixels [1, S, S] of a square of `sides`, 0 from thrice that on."""
+    fade = max(1, round(float(_NEAR_FACES * covered.shape[-1] / sides)))
+    near, reach = covered[None], 2 * fade
+    for kernel, padding in (((1, 2 * reach + 1), (0, reach)), ((2 * reach + 1, 1), (reach, 0))):
+        near = F.max_pool2d(near, kernel, 1, padding)
+    return F.avg_pool2d(near, 2 * fade + 1, 1, fade, count_include_pad=False)
 
 
 def mirrored_x(vectors: Tensor) -> Tensor:

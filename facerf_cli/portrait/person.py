@@ -82,7 +82,7 @@ class SeenPerson:
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
-        own = own_shading(self.image, self.classes, self.maps.normals, rig, visible)
+        own = own_shading(self.image, self.classes, self.maps.normals, rig, visible, self.sides)
         exposed = self.image[None] / self.exposure
         reached = reached_by(rig, visible, self.square.size_px)
         sides = torch.full((1, 1, 1, 1), self.sides)

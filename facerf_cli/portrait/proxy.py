@@ -39,7 +39,7 @@ _OFF_M = 0.003  # of rays, from the surface: hides its facets
 _RADIUS_DEG, _RAYS = 3.0, 2  # of the disc of a light, and rays to it from each point
 _SOFT_PX = 0.7  # standard deviation of a blur of visibility
 _SEED = 7
-_SOLVED_PX = 48  # side at which the light is estimated
+_SOLVED_PX, _SOLVED_SIDES = 48, 3.0  # side at which the light is estimated, in a square of so many faces
 _SURE = 0.8  # share of skin, and cover of the proxy, of the pixels that are explained
 _RIDGE = 0.05  # of the weights, per root of the number of pixels: many lights explain a photo alike
 _LEAST_PIXELS = 30
@@ -230,15 +230,18 @@ def _mean_person() -> _MeanPerson:
     return _MeanPerson(**tensors, face_m=face)
 
 
-def own_shading(image: Tensor, classes: Tensor, normals: Tensor, rig: Tensor, visible: Tensor) -> Tensor:
+def own_shading(
+    image: Tensor, classes: Tensor, normals: Tensor, rig: Tensor, visible: Tensor, sides: float
+) -> Tensor:
     """Shading [1, S, S], with a mean of 1 over the skin, of a proxy under a photo's estimated light.
 
     The skin is taken to be of one colour and matt. image [3, S, S] scene-linear; classes [C, S, S]; normals
-    [3, S, S]; visible [L, s, s] of a rig [L, 3] all around.
+    [3, S, S]; visible [L, s, s] of a rig [L, 3] all around. The square is so many faces wide.
     """
-    skin = _at(classes[SKIN : SKIN + 1], _SOLVED_PX)[0]
-    olats = _olats(_at(normals, _SOLVED_PX), rig, _at(visible, _SOLVED_PX))
-    grey = _at(image.mean(0, keepdim=True), _SOLVED_PX)[0]
+    solved_px = _SOLVED_PX * max(1, round(sides / _SOLVED_SIDES))
+    skin = _at(classes[SKIN : SKIN + 1], solved_px)[0]
+    olats = _olats(_at(normals, solved_px), rig, _at(visible, solved_px))
+    grey = _at(image.mean(0, keepdim=True), solved_px)[0]
     sure = skin > _SURE
     side = image.shape[-1]
     if sure.sum() < _LEAST_PIXELS:

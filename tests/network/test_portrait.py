@@ -210,9 +210,9 @@ def test_at_every_scale_a_network_begins_with_the_same_maps() -> None:
 
 
 def test_far_from_the_proxy_nothing_of_it_is_seen() -> None:
-    """A square of 3 faces; the proxy covers its left quarter, and with .15 of a face 2 pixels more."""
+    """A square of 3 faces; the proxy covers its left quarter, and ends three tenths of a face beyond."""
     network, given = PortraitNetwork(replace(TINY, scaled=True)), inputs()
-    edge = SIDE // 4 + 2
+    edge = SIDE // 4 + 3
     given.covered[..., SIDE // 4 :] = 0
     other = replace(given, **{n: getattr(given, n).clone() for n in ("normals", "depth", "reached", "own")})
     for values in (other.normals, other.depth, other.reached, other.own):

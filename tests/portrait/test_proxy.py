@@ -160,13 +160,13 @@ def test_a_lamp_is_found(light: int) -> None:
     normals, classes, visible = ball()
     cosine = torch.einsum("c,cij->ij", RIG[light], normals).clamp_min(0)
     image = 0.4 * cosine.expand(3, -1, -1) * torch.tensor([1.0, 0.7, 0.5]).view(3, 1, 1)
-    shading = own_shading(image, classes, normals, RIG, visible)
+    shading = own_shading(image, classes, normals, RIG, visible, 3.0)
     skin = classes[SKIN] > 0
     wanted = cosine / cosine[skin].mean()
     assert shading.shape == (1, BALL_PX, BALL_PX)
     assert float(shading[0][skin].mean()) == pytest.approx(1, rel=1e-4)
     assert float((shading[0] - wanted)[skin].abs().mean()) < 0.12
-    brighter = own_shading(7 * image, classes, normals, RIG, visible)
+    brighter = own_shading(7 * image, classes, normals, RIG, visible, 3.0)
     torch.testing.assert_close(brighter, shading, rtol=1e-3, atol=1e-3)
 
 
@@ -177,12 +177,20 @@ def test_shadows_of_the_proxy_are_in_it() -> None:
     visible[light, BALL_PX * 3 // 16 : BALL_PX * 5 // 16] = 0
     cosine = torch.einsum("c,cij->ij", RIG[light], normals).clamp_min(0)
     cosine[band] *= 0.02
-    shading = own_shading(cosine.expand(3, -1, -1), classes, normals, RIG, visible)[0]
+    shading = own_shading(cosine.expand(3, -1, -1), classes, normals, RIG, visible, 3.0)[0]
     middle = shading[:, BALL_PX * 3 // 8 : BALL_PX * 5 // 8]
     assert middle[band].mean() < 0.4 * middle[BALL_PX // 4 : BALL_PX * 3 // 8].mean()
 
 
+def test_in_a_wide_square_a_small_face_is_enough() -> None:
+    normals, classes, visible = ball()
+    classes[SKIN] *= normals[2] > 0.993
+    image = torch.einsum("c,cij->ij", RIG[8], normals).clamp_min(0).expand(3, -1, -1)
+    near, wide = (own_shading(image, classes, normals, RIG, visible, sides) for sides in (3.0, 6.0))
+    assert near.std() == 0 and wide.std() > 0.1
+
+
 def test_without_skin_nothing_is_guessed() -> None:
     normals, classes, visible = ball()
-    shading = own_shading(torch.rand(3, BALL_PX, BALL_PX), 0 * classes, normals, RIG, visible)
+    shading = own_shading(torch.rand(3, BALL_PX, BALL_PX), 0 * classes, normals, RIG, visible, 3.0)
     torch.testing.assert_close(shading, torch.ones(1, BALL_PX, BALL_PX))

@@ -425,7 +425,7 @@ def sample_of(
     stored = backgrounds[_below(len(backgrounds), generator)]
     background = 4 * background_of(stored, side, generator) * lit.behind
     photo = _as_taken(images[0] / _mean_over(images[0], skin) + background, generator)
-    normals = seen["normals"].float()
+    normals, sides = seen["normals"].float(), seen.get("sides", torch.tensor(SIDES))
     inputs = PortraitInputs(
         image=photo / _mean_over(photo, skin) * MEAN_RADIANCE,
         classes=classes,
@@ -433,8 +433,8 @@ def sample_of(
         depth=seen["depth"].float(),
         covered=seen["covered"].float() / 255,
         reached=reached_by(directions, around, side),
-        own=own_shading(photo, classes, normals, directions, around),
-        sides=seen.get("sides", torch.tensor(SIDES)).view(1, 1, 1),
+        own=own_shading(photo, classes, normals, directions, around, float(sides)),
+        sides=sides.view(1, 1, 1),
     )
     sample = PortraitSample(
         inputs=inputs,
