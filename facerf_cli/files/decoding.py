@@ -121,7 +121,7 @@ def _stored_values(path: Path, opened: OpenedImage, first: int, past: int, kind:
     if message:
         log.warning("%s: %s", path, message)
     values = np.asarray(values).reshape(spec.height, spec.width, past - first)
-    return (values / radiance.scale).astype(np.float32) if radiance else values
+    return values / radiance.scale if radiance and (radiance.scale != 1).any() else values
 
 
 def _black_is_zero(values: np.ndarray, alpha: int | None) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
+from facerf_cli.run import memory
 
 _LIMIT_BYTES = 1 << 16  # of a header
 # The Exif orientation of each order of the axes: the first is that of rows in the file.
@@ -20,6 +21,7 @@ _ORIENTATIONS = {
     for number, order in enumerate(("-Y+X", "-Y-X", "+Y-X", "+Y+X", "+X-Y", "-X-Y", "-X+Y", "+X+Y"), 1)
 }
 _EXPONENT_BIAS = 128 + 8
+_RUNS_BYTES = 60  # of a pixel while runs are decoded
 _REPEAT = (1, 1, 1)  # a pixel that says how often the one before it is repeated
 
 
@@ -55,7 +57,7 @@ def read_radiance_header(path: Path) -> RadianceHeader:
     try:
         exposures = [[float(text)] * 3 for text in fields["EXPOSURE"]]
         colours = [[float(word) for word in text.split()] for text in fields["COLORCORR"]]
-        scale = np.prod(np.array([[1.0] * 3, *exposures, *colours]), 0)
+        scale = np.prod(np.array([[1.0] * 3, *exposures, *colours]), 0).astype(np.float32)
         aspect = 1 / float(np.prod([float(text) for text in fields["PIXASPECT"]]))
         primaries = tuple(float(word) for text in fields["PRIMARIES"][-1:] for word in text.split())
         slow, rows, fast, columns = resolution.decode("ascii").split()
@@ -69,17 +71,20 @@ def read_radiance_header(path: Path) -> RadianceHeader:
 
 
 def read_old_runs(path: Path, header: RadianceHeader) -> np.ndarray | None:
-    """Decode values [H, W, 3] float32 that are stored by pixel, plainly or as runs; None in the newer form.
+    """Decode values [H, W, 3] float32 of runs of pixels; None for the forms that OpenImageIO reads.
 
-    The newer form has runs by channel, and begins each row with 2, 2 and its length.
+    These are pixels without runs, and runs by channel, of which each row begins with 2, 2 and its length.
     """
     height, width = header.size
     pixels = height * width
     with path.open("rb") as stream:
         stream.seek(header.values_from)
-        records = np.frombuffer(stream.read(4 * pixels), np.uint8)
-    records = records[: len(records) // 4 * 4].reshape(-1, 4)
-    if not len(records) or records[0].tolist() == [2, 2, width >> 8, width & 255]:
+        stored = stream.read(4 * pixels)
+    if len(stored) == 4 * pixels or stored[:4] == bytes([2, 2, width >> 8 & 255, width & 255]):
+        return None
+    memory.require(f"{path}: {width} x {height} pixels", _RUNS_BYTES * pixels, "make it smaller")
+    records = np.frombuffer(stored[: len(stored) // 4 * 4], np.uint8).reshape(-1, 4)
+    if not len(records):
         return None
     is_run = (records[:, :3] == _REPEAT).all(1)
     is_run[0] = False
