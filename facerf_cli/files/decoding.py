@@ -68,7 +68,8 @@ def decode(
     if is_heif(path):
         values, spec = decode_heif(path, limit_px, LINEAR_BYTES + max(HEIF_BYTES, kept_px))
         colour, alpha = pick_channels(spec)
-        return Decoded(values, spec, colour, alpha if with_alpha else None)
+        is_associated = not spec.get_int_attribute("oiio:UnassociatedAlpha")
+        return Decoded(values, spec, colour, alpha if with_alpha else None, is_associated)
     require_whole_png(path)
     opened = open_image(path, layer)
     try:

@@ -16,7 +16,7 @@ from facerf_cli.run import memory
 HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
 _BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _FULL_RANGE = 1  # to which pi-heif decodes
-PIXELS, PROFILE, CODES, SIZE = "pixels", "profile", "codes", "size"
+PIXELS, PROFILE, CODES, SIZE, ASSOCIATED = "pixels", "profile", "codes", "size", "associated"
 
 
 def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray]:
@@ -34,7 +34,10 @@ def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray
     if width * height > most_px:
         return {SIZE: np.array([width, height])}
     pixels = np.array(image)  # a copy: the memory of pi-heif ends with its image
-    arrays = {PIXELS: pixels.reshape(height, width, -1)}
+    arrays = {
+        PIXELS: pixels.reshape(height, width, -1),
+        ASSOCIATED: np.array(bool(image.premultiplied_alpha)),
+    }
     if profile := image.info.get("icc_profile"):
         arrays[PROFILE] = np.frombuffer(profile, np.uint8)
     elif code := image.info.get("nclx_profile"):
@@ -68,7 +71,7 @@ def decode_heif(path: Path, limit_px: int, bytes_px: int = HEIF_BYTES) -> tuple[
     values = arrays[PIXELS]
     height, width, channels = values.shape
     spec = oiio.ImageSpec(width, height, channels, str(values.dtype))
-    spec.attribute("oiio:UnassociatedAlpha", 1)
+    spec.attribute("oiio:UnassociatedAlpha", int(not arrays[ASSOCIATED]))
     if PROFILE in arrays:
         content = arrays[PROFILE]
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(content)}]"), content)

@@ -93,10 +93,11 @@ def open_image(path: Path, layer: str | None = None) -> OpenedImage:
 def _at_layer(path: Path, stream: Any, wanted: str | None) -> OpenedImage:
     is_exr = stream.format_name() == "openexr"
     specs = [stream.spec()]
-    while is_exr and stream.seek_subimage(len(specs), 0):
+    is_tiff = stream.format_name() == "tiff"
+    while (is_exr or (is_tiff and len(specs) == 1)) and stream.seek_subimage(len(specs), 0):
         specs.append(stream.spec())
     oiio_error(stream)  # that there are no more
-    _require_developed(path, stream.format_name() == "tiff" and _is_raw(path, specs[0]))
+    _require_developed(path, is_tiff and _is_raw(path, *specs))
     layers = list(_layers(specs)) if is_exr else []
     if wanted is not None:
         chosen = _named(path, layers, wanted)
@@ -135,13 +136,14 @@ def _require_developed(path: Path, is_raw: bool) -> None:
         raise InputError(f"{path}: a raw file of a camera, or a thumbnail first, is not read; {advice}")
 
 
-def _is_raw(path: Path, spec: oiio.ImageSpec) -> bool:
-    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
+def _is_raw(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None = None) -> bool:
+    """Return whether a TIFF has a thumbnail first, before its next image, or the values of a sensor."""
     with path.open("rb") as stream:
         is_cr2 = stream.read(10)[8:] == b"CR"
-    return (
-        is_cr2 or colours in _RAW_COLOURS or bool(spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL)
-    )
+    is_thumbnail = bool(spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL)
+    is_smaller = following is not None and 2 * spec.width <= following.width
+    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
+    return is_cr2 or is_thumbnail or is_smaller or colours in _RAW_COLOURS
 
 
 def _layers(specs: Sequence[oiio.ImageSpec]) -> Iterator[ImageLayer]:

@@ -98,7 +98,7 @@ def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
     if choice.path is None:
         return None
     with beside_person((height, width), images=1):
-        return _covering(read_image(choice.path, None).pixels, height, width)
+        return _covering(read_image(choice.path, with_alpha=False).pixels, height, width)
 
 
 def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -13,6 +13,7 @@ import tifffile
 from PIL import Image
 
 from facerf_cli.errors import InputError
+from facerf_cli.files import heif
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import read_map_file
@@ -127,6 +128,18 @@ def test_associated_integers_stay_within_white(tmp_path: Path) -> None:
     values = np.dstack([np.full((H, W, 3), 3, np.uint8), np.full((H, W), 2, np.uint8)])
     tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=["assocalpha"])
     assert read_image(tmp_path / "a.tif").pixels.max() == 1
+
+
+def test_alpha_and_codes_of_a_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As pi-heif reports them: alpha that is multiplied in, and HLG, which is refused."""
+    (path := tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    values = np.dstack([QUADS // 2, np.full((H, W), 128, np.uint8)])
+    found = {heif.PIXELS: values, heif.ASSOCIATED: np.array(True), heif.CODES: np.array([1, 13])}
+    monkeypatch.setattr(heif, "arrays_apart", lambda *_: found)
+    np.testing.assert_allclose(levels_of(path), QUADS, atol=2)
+    found[heif.CODES] = np.array([9, 18])
+    with pytest.raises(InputError, match=r"a\.heic: is an HDR image \(HLG\)"):
+        read_image(path)
 
 
 @pytest.mark.parametrize("suffix", ["bmp", "png", "exr"])
@@ -347,6 +360,9 @@ def test_a_raw_file_is_never_read_as_its_thumbnail(tmp_path: Path) -> None:
     """By its suffix, or by what it holds: a thumbnail first, a mosaic, a CR2."""
     tifffile.imwrite(tmp_path / "a.nef", QUADS)
     tifffile.imwrite(tmp_path / "thumbnail.tif", QUADS, subfiletype=1)
+    with tifffile.TiffWriter(tmp_path / "pages.tif") as pages:
+        pages.write(QUADS)
+        pages.write(QUADS.repeat(2, 0).repeat(2, 1))
     tifffile.imwrite(tmp_path / "mosaic.tif", GREY, photometric=32803)
     tifffile.imwrite(tmp_path / "cr2.tif", QUADS, byteorder="<")
     data = (tmp_path / "cr2.tif").read_bytes()
