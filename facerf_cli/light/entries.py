@@ -29,11 +29,11 @@ _PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has
 # Keys of one kind of light.
 _NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=, az=, el=)", "maps (map=)"
 _OF_KIND = {"size": _NEAR, "spot": _NEAR, "size_deg": _FAR, "rotate": _MAP}
-KEYS = ("at", "from", "az", "el", "map", "rgb", "kelvin", "stops", *_OF_KIND)
+KEYS = ("at", "from", "az", "el", "map", "rgb", "kelvin", "stops", *_OF_KIND, "face")
 # Limits of values.
 _KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
 _SIZE_M, _SIZE_DEG, _SPOT_DEG, _RGB = (0.0, 10.0), (0.0, 120.0), (1.0, 170.0), (0.0, 1e6)
-_TURN_DEG = (-3600.0, 3600.0)
+_TURN_DEG, _FACE = (-3600.0, 3600.0), (0.0, 99.0)
 
 
 Triple = tuple[float, float, float]
@@ -57,7 +57,8 @@ class StudioLight:
     Camera axes. At the face's centre its irradiance is that of a far light of its colour: `rgb` times the
     colour of a blackbody of `kelvin`, times 2 to `stops`; a map's radiance is multiplied by these. `size_m`
     is the side of the square of a near light, which faces the face; `size_deg` that of a far one, as seen
-    from there. `spot_deg` is the full angle of a near light's cone, which is aimed at the face.
+    from there. `spot_deg` is the full angle of a near light's cone, which is aimed at the face. Of several
+    people a light may shine on one alone, by the number of the `face` from the left, from 0.
     """
 
     azel_deg: tuple[float, float] | None = None
@@ -70,6 +71,7 @@ class StudioLight:
     spot_deg: float | None = None
     envmap: MapSource | None = None
     rotate_deg: float = 0.0
+    face: int | None = None
 
     @property
     def is_around(self) -> bool:
@@ -186,6 +188,9 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
     def number(key: str, form: str, limits: tuple[float, float]) -> float | None:
         return _numbers(given[key], form, limits, f"{where} {key}")[0] if key in given else None
 
+    face = number("face", "NUMBER", _FACE)
+    if face is not None and not face.is_integer():
+        raise UsageError(f"{where} face {given['face']!r}: give the number of one; 0 is on the left")
     rgb = _numbers(given.get("rgb", "1,1,1"), "R,G,B", _RGB, f"{where} rgb")
     common = StudioLight(
         rgb=(rgb[0], rgb[1], rgb[2]),
@@ -194,6 +199,7 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
         size_m=number("size", "METRES", _SIZE_M) or 0.0,
         size_deg=number("size_deg", "DEG", _SIZE_DEG) or 0.0,
         spot_deg=number("spot", "DEG", _SPOT_DEG),
+        face=None if face is None else int(face),
     )
     names = () if name is None else (name,)
     if kind == _MAP:

@@ -436,9 +436,10 @@ class GroupComposition:
         self.size_px = self._first.size_px
         self.nbytes = sum(one.nbytes for one in compositions)
 
-    def relit(self, lights: Lights) -> Iterator[Group]:
-        """The people under each sum of lights."""
-        return zip(*(one.relit(lights) for one in (self._first, *self._others)), strict=True)
+    def relit(self, lights: Sequence[Lights]) -> Iterator[Group]:
+        """The people, each under each of the sums of its own lights."""
+        people = zip((self._first, *self._others), lights, strict=True)
+        return zip(*(one.relit(own) for one, own in people), strict=True)
 
     def bands(self, relit: Group, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The people in the photo's frame; see `Composition.bands`."""

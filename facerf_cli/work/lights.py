@@ -71,7 +71,8 @@ def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling
     single = single_lights(setups)
     if not _maps_of(setups):
         return single
-    every, of_maps = _maps_over_rig(setups, rig, sampling)
+    maps = (tuple(light for light in setup.lights if light.envmap is not None) for setup in setups)
+    every, of_maps = _maps_over_rig(tuple(LightSetup("", lights=lights) for lights in maps), rig, sampling)
     directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
     return replace(single, directions=directions, weights=weights)
 
@@ -105,6 +106,13 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
     for row, light, rgb in near:
         near_weights[row, lights.index(light)] += rgb
     return replace(far, near=lights, near_weights=near_weights)
+
+
+def on_face(setup: LightSetup, number: int) -> LightSetup:
+    """A setup in which the lights of other faces than one are dark."""
+    dark = (0.0, 0.0, 0.0)
+    lights = (light if light.face in (None, number) else replace(light, rgb=dark) for light in setup.lights)
+    return replace(setup, lights=tuple(lights))
 
 
 def with_room(setup: LightSetup) -> LightSetup:

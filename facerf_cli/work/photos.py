@@ -80,6 +80,7 @@ class PhotoFace:
     found: FaceBox
     facts: dict[str, float] = field(default_factory=dict)
     touches: dict[str, list[float]] = field(default_factory=dict)
+    number: int = 0  # from the left
 
     def see(self, segmentation: Segmentation) -> None:
         """Learn the facts of its person's matte, and where that touches the frame."""
@@ -222,7 +223,9 @@ def find_people(
             x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
             name += f": face {number} from the left, at x {x_px}, y {y_px} px"
         facts = {} if face.view is None else face_facts(face.view, image.pixels)
-        found.append(PhotoFace(f"_face{number}" if options.face == "all" else "", name, face, facts))
+        found.append(
+            PhotoFace(f"_face{number}" if options.face == "all" else "", name, face, facts, number=number)
+        )
     return found
 
 
@@ -286,7 +289,7 @@ def _fitted(
             SUPPORTED_YAW_DEG,
         )
     facts = face.facts | ({"turned": abs(yaw_deg)} if face.facts else {})
-    return FittedFace(face.tag, face.name, face.found, facts, head=head, matte=matte)
+    return FittedFace(face.tag, face.name, face.found, facts, number=face.number, head=head, matte=matte)
 
 
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:

@@ -26,7 +26,14 @@ from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, GroupComposition, Target
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import each_alone, lights_over_rig, lights_over_stack, read_map, with_room
+from facerf_cli.work.lights import (
+    each_alone,
+    lights_over_rig,
+    lights_over_stack,
+    on_face,
+    read_map,
+    with_room,
+)
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
@@ -117,22 +124,41 @@ def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _LitScene:
-    """People of a photo, or a stack: its composer, the lights of setups, and what is behind."""
+    """People of a photo, or a stack: its composer, the lights of setups, and what is behind.
+
+    `faces` are the numbers, from the left, of the people's faces in the order of the composer.
+    """
 
     composer: Composer
     setups: tuple[LightSetup, ...]
     lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    faces: tuple[int, ...] = (0,)
     alpha: np.ndarray | None = None  # of the photo
     behind: Behind | None = None
 
     @cached_property
-    def lights(self) -> Lights:
-        """The lights of all setups."""
-        return self.lights_of(self.setups)
+    def lights(self) -> list[Lights]:
+        """The lights of all setups on each of the people."""
+        return [self.lights_of(_as_lit(self.setups, number)) for number in self.faces]
 
     def relit(self, part: slice) -> list[Any]:
         """The people under some of the setups."""
-        return list(self.composer.relit(self.lights[part]))
+        return list(self._composed([lights[part] for lights in self.lights]))
+
+    def relit_by_each(self, setup: LightSetup, part: slice) -> Iterator[Any]:
+        """The people under some of the lights of a setup, each alone."""
+        lit = [_as_lit((setup,), number)[0] for number in self.faces]
+        return self._composed([self.lights_of(each_alone(one)[part]) for one in lit])
+
+    def _composed(self, lights: Sequence[Lights]) -> Iterator[Any]:
+        if isinstance(self.composer, GroupComposition):
+            return self.composer.relit(lights)
+        return self.composer.relit(lights[0])
+
+
+def _as_lit(setups: Sequence[LightSetup], face: int) -> tuple[LightSetup, ...]:
+    """Setups as they shine on one of the people, with the light of their rooms."""
+    return tuple(with_room(on_face(setup, face)) for setup in setups)
 
 
 Scenes = Iterator[tuple[str, _LitScene]]  # each with the tag of its files
@@ -156,13 +182,15 @@ def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
 
     Facts of the mattes are known once the scenes are made.
     """
-    _over_rig(work)(_in_rooms(work))  # maps are read before the photo, not beside it
+    _over_rig(work)(_as_lit(work.setups, 0))  # maps are read before the photo, not beside it
     image, faces = _image_and_faces(item, work)
     facts: list[dict[str, Any]] = []
 
     def scenes() -> Scenes:
         parts = [list(faces)[::-1]] if work.composite == "photo" else ([face] for face in faces)
         for some in parts:
+            if not facts:
+                _check_faces(item, some[-1].number, work)
             yield "" if work.composite == "photo" else some[0].tag, _scene(item, image, some, work)
             facts[:0] = [face.described() for face in some]
 
@@ -208,21 +236,26 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     return _exposures_ev(scene, batches(len(scene.setups), scene.composer.nbytes), scene.relit, work)
 
 
+def _check_faces(item: Item, last: int, work: Relight) -> None:
+    """Raise InputError where a light is for a face whose number is beyond the last one's."""
+    most = max((light.face or 0 for setup in work.setups for light in setup.lights), default=0)
+    if most > last:
+        raise InputError(
+            f"{item.input_path}: a light is for face {most}, and the last is {last}; add --face all"
+        )
+
+
 def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _LitScene:
     """People of one photo in one image; the nearest first."""
     by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
     people = [_composed(item, image, face, work) for face in by_size]
     composer = people[0] if len(people) == 1 else GroupComposition(people)
-    scene = _LitScene(composer, _in_rooms(work), _over_rig(work))
+    scene = _LitScene(composer, work.setups, _over_rig(work), tuple(face.number for face in by_size))
     if work.composite != "photo":
         return scene
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
     alpha = image.alpha if work.background.kind == "photo" else None
     return replace(scene, alpha=alpha, behind=_backdrop(work, camera))
-
-
-def _in_rooms(work: Relight) -> tuple[LightSetup, ...]:
-    return tuple(with_room(setup) for setup in work.setups)
 
 
 def _over_rig(work: Relight) -> Callable[[tuple[LightSetup, ...]], Lights]:
@@ -269,6 +302,7 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
 def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
     """A stack under its own lights, the metadata of its images, and facts of its fit."""
     _check_stack(item, work)
+    _check_faces(item, 0, work)
     header = read_olat_header(item.input_path)
     own = torch.from_numpy(header.directions).float()
     lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
@@ -282,8 +316,8 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
         composer, facts = StackImages(header, item.input_path), {}
     else:
         composer, facts = _face_of_stack(item, header, work)
-    rooms = _in_rooms(work) if work.asked_for_room else tuple(replace(one, room=0.0) for one in work.setups)
-    scene = _LitScene(composer, rooms, lights_of, behind=behind)
+    lit = work.setups if work.asked_for_room else tuple(replace(setup, room=0.0) for setup in work.setups)
+    scene = _LitScene(composer, lit, lights_of, behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
     return iter([("", scene)]), dict(metadata), lambda: facts
 
@@ -382,10 +416,10 @@ def _rendered(
     layers = filled(composer.layers(work.aov, relit), *size_px, empty)
     keeps = "A" not in arrays and work.background.kind != "envmap"
     share = layers.get("person.A") if keeps else None
-    for part in batches(len(setup.names), composer.nbytes):
-        some = scene.lights_of(each_alone(replace(setup, lights=setup.lights[part])))
-        each: Iterator[Any] = composer.relit(some)
-        for name, one in zip(setup.names[part], each, strict=True):
+    names = with_room(setup).names
+    for part in batches(len(names), composer.nbytes):
+        each = scene.relit_by_each(setup, part)
+        for name, one in zip(names[part], each, strict=True):
             layers |= filled({name: composer.light_layer(one)}, *size_px, empty)
         del each, one  # before others are relit
     return OutputImage(arrays["rgb"], arrays.get("A", scene.alpha), layers, share)
@@ -409,7 +443,7 @@ def _exposures_ev(
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
     found: dict[str, float] = {}
-    strengths = scene.lights.strengths()
+    strengths = scene.lights[0].strengths()
     for part in parts:
         for setup, light, relit in zip(scene.setups[part], strengths[part], relit_by(part), strict=True):
             most_ev = most_exposure_ev(work.exposure, light)

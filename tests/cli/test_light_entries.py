@@ -85,6 +85,8 @@ def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
         ("az=0:90:2;el=0:9:3", "give one N"),
         ("el=0:200:4", "the elevation is out of range"),
         ("from=around;size_deg=3", "a light from all around has no size; leave size_deg out"),
+        ("at=0,0,1;rotate=30", "rotate is of maps (map=); leave it out"),
+        ("az=20;face=1.5", "face '1.5': give the number of one"),
         ("name=;at=0,0,1", "'': give each light a name of its own"),
         ("=40,20", "'': give each light a name"),
         ("rembrant", "no such preset; give AZ,EL, a rig file (.toml) or one of beauty, butterfly"),

@@ -7,13 +7,17 @@ import pytest
 import torch
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.studio_points import Lights
+from facerf_cli.main import main
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, in_room
 from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.relight_options import parse_background
+from tests.astronaut import PATH as PHOTO
 from tests.cli.test_relight import relight
+from tests.exr_layers import exr_layers
 
 KEY, RIM = "name=key;az=40;el=20;kelvin=3200", "name=rim;az=160;stops=-1;rgb=0.5,1,1"
 
@@ -145,3 +149,25 @@ def test_the_line_says_which_room_was_taken_and_a_stack_has_none(
     }
     np.testing.assert_array_equal(images["default"], images["none"])
     assert images["wide"].mean() > 1.2 * images["none"].mean()
+
+
+def test_each_person_of_a_group_has_lights_of_its_own(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Red on the left one, which is smaller and so composed last, green on the right one."""
+    small = read_image(PHOTO).pixels[:300, 60:400]
+    large = resized(small, 375, 425)
+    write_display(
+        tmp_path / "two.png", np.concatenate([np.pad(small, ((0, 75), (0, 0), (0, 0)), "edge"), large], 1)
+    )
+    red, green = "name=a;from=20,10;rgb=1,0,0;face=0", "name=b;from=-20,10;rgb=0,1,0;face=1"
+    line = ["--reflectance", "field", "--room", "none", "--background", "0,0,0", "--format", "exr"]
+    checkpoint = ["--checkpoint", str(given / "lambert.safetensors")]
+    photo = [*checkpoint, "relight", str(tmp_path / "two.png"), "--light", red, "--light", green, *line]
+    assert main([*photo, "--face", "all", "-o", str(tmp_path / "out")]) == 0
+    layers = exr_layers(tmp_path / "out/two_light_a+b.exr")
+    for of_red, of_green in (("R", "G"), ("a.R", "b.G")):
+        assert layers[of_red][:, :340].max() > 0.05 and layers[of_green][:, 340:].max() > 0.05
+        assert layers[of_red][:, 400:].max() == 0 == layers[of_green][:, :300].max()
+    assert main([*photo, "-o", str(tmp_path / "one")]) == 1
+    assert "a light is for face 1, and the last is 0; add --face all" in capsys.readouterr().err
