@@ -2,8 +2,10 @@
 
 import io
 import json
+import struct
 import tarfile
 import zipfile
+import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+import tifffile
 import torch
 from safetensors.torch import save
 
@@ -85,7 +88,37 @@ def images() -> Samples:
     files |= _written(lambda path: (_oiio(path), embed_xmp(path, {"Software": "x"})), "xmp.png", "xmp.jpg")
     profile = _profile()
     files |= _written(lambda path: _with_profile(path, profile), "icc.png", "icc.jpg", "icc.tif")
+    return files | _stated()
+
+
+def _stated() -> Samples:
+    """Images whose header says more than size and format."""
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\nCOLORCORR=1 2 1\nPIXASPECT=2\n"
+    head += b"PRIMARIES=.708 .292 .17 .797 .131 .046 .3127 .329\n\n+X 4 -Y 24\n"
+    files = {"runs.hdr": head + 4 * bytes([9, 8, 7, 128, 1, 1, 1, 23])}
+    files |= _written(lambda path: _oiio(path, "half", PixelAspectRatio=2.0), "wide.exr")
+    chunks = {b"gAMA": 45455, b"cHRM": 31270}
+    body = b"".join(
+        _chunk(kind, struct.pack(">I", value) * (8 if kind == b"cHRM" else 1))
+        for kind, value in chunks.items()
+    )
+    sound = _written(_oiio, "a.png")["a.png"]
+    files["primaries.png"] = sound[:33] + body + sound[33:]
+    files["codes.png"] = sound[:33] + _chunk(b"cICP", bytes([9, 14, 0, 0])) + sound[33:]
+    values = (255 * _draw().random((_HEIGHT, _WIDTH, 5))).astype(np.uint8)
+    kinds = {"separated": values, "miniswhite": values[..., :2].astype(np.uint16)}
+    for name, stored in kinds.items():
+        files |= _written(
+            lambda path, n=name, s=stored: tifffile.imwrite(
+                path, s, photometric=n, extrasamples=["assocalpha"]
+            ),  # type: ignore[misc]
+            f"{name}.tif",
+        )
     return files
+
+
+def _chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
 @cache

@@ -98,7 +98,7 @@ def _at_layer(path: Path, stream: Any, wanted: str | None) -> OpenedImage:
         specs.append(stream.spec())
     oiio_error(stream)  # that there are no more
     _require_developed(path, is_tiff and _is_raw(path, *specs))
-    layers = list(_layers(specs)) if is_exr else []
+    layers = list(_layers(specs if is_exr else specs[:1]))
     if wanted is not None:
         chosen = _named(path, layers, wanted)
     else:
@@ -182,12 +182,9 @@ def _named(path: Path, layers: Sequence[ImageLayer], wanted: str) -> ImageLayer:
 
 
 def pick_channels(spec: oiio.ImageSpec) -> tuple[list[int], int | None]:
-    """Choose the indices of colour (one for grey, else three) and alpha: R, G, B; else the first ones."""
-    lower = [name.lower() for name in spec.channelnames]
-    if all(letter in lower for letter in "rgb"):
-        return [lower.index(letter) for letter in "rgb"], lower.index("a") if "a" in lower else None
+    """Choose the first channels as colour, one for grey or three, and alpha."""
     alpha = spec.alpha_channel
-    rest = [index for index in range(len(lower)) if index != alpha]
+    rest = [index for index in range(spec.nchannels) if index != alpha]
     colour = rest[:3] if len(rest) >= 3 else rest[:1] or [0]
     return colour, alpha if alpha >= 0 and alpha not in colour else None
 

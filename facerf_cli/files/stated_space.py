@@ -24,7 +24,6 @@ from facerf_cli.image.colour import (
     REC2020,
     SRGB,
     ColourSpace,
-    encoded_space,
     find_space,
     linear_space,
     power_curve,
@@ -111,11 +110,13 @@ def _space_of_png(path: Path) -> ColourSpace | None:
     white_first = info.get("chromaticity")
     primaries = (*white_first[2:], *white_first[:2]) if white_first else REC709_CHROMATICITIES
     gamma = info.get("gamma")
-    curve = power_curve(1 / gamma) if gamma else SRGB.decode
-    found = encoded_space("PNG gAMA and cHRM", primaries, None if gamma == 1 else curve)
-    if found is None:
+    linear = linear_space(primaries)
+    if linear is None:
         log.warning("%s: impossible primaries in the header; sRGB is used", path)
-    return found
+    if linear is None or gamma == 1:
+        return linear
+    curve = power_curve(1 / gamma) if gamma else SRGB.decode
+    return ColourSpace("PNG gAMA and cHRM", linear.chromaticities, curve)
 
 
 def _by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
@@ -152,18 +153,16 @@ def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
 
 
 def _space_of_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
-    """Return the linear space of a JPEG with a gain map, with the primaries of the map, else of the image."""
-    stored = spec.getattribute("ICCProfile")
-    profile = _gain_map_profile(path) or (b"" if stored is None else bytes(stored))
-    space = space_of_profile(profile, "") or SRGB
-    return (space.chromaticities and linear_space(space.chromaticities)) or LINEAR
+    """Return the linear space of a JPEG with a gain map, with the primaries of the map, else of the image.
 
+    The gain map (ISO 21496-1) is the file's second image.
+    """
 
-def _gain_map_profile(path: Path) -> bytes:
-    """Return the ICC profile of the gain map (ISO 21496-1), the file's second image; empty without one."""
-
-    def second(image: Any) -> bytes:
+    def of_second(image: Any) -> bytes:
         image.seek(1)
         return bytes(image.info.get("icc_profile", b""))
 
-    return _by_pillow(path, second) or b""
+    stored = spec.getattribute("ICCProfile")
+    profile = _by_pillow(path, of_second) or (b"" if stored is None else bytes(stored))
+    space = space_of_profile(profile, "") or SRGB
+    return (space.chromaticities and linear_space(space.chromaticities)) or LINEAR

@@ -102,11 +102,6 @@ def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
     return np.copysign(decoded, encoded).astype(np.float32)
 
 
-def _adobe_to_linear(encoded: np.ndarray) -> np.ndarray:
-    curve = colour_science().RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding
-    return np.copysign(curve(np.abs(encoded)), encoded).astype(np.float32)
-
-
 def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Invert the transfer function of ROMM RGB (ISO 22028-2), which is ProPhoto RGB."""
     decoded = colour_science().models.cctf_decoding_ROMMRGB(np.abs(encoded))
@@ -136,7 +131,7 @@ class ColourSpace:
 LINEAR = ColourSpace("linear Rec.709", REC709_CHROMATICITIES)
 SRGB = ColourSpace("sRGB", REC709_CHROMATICITIES, srgb_to_linear)
 DISPLAY_P3 = ColourSpace("Display P3", _P3_CHROMATICITIES, srgb_to_linear)
-ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, _adobe_to_linear)
+ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, power_curve(563 / 256))
 ACESCG = ColourSpace("ACEScg", _AP1_CHROMATICITIES)
 REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
 LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
@@ -174,14 +169,6 @@ def known_space(space: ColourSpace) -> ColourSpace:
     """Return the space of a usual name that has the same primaries and curve, else the space itself."""
     alike = (known for known in _ALIASES if known.decode is space.decode)
     return next((known for known in alike if known.chromaticities == space.chromaticities), space)
-
-
-def encoded_space(name: str, chromaticities: tuple[float, ...], decode: Any) -> ColourSpace | None:
-    """Return the space of these primaries and white and a decoding curve; None if they are impossible."""
-    linear = linear_space(chromaticities)
-    if linear is None:
-        return None
-    return linear if decode is None else known_space(ColourSpace(name, linear.chromaticities, decode))
 
 
 def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
