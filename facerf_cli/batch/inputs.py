@@ -185,8 +185,8 @@ def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
         if other is not item and not apart:
             alike = "--name names them alike; give it more fields, such as {stem} and {ext}"
             by_path = (
-                f"would both be written as {item.name}; rename one, name the folder that holds both, or, of "
-                "a verb that has it, give --name, such as '{dir}/{stem}_{ext}'"
+                f"would both be written as {item.name}; rename one, name the folder that holds both, or "
+                "give --name where the verb has it, such as '{dir}/{stem}_{ext}'"
             )
             raise UsageError(f"{other.input_path} and {item.input_path}: {alike if pattern else by_path}")
 

@@ -140,7 +140,8 @@ def _extra_channel(path: Path) -> int:
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     with path.open("rb") as stream:
-        directory = ImageFileDirectory_v2(stream.read(8))
+        start = stream.read(16)
+        directory = ImageFileDirectory_v2(start if 43 in start[2:4] else start[:8])  # 43: BigTIFF
         stream.seek(directory.next)
         directory.load(stream)
         return int(directory.get(_EXTRA_SAMPLES, (0,))[0])

@@ -255,7 +255,9 @@ def test_inks_with_alpha(tmp_path: Path, bits: int, kind: str) -> None:
     inks = np.dstack([1 - light.clip(0, 0.5) / 0.5, np.full((H, W), 0.5)])
     stored = np.dstack([inks * (alpha if kind == "assocalpha" else 1), np.full((H, W), alpha)])
     values = np.round(stored * (2**bits - 1)).astype(f"uint{bits}")
-    tifffile.imwrite(tmp_path / "a.tif", values, photometric="separated", extrasamples=[kind])
+    tifffile.imwrite(
+        tmp_path / "a.tif", values, photometric="separated", extrasamples=[kind], bigtiff=bits == 16
+    )
     image = read_image(tmp_path / "a.tif")
     np.testing.assert_allclose(255 * linear_to_srgb(image.pixels), 255 * light.clip(0, 0.5), atol=2.5)
     assert image.alpha == pytest.approx(alpha, abs=0.003)
