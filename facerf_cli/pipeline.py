@@ -35,7 +35,7 @@ from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered
-from facerf_cli.portrait.person import look_at_person
+from facerf_cli.portrait.person import look_at_person, wider_square
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
 from facerf_cli.relighting.field import (
@@ -143,9 +143,12 @@ def reflectance_of(
     if photo is None or kind == "field":
         return field
     if steady and steady.portrait:
-        return PortraitField.of(models.face, head, field, own, *steady.portrait)
+        return PortraitField.of(models.face, head, field, own, steady.portrait)
     person = look_at_person(models.networks.people, models.face, photo, head.fit, matte=matte)
-    return PortraitField.of(models.face, head, field, own, person, maps_of(models.networks.portrait, person))
+    wide = wider_square(person.square, person.segmentation.matte)
+    people = [person] if wide is None else [person, person.within(wide, photo)]
+    seen = [(one, maps_of(models.networks.portrait, one)) for one in people]
+    return PortraitField.of(models.face, head, field, own, seen)
 
 
 @dataclass(frozen=True, eq=False)

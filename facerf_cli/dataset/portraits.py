@@ -10,7 +10,7 @@ normals and classes of real people: the fully lit image stands for the albedo, w
 import logging
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -164,6 +164,7 @@ def _portrait_of(networks: Networks, stack: Path) -> dict[str, Tensor]:
     header = read_olat_header(stack)
     directions, around = torch.from_numpy(header.directions).float(), rig_directions(_AROUND)
     person = person_in(networks.people, header.source)
+    person = person.within(replace(person.square, size_px=SIDE_PX), header.source)
     squared = [
         _in_square(person.square.apply(olat.permute(1, 2, 0).float().numpy())) for olat in read_olats(stack)
     ]

@@ -1,11 +1,12 @@
 """The Portrait Network: from a photo of a person to its light transport, as maps that every light shares.
 
-    OLAT_l = A (V'_l (n . l)+ + (V'_l sum_k b_k(l) P_k + sum_k b_k(l) U_k)+) + V'_l sum_j g_j lobe_j(n, t, l)
+    OLAT_l = A (V'_l (n . l)+ + (V'_l sum_k b_k(l) P_k + sum_k b_k(l) U_k)+) + V'_l G_l sum_j g_j lobe_j
 
 A is the photo without its light, gain times photo plus bias, so that detail survives. The gain starts from
 the proxy's shading under the light that explains the photo best (`portrait/proxy.py`). b_k are
 spherical harmonics of the light's direction; P and U hold light with and without the shadows of the proxy
-V_l; the lobes are highlights about normals n, and about strands t of hair. V'_l corrects those shadows:
+V_l; the lobes of l are highlights about normals n and, in hair (`HAIRY`), about strands t. G_l is 1 in hair;
+elsewhere it ends highlights where a surface turns from the light. V'_l corrects the shadows V_l:
 logit V'_l = a (2 V_l - 1) + sum_k b_k(l) W_k. All maps come from one forward pass; a light then costs a few
 products a pixel. The sum over lights is linear in their intensities.
 """
@@ -20,12 +21,15 @@ from torch import Tensor, nn
 from facerf_cli.light.sh import mirror_signs, sh_basis
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, Blocks, Classes, Side, WidthsOfFour
 from facerf_cli.network.parsing import Residual, UNet
+from facerf_cli.raster.texture import smoothstep
 
 SKIN = 1  # index of the class whose mean exposes the image
+HAIRY = (2, 6, 7)  # brows, hair and beard
 _REACH = 3  # order of the spherical harmonics that summarise the proxy's visibility
 LIT_ORDER, SHADOW_ORDER = 3, 4  # of P and U; of W
 _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
 _STRAND_SHARPNESS = 30.0
+_TURNED = 0.15  # n . l at which highlights begin to fade, and, below 0, end
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
 _NEAR_FACES = 0.1  # around the proxy, where hair and cloth may be that it lacks; so far on its layers fade
@@ -131,7 +135,7 @@ def skin_exposure(image: Tensor, classes: Tensor) -> Tensor:
 class PortraitMaps(NamedTuple):
     """Maps of B people, [B, C, S, S], the last three of half the side.
 
-    Albedo is in the units of the exposed image.
+    Albedo is in the units of the exposed image; hair is the share of what has strands.
     """
 
     gain: Tensor
@@ -140,6 +144,7 @@ class PortraitMaps(NamedTuple):
     normals: Tensor
     strands: Tensor
     gloss: Tensor
+    hair: Tensor
     trust: Tensor
     lit: Tensor
     around: Tensor
@@ -193,11 +198,12 @@ class PortraitMaps(NamedTuple):
         half = F.normalize(lights + lights.new_tensor(_VIEW), dim=-1)
         n_dot_h = torch.einsum(product, half, self.normals).clamp(1e-3, 1).log()
         t_dot_h = torch.einsum(product, half, self.strands)
-        glow = torch.exp(-0.5 * _STRAND_SHARPNESS * t_dot_h.square()) * self.gloss[:, -1:]
+        glow = torch.exp(-0.5 * _STRAND_SHARPNESS * t_dot_h.square()) * self.gloss[:, -1:] * self.hair
         for index, sharpness in enumerate(_SHARPNESS):
             lobe = torch.exp(sharpness * n_dot_h) * (sharpness / 8)
             glow = glow + lobe * self.gloss[:, index : index + 1]
-        return shading, visible * glow, visible
+        facing = smoothstep((cosine + _TURNED) / (2 * _TURNED))
+        return shading, visible * torch.maximum(facing, self.hair) * glow, visible
 
     def olats(self, lights: Tensor, visible: Tensor) -> Tensor:
         """Images [B, L, 3, S, S] under single lights of rgb 1; see `shaded`."""
@@ -266,6 +272,7 @@ def _maps(raw: dict[str, Tensor], inputs: PortraitInputs, shown: Tensor) -> Port
         normals=F.normalize(inputs.normals + raw["normals"], dim=1),
         strands=F.normalize(raw["strands"] + raw["strands"].new_tensor([0.0, 1.0, 0.0]).view(3, 1, 1), dim=1),
         gloss=0.1 * F.softplus(raw["gloss"] - 2),
+        hair=inputs.classes[:, list(HAIRY)].sum(1, keepdim=True).clamp(0, 1),
         lit=0.3 * raw["lit"],
         around=torch.cat([0.3 * raw["around"][:, :1] + 0.05, 0.3 * raw["around"][:, 1:]], 1),
         trust=4 * F.softplus(raw["trust"] + 0.5) * shown,

@@ -10,6 +10,7 @@ where p_l is the likeness of s_l and E, f a small floor, and p the mean of p_l i
 lights, weighted by their share of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum of
 lights is the sum of their corrections. Where a light makes a pixel brighter than the photo's light does, its
 likeness falls in proportion: a shadow's error, which is a large share of little light, stays as small there.
+What darkens is a factor of s_l alone, no less than 0, so that no light is negative.
 Where the photo is nearly black its colours are noise, and Q is of one value in all channels. Q is blurred by
 a pixel: enlarged to the photo's resolution its edges would be stairs.
 """
@@ -67,7 +68,9 @@ class Correction:
         brightness = self._brightness(grey)
         power = self._likeness(grey, brightness) / self.mean_likeness
         change = power.clamp(max=_LARGEST) * self.excess[:, None]
-        return (1 + change).clamp_min_(0), change * (self.floor * brightness)
+        more, less, raised = change.clamp(min=0), change.clamp(max=0), self.floor * brightness
+        factor = 1 + more + less * (1 + raised / grey.clamp_min(1e-9))
+        return factor.clamp_min_(0), more * raised
 
     def _brightness(self, grey: Tensor) -> Tensor:
         """k_l [l, 1, 1]."""

@@ -29,8 +29,11 @@ from facerf_cli.portrait.proxy import (
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
-SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network sees
+SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network is trained on
+SEEN_PX = 224  # and in which it sees a photo: face and hair come out better, ears and neck a little worse
 SIDES = 3.0  # its side in extents of the landmarks: the larger side of their bounds
+_WIDEST = 7.0  # and the largest side of the square around the whole person
+_OVERHANG = 0.03  # of a person over the square, in sides, that needs no wider one; and its margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +100,34 @@ def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
     return maps.normals[None], depth.clamp(-3, 3)[None, None], covered[None, None]
 
 
-def portrait_square(landmarks_px: np.ndarray, size_px: int = SIDE_PX) -> Crop:
+def portrait_square(landmarks_px: np.ndarray) -> Crop:
     """The square of a photo around landmarks [68, 2] in its pixels."""
     low, high = _bounds(landmarks_px)
     side_px = SIDES * float((high - low).max())
     x_px, y_px = (low + high) / 2
-    return Crop(float(x_px) - side_px / 2, float(y_px) - side_px / 2, side_px, size_px)
+    return Crop(float(x_px) - side_px / 2, float(y_px) - side_px / 2, side_px, SEEN_PX)
+
+
+def wider_square(square: Crop, matte: np.ndarray) -> Crop | None:
+    """The square that holds a person's matte [H, W], too, if a square around head and shoulders does not.
+
+    It is no larger than `_WIDEST` faces; then it lies toward where most of the person is.
+    """
+    shown = matte > 0.5
+    if not shown.any():
+        return None
+    columns, rows = (np.flatnonzero(shown.any(axis)) for axis in (0, 1))
+    start_px, end_px = np.array([square.x0_px, square.y0_px]), square.side_px
+    low = np.minimum([columns[0], rows[0]], start_px)
+    high = np.maximum([columns[-1] + 1, rows[-1] + 1], start_px + end_px)
+    beyond_px = max(float((start_px - low).max()), float((high - start_px - end_px).max()))
+    if beyond_px < _OVERHANG * square.side_px:
+        return None
+    side_px = min(float((high - low).max()) * (1 + 2 * _OVERHANG), _WIDEST / SIDES * square.side_px)
+    # as near to the middle of the person as the square of the head allows
+    least, most = start_px + square.side_px - side_px, start_px
+    x_px, y_px = np.clip((low + high) / 2 - side_px / 2, least, most)
+    return Crop(float(x_px), float(y_px), side_px, SEEN_PX)
 
 
 def _bounds(landmarks_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

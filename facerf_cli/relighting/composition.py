@@ -85,9 +85,9 @@ AS_IN_PHOTO = Target()
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """A head under one light: its texture [3, T, T], and the light around it [C, s, s] (`AroundFace`).
+    """A head under one light: its texture [3, T, T], and the light around it.
 
-    `surround` is None where the face is shown alone.
+    `surround` is [3, s, s] of a `Surround`, [views, 9, S, S] of a `WholePerson`; None of a face alone.
     """
 
     texture: Tensor
@@ -151,6 +151,7 @@ class Composition:
         shown = self.own.small if isinstance(self.own, PersonColours) else self._photo
         self._display_ev = display_ev(shown)
         self._detail = PhotoDetail(head.face, self.view)
+        self._grain = self.person.grain(self.own, self._display_ev, self.matte) if self.person else None
         self.surround = self.person or Surround(vertices, crop, head.face.texture, size_px[1])
 
     @property
@@ -180,7 +181,8 @@ class Composition:
             for points, rgb in near:
                 texture = near_texture(reflectance.field, points, self.vertices_m, side)
                 textures = textures + rgb[..., None, None] * texture
-            yield from map(Relit, reflectance.blended(textures, lit), lit.stacked)
+            stacked = torch.stack([view.stacked for view in lit], 1)
+            yield from map(Relit, reflectance.blended(textures, lit[0]), stacked)
             return
         changes = self.surround.changes if isinstance(self.surround, Surround) else None
         pairs: Iterable[tuple[Tensor, Tensor | None]]
@@ -245,7 +247,7 @@ class Composition:
                 part += self.face_share(inside)[..., None] * (detail(inside) - part)
             return person
 
-        return of
+        return self._grain.given(of) if self._grain else of
 
     def face_share(self, inside: slice) -> np.ndarray:
         """Share [h, w] of the face in rows of the view's window, without what is seen before it."""

@@ -37,6 +37,7 @@ _LIGHTS_AT_ONCE = 16
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
 _CLOTH = ("garment", "headwear")
+_DARK = 0.1  # of the mean of a person without light: what is darker has no colour of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +62,12 @@ class PortraitLight:
 class SteadyFrame:
     """A person in one frame of a shot, steadied by the frames around it, and the light held over the shot.
 
-    `portrait` is for the portrait field alone: the person as it sees them, and their maps.
+    `portrait` is for the portrait field alone: the person in each view, and their maps.
     """
 
     light: RigLight
     segmentation: Segmentation
-    portrait: tuple[SeenPerson, PortraitMaps] | None = None
+    portrait: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()
 
 
 class _Some(NamedTuple):
@@ -80,32 +81,22 @@ class _Some(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class PortraitField:
-    """The light transport of a person; a `Reflectance`, whose textures are those of the face."""
+class PortraitView:
+    """The light transport of a person as seen in one square of the photo."""
 
     person: SeenPerson
     maps: PortraitMaps  # of one person; albedo in the units of the network's input
     exposure: float  # radiance of the photo over that of the maps in the photo's light
-    field: Field
-    texels: Tensor  # [T, T, 2] of the face's texture, in the square, for grid_sample
     correction: Correction | None = None
 
     @staticmethod
-    @torch.no_grad()
-    def of(
-        model: MorphableModel,
-        head: Head,
-        field: Field,
-        own: OwnLight | None,
-        person: SeenPerson,
-        maps: PortraitMaps,
-    ) -> "PortraitField":
-        """The field of a person with its maps; `own` is the photo's estimated light."""
-        found = PortraitField(person, maps, person.exposure, field, _texels_in_square(model, head, person))
+    def of(person: SeenPerson, maps: PortraitMaps, own: OwnLight | None) -> "PortraitView":
+        """The view of a person with its maps, corrected by the photo's estimated light `own`."""
+        found = PortraitView(person, maps, person.exposure)
         return found if own is None else found._corrected(own)
 
-    def _corrected(self, own: OwnLight) -> "PortraitField":
-        """The field in the units of the photo's light, corrected to give the photo back under it."""
+    def _corrected(self, own: OwnLight) -> "PortraitView":
+        """The view in the units of the photo's light, corrected to give the photo back under it."""
         used = own.light.weights.sum(1) > 0
         directions, weights = own.light.directions[used], own.light.weights[used]
         shade, glow, _ = self._shaded(directions, self.person.visibility(directions))
@@ -172,13 +163,51 @@ class PortraitField:
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
         return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6))
 
+
+@dataclass(frozen=True, eq=False)
+class PortraitField:
+    """The light transport of a person; a `Reflectance`, whose textures are those of the face.
+
+    The first view is of head and shoulders; a second one, of all of the person, is there where it shows more.
+    """
+
+    views: tuple[PortraitView, ...]
+    field: Field
+    texels: Tensor  # [T, T, 2] of the face's texture, in the first view's square, for grid_sample
+
+    @staticmethod
+    @torch.no_grad()
+    def of(
+        model: MorphableModel,
+        head: Head,
+        field: Field,
+        own: OwnLight | None,
+        seen: Sequence[tuple[SeenPerson, PortraitMaps]],
+    ) -> "PortraitField":
+        """The field of a person `seen` in squares, with the maps of each; `own` is the photo's light."""
+        views = tuple(PortraitView.of(*one, own) for one in seen)
+        return PortraitField(views, field, _texels_in_square(model, head, seen[0][0]))
+
+    @property
+    def person(self) -> SeenPerson:
+        """The person in the square around head and shoulders."""
+        return self.views[0].person
+
+    def lit(
+        self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
+    ) -> list[PortraitLight]:
+        """The person in each view under sums of lights; see `PortraitView.lit`."""
+        return [view.lit(directions, weights, near) for view in self.views]
+
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] of the face; of a turned head the neural field's alone."""
         textures = self.field.relit(directions, weights, turn)
-        return textures if turn is not None else self.blended(textures, self.lit(directions, weights))
+        return (
+            textures if turn is not None else self.blended(textures, self.views[0].lit(directions, weights))
+        )
 
     def blended(self, textures: Tensor, lit: PortraitLight) -> Tensor:
-        """Textures [M, 3, T, T] of the neural field, mixed with the portrait's."""
+        """Textures [M, 3, T, T] of the neural field, mixed with the portrait's, lit in the first view."""
         grid = self.texels[None]
 
         def sampled(maps: Tensor) -> Tensor:
@@ -186,9 +215,10 @@ class PortraitField:
                 maps, grid.expand(len(maps), -1, -1, -1), padding_mode="border", align_corners=False
             )
 
-        texture = self.field.face.texture[None] / self.person.exposure
-        albedo = texture * sampled(self.maps.gain) + sampled(self.maps.bias)
-        own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * self.exposure
+        view = self.views[0]
+        texture = self.field.face.texture[None] / view.person.exposure
+        albedo = texture * sampled(view.maps.gain) + sampled(view.maps.bias)
+        own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * view.exposure
         return torch.lerp(textures, own, _SHARE)
 
 
@@ -204,20 +234,34 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     on_device = inputs.to(device)
     both = network(on_device).averaged(network(on_device.mirrored()).mirrored())
     maps = PortraitMaps(*(part.cpu() for part in both))
-    maps = _with_clear_cloth(maps, inputs)
+    maps = _with_own_colours(maps, inputs)
     return maps.without_colours() if is_grey(inputs.image[0]) else maps
 
 
-def _with_clear_cloth(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMaps:
-    """Limit the bias of cloth to what the photo shows there.
+def _with_own_colours(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMaps:
+    """Give the bias the colours that the photo shows, and limit it on cloth to what the photo shows there.
 
-    Cloth in deep shadow needs more, and the network allows for it: dark cloth would lie in a haze.
+    A bias of its own colour bleaches lips. Nearly black pixels, whose colours are noise, have that of their
+    class. Cloth in deep shadow needs more bias, and the network allows for it: dark cloth would lie in haze.
     """
+    own = (inputs.image * maps.gain).clamp_min(0)
+    shown = own.mean(1, keepdim=True)
+    person = 1 - inputs.classes[:, :1]
+    dark = (
+        _DARK
+        * (shown * person).mean((2, 3), keepdim=True)
+        / person.mean((2, 3), keepdim=True).clamp_min(1e-6)
+    )
+    of_classes = torch.einsum("bkij,bcij->bkc", inputs.classes, own)
+    of_classes = of_classes / of_classes.mean(2, keepdim=True).clamp_min(1e-9)
+    typical = torch.einsum("bkij,bkc->bcij", inputs.classes, of_classes)
+    colour = torch.lerp(
+        typical, own / shown.clamp_min(1e-9), shown**2 / (shown**2 + dark**2).clamp_min(1e-12)
+    )
+    amount = maps.bias.mean(1, keepdim=True)
     cloth = inputs.classes[:, [class_index(name) for name in _CLOTH]].sum(1, keepdim=True)
-    own = inputs.image * maps.gain
-    least = torch.minimum(maps.bias, own.mean(1, keepdim=True).clamp_min(0))
-    bias = torch.lerp(maps.bias, least, cloth)
-    return maps._replace(bias=bias, albedo=own + bias)
+    bias = colour * torch.lerp(amount, torch.minimum(amount, shown), cloth)
+    return maps._replace(bias=bias, albedo=inputs.image * maps.gain + bias)
 
 
 def _texels_in_square(model: MorphableModel, head: Head, person: SeenPerson) -> Tensor:

@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_batch, fit_landmarks, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
@@ -28,7 +28,7 @@ from facerf_cli.network.portrait import PortraitMaps
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, LandmarksFrom, choose_face, detect_faces, face_near
 from facerf_cli.portrait.parse import uncovered_in
-from facerf_cli.portrait.person import SeenPerson, look_at_person
+from facerf_cli.portrait.person import SeenPerson, look_at_person, portrait_square, wider_square
 from facerf_cli.portrait.segment import (
     Segmentation,
     parsed,
@@ -304,8 +304,10 @@ class ShotView:
         self._classes = lru_cache(_KEPT)(self._look)
         self.head: Callable[[int], Head] = lru_cache(_KEPT)(self._seen_head)  # without what covers its skin
         self.segmentation: Callable[[int], Segmentation] = lru_cache(_KEPT)(self._segmentation)
-        self._person = lru_cache(_KEPT)(self._seen_person)
-        self._maps = lru_cache(_KEPT)(lambda frame: maps_of(models.networks.portrait, self._person(frame)))
+        self._people = lru_cache(_KEPT)(self._seen_people)
+        self._maps = lru_cache(_KEPT)(
+            lambda frame: [maps_of(models.networks.portrait, person) for person in self._people(frame)]
+        )
 
     def _seen_head(self, frame: int) -> Head:
         model, fit, photo = self._models.face, self._fit(frame), self._read(frame)
@@ -320,8 +322,8 @@ class ShotView:
 
     def steady(self, frame: int, portrait: bool = True) -> SteadyFrame:
         """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
-        maps = (self._person(frame), self._steady_maps(frame)) if portrait else None
-        return SteadyFrame(self.light, self.segmentation(frame), maps)
+        views = tuple(zip(self._people(frame), self._steady_maps(frame), strict=True)) if portrait else ()
+        return SteadyFrame(self.light, self.segmentation(frame), views)
 
     @cached_property
     def light(self) -> RigLight:
@@ -391,33 +393,59 @@ class ShotView:
             return within_matte(mean, self._given(frame))
         return segmentation_of(mean, self._display(frame), self.landmarks_px(frame))
 
-    def _seen_person(self, frame: int) -> SeenPerson:
+    @cached_property
+    def _wide(self) -> tuple[float, float, float] | None:
+        """Place and side of the wider square in the middle of the shot, in sides of the head's square."""
+        frame = self.middle_first[0]
+        fit = self._fit(frame)
+        head = portrait_square(fit.crop.to_photo(fit.landmarks_px.numpy()))
+        wide = wider_square(head, self.segmentation(frame).matte)
+        if wide is None:
+            return None
+        offsets = wide.x0_px - head.x0_px, wide.y0_px - head.y0_px
+        return offsets[0] / head.side_px, offsets[1] / head.side_px, wide.side_px / head.side_px
+
+    def _seen_people(self, frame: int) -> list[SeenPerson]:
+        """The person of a frame around the head and, if it needs it, in a wider one that follows the head."""
         fit, segmentation = self._fit(frame), self.segmentation(frame)
         people, model, photo = self._models.networks.people, self._models.face, self._read(frame)
-        return look_at_person(people, model, photo, fit, segmentation=segmentation)
+        person = look_at_person(people, model, photo, fit, segmentation=segmentation)
+        if self._wide is None:
+            return [person]
+        x, y, side = (part * person.square.side_px for part in self._wide)
+        head = person.square
+        return [person, person.within(Crop(head.x0_px + x, head.y0_px + y, side, head.size_px), photo)]
 
-    def _steady_maps(self, frame: int) -> PortraitMaps:
-        """Maps of a frame, averaged with its neighbours' in the square, which follows the head."""
+    def _steady_maps(self, frame: int) -> list[PortraitMaps]:
+        """Maps of a frame, averaged with its neighbours' in the squares, which follow the head."""
         around = self._around(frame)
+        people, maps = [self._people(one) for one in around], [self._maps(one) for one in around]
         middle = around.index(frame)
-        maps = [self._maps(one) for one in around]
-        images = [_encoded(self._person(one)) for one in around]
-        halves = [F.avg_pool2d(image[None], 2)[0] for image in images]
+        return [
+            _steadied_maps([frames[view] for frames in maps], [frames[view] for frames in people], middle)
+            for view in range(len(people[0]))
+        ]
 
-        def mean(name: str) -> Tensor:
-            layers = [getattr(one, name)[0] for one in maps]
-            if name == "gain":
-                layers = [layer.log() for layer in layers]
-            seen = images if layers[0].shape[-1] == images[0].shape[-1] else halves
-            found = steadied(layers, seen, middle)
-            if name in _UNIT:
-                found = F.normalize(found, dim=0)
-            return (found.exp() if name == "gain" else found)[None]
 
-        means = {name: mean(name) for name in PortraitMaps._fields if name != "albedo"}
-        person = self._person(frame)
-        albedo = person.image[None] / person.exposure * means["gain"] + means["bias"]
-        return PortraitMaps(albedo=albedo, **means)
+def _steadied_maps(maps: Sequence[PortraitMaps], people: Sequence[SeenPerson], middle: int) -> PortraitMaps:
+    """Maps of the middle one of some frames, averaged with the others'."""
+    images = [_encoded(person) for person in people]
+    halves = [F.avg_pool2d(image[None], 2)[0] for image in images]
+
+    def mean(name: str) -> Tensor:
+        layers = [getattr(one, name)[0] for one in maps]
+        if name == "gain":
+            layers = [layer.log() for layer in layers]
+        seen = images if layers[0].shape[-1] == images[0].shape[-1] else halves
+        found = steadied(layers, seen, middle)
+        if name in _UNIT:
+            found = F.normalize(found, dim=0)
+        return (found.exp() if name == "gain" else found)[None]
+
+    means = {name: mean(name) for name in PortraitMaps._fields if name != "albedo"}
+    person = people[middle]
+    albedo = person.image[None] / person.exposure * means["gain"] + means["bias"]
+    return PortraitMaps(albedo=albedo, **means)
 
 
 def _encoded(person: SeenPerson) -> Tensor:

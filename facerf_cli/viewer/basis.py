@@ -28,7 +28,7 @@ from facerf_cli.pipeline import Person
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.portrait_field import PortraitField, PortraitView
 
 RATIO_PX = 320  # the longer side of a ratio
 MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept
@@ -160,12 +160,14 @@ def basis_of_photo(
     rig = rig_directions()
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []
+    view = field.views[0]
 
     def add(relit: Relit) -> None:
         assert relit.surround is not None
         images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
-        part = field.maps.albedo[0] * relit.surround[:3] + relit.surround[3:6]
-        coarse.append((part * field.exposure).permute(1, 2, 0).numpy().astype(np.float16))
+        shading, highlights, _ = relit.surround[0].chunk(3)
+        part = (view.maps.albedo[0] * shading + highlights) * view.exposure
+        coarse.append(part.permute(1, 2, 0).numpy().astype(np.float16))
 
     mean: Relit | None = None
     for relit in _single(composition, rig):
@@ -188,10 +190,15 @@ def _single(composition: Composition, lights: Tensor) -> Iterator[Relit]:
 
 def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) -> PortraitField:
     """The same field for the photo at a smaller size."""
-    person = field.person
-    segmentation = replace(person.segmentation, matte=resized(person.segmentation.matte, height, width))
-    square = person.square.of_scaled(width / photo.shape[1])
-    return replace(field, person=replace(person, square=square, segmentation=segmentation))
+    segmentation = field.person.segmentation
+    segmentation = replace(segmentation, matte=resized(segmentation.matte, height, width))
+    scale = width / photo.shape[1]
+
+    def shrunk(view: PortraitView) -> PortraitView:
+        square = view.person.square.of_scaled(scale)
+        return replace(view, person=replace(view.person, square=square, segmentation=segmentation))
+
+    return replace(field, views=tuple(map(shrunk, field.views)))
 
 
 def basis_of_stack(

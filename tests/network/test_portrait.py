@@ -51,6 +51,7 @@ def plain_maps() -> PortraitMaps:
         normals=up,
         strands=torch.tensor([0.0, 1, 0]).view(1, 3, 1, 1).expand_as(up),
         gloss=zeros,
+        hair=zeros[:, :1],
         trust=zeros[:, :1] + 50,
         lit=few,
         around=few,
@@ -142,7 +143,7 @@ def test_near_lights_have_a_direction_for_each_pixel() -> None:
 def test_strands_shine_across_themselves() -> None:
     gloss = torch.zeros(1, 3, SIDE, SIDE)
     gloss[:, 2] = 0.1
-    maps = plain_maps()._replace(gloss=gloss)  # the strands are upright
+    maps = plain_maps()._replace(gloss=gloss, hair=1 + gloss[:, :1])  # the strands are upright
     aside, above = (
         maps.shaded(one_light(*at), lit_everywhere())[1].mean() for at in ((60.0, 0.0), (0.0, 60.0))
     )
@@ -253,3 +254,12 @@ def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
     for wrong in ({"widths": [8]}, {"side": 33}, {"classes": 1}, {"blocks": [0, 1, 99]}):
         with pytest.raises(ValueError, match=r"[Ss]ettings"):
             PortraitNetwork.from_metadata(network.as_metadata() | wrong)
+
+
+def test_what_is_turned_away_does_not_shine_but_hair_does() -> None:
+    gloss = torch.full((1, 3, SIDE, SIDE), 0.1)
+    skin, hair = (plain_maps()._replace(gloss=gloss, hair=share + 0 * gloss[:, :1]) for share in (0, 1))
+    behind, ahead = one_light(170, 0), one_light(10, 0)
+    assert skin.shaded(behind, lit_everywhere())[1].max() == 0
+    assert hair.shaded(behind, lit_everywhere())[1].min() > 0.05
+    assert skin.shaded(ahead, lit_everywhere())[1].min() > 0

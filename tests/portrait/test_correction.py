@@ -42,7 +42,8 @@ def test_the_photos_light_gives_the_photo_back() -> None:
     found = torch.einsum("lc,lcij->cij", WEIGHTS, corrected(correction))
     away = torch.ones(SIDE, SIDE, dtype=torch.bool)
     away[15:35, 15:45], away[25, 25:35] = False, True  # of the mark's edges, which are blurred
-    torch.testing.assert_close(found[:, away], photo[:, away], rtol=2e-3, atol=1e-4)
+    # No image is made darker than black, so where the third light is nearly black a little is missing.
+    torch.testing.assert_close(found[:, away], photo[:, away], rtol=1e-2, atol=1e-4)
     plain = torch.einsum("lc,lcij->cij", WEIGHTS, olats())
     assert (plain - photo).abs().max() > 0.1
 

@@ -35,6 +35,7 @@ def perfect() -> PortraitMaps:
         normals=whole(NORMAL),
         strands=whole(NORMAL),
         gloss=whole(0),
+        hair=whole(0, 1),
         trust=whole(60, 1),
         lit=few,
         around=few,

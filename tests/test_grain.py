@@ -1,0 +1,49 @@
+"""What of the photo's detail a relit image keeps."""
+
+import numpy as np
+
+from facerf_cli.image.strips import whole
+from facerf_cli.relighting.grain import Grain
+
+SIDE, MAP_PX = 96, 4.0
+random = np.random.default_rng(0)
+PORES = np.exp(0.02 * random.standard_normal((SIDE, SIDE))).astype(np.float32)
+SMOOTH = np.linspace(0.2, 1, SIDE, dtype=np.float32)[None, :, None].repeat(SIDE, 0).repeat(3, 2)
+ALL = np.ones((SIDE, SIDE), np.float32)
+
+
+def given(relit: np.ndarray, guided: np.ndarray, coarse: np.ndarray, share: np.ndarray = ALL) -> np.ndarray:
+    flat = np.stack([guided, coarse], -1)
+    return whole(Grain(flat.__getitem__, share, MAP_PX).given(relit.__getitem__), SIDE, SIDE)
+
+
+def test_a_smooth_image_gets_the_photos_pores() -> None:
+    found = given(SMOOTH, ALL, PORES)[8:-8, 8:-8] / SMOOTH[8:-8, 8:-8]
+    wanted = np.log(PORES[8:-8, 8:-8]).std()
+    assert 0.85 * wanted < np.log(found).std() < 1.05 * wanted
+    assert np.corrcoef(np.log(found[..., 0]).ravel(), np.log(PORES[8:-8, 8:-8]).ravel())[0, 1] > 0.95
+
+
+def test_edges_of_the_photos_light_are_not_its_detail() -> None:
+    shadow = np.where(np.arange(SIDE) < SIDE // 2, 0.3, 1).astype(np.float32)[None].repeat(SIDE, 0)
+    found = given(SMOOTH, ALL, shadow)
+    assert np.abs(found / SMOOTH - 1).max() < 0.1
+
+
+def test_hair_and_what_is_nearly_black_stay_as_they_are() -> None:
+    half = ALL.copy()
+    half[:, : SIDE // 2] = 0
+    assert np.array_equal(given(SMOOTH, ALL, PORES, half)[:, : SIDE // 2], SMOOTH[:, : SIDE // 2])
+    dark = np.where(half > 0, 1, 0.001).astype(np.float32)
+    left = slice(0, SIDE // 2 - 8)
+    assert np.array_equal(given(SMOOTH, dark, dark * PORES)[:, left], SMOOTH[:, left])
+
+
+def test_images_add_up_and_strips_show_no_borders() -> None:
+    other = np.ascontiguousarray(SMOOTH[:, ::-1])
+    grain = Grain(np.stack([ALL, PORES], -1).__getitem__, ALL, MAP_PX)
+    both, one, two = (grain.given(image.__getitem__) for image in (SMOOTH + other, SMOOTH, other))
+    rows = slice(0, SIDE)
+    np.testing.assert_allclose(both(rows), one(rows) + two(rows), rtol=1e-5)
+    parts = np.concatenate([both(slice(0, 37)), both(slice(37, SIDE))])
+    np.testing.assert_allclose(parts, both(rows), rtol=1e-5)
