@@ -32,7 +32,7 @@ _INTEGERS = (oiio.TypeDesc(oiio.UINT8), oiio.TypeDesc(oiio.UINT16))
 _UNSUPPORTED = re.compile(
     r"unsupported|not (supported|configured|implemented|available)|unknown compression", re.I
 )
-_WHITE_IS_ZERO, _SEPARATED = 0, 5  # a TIFF's photometric interpretations
+_WHITE_IS_ZERO, _SEPARATED, _CIELAB = 0, 5, 8  # a TIFF's photometric interpretations
 _EXTRA_SAMPLES, _ASSOCIATED, _UNASSOCIATED = 338, 1, 2  # a TIFF's tag, and its values
 _INKS = 4  # cyan, magenta, yellow, black
 
@@ -88,12 +88,13 @@ def _decode_by_oiio(
     stream, spec, layer = opened.stream, opened.spec, opened.layer
     if stream.format_name() == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5:
         raise InputError(f"{path}: a DPX file that lies on its side is not read; save it upright")
+    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
+    if colours == _CIELAB:
+        raise InputError(f"{path}: a TIFF in CIELAB is not read; save it in RGB")
     if opened.choice:
         log.info("%s: %s", path, opened.choice)
-    # The alpha of an Ultra HDR JPEG is opaque, and OpenImageIO's own.
-    alpha = layer.alpha if with_alpha and not is_ultra_hdr(path, spec) else None
+    alpha = layer.alpha if with_alpha and opened.has_alpha and not is_ultra_hdr(path, spec) else None
     used = layer.colour if alpha is None else [*layer.colour, alpha]
-    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
     has_inks = colours == _SEPARATED and spec.nchannels > _INKS
     first, past = (0, spec.nchannels) if has_inks else (min(used), max(used) + 1)
     kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)

@@ -25,6 +25,7 @@ _RAW_SUFFIXES = frozenset(_RAW.split())
 _HAVE_WINDOWS = ("openexr", "rla")
 # Formats whose colour is multiplied by alpha, unless the header says otherwise.
 _ASSOCIATED = ("openexr", "tiff", "targa", "rla", "iff", "dpx", "softimage")
+_TGA_ASSOCIATED = 4
 _LETTERS = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
 # Words in a layer's name: of the image itself, and of what else is rendered.
 _IMAGE = "combined beauty rgba rgb image color colour composite final"
@@ -37,7 +38,7 @@ _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _MOST_NAMED = 8
 _THUMBNAIL = 1  # bit of a TIFF's NewSubfileType
 _RAW_COLOURS = (32803, 34892)  # a TIFF's photometric interpretations of a colour filter array, of linear raw
-_SAME_ASPECT, _MOST_ASPECT = 0.01, 8.0
+_SAME_ASPECT, _MOST_ASPECT = 0.03, 8.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,12 @@ class OpenedImage:
         """True if the colour is multiplied by alpha."""
         stated = self.spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
         return self.stream.format_name() in _ASSOCIATED and not stated
+
+    @property
+    def has_alpha(self) -> bool:
+        """False for the fourth channel of a TGA that says of none that it is alpha."""
+        is_known = self.spec.get_int_attribute("targa:alpha_type", 0) == _TGA_ASSOCIATED
+        return self.stream.format_name() != "targa" or is_known or not self.is_associated
 
 
 def open_image(path: Path, layer: str | None = None) -> OpenedImage:

@@ -145,7 +145,7 @@ def _space_of_icc(path: Path, profile: bytes, description: str, default: ColourS
 
 
 def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
-    """Return whether a file is a JPEG with a gain map, which OpenImageIO applies: its values are linear."""
+    """Return whether a file is a JPEG with a gain map, which OpenImageIO applies: linear, with alpha of 1."""
     if not is_floating(spec):
         return False
     with path.open("rb") as stream:

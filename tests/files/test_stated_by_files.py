@@ -151,6 +151,17 @@ def test_alpha_of_zero_everywhere_is_no_alpha(tmp_path: Path, suffix: str) -> No
     np.testing.assert_allclose(image.pixels, LINEAR, atol=1e-4)
 
 
+@pytest.mark.parametrize(("bits", "alpha"), [(0, None), (8, 99 / 255)])
+def test_the_fourth_channel_of_a_tga(tmp_path: Path, bits: int, alpha: float | None) -> None:
+    """It is alpha where the descriptor counts its bits."""
+    head = struct.pack("<BBB9xHHBB", 0, 0, 2, W, H, 32, 0x20 | bits)
+    values = np.dstack([QUADS[..., ::-1], np.full((H, W), 99, np.uint8)])
+    (tmp_path / "a.tga").write_bytes(head + values.tobytes())
+    image = read_image(tmp_path / "a.tga")
+    np.testing.assert_allclose(image.pixels, LINEAR, atol=1e-6)
+    assert image.alpha is None if alpha is None else image.alpha == pytest.approx(alpha)
+
+
 def test_the_alpha_of_a_map_is_no_light(tmp_path: Path) -> None:
     values = np.full((8, 16, 4), 0.3, np.float32)
     values[..., 3] = np.linspace(0, 1, 16)
@@ -377,6 +388,13 @@ def test_a_raw_file_is_never_read_as_its_thumbnail(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"a raw file of a camera.* is not read; develop it to EXR"):
             read_image(path)
         assert read_header(path) is None
+
+
+def test_cielab_is_refused(tmp_path: Path) -> None:
+    """OpenImageIO turns it into RGB with a cast."""
+    tifffile.imwrite(tmp_path / "a.tif", QUADS, photometric="cielab")
+    with pytest.raises(InputError, match="in CIELAB is not read; save it in RGB"):
+        read_image(tmp_path / "a.tif")
 
 
 @pytest.mark.parametrize("compression", [50000, 34925, 50002])
