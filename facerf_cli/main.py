@@ -11,6 +11,7 @@ import io
 import logging
 import math
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -80,6 +81,7 @@ SEVERAL = {"--envmap": (".exr", ".hdr")}
 _SPINS = (
     "20000"  # turns of a waiting thread of torch's before it sleeps; with more, other programs wait for it
 )
+_AMERICAN = re.compile(r"^(--(?:in|out)put-)colorspace(?=$|=)")
 _LONGEST_PATH = 4096  # bytes, of Linux
 _MOST_SEED = 2**63 - 1  # torch's
 _PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
@@ -240,7 +242,8 @@ def main(arguments: Sequence[str]) -> int:
     configure_logging()
     try:
         _check_surroundings()
-        line = repeat_options(global_options_first(arguments or ["--help"]))
+        spelt = [_AMERICAN.sub(r"\1colourspace", argument) for argument in arguments]
+        line = repeat_options(global_options_first(spelt or ["--help"]))
         try:
             code = app(args=line, prog_name="facerf", standalone_mode=False)
         finally:

@@ -332,3 +332,9 @@ def test_one_broken_pixel_sets_no_mean_and_ordinary_photos_stay() -> None:
     assert limited.dtype == np.float32 and abs(limited.mean() / photo.mean() - 1) < 0.01
     assert (limited == broken)[broken < 1].all()
     assert (ours.without_fireflies(photo * 1000) == photo * 1000).all()  # in other units
+
+
+def test_a_view_is_named_by_its_beginning() -> None:
+    assert ours.named_view("un-tone").name == "Un-tone-mapped"
+    with pytest.raises(UsageError, match="unknown view 'Z'"):
+        ours.named_view("Z")

@@ -66,6 +66,11 @@ class NamePattern:
             raise UsageError(f"{option} {text!r}: give a path inside the output folder")
         return NamePattern(tuple(found))
 
+    @staticmethod
+    def literal(name: str) -> "NamePattern":
+        """A pattern of one name, without fields."""
+        return NamePattern(((name, None, ""),))
+
     def filled(self, values: dict[str, str]) -> str:
         """Fill the fields in; an empty one takes the separator before it along."""
         result = ""

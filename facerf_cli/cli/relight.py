@@ -11,7 +11,7 @@ from facerf_cli.batch.run import BatchOptions, Outcome
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.option import Without
 from facerf_cli.work.light_setups import LightSources
-from facerf_cli.work.output_options import NEEDS, STDOUT
+from facerf_cli.work.output_options import NEEDS, STDOUT, format_of_file
 from facerf_cli.work.relight_options import Relight
 from facerf_cli.work.shots import ShotOptions, film_output
 
@@ -35,8 +35,9 @@ def relight(
         typer.Option(
             "--output",
             "-o",
-            metavar="DIR|FILE.mp4",
-            help="Write the results to this folder, or one film as .mp4 (H.264) or .mov (ProRes).",
+            metavar="DIR|FILE",
+            help="Write the results to this folder; one image to this file (.exr, .png, .jpg, .tif); or one "
+            "film as .mp4 (H.264) or .mov (ProRes).",
             show_default=False,
         ),
     ],
@@ -56,8 +57,13 @@ def relight(
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
     --light takes the nearest of them.
     """
-    film, formats = film_output(output, work.fps), work.output.formats
-    if film is not None:
+    file, formats = format_of_file(output), work.output.formats
+    film = None if file else film_output(output, work.fps)
+    if file is not None:
+        formats = (file,) if is_default(context, "formats") else formats
+        refuse_given(context, ("ball", "name", "fps"), f"is not for -o {output}, one image; leave it out")
+        work, output = work.into_file(output, file, formats), output.parent
+    elif film is not None:
         refuse_given(context, ("formats", "ball", "name"), f"is not for -o {output}; leave it out")
         formats, output = film.formats, film.folder
     elif output == STDOUT:

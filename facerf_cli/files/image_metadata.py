@@ -6,6 +6,7 @@ source type.
 
 import logging
 import os
+import re
 import shutil
 import struct
 import zlib
@@ -39,6 +40,11 @@ _XMP_NAMESPACES = {
 # Attributes that XMP calls by another name.
 _XMP_PROPERTIES = {"IPTC:DigitalSourceType": "Iptc4xmpExt:DigitalSourceType", "Software": "xmp:CreatorTool"}
 
+_OF_PLATE = re.compile(
+    r"smpte:TimeCode|FramesPerSecond|DateTime|Make|Model|ExposureTime|FNumber|reelName|Exif:(?!GPS|.*Note)\w+"
+    r"|(camera|lens)\w*|(nominal|effective|entrancePupil|pinhole)\w*|focus|aperture|expTime|isoSpeed|shutterAngle"
+)
+_TUPLES = {"smpte:TimeCode": "timecode", "FramesPerSecond": "rational"}
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -94,6 +100,19 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
                 attributes[entry.name] = entry.value
     attributes.pop("Orientation", None)  # `read_image` turns the image upright
     return attributes
+
+
+def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Select metadata of a photo that its results keep: how it was made, not where."""
+    return {name: value for name, value in metadata.items() if _OF_PLATE.fullmatch(name)}
+
+
+def set_attribute(spec: oiio.ImageSpec, name: str, value: Any) -> None:
+    """Set an attribute of an image; a tuple has the type of its name."""
+    if isinstance(value, tuple):
+        spec.attribute(name, oiio.TypeDesc(_TUPLES.get(name, "rational")), value)
+    else:
+        spec.attribute(name, value)
 
 
 def require_whole_png(path: Path) -> None:

@@ -18,7 +18,7 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode, full_frame, upright
 from facerf_cli.files.icc import linear_profile
-from facerf_cli.files.image_metadata import Attributes, embed_xmp, metadata_of
+from facerf_cli.files.image_metadata import Attributes, embed_xmp, metadata_of, set_attribute
 from facerf_cli.files.image_parts import is_floating, oiio_error, shown_size, utf8_path
 from facerf_cli.files.stated_space import OCIO_SPACE, default_space, stated_space
 from facerf_cli.image.colour import (
@@ -162,13 +162,14 @@ def write_exr(
     metadata: Attributes | None = None,
     space: ColourSpace = LINEAR,
     compression: str = "zip",
+    single: bool = False,
 ) -> int:
     """Write linear Rec.709 [H, W, 3] in half floats in a colour space; return how many were out of range.
 
     The colour must not be premultiplied; it is written multiplied by alpha [H, W], as EXR requires. `layers`
     are [H, W] or [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z, depth.Z and uv.U/V in float, others as R,
-    G, B in half. Each name before the dot is a part. Values beyond the range of half floats (65504) are
-    clamped with a warning.
+    G, B in half. Each name before the dot is a part, or with `single` all are channels of one. Values beyond
+    the range of half floats (65504) are clamped with a warning.
     """
     parts, specs = [_exr_image(pixels, alpha, space), *_exr_layers(layers or {}, space)], []
     for part in parts:
@@ -178,9 +179,10 @@ def write_exr(
         if len(parts) > 1:
             spec.attribute("name", part.name)
         spec.attribute("compression", compression)
-        spec.attribute("oiio:ColorSpace", _OIIO_NAMES.get(space, space.name))
+        spec.attribute("oiio:ColorSpace", "data" if part.is_data else _OIIO_NAMES.get(space, space.name))
         if space.chromaticities is None:  # its name may be unknown to OpenImageIO, which then leaves it out
-            spec.attribute(OCIO_SPACE, space.name)
+            if not part.is_data:
+                spec.attribute(OCIO_SPACE, space.name)
         else:  # the same in all parts, as OpenEXR requires
             spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
         specs.append(spec)
@@ -194,9 +196,27 @@ def write_exr(
         beyond.append(count)
         return data
 
-    write_parts(path, specs, [partial(band, part) for part in parts], metadata)
+    bands: list[Band] = [partial(band, part) for part in parts]
+    if single:
+        specs, bands = [_one_spec(specs)], [_one_band(bands)]
+    write_parts(path, specs, bands, metadata)
     warn_of_clamped(path, sum(beyond))
     return sum(beyond)
+
+
+def _one_spec(specs: Sequence[oiio.ImageSpec]) -> oiio.ImageSpec:
+    """The specification of one part with the channels of all, each in its own number format."""
+    one = oiio.ImageSpec(specs[0])
+    one.nchannels = sum(spec.nchannels for spec in specs)
+    one.channelnames = tuple(name for spec in specs for name in spec.channelnames)
+    one.channelformats = tuple(spec.format for spec in specs for _ in range(spec.nchannels))
+    one.format = oiio.TypeDesc(oiio.FLOAT)
+    one.erase_attribute("name")
+    return one
+
+
+def _one_band(bands: Sequence[Band]) -> Band:
+    return lambda rows: np.dstack([band(rows).astype(np.float32, copy=False) for band in bands])
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +231,7 @@ class _ExrPart:
     channels: list[str]
     of: list[Band]
     alpha_channel: int = -1
+    is_data: bool = False  # no colours: it has no colour space
 
 
 def _exr_image(pixels: np.ndarray, alpha: np.ndarray | None, space: ColourSpace) -> _ExrPart:
@@ -232,10 +253,11 @@ def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterato
     for layer, values in layers.items():
         letters, kind = _LAYER_CHANNELS.get(layer, ("RGB", "half"))
         name = layer.split(".")[0]
-        group = grouped.setdefault(name, _ExrPart(name, kind, [], []))
         single = len(values.shape) == 2
+        is_data = single or letters != "RGB"
+        group = grouped.setdefault(name, _ExrPart(name, kind, [], [], is_data=is_data))
         group.channels.extend([layer] if single else [f"{layer}.{x}" for x in letters[: values.shape[-1]]])
-        group.of.append(_in_space(values, None if single or letters != "RGB" else space))
+        group.of.append(_in_space(values, None if is_data else space))
     yield from grouped.values()
 
 
@@ -348,7 +370,7 @@ def write_parts(
     A band gives rows [h, W, C] of its part; they are written in strips as they come.
     """
     for name, value in (metadata or {}).items():
-        specs[0].attribute(name, value)
+        set_attribute(specs[0], name, value)
     with atomic_path(path) as temporary:
         stream = oiio.ImageOutput.create(utf8_path(temporary))
         if stream is None:

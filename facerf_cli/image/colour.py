@@ -414,10 +414,11 @@ def named_view(name: str, config: str = "", display: str = "") -> View:
 
 
 def _spelt(name: str, known: Sequence[str], what: str, more: Sequence[str] = ()) -> str:
-    """A name as OpenColorIO spells it."""
-    for spelt in known:
-        if spelt.casefold() == name.casefold():
-            return spelt
+    """A name, or the beginning of one alone, as OpenColorIO spells it."""
+    for alike in (str.__eq__, str.startswith):
+        found = [spelt for spelt in known if alike(spelt.casefold(), name.casefold())]
+        if len(found) == 1:
+            return found[0]
     raise UsageError(f"unknown {what} '{name}' (known: {', '.join([*more, *known])})")
 
 

@@ -4,6 +4,7 @@ The photo is searched as a whole, then in parts and turned (`mesh.py`). The Pars
 face that is found.
 """
 
+import logging
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,9 @@ from facerf_cli.portrait.mesh import (
     unsteadiness,
 )
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
+from facerf_cli.run.logs import LOGGER_NAME
 
+log = logging.getLogger(LOGGER_NAME)
 LandmarksFrom = Literal["facerf", "dlib"]
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
@@ -81,6 +84,10 @@ def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
     if which == "all":
         return faces
     if which == "largest":
+        if len(faces) > 1:
+            log.info(
+                "%s: %d faces are found, the largest is taken (--face all or an index)", name, len(faces)
+            )
         return [max(faces, key=lambda face: face.area_px * face.score)]
     if not which.isdecimal():
         raise UsageError(f"--face {which}: not a choice; give largest, all or a number from 0")

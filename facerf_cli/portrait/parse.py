@@ -129,7 +129,7 @@ class SquareView:
 
     @property
     def classes(self) -> Tensor:
-        """Shares [C, S, S] of the classes, which sum to 1: the mean of all looks; made anew each time."""
+        """Shares [C, S, S] of the classes, which sum to 1: the mean of all looks; computed each time."""
         return self.logits.softmax(1).mean(0)
 
     @property

@@ -1,6 +1,7 @@
 """The lights of setups: maps read, drawn or estimated from a photo, and single lights; and their balls."""
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
@@ -137,6 +138,13 @@ def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampli
         nearest = (towards @ directions.T).argmax(1)
         weights[row].index_add_(0, nearest, rgb)
     return Lights(directions, weights)
+
+
+def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
+    """The largest angle between a single far light and the nearest of a stack's own [L, 3], in degrees."""
+    far = [light for setup in setups for light in setup.lights if light.azel_deg is not None]
+    cosines = [float((far_samples(light)[0] @ directions.T).amax(1).min()) for light in far]
+    return math.degrees(math.acos(min(1.0, *cosines))) if cosines else 0.0
 
 
 def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor]]:

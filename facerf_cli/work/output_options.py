@@ -1,10 +1,11 @@
 """Options of written images: formats, colours, compression; and one image on standard output."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers
 from facerf_cli.option import IMAGE, option
@@ -12,6 +13,9 @@ from facerf_cli.option import IMAGE, option
 Format = Literal["exr", "png", "png16", "tiff", "jpg"]
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
 SUFFIXES: dict[Format, str] = {"exr": ".exr", "png": ".png", "png16": ".png", "tiff": ".tif", "jpg": ".jpg"}
+_ALIASES = {"jpeg": "jpg", "tif": "tiff"}
+_FILES: dict[str, Format] = {".exr": "exr", ".png": "png", ".tif": "tiff", ".tiff": "tiff", ".jpg": "jpg"}
+_FILES |= {".jpeg": "jpg"}
 _MOST_EV = 20.0
 Exposure = float | Literal["auto", "face"]  # EV, or the rule that chooses it
 STDOUT = Path("-")
@@ -20,15 +24,22 @@ _DISPLAYED: tuple[Format, ...] = ("png", "png16", "jpg")
 NEEDS: dict[str, tuple[Format, ...]] = {
     "aov": ("exr",),
     "compression": ("exr",),
+    "exr": ("exr",),
     "output_colourspace": ("exr", "tiff"),
     "view": _DISPLAYED,
     "display": _DISPLAYED,
 }
 
 
+def format_of_file(output: Path) -> Format | None:
+    """The format of the one image that `-o` names; None for a folder, or for another file."""
+    return None if output.is_dir() else _FILES.get(output.suffix.lower())
+
+
 def parse_formats(text: str) -> tuple[Format, ...]:
     """Parse `--format`; raises UsageError for an unknown format, or two with the same file name."""
-    names = dict.fromkeys(name.strip() for name in text.split(",") if name.strip())
+    given = filter(None, map(str.strip, text.split(",")))
+    names = dict.fromkeys(_ALIASES.get(name, name) for name in given)
     formats = tuple(name for name in SUFFIXES if name in names)
     if unknown := [name for name in names if name not in SUFFIXES]:
         raise UsageError(f"--format {unknown[0]!r}: no such format; give some of {', '.join(SUFFIXES)}")
@@ -57,6 +68,7 @@ class OutputOptions:
         formats: Write each image as exr (half floats, layers), tiff (floats), png, png16 or jpg.
         output_colourspace: Write EXR and TIFF in this space: ACEScg, lin_rec2020, any name of OCIO.
         compression: Compress EXR files: zip, zips, piz, rle (lossless), none, pxr24, b44, b44a, dwaa, dwab.
+        exr: Write layers as parts of the EXR, or as channels of a single part, which more programs read.
         view: Show PNG and JPEG by sRGB with a soft shoulder, clipped (none), by aces, or a view of OCIO.
         display: Take --view, or the default view, from this display of OCIO.
         config: Use this OpenColorIO configuration.
@@ -73,6 +85,7 @@ class OutputOptions:
     )
     output_colourspace: str | None = option(None, metavar="NAME", shown_default="linear Rec.709", panel=IMAGE)
     compression: Compression = option("zip", metavar="NAME", panel=IMAGE)
+    exr: Literal["parts", "single"] = option("parts", panel=IMAGE)
     view: str = option("soft", metavar="NAME", panel=IMAGE)
     display: str = option("", metavar="NAME", shown_default="the configuration's", panel=IMAGE)
     config: str = option(
@@ -85,15 +98,21 @@ class OutputOptions:
         panel=IMAGE,
     )
 
+    file_suffix: str = field(default="", metadata=NOT_IN_RECIPE)  # of the one file that -o names
+
+    def suffix_of(self, name: Format) -> str:
+        """The suffix of files of a format."""
+        return self.file_suffix or SUFFIXES[name]
+
     @property
     def suffixes(self) -> tuple[str, ...]:
         """Suffixes of the files of each image."""
-        return tuple(SUFFIXES[name] for name in self.formats)
+        return tuple(map(self.suffix_of, self.formats))
 
     @property
     def shown_suffix(self) -> str | None:
         """The suffix of the first format that is exposed for a display."""
-        return next((SUFFIXES[name] for name in self.formats if name in _DISPLAYED), None)
+        return next((self.suffix_of(name) for name in self.formats if name in _DISPLAYED), None)
 
 
 def parse_exposure(text: str) -> Exposure:

@@ -13,7 +13,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.work.output_options import SUFFIXES, Format, OutputOptions
+from facerf_cli.work.output_options import Format, OutputOptions
 
 Exposure = float | Literal["auto"]
 log = logging.getLogger(LOGGER_NAME)
@@ -24,12 +24,14 @@ class OutputImage:
     """An image to write: linear Rec.709 [H, W, 3], not multiplied by alpha [H, W], and its layers.
 
     `share` [H, W] is how far a soft view applies to each pixel (`colour.encode_display`); None: to all.
+    `header` is further metadata of the EXR alone.
     """
 
     pixels: np.ndarray
     alpha: np.ndarray | None = None
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
     share: np.ndarray | None = None
+    header: Mapping[str, Any] = field(default_factory=dict)
 
 
 def check_output(options: OutputOptions) -> None:
@@ -49,9 +51,13 @@ def write_output(
     space, view = _space_of(options), _view_of(options)
 
     def write(name: Format) -> None:
-        target = path.with_suffix(SUFFIXES[name])
+        target = path.with_suffix(options.suffix_of(name))
         if name == "exr":
-            write_exr(target, image.pixels, image.alpha, image.layers, metadata, space, options.compression)
+            one = options.exr == "single"
+            header = {**(metadata or {}), **image.header}
+            write_exr(
+                target, image.pixels, image.alpha, image.layers, header, space, options.compression, one
+            )
         elif name == "tiff":
             write_tiff(target, image.pixels, image.alpha, metadata, space)
         else:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,14 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.made_from import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.face.view import photo_camera
+from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import most_exposure_ev
 from facerf_cli.image.strips import Band, filled
 from facerf_cli.light.envmap import backdrop
@@ -24,12 +27,13 @@ from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, GroupComposition, Target
-from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
+from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (
     each_alone,
     lights_over_rig,
     lights_over_stack,
+    off_rig_deg,
     on_face,
     read_map,
     with_room,
@@ -70,6 +74,8 @@ from facerf_cli.work.stack_composers import (
 )
 
 log = logging.getLogger(LOGGER_NAME)
+_OFF_RIG_DEG = 1.0  # from which on a light that a stack lacks is named
+_digest_once = lru_cache(maxsize=256)(file_sha256)
 
 Composer = Composition | GroupComposition | StackImages
 Behind = Callable[[LightSetup, float], Band | None]  # the image behind a person, for a setup and an exposure
@@ -135,6 +141,7 @@ class _LitScene:
     faces: tuple[int, ...] = (0,)
     alpha: np.ndarray | None = None  # of the photo
     behind: Behind | None = None
+    plate: Mapping[str, Any] = field(default_factory=dict)  # metadata of the photo that results keep
 
     @cached_property
     def lights(self) -> list[Lights]:
@@ -250,7 +257,8 @@ def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Re
     by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
     people = [_composed(item, image, face, work) for face in by_size]
     composer = people[0] if len(people) == 1 else GroupComposition(people)
-    scene = _LitScene(composer, work.setups, _over_rig(work), tuple(face.number for face in by_size))
+    numbers = tuple(face.number for face in by_size)
+    scene = _LitScene(composer, work.setups, _over_rig(work), numbers, plate=plate_metadata(image.metadata))
     if work.composite != "photo":
         return scene
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
@@ -305,6 +313,9 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
     _check_faces(item, 0, work)
     header = read_olat_header(item.input_path)
     own = torch.from_numpy(header.directions).float()
+    if (off_deg := off_rig_deg(work.setups, own)) > _OFF_RIG_DEG:
+        said = "%s: lacks a light that is asked for; the nearest is %.1f degrees off (give the photo)"
+        log.warning(said, item.input_path, off_deg)
     lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
     composer: Composer
     behind = None
@@ -392,6 +403,7 @@ def _write_setups(
             path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
             with image_canvas(path, scene.composer.size_px, len(work.output.formats)) as empty:
                 image = _rendered(scene, setup, relit, ev, work, empty)
+                image = replace(image, header={**scene.plate, **_made_by(setup, work)})
                 write_output(path, image, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
                 del image
             said = [f"exposure {ev:+.2f} EV"] if work.output.shown_suffix else []
@@ -401,6 +413,19 @@ def _write_setups(
             written[path] = ev
             del relit  # of all of its part, beside the next
     return written
+
+
+def _made_by(setup: LightSetup, work: Relight) -> dict[str, str]:
+    """The lights, the options and the networks of an image, as JSON for its header; files by digests."""
+    served = load_models_once(work.photo).networks.served()
+    networks = {name: {**file, "file": Path(file["file"]).name} for name, file in served.items()}
+    lights = json_line(recipe_of(setup, _digest_once))
+    return {"facerf:lights": lights, "facerf:options": _options(work), "facerf:networks": json_line(networks)}
+
+
+@lru_cache(maxsize=4)
+def _options(work: Relight) -> str:
+    return json_line(recipe_of(work, _digest_once))
 
 
 def _rendered(

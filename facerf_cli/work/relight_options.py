@@ -1,6 +1,7 @@
 """`facerf relight`: its options, what each image is made by, and where it goes. Light to import."""
 
 import itertools
+import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -8,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
@@ -26,7 +27,15 @@ from facerf_cli.work.light_setups import (
     collect_setups,
     in_room,
 )
-from facerf_cli.work.output_options import STDOUT, Exposure, OutputOptions, check_stdout, parse_exposure
+from facerf_cli.work.output_options import (
+    STDOUT,
+    SUFFIXES,
+    Exposure,
+    Format,
+    OutputOptions,
+    check_stdout,
+    parse_exposure,
+)
 from facerf_cli.work.photo_options import (
     LightOptions,
     PhotoOptions,
@@ -51,7 +60,7 @@ ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
 _LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
-_FORMS = "photo, envmap, none, an image file, #RRGGBB or R,G,B"
+_FORMS = "photo, envmap, none, an image file, black or another name, #RRGGBB or R,G,B"
 
 
 @dataclass(frozen=True)
@@ -74,10 +83,10 @@ def parse_background(text: str) -> BackgroundChoice:
     """Parse `--background`; raises UsageError where it names none."""
     if text in ("photo", "envmap", "none"):
         return BackgroundChoice(text)  # type: ignore[arg-type]
-    if text.startswith("#"):
-        return BackgroundChoice("colour", colour=_hex(text))
     if Path(text).is_file():
         return BackgroundChoice("file", Path(text))
+    if (colour := _named(text)) is not None:
+        return BackgroundChoice("colour", colour=colour)
     if "," in text:
         red, green, blue = numbers(text, ("R,G,B",), "--background")
         if min(red, green, blue) < 0:
@@ -94,11 +103,14 @@ def parse_aov(text: str) -> tuple[str, ...]:
     return tuple(name for name in names if name != "matte")
 
 
-def _hex(text: str) -> tuple[float, float, float]:
-    digits = text.removeprefix("#")
-    if len(digits) != 6 or any(digit not in "0123456789abcdefABCDEF" for digit in digits):
-        raise UsageError(f"--background {text!r}: not a colour; give #RRGGBB, as in #202830")
-    red, green, blue = (_linear(int(digits[k : k + 2], 16) / 255) for k in (0, 2, 4))
+def _named(text: str) -> tuple[float, float, float] | None:
+    """The colour of a name of CSS or of #RRGGBB, scene-linear; None for another text."""
+    from PIL import ImageColor  # --help does without it
+
+    try:
+        red, green, blue, *_ = (_linear(value / 255) for value in ImageColor.getrgb(text))
+    except ValueError:
+        return None
     return red, green, blue
 
 
@@ -304,8 +316,24 @@ class Relight:
             return item.output_base.parent
         return item.output_base.with_name(split_frame(item.output_base.name)[0])
 
+    def into_file(self, file: Path, format_of_it: Format, formats: tuple[Format, ...]) -> Self:
+        """These settings for one image, the file that `-o` names; raises UsageError for other formats."""
+        if [SUFFIXES[name] for name in formats] != [SUFFIXES[format_of_it]]:
+            raise UsageError(f"-o {file}: is not what --format says; leave that out, or give a folder")
+        output = replace(self.output, file_suffix=file.suffix)
+        return replace(self, output=output, name=NamePattern.literal(file.stem))
+
     def refuse_meeting(self, items: Sequence[Item]) -> None:
-        """Raise UsageError where two images would have one path, as a --name may make them."""
+        """Raise UsageError where two images would have one path, as a --name may make them.
+
+        A file that -o names is one image, and no input.
+        """
+        for path in self.outputs_of(items[0]) if self.output.file_suffix else ():
+            faces = 1 + (self.photo.face == "all" and self.composite == "face")
+            if len(items) * len(self.setups) * faces != 1:
+                raise UsageError(f"-o {path}: is one image; give one photo, face and light, or a folder")
+            if path.exists() and os.path.samefile(path, items[0].input_path):
+                raise UsageError(f"-o {path}: is the input; give another name")
         paths: set[Path] = set()
         for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
             if path in paths:

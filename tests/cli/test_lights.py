@@ -17,7 +17,7 @@ from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
-from facerf_cli.work.lights import lights_over_rig, lights_over_stack, readable, write_balls
+from facerf_cli.work.lights import lights_over_rig, lights_over_stack, off_rig_deg, readable, write_balls
 from facerf_cli.work.output_options import OutputOptions
 
 HEIGHT_PX = 16
@@ -188,6 +188,8 @@ def test_lamps_of_a_stack_go_to_its_nearest_light() -> None:
     weights = lights_over_stack(setups, directions, "cell").weights
     nearest = int((directions - azel_to_direction(30.0, 20.0)).norm(dim=-1).argmin())
     torch.testing.assert_close(weights[0, nearest], torch.tensor([1.0, 2, 3]))
+    apart = directions[nearest] @ azel_to_direction(30.0, 20.0)
+    assert math.isclose(math.cos(math.radians(off_rig_deg(setups, directions))), float(apart), rel_tol=1e-5)
     assert int((weights != 0).any(-1).sum()) == 1
 
 

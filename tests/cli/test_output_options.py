@@ -13,6 +13,7 @@ from PIL import Image
 
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.image import colour
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas
@@ -42,6 +43,7 @@ def relight(given: Path, output: Path, *line: str, photo: Path | None = None) ->
 
 def test_formats_of_the_command_line() -> None:
     assert parse_formats("png, exr") == ("exr", "png")
+    assert parse_formats("jpeg,tif") == ("tiff", "jpg")
     options = OutputOptions(parse_formats("jpg,tiff,png16"))
     assert options.suffixes == (".png", ".tif", ".jpg")
     for wrong in ("", "png,png16", "bmp", "exr,gif"):
@@ -199,3 +201,57 @@ def test_layers_that_do_not_fit_are_files_that_go(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
     with canvas(path, held_bytes=0) as empty:
         assert not isinstance(empty("rgb", (6, 8, 3)), np.memmap) and not any(tmp_path.iterdir())
+
+
+def test_one_image_goes_to_the_file_that_is_named(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert relight(given, tmp_path / "out.v2.jpeg", *LIGHT, "--background", "black") == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'out.v2.jpeg'}\n"
+    with Image.open(tmp_path / "out.v2.jpeg") as image:
+        assert image.format == "JPEG"
+    assert not list(tmp_path.glob("*.exr"))
+    photo = shutil.copy(given / "astronaut.png", tmp_path / "me.png")
+    for output, line in (
+        ("two.png", (*LIGHT, "--light", "9,9")),
+        ("wrong.png", (*LIGHT, "--format", "exr")),
+        ("me.png", LIGHT),
+    ):
+        assert relight(given, tmp_path / output, *line, photo=Path(photo)) == 2
+        assert f"-o {tmp_path / output}: is " in capsys.readouterr().err
+
+
+def test_layers_are_parts_or_channels_of_one_and_data_have_no_colour_space(
+    given: Path, tmp_path: Path
+) -> None:
+    line = (*LIGHT, "--format", "exr", "--aov", "normal,depth,albedo", "--output-colorspace", "ACEScg")
+    assert relight(given, tmp_path / "parts", *line) == 0
+    assert relight(given, tmp_path / "one.exr", *line, "--exr", "single") == 0
+    single, parts = tmp_path / "one.exr", tmp_path / "parts" / f"{NAME}.exr"
+    assert oiio.ImageBuf(str(single)).nsubimages == 1
+    layers = exr_layers(single)
+    for name, values in exr_layers(parts).items():
+        np.testing.assert_array_equal(values, layers[name])
+    spaces = {
+        (spec := oiio.ImageBuf(str(parts), part, 0).spec())["name"]: spec["oiio:ColorSpace"]
+        for part in range(oiio.ImageBuf(str(parts)).nsubimages)
+    }
+    data = dict.fromkeys(("person", "normal", "depth"), "data")
+    assert spaces == dict.fromkeys(("rgba", "albedo"), "lin_ap1_scene") | data
+
+
+def test_the_header_keeps_the_plate_s_camera_and_says_what_made_the_image(
+    given: Path, tmp_path: Path
+) -> None:
+    pixels = read_image(given / "astronaut.png").pixels
+    said = {"smpte:TimeCode": (16777216, 0), "FramesPerSecond": (24000, 1001), "lensModel": "50 mm"}
+    write_exr(tmp_path / "plate.exr", pixels, metadata={**said, "Exif:GPSLatitude": "here"})
+    line = ("--envmap", str(given / "maps/grey.exr"))
+    assert relight(given, tmp_path / "out.exr", *line, photo=tmp_path / "plate.exr") == 0
+    header = read_image(tmp_path / "out.exr").metadata
+    assert {name: header[name] for name in said} == said and "Exif:GPSLatitude" not in header
+    digest = file_sha256(given / "maps/grey.exr")[:16]
+    (light,) = json.loads(header["facerf:lights"])["lights"]
+    assert light["envmap"] == f"sha256:{digest}"
+    assert json.loads(header["facerf:options"])["reflectance"] == "portrait"
+    assert json.loads(header["facerf:networks"])["reflectance"]["file"] == "lambert.safetensors"

@@ -7,6 +7,7 @@ import pytest
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.landmarks import read_landmarks, to_display
+from facerf_cli.portrait import find
 from facerf_cli.portrait.find import Face, choose_face
 
 
@@ -20,10 +21,13 @@ def test_of_two_faces_of_one_size_the_surer_is_the_largest(landmarks_px):
     assert choose_face([doubtful, sure], "largest", "p") == [sure]
 
 
-def test_faces_by_number(landmarks_px):
+def test_faces_by_number(landmarks_px, caplog, monkeypatch):
+    monkeypatch.setattr(find.log, "propagate", True)
+    caplog.set_level("INFO")
     small, large = (Face((0, 0, side, side), 1.0, landmarks_px) for side in (20, 50))
     faces = [small, large]
     assert choose_face(faces, "largest", "p") == [large] and choose_face(faces, "all", "p") == faces
+    assert "p: 2 faces are found, the largest is taken" in caplog.text
     assert choose_face(faces, "0", "p") == [small]
     with pytest.raises(InputError, match="2 face"):
         choose_face(faces, "2", "p")
