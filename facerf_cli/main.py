@@ -27,6 +27,7 @@ from facerf_cli.cli import evaluate, face_model
 from facerf_cli.cli.convert_light import convert_light
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
+from facerf_cli.cli.examples import epilog_of
 from facerf_cli.cli.fit_geometry import fit_geometry
 from facerf_cli.cli.installation import check, config, doctor, read_config
 from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups
@@ -195,13 +196,16 @@ def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, .
 
 for _panel, _verbs in VERBS.items():
     for _verb in _verbs:
-        _add = app.command(epilog=EPILOG, context_settings=HELP_NAMES, rich_help_panel=_panel)
+        _add = app.command(context_settings=HELP_NAMES, rich_help_panel=_panel)
         _add(with_groups(_verb))
 for _name, (_group, _panel) in GROUPS.items():
     app.add_typer(_group, name=_name, rich_help_panel=_panel)
-for _verbs_of in (app, *(group for group, _ in GROUPS.values())):
+for _above, _verbs_of in (("", app), *((f"{name} ", group) for name, (group, _) in GROUPS.items())):
     for _command in _verbs_of.registered_commands:
+        assert _command.callback is not None
+        _verb_name = _above + (_command.name or _command.callback.__name__.replace("_", "-"))
         _command.help = unwrapped(_command.callback.__doc__ or "")
+        _command.epilog = epilog_of(_verb_name, EPILOG)
 
 
 def run() -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import EPILOG, HELP_NAMES, is_default, refuse_given, settings_of, with_groups
+from facerf_cli.cli.options import HELP_NAMES, is_default, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.options import (
     EvaluateOptions,
@@ -208,7 +208,7 @@ def pairs(
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
-    app.command(epilog=EPILOG, context_settings=HELP_NAMES)(with_groups(_protocol))
+    app.command(context_settings=HELP_NAMES)(with_groups(_protocol))
 
 
 def _run(context: typer.Context, settings: FaceSettings, inputs: Sequence[str]) -> None:

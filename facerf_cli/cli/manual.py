@@ -15,6 +15,8 @@ from typing import Any
 import typer.main
 
 from facerf_cli._version import __version__
+from facerf_cli.cli.examples import examples_of
+from facerf_cli.cli.options import EPILOG
 from facerf_cli.errors import UsageError
 from facerf_cli.main import app
 
@@ -46,7 +48,7 @@ def _walk(context: Any, command: Any, path: tuple[str, ...]) -> Iterator[tuple[t
 
 def _page(path: tuple[str, ...], command: Any) -> str:
     context = typer.Context(command, info_name=" ".join(path))
-    summary, _, rest = (command.help or "").strip().partition("\n")
+    summary, _, rest = (command.help or "").replace("\\[", "[").strip().partition("\n")
     lines = [f'.TH "{"-".join(path).upper()}" "1" "" "facerf {__version__}" "facerf manual"']
     lines += [".SH NAME", f"{_text('-'.join(path))} \\- {_text(summary.rstrip('.'))}"]
     lines += [
@@ -66,10 +68,16 @@ def _page(path: tuple[str, ...], command: Any) -> str:
     verbs = getattr(command, "commands", {})
     listed = [(_panel_of(verb), (name, verb.get_short_help_str(200))) for name, verb in verbs.items()]
     lines += _section("VERBS", listed)
-    if len(path) == 1:
-        lines += [".SH EXIT STATUS", *_definitions(_EXIT_CODES)]
-    elif command.epilog:
-        lines += [".PP", _text(command.epilog)]
+    if not verbs:
+        lines += [
+            ".PP",
+            _text(EPILOG),
+            ".SH EXAMPLES",
+            ".nf",
+            *map(_text, examples_of(" ".join(path[1:]))),
+            ".fi",
+        ]
+    lines += [".SH EXIT STATUS", *_definitions(_EXIT_CODES)]
     pages_nearby = ["-".join((*path, name)) for name in sorted(verbs)] or ["-".join(path[:-1])]
     lines += [".SH SEE ALSO", ", ".join(f"\\fB{_text(name)}\\fR(1)" for name in pages_nearby)]
     return "\n".join(lines) + "\n"

@@ -9,6 +9,7 @@ from functools import cache
 from typing import Annotated, Any, get_type_hints
 
 import typer
+from rich.markup import escape
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
@@ -69,8 +70,11 @@ FramesArgument = Annotated[
 
 
 def unwrapped(docstring: str) -> str:
-    """A docstring with a line for each paragraph, which the help breaks at the terminal's width."""
-    return "\n\n".join(" ".join(paragraph.split()) for paragraph in docstring.split("\n\n"))
+    """A docstring with a line for each paragraph, which the help breaks at the terminal's width.
+
+    Brackets are escaped: rich would take [relight] for a style.
+    """
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in escape(docstring).split("\n\n"))
 
 
 def with_groups(verb: Callable[..., Any]) -> Callable[..., Any]:

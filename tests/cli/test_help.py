@@ -1,5 +1,6 @@
 """The help: verbs in the order of a day, options in panels, texts of a line or two at any width."""
 
+import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -10,7 +11,8 @@ import pytest
 import typer.main
 
 from facerf_cli.cli import manual
-from facerf_cli.main import app, main
+from facerf_cli.cli.examples import examples_of
+from facerf_cli.main import FLAGS, VALUED, app, main
 
 # Options whose value is a small language, which their help explains.
 LANGUAGES = {"envmap", "light", "light_from", "reflectance", "aov", "background"}
@@ -25,6 +27,8 @@ def commands() -> Iterator[tuple[str, Any]]:
 
 
 COMMANDS = dict(commands())
+ROOT = typer.main.get_command(app)
+CONTEXT = typer.Context(ROOT)
 MAN = Path(__file__).parents[2] / "man"
 
 
@@ -100,3 +104,26 @@ def test_groff_has_no_complaint(name: str) -> None:
         ["groff", "-man", "-Tascii", "-ww", str(MAN / name)], capture_output=True, text=True, check=True
     )
     assert result.stderr == "" and "OPTIONS" in result.stdout
+
+
+@pytest.mark.parametrize("path", [path for path, _ in manual._walk(CONTEXT, ROOT, ()) if path])
+def test_each_verb_has_three_examples_of_options_that_it_has(path: tuple[str, ...]) -> None:
+    command: Any = ROOT
+    for name in path:
+        command = command.commands[name]
+    if hasattr(command, "commands"):
+        return
+    known = {name for option in command.params for name in (*option.opts, *option.secondary_opts)}
+    lines = examples_of(" ".join(path))
+    assert len(lines) == 3 and command.epilog.endswith(f"  {lines[-1]}")
+    for line in lines:
+        words = shlex.split(line)[1 + len(path) :]
+        assert not {word for word in words if word[0] == "-"} - known - FLAGS - VALUED
+    page = manual.pages()[f"facerf-{'-'.join(path)}.1"]
+    assert ".SH EXAMPLES" in page and ".SH EXIT STATUS" in page
+
+
+def test_brackets_of_a_help_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "--help"]) == 0
+    assert "([relight]," in capsys.readouterr().out
+    assert "([relight]," in manual.pages()["facerf-config.1"]

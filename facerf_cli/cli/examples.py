@@ -1,0 +1,89 @@
+"""Three examples of each verb, for its help and its man page."""
+
+_LINES = """
+facerf relight me.jpg --light 40,20 -o relit.png
+facerf relight photos/ --envmap skies/ --rotate 0:360:24 -o relit/
+facerf relight plate.exr --light key=40,20 --light rim=160,10 --exr single -o relit/
+facerf view me.jpg -o me.html
+facerf view photos/ -o pages/
+facerf view stacks/me_olat.exr -o me.html
+facerf estimate-light me.jpg -o light/
+facerf estimate-light me.jpg --width 1024 --sh-order 4 -o light/
+facerf estimate-light shot.mp4 -o light/
+facerf predict-olat me.jpg -o stacks/
+facerf predict-olat me.jpg --lights '40,20;-40,20' --frame uv -o stacks/
+facerf predict-olat me.jpg --format relight -o web/
+facerf segment me.jpg -o cut/
+facerf segment group.jpg --face all -o cut/
+facerf segment photos/ --jobs 4 -o cut/
+facerf fit-geometry me.jpg -o fit/
+facerf fit-geometry me.jpg --face-model ict.npz -o fit/
+facerf fit-geometry photos/ --landmarks points/ -o fit/
+facerf convert-light sky.exr --to sh -o lights/
+facerf convert-light skies/ --to blender --to mitsuba -o lights/
+facerf convert-light light.json --to latlong --width 1024 -o lights/
+facerf envmap -o maps/
+facerf envmap --count 20 -o maps/
+facerf envmap --kind sun --seed 3 -o maps/
+facerf synth-stage --subjects 2 -o capture/
+facerf synth-stage --subjects 40 --jobs 2 -o capture/
+facerf synth-stage --subjects 8 --lights 64 -o capture/
+facerf prepare-dataset capture/ --describe
+facerf prepare-dataset capture/ --checks only -o dataset/
+facerf prepare-dataset capture/ --split 0.8/0.1/0.1 --jobs 2 -o dataset/
+facerf relight-dataset dataset/ --envmaps skies/
+facerf relight-dataset dataset/ --envmaps procedural:500
+facerf relight-dataset dataset/ --envmaps procedural:500 --per-subject 1000 --lazy
+facerf train -o try/ --preset tiny --steps 50
+facerf train --dataset dataset/ -o run/ --max-time 2h
+facerf train -o run/ --resume
+facerf check relit/
+facerf check stacks/ -q
+facerf check relit/ --log-json
+facerf doctor
+facerf doctor --json
+facerf doctor --checkpoint run/
+facerf config
+facerf config relight
+facerf config evaluate.pairs --config facerf.toml
+facerf evaluate olat dataset/ -o report/
+facerf evaluate olat dataset/ --checkpoint run/ -o report/
+facerf evaluate olat dataset/ --against other.safetensors -o report/
+facerf evaluate reconstruction photos/ -o report/
+facerf evaluate reconstruction photos/ --reflectance prt -o report/
+facerf evaluate reconstruction dataset/ --jobs 2 -o report/
+facerf evaluate transfer dataset/ -o report/
+facerf evaluate transfer dataset/ --reflectance field --reflectance prt -o report/
+facerf evaluate transfer photos/ -o report/
+facerf evaluate geometry photos/ -o report/
+facerf evaluate geometry photos/ --face-model ict.npz -o report/
+facerf evaluate geometry dataset/ -o report/
+facerf evaluate yale-b CroppedYale/ -o report/
+facerf evaluate yale-b CroppedYale/ --jobs 2 -o report/
+facerf evaluate yale-b CroppedYale/ --checkpoint run/ -o report/
+facerf evaluate pairs mine/ --truth truth/ -o report/
+facerf evaluate pairs mine/ theirs/ --truth truth/ -o report/
+facerf evaluate pairs mine/ --truth truth/ --masks masks/ -o report/
+facerf face-model fetch ict-facekit
+facerf face-model fetch ict-facekit -v
+facerf face-model fetch ict-facekit -q
+facerf face-model import ict-facekit ICT-FaceKit.zip -o ict.npz
+facerf face-model import flame flame.pkl --landmarks embedding.npy -o flame.npz
+facerf face-model import basel-2019 model2019_bfm.h5 -o basel.npz
+facerf face-model list
+facerf face-model list -v
+facerf face-model list -q
+facerf face-model show
+facerf face-model show builtin -o mean.png
+facerf face-model show ict.npz -o ict.png
+"""
+
+
+def examples_of(verb: str) -> list[str]:
+    """The examples of a verb, such as `evaluate olat`."""
+    return [line for line in _LINES.splitlines() if f"{line} ".startswith(f"facerf {verb} ")]
+
+
+def epilog_of(verb: str, notes: str) -> str:
+    """The end of a verb's help: notes, and its examples after the mark that keeps their lines."""
+    return "\n".join([notes, "", "\b", "EXAMPLES", *(f"  {line}" for line in examples_of(verb))])
