@@ -76,8 +76,8 @@ def decode(
         found = _decode_by_oiio(path, opened, limit_px, kept_px, with_alpha)
     finally:
         opened.stream.close()
-    if found.alpha is not None and not found.values[..., found.alpha].any():
-        log.info("%s: its alpha is 0 everywhere, and is left out", path)
+    is_empty = found.alpha is not None and not found.values[..., found.alpha].any()
+    if is_empty and opened.stream.format_name() == "bmp":  # whose fourth byte need not be alpha
         return Decoded(found.values, found.spec, found.colour, None)
     return found
 
