@@ -143,6 +143,15 @@ class Lights:
         weights = () if self.near_weights is None else self.near_weights.unbind(1)
         return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
 
+    def arriving(self, place_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light that arrives at a place [3]."""
+        directions, weights = [self.directions], [self.weights]
+        for points, rgb in self.around(place_m):
+            toward, irradiance = points.arriving(place_m[:, None, None])
+            directions.append(toward[:, 0, 0])
+            weights.append(rgb[:, None] * irradiance[:, 0, 0, None])
+        return torch.cat(directions), torch.cat(weights, 1)
+
     def strengths(self) -> list[float]:
         """Luminance of all light of each sum, from wherever it comes.
 

@@ -15,6 +15,8 @@ from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.parse import Square, whole_photo
 
+_IRISES = [range(468, 473), range(473, 478)]  # points of each
+_AROUND_68 = 1.8  # side of the square around the 68 landmarks, in their extents
 _MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
 _MESH_PX = 192
 _AFAR = 2.5  # side of the square that shows a photo from afar, in sides of the photo
@@ -123,6 +125,16 @@ def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) ->
         mesh = mesh_in(people.face_mesh, image_srgb, face_square(mesh.points_px))
     extent_px = float(np.ptp(mesh.landmarks_px, axis=0).max())
     return mesh if mesh.score > _LEAST_MESH_SCORE and extent_px > _LEAST_PX else None
+
+
+def irises_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
+    """Centres and radii [N, 3], in pixels, of the irises of a face, by its landmarks [68, 2]; or none."""
+    mesh = mesh_near(people, image_srgb, Square.around(landmarks_px, _AROUND_68, above=0.1))
+    if mesh is None:
+        return np.zeros((0, 3))
+    irises = mesh.points_px[_IRISES, :2]  # [2, 5, 2]: the middle, and four points of the outline
+    radii = np.linalg.norm(irises[:, 1:] - irises[:, :1], axis=-1).mean(1)
+    return np.concatenate([irises[:, 0], radii[:, None]], 1)
 
 
 def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -> float:

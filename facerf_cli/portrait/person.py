@@ -17,6 +17,7 @@ from facerf_cli.image.colour import without_fireflies
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.mesh import irises_of
 from facerf_cli.portrait.proxy import (
     Proxy,
     ProxyMaps,
@@ -47,6 +48,7 @@ class SeenPerson:
     maps: ProxyMaps
     fit: FaceFit
     segmentation: Segmentation
+    irises_px: np.ndarray  # [N, 3] centres and radii in the photo
 
     @cached_property
     def exposure(self) -> float:
@@ -152,13 +154,15 @@ def look_at_person(
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = square or portrait_square(landmarks_px)
-    segmentation = segmentation or segment(people, to_display(photo), landmarks_px, matte)
+    shown = to_display(photo)
+    segmentation = segmentation or segment(people, shown, landmarks_px, matte)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or relight the face alone")
     proxy = proxy_of(model, fit, classes, square)
     maps = proxy_maps(proxy, square_camera(fit, square))
-    return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation)
+    irises_px = irises_of(people, shown, landmarks_px)
+    return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation, irises_px)
 
 
 def _image_in(photo: np.ndarray, square: Crop) -> Tensor:

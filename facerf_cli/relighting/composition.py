@@ -40,6 +40,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
+from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.whole_person import WholePerson
@@ -88,18 +89,21 @@ class Relit:
     """A head under one light: its texture [3, T, T], and the light around it.
 
     `surround` is [3, s, s] of a `Surround`, [views, 9, S, S] of a `WholePerson`; None of a face alone.
+    `mirrored` is what the eyes of a whole person mirror [3, s, s].
     """
 
     texture: Tensor
     surround: Tensor | None = None
+    mirrored: Tensor | None = None
 
-    def plus(self, rgb: Tensor, texture: Tensor, surround: Tensor | None) -> "Relit":
+    def plus(self, rgb: Tensor, other: "Relit") -> "Relit":
         """This and another light of rgb 1, made so bright [3]."""
-        rgb = rgb[:, None, None]
-        around = self.surround
-        if around is not None and surround is not None:
-            around = around + rgb * surround
-        return Relit(self.texture + rgb * texture, around)
+
+        def both(one: Tensor | None, two: Tensor | None) -> Tensor | None:
+            return None if one is None or two is None else one + rgb[:, None, None] * two
+
+        texture = self.texture + rgb[:, None, None] * other.texture
+        return Relit(texture, both(self.surround, other.surround), both(self.mirrored, other.mirrored))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +155,7 @@ class Composition:
         shown = self.own.small if isinstance(self.own, PersonColours) else self._photo
         self._display_ev = display_ev(shown)
         self._detail = PhotoDetail(head.face, self.view)
-        self._grain = self.person.grain(self.own, self._display_ev, self.matte) if self.person else None
+        self._finish = self.person.finish(self.own, self._display_ev, self.matte) if self.person else None
         self.surround = self.person or Surround(vertices, crop, head.face.texture, size_px[1])
 
     @property
@@ -182,7 +186,8 @@ class Composition:
                 texture = near_texture(reflectance.field, points, self.vertices_m, side)
                 textures = textures + rgb[..., None, None] * texture
             stacked = torch.stack([view.stacked for view in lit], 1)
-            yield from map(Relit, reflectance.blended(textures, lit[0]), stacked)
+            mirrored = mirrored_in_cornea(*lights.arriving(self.vertices_m.mean(0)))
+            yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored)
             return
         changes = self.surround.changes if isinstance(self.surround, Surround) else None
         pairs: Iterable[tuple[Tensor, Tensor | None]]
@@ -196,7 +201,8 @@ class Composition:
         for number, pair in enumerate(pairs):
             relit = Relit(*pair)
             for texture, (_, rgb) in zip(extra, near, strict=True):
-                relit = relit.plus(rgb[number], texture, changes(texture[None])[0] if changes else None)
+                around = changes(texture[None])[0] if changes else None
+                relit = relit.plus(rgb[number], Relit(texture, around))
             yield relit
 
     def image(self, relit: Relit, ev: float = 0.0, behind: Band | None = None) -> RelitImage:
@@ -247,7 +253,10 @@ class Composition:
                 part += self.face_share(inside)[..., None] * (detail(inside) - part)
             return person
 
-        return self._grain.given(of) if self._grain else of
+        if self._finish is None or relit.mirrored is None:
+            return of
+        grain, eyes = self._finish
+        return eyes.lit(grain.given(of), relit.mirrored)
 
     def face_share(self, inside: slice) -> np.ndarray:
         """Share [h, w] of the face in rows of the view's window, without what is seen before it."""

@@ -4,6 +4,7 @@ Of its views the narrower lies over the wider one, and fades toward its border.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from torch import Tensor
@@ -13,6 +14,7 @@ from facerf_cli.image.strips import Band, Layer
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.parse import uncovered_rows
 from facerf_cli.relighting.enlarged import Enlarged, Shown
+from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.grain import Grain
 from facerf_cli.relighting.portrait_field import PortraitField
 
@@ -25,6 +27,7 @@ class WholePerson:
         self.matte = segmentation.matte
         self.bare_face = uncovered_rows(segmentation.classes, (photo.shape[0], photo.shape[1]))
         self._segmentation, self._photo = segmentation, photo
+        self._irises_px = field.person.irises_px
         self._views = [Enlarged(view, photo) for view in field.views]
 
     @property
@@ -40,11 +43,15 @@ class WholePerson:
         relit = [view.relit(one, display_ev) for view, one in zip(self._views, lit, strict=True)]
         return self._joined(photo, relit)
 
-    def grain(self, photo: np.ndarray | PersonColours, display_ev: float, matte: np.ndarray) -> Grain:
-        """The detail of the photo [H, W, 3] without its light, for a person's matte [H, W]."""
+    def finish(
+        self, photo: np.ndarray | PersonColours, display_ev: float, matte: np.ndarray
+    ) -> tuple[Grain, Eyes]:
+        """The detail of the photo [H, W, 3] without its light, for a person's matte [H, W]; and the eyes."""
         flat = self._joined(photo, [view.without_light(display_ev) for view in self._views])
         hair = self._segmentation.layer("hair")
-        return Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px)
+        grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px)
+        opening = partial(self._segmentation.layer, "eyes")
+        return grain, Eyes(photo.__getitem__, self._irises_px, opening, self._photo.shape[:2])
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [views, 9, S, S]."""

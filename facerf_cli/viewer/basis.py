@@ -172,9 +172,9 @@ def basis_of_photo(
     mean: Relit | None = None
     for relit in _single(composition, rig):
         add(relit)
-        mean = relit if mean is None else mean.plus(torch.ones(1), relit.texture, relit.surround)
-    assert mean is not None and mean.surround is not None
-    mean = Relit(mean.texture / len(rig), mean.surround / len(rig))
+        mean = relit if mean is None else mean.plus(torch.ones(1), relit)
+    assert mean is not None and mean.surround is not None and mean.mirrored is not None
+    mean = Relit(*(part / len(rig) for part in (mean.texture, mean.surround, mean.mirrored)))
     add(mean)
     shown = whole(composition.light_layer(mean), *composition.size_px)
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
@@ -196,7 +196,9 @@ def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) ->
 
     def shrunk(view: PortraitView) -> PortraitView:
         square = view.person.square.of_scaled(scale)
-        return replace(view, person=replace(view.person, square=square, segmentation=segmentation))
+        irises_px = view.person.irises_px * scale
+        person = replace(view.person, square=square, segmentation=segmentation, irises_px=irises_px)
+        return replace(view, person=person)
 
     return replace(field, views=tuple(map(shrunk, field.views)))
 

@@ -1,0 +1,116 @@
+"""Eyes: the photo's catchlights give way to the mirror image of the new light in the cornea.
+
+The cornea is a ball before the iris that reflects a fixed share of the light; lights are seen in it as discs.
+What is far brighter than the rest of an iris in the photo is a catchlight. All is linear in light.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.image.colour import luminance
+from facerf_cli.image.strips import Band
+from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.raster.texture import smoothstep
+
+_IRIS_OF_CORNEA = 5.9 / 7.8  # their radii, mm
+_REFLECTED = 0.025  # by Fresnel's law, of light that arrives at a right angle
+_LIGHT_RAD = math.radians(9.4)  # radius of a light's disc: a cell of 150 lights all around
+_SIDE = 48  # of the mirror image
+_LEAST_PX = 2.0  # radius of an iris in which something can be seen
+_CATCHLIGHT = 1.5  # radiance from which on a pixel is a catchlight, over the median of the iris
+
+
+def mirrored_in_cornea(directions: Tensor, weights: Tensor) -> Tensor:
+    """Radiance [M, 3, s, s] that an iris mirrors under M sums, rgb weights [M, L, 3], of lights [L, 3].
+
+    The square lies around the iris, as the camera sees it; the eye looks at the camera.
+    """
+    at = 2 * (torch.arange(_SIDE) + PIXEL_CENTRE) / _SIDE - 1
+    down, right = torch.meshgrid(at, at, indexing="ij")
+    x, y = right * _IRIS_OF_CORNEA, -down * _IRIS_OF_CORNEA
+    normals = torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()])
+    seen = 2 * normals[2] * normals - normals.new_tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
+    edges = math.cos(1.2 * _LIGHT_RAD), math.cos(0.8 * _LIGHT_RAD)
+    inside = (right.square() + down.square()) < 1
+    discs = inside * smoothstep(
+        (torch.einsum("lc,cij->lij", directions, seen) - edges[0]) / (edges[1] - edges[0])
+    )
+    # a disc that gives a white surface radiance 1 has itself the radiance 1 / sin^2
+    return torch.einsum("mlc,lij->mcij", weights, discs) * (_REFLECTED / math.sin(_LIGHT_RAD) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Iris:
+    """A window of the photo: share of the iris [h, w], what stays without catchlights [h, w], its grid."""
+
+    rows: slice
+    columns: slice
+    share: np.ndarray
+    kept: np.ndarray
+    grid: Tensor  # [1, h, w, 2], in the mirror image
+
+
+class Eyes:
+    """The irises [N, 3] of a person in a photo [H, W, 3]: centres and radii in its pixels.
+
+    `opening` gives the share [h, W] of the eyes, between the lids, in some rows.
+    """
+
+    def __init__(
+        self,
+        photo: Band,
+        irises_px: np.ndarray,
+        opening: Callable[[slice], np.ndarray],
+        size_px: tuple[int, ...],
+    ) -> None:
+        self._irises = []
+        for x_px, y_px, radius_px in irises_px.tolist():
+            rows, columns = (
+                slice(max(0, math.floor(middle - radius_px)), min(length, math.ceil(middle + radius_px)))
+                for middle, length in zip((y_px, x_px), size_px, strict=True)
+            )
+            if radius_px < _LEAST_PX or rows.start >= rows.stop or columns.start >= columns.stop:
+                continue
+            y, x = (
+                (torch.arange(at.start, at.stop) + PIXEL_CENTRE - middle) / radius_px
+                for at, middle in ((rows, y_px), (columns, x_px))
+            )
+            away = (x[None].square() + y[:, None].square()).sqrt().numpy()
+            share = ((1 - away) * radius_px + 0.5).clip(0, 1) * opening(rows)[:, columns]
+            light = luminance(photo(rows)[:, columns])
+            if (share > 0.5).any():
+                most = _CATCHLIGHT * np.median(light[share > 0.5])
+                kept = np.minimum(1, most / np.maximum(light, 1e-9)).astype(np.float32)
+                grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
+                self._irises.append(_Iris(rows, columns, share.astype(np.float32), kept, grid))
+
+    def lit(self, relit: Band, mirrored: Tensor) -> Band:
+        """A relit image [H, W, 3], by rows, with the mirror image [3, s, s] in its eyes."""
+        images = [self._placed(iris, mirrored) for iris in self._irises]
+
+        def of(rows: slice) -> np.ndarray:
+            pixels = relit(rows)
+            for iris, image in zip(self._irises, images, strict=True):
+                first, last = max(rows.start, iris.rows.start), min(rows.stop, iris.rows.stop)
+                if first < last:
+                    part = pixels[first - rows.start : last - rows.start, iris.columns]
+                    own = slice(first - iris.rows.start, last - iris.rows.start)
+                    share, kept = iris.share[own, :, None], iris.kept[own, :, None]
+                    part += share * (part * (kept - 1) + image[own])
+            return pixels
+
+        return of
+
+    @staticmethod
+    def _placed(iris: _Iris, mirrored: Tensor) -> np.ndarray:
+        """The mirror image [h, w, 3] in the window of an iris, without what is finer than its pixels."""
+        side = max(2, min(_SIDE, len(iris.share)))
+        small = F.interpolate(mirrored[None], (side, side), mode="area")
+        found = F.grid_sample(small, iris.grid, padding_mode="border", align_corners=False)
+        return np.asarray(found[0].permute(1, 2, 0).numpy())

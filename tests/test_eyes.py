@@ -1,0 +1,64 @@
+"""Catchlights: the mirror image of a light in the cornea."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from facerf_cli.image.strips import whole
+from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
+
+SIDE, IRIS = 40, np.array([[20.0, 18.0, 10.0]])
+DARK = np.full((SIDE, SIDE, 3), 0.05, np.float32)
+
+
+def image_of(azimuth_deg: float, elevation_deg: float) -> torch.Tensor:
+    return mirrored_in_cornea(azel_to_direction(azimuth_deg, elevation_deg)[None], torch.ones(1, 1, 3))[0]
+
+
+@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (50, 0), (0, 40), (-40, -20)])
+def test_a_light_is_seen_where_the_cornea_faces_half_way_to_it(azimuth: float, elevation: float) -> None:
+    seen = image_of(azimuth, elevation)[0]
+    half = azel_to_direction(azimuth, elevation) + torch.tensor([0.0, 0, 1])
+    half = half / half.norm() * (7.8 / 5.9)  # radius of the cornea over the iris's
+    at = 2 * (torch.arange(len(seen)) + 0.5) / len(seen) - 1
+    right, down = (seen.sum(0) @ at) / seen.sum(), (seen.sum(1) @ at) / seen.sum()
+    assert float(right) == pytest.approx(float(half[0]), abs=0.04)
+    assert float(-down) == pytest.approx(float(half[1]), abs=0.04)
+
+
+def test_a_light_behind_the_head_is_not_seen() -> None:
+    assert image_of(180, 0).max() == 0 and image_of(0, 0).max() > 0.5
+
+
+def eyes(photo: np.ndarray) -> Eyes:
+    return Eyes(photo.__getitem__, IRIS, lambda rows: np.ones((SIDE, SIDE), np.float32)[rows], (SIDE, SIDE))
+
+
+def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
+    photo = DARK.copy()
+    photo[14:17, 15:18] = 3.0
+    relit, mirrored = 2 * photo, image_of(40, 0)
+    found = whole(eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored), SIDE, SIDE)
+    assert found[14:17, 15:18].max() < 0.2  # 6 before
+    assert found[18, 22:28].max() > 0.5 and found[18, 12:18].max() < 0.2
+    assert np.array_equal(found[:5], relit[:5]) and np.array_equal(found[:, :8], relit[:, :8])
+    rows = slice(17, 21)
+    part = eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored)(rows)
+    assert np.array_equal(part, found[rows])
+
+
+def test_light_that_arrives_from_near_and_far() -> None:
+    place = torch.tensor([0.0, 0.0, -1.0])
+    near = StudioLight(at_m=(0.0, 2.0, 0.0), rgb=(1.0, 1.0, 1.0))
+    lights = Lights(
+        azel_to_direction(90.0, 0.0)[None], torch.ones(1, 1, 3), (near,), torch.full((1, 1, 3), 2.0)
+    )
+    directions, weights = lights.arriving(place)
+    mean = torch.einsum("mnc,nd->mcd", weights, directions)[0, 0]
+    torch.testing.assert_close(mean, torch.tensor([1.0, 2.0, 0.0]), atol=1e-4, rtol=1e-3)
+    assert math.isclose(float(weights[0, :, 0].sum()), 3.0, rel_tol=1e-3)
