@@ -45,6 +45,6 @@ def test_the_options_and_limits_of_facerf_are_those_of_the_code() -> None:
     own = " ".join(row[1] for row in rows(TABLE))
     assert set(re.findall(r"--[a-z-]+", own)) <= options
     read = next(row[1] for row in rows(TABLE) if row[0] == "formats read")
-    short = {".jpg", ".jpeg", ".tif"}  # other spellings of JPEG and TIFF
+    short = {".jpg", ".jpeg", ".jpe", ".jfif", ".tif"}  # other spellings of JPEG and TIFF
     assert {f".{name.lower()}" for name in read.split(", ")} == (PHOTO_SUFFIXES - short) | {".jpeg"}
     assert f"{PHOTO_LIMIT_PX // 10**6} megapixels" in own

@@ -15,12 +15,14 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.batch.made_from import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
+from facerf_cli.face.dlib_landmarks import face_descriptor
+from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.image.colour import most_exposure_ev
+from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.strips import Band, filled
 from facerf_cli.light.envmap import backdrop
 from facerf_cli.light.studio_points import Lights, intensity_of
@@ -142,6 +144,7 @@ class _LitScene:
     alpha: np.ndarray | None = None  # of the photo
     behind: Behind | None = None
     plate: Mapping[str, Any] = field(default_factory=dict)  # metadata of the photo that results keep
+    identity: Callable[[np.ndarray], float] | None = None  # of an exposed image, to the photo
 
     @cached_property
     def lights(self) -> list[Lights]:
@@ -177,11 +180,13 @@ def relight_item(item: Item, work: Relight) -> Outcome:
     read = _scenes_of_stack if is_olat_stack(item.input_path) else _scenes_of_photo
     scenes, metadata, describe = read(item, work)
     shared_ev = _shared_exposures(item, work)
-    written: dict[Path, float] = {}
+    written: dict[Path, dict[str, float]] = {}
     for tag, scene in scenes:
         written |= _write_setups(item, tag, scene, work, metadata, shared_ev)
     outputs = [path.with_suffix(suffix) for path in written for suffix in work.output.suffixes]
-    return Outcome(outputs, describe() | {"exposure_ev": {path.stem: ev for path, ev in written.items()}})
+    names = dict.fromkeys(name for facts in written.values() for name in facts)
+    facts = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
+    return Outcome(outputs, describe() | facts)
 
 
 def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
@@ -252,6 +257,17 @@ def _check_faces(item: Item, last: int, work: Relight) -> None:
         )
 
 
+def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
+    """The distance of an image [H, W, 3] from its photo by descriptors, both at the photo's landmarks."""
+    landmarks_px = face.fit.crop.to_photo(face.head.landmarks_px)
+
+    def descriptor(shown: np.ndarray) -> np.ndarray:
+        return face_descriptor(linear_to_srgb(shown.clip(0, 1)), landmarks_px)
+
+    own = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
+    return lambda shown: round(float(np.linalg.norm(descriptor(shown) - own)), 3)
+
+
 def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _LitScene:
     """People of one photo in one image; the nearest first."""
     by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
@@ -261,6 +277,8 @@ def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Re
     scene = _LitScene(composer, work.setups, _over_rig(work), numbers, plate=plate_metadata(image.metadata))
     if work.composite != "photo":
         return scene
+    if work.identity:
+        scene = replace(scene, identity=_identity_of(image.pixels, by_size[0]))
     camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
     alpha = image.alpha if work.background.kind == "photo" else None
     return replace(scene, alpha=alpha, behind=_backdrop(work, camera))
@@ -383,11 +401,11 @@ def _write_setups(
     work: Relight,
     metadata: Mapping[str, Any],
     shared_ev: Mapping[str, float] | None,
-) -> dict[Path, float]:
+) -> dict[Path, dict[str, float]]:
     """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
 
     Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
-    of each image, and the exposure of the PNG in its place.
+    of each image, and facts of it for the report: the exposure of the PNG in its place, the identity.
     """
     parts = batches(len(scene.setups), scene.composer.nbytes)
     whole = scene.relit(parts[0]) if len(parts) == 1 else None
@@ -396,7 +414,7 @@ def _write_setups(
         return scene.relit(part) if whole is None else whole
 
     exposures_ev = shared_ev or _exposures_ev(scene, parts, relit_by, work)
-    written: dict[Path, float] = {}
+    written: dict[Path, dict[str, float]] = {}
     for part in parts:
         for setup, relit in zip(scene.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
@@ -405,12 +423,14 @@ def _write_setups(
                 image = _rendered(scene, setup, relit, ev, work, empty)
                 image = replace(image, header={**scene.plate, **_made_by(setup, work)})
                 write_output(path, image, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
+                written[path] = {"exposure_ev": ev}
+                if scene.identity is not None:
+                    written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
                 del image
             said = [f"exposure {ev:+.2f} EV"] if work.output.shown_suffix else []
             said += [f"in a room that sends {setup.room:g} back"] if setup.room else []
             if said and not shared_ev:
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
-            written[path] = ev
             del relit  # of all of its part, beside the next
     return written
 

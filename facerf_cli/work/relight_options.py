@@ -139,6 +139,8 @@ class Relight:
         matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
             matte.
         photo_of_stack: Put an OLAT stack back on its photo, at the photo's resolution.
+        identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
+            (an extra).
         ball: Write a mirror ball and a diffuse ball under each map, too.
         fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.
         name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
@@ -181,6 +183,7 @@ class Relight:
         None, metavar="FILE|DIR|PATTERN", flags=("--photo",), shown_default=False, panel=IMAGE
     )
     ball: bool = option(False, in_recipe=False, panel=IMAGE)
+    identity: bool = option(False, in_recipe=False, panel=METHOD)
     network_alone: bool = network_alone_option()
     fps: Fraction | None = option(
         None, metavar="RATE", in_recipe=False, shown_default="24", parse=film_rate, panel=IMAGE
@@ -259,6 +262,8 @@ class Relight:
             raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
         if film and (self.background.kind == "none" or alone):
             raise UsageError(f"-o {film.path}: a film has no alpha; give a folder, or --background COLOUR")
+        if self.identity and alone:
+            raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
         check_companion(self.matte, "--matte")
         check_companion(self.photo_of_stack, "--photo")
         of_light: Kind = "field" if self.reflectance == "portrait" else self.reflectance

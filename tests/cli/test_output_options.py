@@ -256,3 +256,12 @@ def test_the_header_keeps_the_plate_s_camera_and_says_what_made_the_image(
     assert light["envmap"] == f"sha256:{digest}"
     assert json.loads(header["facerf:options"])["reflectance"] == "portrait"
     assert json.loads(header["facerf:networks"])["reflectance"]["file"] == "lambert.safetensors"
+
+
+def test_the_distance_of_the_identity_is_reported(given: Path, tmp_path: Path) -> None:
+    pytest.importorskip("dlib")
+    assert relight(given, tmp_path, *LIGHT, "--identity") == 0
+    (row,) = map(json.loads, (tmp_path / "report.jsonl").read_text().splitlines())
+    assert row["exposure_ev"].keys() == row["identity_distance"].keys() == {NAME}
+    assert 0.01 < row["identity_distance"][NAME] < 0.6  # below it dlib takes two photos for one person's
+    assert relight(given, tmp_path, *LIGHT, "--identity", "--composite", "face") == 2
