@@ -1,7 +1,7 @@
 """Basis images of an OLAT stack: an image under any light is a guide times a weighted sum of ratios.
 
 The guide is the mean of all lights' images, as large as the photo, and keeps every pore and hair. A ratio,
-a light's image over the guide, is smooth, so it is small. Both are bytes: the guide of sRGB, a ratio of its
+a light's image over the mean, both small, is smooth. Both are bytes: the guide of sRGB, a ratio of its
 square root.
 """
 
@@ -125,7 +125,8 @@ class Basis:
         encoded = np.round(255 * linear_to_srgb((guide / white).clip(0, 1))).astype(np.uint8)
         size = images.shape[1:3]
         share = resized(matte, *size)
-        below = np.maximum(resized(_linear(encoded, white), *size), dark * share.clip(_PERSON)[..., None])
+        small = images[: len(directions)].mean(0, dtype=np.float32).clip(0) + dark * share[..., None]
+        below = np.clip(small, dark * share.clip(_PERSON)[..., None], white)
         outside = share < _PERSON
         nearest = tuple(distance_transform_edt(outside, return_distances=False, return_indices=True))
         ratios, scales = np.empty(images.shape, np.uint8), np.empty(len(images), np.float32)
