@@ -108,6 +108,7 @@ def test_every_global_option_is_known_to_the_mover() -> None:
 @pytest.mark.parametrize("line", [
     ["nonsense"], ["--nonsense"], ["doctor", "--nonsense"], ["--seed", "x", "doctor"],
     ["--device", "abacus", "doctor"], ["-v", "-q", "doctor"], ["--seed"], ["-v"], ["doctor", "extra"],
+    ["relight", "a.png", "-o", "out", "--light", "1,2", "--background-blur", "nan"],
 ])  # fmt: skip
 def test_a_wrong_line_is_one_line_and_code_2(capsys: Capture, line: list[str]) -> None:
     assert main.main(line) == 2

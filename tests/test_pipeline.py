@@ -12,7 +12,15 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.light.estimate import estimate_signed_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
-from facerf_cli.pipeline import Estimator, Person, estimate_light, predict_olat, reflectance_of
+from facerf_cli.pipeline import (
+    Estimator,
+    Person,
+    estimate_light,
+    fit_photo,
+    predict_olat,
+    reflectance_of,
+)
+from facerf_cli.portrait.person import look_at_person
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.field import photo_evidence, weighted_sum
@@ -194,3 +202,14 @@ def test_a_face_beyond_the_budget_is_refused(models: Models, head: Head) -> None
     memory.set_limit(34 * unit)
     with pytest.raises(InputError, match=r"a face of \d+ x \d+ pixels: needs .* of memory.*smaller photo"):
         require_face(models.face, head.fit, size)
+
+
+def test_a_broken_pixel_in_the_face_changes_little_of_its_light(models: Models) -> None:
+    photo, landmarks_px = astronaut.photo().copy(), astronaut.face().landmarks_px
+    x, y = landmarks_px[30].round().astype(int)  # the tip of the nose
+    photo[y, x] = 1e6
+    whole, broken = (fit_photo(models, image, landmarks_px) for image in (astronaut.photo(), photo))
+    means = [float((head.face.texture * head.face.visible).mean()) for head in (whole, broken)]
+    assert means[1] < 1.02 * means[0]
+    seen = look_at_person(models.networks.people, models.face, photo, broken.fit)
+    assert float(seen.image.max()) < 10

@@ -18,7 +18,7 @@ import pytest
 from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import configure_logging
-from facerf_cli.run.ray_workers import connect, in_ray
+from facerf_cli.run.ray_workers import _initialise, connect, in_ray
 from tests.cli.toy_batch import run
 from tests.processes import wait_until
 
@@ -241,3 +241,12 @@ def test_a_lost_cluster_is_one_line_that_says_what_to_do(when: str, monkeypatch:
         FacerfError, match=r"^--ray a:1: the cluster was lost \(The node died\); start it again"
     ):
         list(in_ray(str, ["item"], "a:1", 1, 0, lambda item, error: item))
+
+
+def test_a_temporary_folder_too_deep_for_sockets_is_one_line() -> None:
+    def init(**_: object) -> None:
+        raise OSError("AF_UNIX path length cannot exceed 107 bytes: /deep")
+
+    ray = SimpleNamespace(init=init, exceptions=SimpleNamespace(RayError=RuntimeError))
+    with pytest.raises(UsageError, match="--ray local: TMPDIR has too long a name"):
+        _initialise(ray, "local", 1)

@@ -121,6 +121,10 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
         with chdir(_NO_MODULES):  # Ray lets workers import from the folder where it is started
             ray.init(address=address, **options)
     except (OSError, RuntimeError, ValueError, AssertionError, ray.exceptions.RayError) as error:
+        if "AF_UNIX" in str(error):
+            raise UsageError(
+                f"--ray {address}: TMPDIR has too long a name for Ray; set TMPDIR=/tmp"
+            ) from error
         raise UsageError(f"--ray {address}: {_first_sentence(error)}") from error
     finally:
         signal.signal(signal.SIGTERM, ours)  # Ray sets one of its own

@@ -427,9 +427,10 @@ def _write_setups(
                 if scene.identity is not None:
                     written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
                 del image
-            said = [f"exposure {ev:+.2f} EV"] if work.output.shown_suffix else []
+            group = " of its group" if shared_ev else ""
+            said = [f"exposure {ev:+.2f} EV{group}"] if work.output.shown_suffix else []
             said += [f"in a room that sends {setup.room:g} back"] if setup.room else []
-            if said and not shared_ev:
+            if said and not (shared_ev and work.shots):
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
             del relit  # of all of its part, beside the next
     return written
