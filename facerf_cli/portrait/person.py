@@ -158,7 +158,7 @@ def look_at_person(
     segmentation = segmentation or segment(people, shown, landmarks_px, matte)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
-        raise InputError("no skin is seen around the landmarks; check them, or relight the face alone")
+        raise InputError("no skin is seen around the landmarks; check them, or relight --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
     maps = proxy_maps(proxy, square_camera(fit, square))
     irises_px = irises_of(people, shown, landmarks_px)
