@@ -6,7 +6,7 @@ Grain: local contrast of the relit person over that of the photo (standard devia
 without what is coarser than 3 pixels, in blocks of 16 x 16 pixels that are black in neither): its median, and
 the share of blocks that keep less than half. Voids: the share of the person's pixels that are below 6 of 255,
 and above 16 in the photo. Least: the smallest value of the person in the EXR. The room is the default one;
-the twin is the photo under a map, studio.
+the twin is the photo under a map.
 """
 
 import tempfile
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
-from _common import arguments, photos
+from _common import ROOT, arguments, photos
 from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
@@ -25,6 +25,7 @@ from facerf_cli.main import app
 BLOCK, COARSE_PX, FLOOR = 16, 3.0, 0.002
 VOID, SEEN = 6, 16  # of 255
 LIGHTS = ("45,20", "-75,10", "160,10")
+MAP = ROOT / "examples" / "maps" / "low_sun.exr"
 
 
 def main() -> None:
@@ -35,7 +36,7 @@ def main() -> None:
     given = parser.parse_args()
     print("| light | median grain | blocks below half | voids | least |\n|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        for light in (*(given.light or LIGHTS), "studio"):
+        for light in (*(given.light or LIGHTS), MAP.stem):
             rows = [row_of(path, light, given.keep or Path(folder)) for path in photos(given.photos)]
             *means, _ = np.mean(rows, 0)
             print(
@@ -45,14 +46,9 @@ def main() -> None:
 
 def row_of(path: Path, light: str, folder: Path) -> tuple[float, float, float, float]:
     """Median of grain, share below half, share of voids and least value of a photo's person under a light."""
-    option = "--envmap" if light == "studio" else "--light"
-    named = (
-        ["--name", "{stem}_{light}"]
-        if light == "studio"
-        else ["--name", f"{{stem}}_{light.replace(',', '_')}"]
-    )
-    command = ["relight", str(path), option, light, "-o", str(folder), "--overwrite", "always"]
-    result = CliRunner().invoke(app, [*command, "--format", "exr,png", *named])
+    source = ["--envmap", str(MAP)] if light == MAP.stem else ["--light", light]
+    command = ["relight", str(path), *source, "-o", str(folder), "--overwrite", "always"]
+    result = CliRunner().invoke(app, [*command, "--format", "exr,png"])
     if result.exit_code:
         raise SystemExit(f"{' '.join(command)}: {result.output}")
     exr = next(Path(line) for line in result.output.splitlines() if line.endswith(".exr"))
