@@ -268,13 +268,15 @@ def _crops(
     clipped = 0
     for place, weight in enumerate(constant_weights(header.directions)):
         image = np.maximum(crop.apply(person.capture.frame(person.name, camera, person.lights[place])), 0)
+        clipped += int((image > HALF_MAX).any(-1).sum())
+        image = np.minimum(image, HALF_MAX)
         np.add(header.source, weight * image, out=header.source)
         if place in sheet_images:
             sheet_images[place] = image
-        clipped += int((image > HALF_MAX).any(-1).sum())
         yield torch.from_numpy(image).permute(2, 0, 1)[None]
     # Under a constant map of 1 a face is below 1; what leaves the range of half floats is warned of.
     name, lit = f"{person.name}/{camera}", float(header.source.max())
+    np.minimum(header.source, HALF_MAX, out=header.source)
     if clipped:
         advice = "the lights' intensities in stage.json are too small"
         log.warning("%s: %d pixels are above %g and were clipped; %s", name, clipped, HALF_MAX, advice)
