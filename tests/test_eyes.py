@@ -8,7 +8,7 @@ import torch
 
 from facerf_cli.image.strips import whole
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
 
@@ -33,6 +33,16 @@ def test_a_light_is_seen_where_the_cornea_faces_half_way_to_it(azimuth: float, e
 
 def test_a_light_behind_the_head_is_not_seen() -> None:
     assert image_of(180, 0).max() == 0 and image_of(0, 0).max() > 0.5
+    assert mirrored_in_cornea(torch.zeros(0, 3), torch.zeros(1, 0, 3)).abs().max() == 0
+
+
+def test_light_from_all_around_is_seen_as_a_smooth_veil() -> None:
+    around = rig_directions(24)
+    seen = mirrored_in_cornea(around, torch.full((1, 24, 3), 4 / 24))[0, 0]
+    at = 2 * (torch.arange(len(seen)) + 0.5) / len(seen) - 1
+    iris = seen[(at[None].square() + at[:, None].square()) < 0.9]
+    assert float(iris.mean()) == pytest.approx(0.025, rel=0.3)  # of a radiance of 1
+    assert iris.std() < 0.5 * iris.mean()
 
 
 def eyes(photo: np.ndarray) -> Eyes:
