@@ -45,6 +45,15 @@ def test_light_from_all_around_is_seen_as_a_smooth_veil() -> None:
     assert iris.std() < 0.5 * iris.mean()
 
 
+def test_a_light_is_seen_alike_whatever_else_shines() -> None:
+    lamps = torch.cat(
+        [azel_to_direction(20.0, 10.0)[None], rig_directions(24), azel_to_direction(24.0, 10.0)[None]]
+    )
+    weights = torch.rand(1, len(lamps), 3, generator=torch.Generator().manual_seed(0))
+    each = [mirrored_in_cornea(lamps[[n]], weights[:, [n]]) for n in range(len(lamps))]
+    torch.testing.assert_close(mirrored_in_cornea(lamps, weights), sum(each))
+
+
 def eyes(photo: np.ndarray) -> Eyes:
     return Eyes(photo.__getitem__, IRIS, lambda rows: np.ones((SIDE, SIDE), np.float32)[rows], (SIDE, SIDE))
 

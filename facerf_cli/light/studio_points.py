@@ -10,7 +10,7 @@ from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.light.sphere import RIG_LIGHTS, RigLight, azel_to_direction, rig_directions
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
 _AROUND = 24  # samples of a light from all around
@@ -53,6 +53,19 @@ def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     wide = 2 * math.tan(math.radians(light.size_deg / 2))
     directions = F.normalize(middle + wide * _grid(middle, light.size_deg), dim=1)
     return directions, torch.ones(len(directions)) / (directions @ middle).sum()
+
+
+def seen_radii(directions: Tensor) -> Tensor:
+    """Radii [N], in radians, of the discs as which lights [N, 3] are seen, whatever other lights there are.
+
+    A light is as large as a cell of a rig of 150, a sample of light from all around as large as its share.
+    """
+    around = (directions[:, None] == rig_directions(_AROUND)).all(-1).any(-1)
+    return torch.where(around, _cell_rad(_AROUND), _cell_rad(RIG_LIGHTS))
+
+
+def _cell_rad(lights: int) -> float:
+    return math.acos(1 - 2 / lights)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,14 +15,12 @@ from torch import Tensor
 
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Band
+from facerf_cli.light.studio_points import seen_radii
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import smoothstep
 
 _IRIS_OF_CORNEA = 5.9 / 7.8  # their radii, mm
 _REFLECTED = 0.025  # by Fresnel's law, of light that arrives at a right angle
-_DISC_RAD = math.radians(9.4)  # radius of the disc of a light that stands alone
-_LEAST_RAD, _ALONE_RAD = math.radians(6.0), math.radians(30.0)  # of others' discs; of a light that is alone
-_CELL = 0.6  # radius of a disc in distances to the next light, so that lights all around tile the cornea
 _SIDE = 64  # of the mirror image
 _LEAST_PX = 2.0  # radius of an iris in which something can be seen
 _CATCHLIGHT = 1.5  # radiance from which on a pixel is a catchlight, over the median of the iris
@@ -38,22 +36,12 @@ def mirrored_in_cornea(directions: Tensor, weights: Tensor) -> Tensor:
     x, y = right * _IRIS_OF_CORNEA, -down * _IRIS_OF_CORNEA
     normals = torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()])
     seen = 2 * normals[2] * normals - normals.new_tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
-    used = weights.abs().sum((0, 2)) > 0
-    directions, weights = directions[used], weights[:, used]
-    radii = _radii(directions)[:, None, None]
+    radii = seen_radii(directions)[:, None, None]
     outer, inner = (1.2 * radii).cos(), (0.8 * radii).cos()
     inside = (right.square() + down.square()) < 1
     discs = inside * smoothstep((torch.einsum("lc,cij->lij", directions, seen) - outer) / (inner - outer))
     # a disc that gives a white surface radiance 1 has itself the radiance 1 / sin^2
     return torch.einsum("mlc,lij->mcij", weights, discs * (_REFLECTED / radii.sin().square()))
-
-
-def _radii(directions: Tensor) -> Tensor:
-    """Radii [L] of the discs in which lights [L, 3] are seen, in radians."""
-    apart = (directions @ directions.T).clamp(-1, 1).acos()
-    others = F.pad(apart.masked_fill(apart < 1e-3, math.inf), (0, 1), value=math.inf)
-    cells = _CELL * others.amin(1)
-    return torch.where(cells > _ALONE_RAD, _DISC_RAD, cells.clamp_min(_LEAST_RAD))
 
 
 @dataclass(frozen=True, eq=False)
