@@ -58,7 +58,7 @@ def sheet(photo: Path, maps: Path) -> np.ndarray:
 
 def head(photo: np.ndarray, path: Path) -> Crop:
     """The square around the face, with room for hair."""
-    face = from_landmarks(find_faces(SHIPPED_NETWORKS.parsing, photo, str(path))[0].landmarks_px, CELL_PX)
+    face = from_landmarks(find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px, CELL_PX)
     room = MARGIN * face.side_px
     return Crop(face.x0_px - room, face.y0_px - room, face.side_px + 2 * room, CELL_PX)
 

@@ -25,7 +25,7 @@ MARGIN = 0.08  # in sides of the face's crop
 def sheet(photo: Path) -> np.ndarray:
     """The presets, three in a row [2 cells, 3 cells, 3], linear, over black."""
     face = from_landmarks(
-        find_faces(SHIPPED_NETWORKS.parsing, read_image(photo).pixels, str(photo))[0].landmarks_px, CELL_PX
+        find_faces(SHIPPED_NETWORKS.people, read_image(photo).pixels, str(photo))[0].landmarks_px, CELL_PX
     )
     room = MARGIN * face.side_px
     frame = Crop(face.x0_px - room, face.y0_px - room, face.side_px + 2 * room, CELL_PX)
