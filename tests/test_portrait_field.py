@@ -94,6 +94,16 @@ def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more
     assert (maps.bias.mean(1, keepdim=True) > own + 1e-6).any() == may_be_more
 
 
+def test_the_bias_has_the_photos_colours(field: PortraitField) -> None:
+    """A bias of its own colour would bleach lips."""
+    view = field.views[0]
+    own, bias = view.person.image / view.person.exposure * view.maps.gain[0], view.maps.bias[0]
+    bright = (own.mean(0) > own.mean()) & (view.person.classes[0] < 0.1)
+    shown, found = (colour[:, bright] / colour[:, bright].mean(0) for colour in (own, bias))
+    assert shown.std(1).max() > 0.1
+    torch.testing.assert_close(found, shown, atol=0.05, rtol=0)
+
+
 def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
     rig = rig_directions(48)
     given = field.person.inputs(rig, field.person.visibility(rig))
@@ -172,7 +182,7 @@ def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitF
     matte = head.person.segmentation.matte
     columns, weight = Enlarged(head, np.zeros((*matte.shape, 3), np.float32)).weight(slice(0, len(matte)))
     assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
-    assert np.abs(np.diff(weight, axis=1)).max() < 0.05
+    assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
 
 
 def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:

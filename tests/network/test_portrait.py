@@ -263,3 +263,5 @@ def test_what_is_turned_away_does_not_shine_but_hair_does() -> None:
     assert skin.shaded(behind, lit_everywhere())[1].max() == 0
     assert hair.shaded(behind, lit_everywhere())[1].min() > 0.05
     assert skin.shaded(ahead, lit_everywhere())[1].min() > 0
+    gloss[:, :2] = 0
+    assert skin.shaded(ahead, lit_everywhere())[1].max() == 0  # strands are hair's
