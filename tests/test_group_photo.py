@@ -14,7 +14,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.images import LinearImage
 from facerf_cli.image.strips import Band, Layer, filled, whole
 from facerf_cli.portrait.find import FaceBox
-from facerf_cli.relighting.composition import GroupComposition
+from facerf_cli.relighting.group import GroupComposition
 from facerf_cli.run import memory
 from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions

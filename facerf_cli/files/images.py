@@ -111,9 +111,8 @@ def read_image(
         if alpha is not None and opaque is not None:
             alpha[rows] = opaque.clip(0, 1)
             if found.is_associated:
-                most = (
-                    np.inf if values.dtype.kind == "f" else 1.0
-                )  # which rounding exceeds where alpha is small
+                # rounding exceeds 1 where alpha is small
+                most = np.inf if values.dtype.kind == "f" else 1.0
                 colour = unit_floats(colour) / np.where(alpha[rows] > 0, alpha[rows], 1)[..., None]
                 colour = colour.clip(None, most)
         pixels[rows] = to_linear_rec709(colour, space)

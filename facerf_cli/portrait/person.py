@@ -142,18 +142,17 @@ def look_at_person(
     model: MorphableModel,
     photo: np.ndarray,
     fit: FaceFit,
-    square: Crop | None = None,
     segmentation: Segmentation | None = None,
     matte: np.ndarray | None = None,
 ) -> SeenPerson:
     """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
 
-    All is seen in the square around the landmarks, or in a given one; a `segmentation` may be given, or the
-    person's `matte` [H, W].
+    All is seen in the square around the landmarks; a `segmentation` may be given, or the person's `matte`
+    [H, W].
     Raises InputError where no skin is seen, by which the person is exposed.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
-    square = square or portrait_square(landmarks_px)
+    square = portrait_square(landmarks_px)
     shown = to_display(photo)
     segmentation = segmentation or segment(people, shown, landmarks_px, matte)
     classes = _classes_in(segmentation, square)

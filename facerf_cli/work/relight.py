@@ -28,7 +28,8 @@ from facerf_cli.light.envmap import backdrop
 from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.pipeline import Person, reflectance_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
-from facerf_cli.relighting.composition import Composition, GroupComposition, Target
+from facerf_cli.relighting.composition import Composition, Target
+from facerf_cli.relighting.group import GroupComposition
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (

@@ -1,0 +1,86 @@
+"""Relit people of one photo, laid over each other in its frame."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from facerf_cli.image.colour import ExposureRule
+from facerf_cli.image.strips import Band, Layer, by_rows
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.relighting.composition import Composition, Relit
+
+Group = Sequence[Relit]  # of each person, in the order of the compositions
+_PERSON_MATTE = "person.A"
+
+
+class GroupComposition:
+    """Compose relit people of one photo, each by a composition of its own; the first is the nearest."""
+
+    def __init__(self, compositions: Sequence[Composition]) -> None:
+        self._first, *self._others = compositions
+        self.size_px = self._first.size_px
+        self.nbytes = sum(one.nbytes for one in compositions)
+
+    def relit(self, lights: Sequence[Lights]) -> Iterator[Group]:
+        """The people, each under each of the sums of its own lights."""
+        people = zip((self._first, *self._others), lights, strict=True)
+        return zip(*(one.relit(own) for one, own in people), strict=True)
+
+    def bands(self, relit: Group, ev: float, behind: Band | None) -> dict[str, Layer]:
+        """The people in the photo's frame; see `Composition.bands`."""
+        first = self._first.bands(relit[0], ev, behind)
+        pixels, alpha = by_rows(first["rgb"]), first.get("A")
+        for person, share in self._people(relit):
+            if alpha is None:
+                pixels = _over(person, share, pixels)
+                continue
+            whole = _over(_ones, share, by_rows(alpha))
+            both = _over(person, share, _times(pixels, by_rows(alpha)))
+            pixels, alpha = _straight(both, whole), whole
+        return {"rgb": pixels} if alpha is None else {"rgb": pixels, "A": alpha}
+
+    def light_layer(self, relit: Group) -> Band:
+        """The people [H, W, 3] under one of several lights, over black."""
+        layer = self._first.light_layer(relit[0])
+        for person, share in self._people(relit):
+            layer = _over(person, share, layer)
+        return layer
+
+    def layers(self, names: Sequence[str], relit: Group) -> dict[str, Layer]:
+        """Layers by the names that they have in a file; positions are in each person's own camera."""
+        found = self._first.layers(names, relit[0])
+        for composition, one, (_, share) in zip(self._others, relit[1:], self._people(relit), strict=True):
+            for name, layer in composition.layers(names, one).items():
+                own = _ones if name == _PERSON_MATTE else by_rows(layer)
+                found[name] = _over(own, share, by_rows(found[name]))
+        return found
+
+    def exposure_ev(self, relit: Group, rule: ExposureRule) -> float:
+        """The exposure in EV of the first person, by a rule."""
+        return self._first.exposure_ev(relit[0], rule)
+
+    def _people(self, relit: Group) -> Iterator[tuple[Band, Band]]:
+        for composition, one in zip(self._others, relit[1:], strict=True):
+            yield composition.person_and_share(one)
+
+
+def _over(top: Band, share: Band, below: Band) -> Band:
+    def of(rows: slice) -> np.ndarray:
+        under, weight = below(rows), share(rows)
+        weight = weight[..., None] if under.ndim == 3 else weight
+        return np.asarray(under + weight * (top(rows) - under))
+
+    return of
+
+
+def _ones(rows: slice) -> np.ndarray:
+    return np.ones((), np.float32)
+
+
+def _times(pixels: Band, alpha: Band) -> Band:
+    return lambda rows: pixels(rows) * alpha(rows)[..., None]
+
+
+def _straight(pixels: Band, alpha: Band) -> Band:
+    """Colours before they were multiplied by alpha."""
+    return lambda rows: pixels(rows) / np.maximum(alpha(rows), 1e-6)[..., None]
