@@ -39,7 +39,8 @@ class Comparison:
 
     They are compared inside the mask [H, W] in 0..1. `source` is the image that the methods were given, in
     its own frame. landmarks_px [68, 2] are those of the truth, for the face-recognition distance; without
-    them it is not measured. `extra` holds each method's figures that only the protocol can compute
+    them it is not measured. `source_face`, for that of the source, is the face's mask [h, w] in the source
+    and its landmarks [68, 2] there. `extra` holds each method's figures that only the protocol can compute
     ('light_error_deg'). `grey_as_given` is that of `pairs.read_predictions`.
     """
 
@@ -49,10 +50,12 @@ class Comparison:
     predictions: Mapping[str, np.ndarray]  # by method
     source: np.ndarray | None = None
     landmarks_px: np.ndarray | None = None
+    source_face: tuple[np.ndarray, np.ndarray] | None = None
     extra: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by method
     grey_as_given: bool = False
 
 
+SOURCE = "source, not relit"  # the row of the source's Face dis
 _PACKAGE, _FILE = "lpips", "weights/v0.1/vgg.pth"  # Zhang et al., LPIPS v0.1, BSD 2-Clause
 _ADVICE = "give --lpips lpips/weights/v0.1/vgg.pth of the package lpips"
 # SHA-256 of the heads' values, float32 little-endian. Version 0.0 has heads of the same names and shapes.
@@ -142,14 +145,14 @@ class Row:
     values: Mapping[str, float]
 
 
-def measure(comparison: Comparison, measures: Measures) -> list[Row]:
-    """Measure each method's prediction.
+def measure(comparison: Comparison, measures: Measures, faces: bool = True) -> list[Row]:
+    """Measure each method's prediction, and with `faces` Face dis, of the source too if its face is known.
 
     Face dis and LPIPS compare images as `shown` returns them, in any space. Raises InputError where a
     prediction has another size than the truth or values that are not finite, or where the mask is empty.
     """
     _check(comparison)
-    case, landmarks_px = comparison.case, comparison.landmarks_px
+    case, landmarks_px = comparison.case, comparison.landmarks_px if faces else None
     true = shown(comparison.truth, comparison)
     descriptor = None if landmarks_px is None else face_descriptor(true, landmarks_px)
     rows = []
@@ -162,14 +165,22 @@ def measure(comparison: Comparison, measures: Measures) -> list[Row]:
             values["face_distance"] = float(np.linalg.norm(face_descriptor(ours, landmarks_px) - descriptor))
         values |= comparison.extra.get(method, {})
         rows.append(Row(case.name, case.person, method, case.facts, values))
+    if descriptor is not None and comparison.source is not None and comparison.source_face is not None:
+        mask, places_px = comparison.source_face
+        given = face_descriptor(_encoded(comparison.source, comparison.source, mask), places_px)
+        distance = float(np.linalg.norm(given - descriptor))
+        rows.append(Row(case.name, case.person, SOURCE, case.facts, {"face_distance": distance}))
     return rows
 
 
 def shown(image: np.ndarray, comparison: Comparison) -> np.ndarray:
     """Encode an image [H, W, 3] for a viewer: masked, at the truth's exposure, sRGB in 0..1."""
-    ev = auto_exposure_ev(comparison.truth, comparison.mask)
-    exposed = np.clip(image * np.float32(2.0**ev), 0, 1)
-    return linear_to_srgb(exposed) * comparison.mask[..., None].astype(np.float32)
+    return _encoded(image, comparison.truth, comparison.mask)
+
+
+def _encoded(image: np.ndarray, exposed_as: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    exposed = np.clip(image * np.float32(2.0 ** auto_exposure_ev(exposed_as, mask)), 0, 1)
+    return linear_to_srgb(exposed) * mask[..., None].astype(np.float32)
 
 
 def _pixel_values(prediction: np.ndarray, comparison: Comparison, space: Space) -> dict[str, float]:

@@ -63,7 +63,6 @@ class PairsOptions:
         masks: Compare inside masks: images with the truths' names, white inside.
         facts: Read a row for each image: name, person, and columns for the tables (text) or for the list of
             images (numbers).
-        face_distance: Detect the truths' faces and measure Face dis, too.
     """
 
     truth: Path = option(..., metavar="DIR", in_recipe=False, shown_default=False)
@@ -73,7 +72,6 @@ class PairsOptions:
     facts: Path | None = option(
         None, metavar="CSV", shown_default="a person is a truth's topmost folder", panel=DATA
     )
-    face_distance: bool = option(False, panel=MEASURES)
     predictions: tuple[Path, ...] = ()
     names: tuple[str, ...] = ()  # of the predictions' methods
 
@@ -112,11 +110,14 @@ class Measures:
         space: Measure scene-linear values, or values encoded by sRGB.
         lpips: Read the linear heads of LPIPS (v0.1, VGG) from a file.
         vgg_weights: Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.
+        face_distance: Measure Face dis, too, where no table of the paper has it (extra dlib), and that of the
+            source, for comparison.
     """
 
     space: Space = option("linear", panel=MEASURES)
     lpips: Path | None = option(None, metavar="FILE", shown_default="where installed", panel=MEASURES)
     vgg_weights: str | None = option(None, metavar="imagenet|PATH", shown_default="no LPIPS", panel=MEASURES)
+    face_distance: bool = option(False, panel=MEASURES)
 
     def check(self) -> None:
         """Raise UsageError for heads without the network that they belong to."""

@@ -112,6 +112,11 @@ class HeadView:
     uv: Tensor
     mask: np.ndarray
 
+    @property
+    def face(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the face is in the head's crop: the mask [S, S] and landmarks [68, 2]."""
+        return self.mask, self.head.landmarks_px
+
     def region(self, name: str) -> np.ndarray:
         """The mask [S, S] in 0..1 of a named region of the face (`face/topology.py`)."""
         return sample_texture(region_mask(name, _MASK_SIDE)[None], self.uv)[..., 0].numpy()

@@ -95,6 +95,8 @@ def compare_olats(faces: Sequence[SourceFace], methods: Sequence[Method]) -> Ite
         common_mask(views),
         predictions,
         source=first.head.cropped,
+        landmarks_px=(target or face.portrait).by(methods[0].models).head.landmarks_px,
+        source_face=face.portrait.by(methods[0].models).face,
     )
     yield _with_drift(comparison, person.albedo, first.region("skin"))
 
@@ -159,7 +161,7 @@ def reconstruct(
             extra[method.name] = {"light_error_deg": light_error_deg(estimated, brightest(*truth))}
     head = views[0].head
     yield Comparison(
-        face.case, head.cropped, common_mask(views), predictions, head.cropped, head.landmarks_px, extra
+        face.case, head.cropped, common_mask(views), predictions, head.cropped, head.landmarks_px, extra=extra
     )
 
 
@@ -206,6 +208,7 @@ def transfer(faces: Sequence[SourceFace], methods: Sequence[Method]) -> Iterator
             predictions,
             source.cropped,
             first.landmarks_px,
+            views[other][0].face,
         )
 
 

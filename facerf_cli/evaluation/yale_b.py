@@ -24,7 +24,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.pipeline import head_of
-from facerf_cli.portrait.find import FaceBox
+from facerf_cli.portrait.find import Face, FaceBox
 from facerf_cli.relighting.composition import Target
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
@@ -229,6 +229,7 @@ def compare_subject(
     subject = YaleSubject(database, name)
     relightings = list(subject.relightings())
     face = reading.find(_rgb(subject.image("frontal")), str(database.folder / name))
+    places_px = face.landmarks_px if isinstance(face, Face) else None
     for source in dict.fromkeys(one.source for one in relightings):
         of_source = [one for one in relightings if one.source == source]
         photo = _rgb(subject.image(source))
@@ -240,6 +241,8 @@ def compare_subject(
                 mask=face_mask().astype(np.float32),
                 predictions={method: _rgb(images[row]) for method, images in relit.items()},
                 source=photo,
+                landmarks_px=places_px,
+                source_face=None if places_px is None else (face_mask(), places_px),
                 grey_as_given=True,
             )
 

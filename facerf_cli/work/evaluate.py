@@ -49,7 +49,7 @@ from facerf_cli.work.photos import face_model
 CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
 KEPT, STRIPS = "pictures", "strips"
 _STRIP_QUALITY = 88
-_MEASURING = 5  # raised where the same recipe gives other figures
+_MEASURING = 6  # raised where the same recipe gives other figures
 log = logging.getLogger(LOGGER_NAME)
 
 CompareItem = Callable[[Item], Iterable[Comparison]]
@@ -148,7 +148,7 @@ class Evaluation:
                 images += self._keep_images(own)
             comparison = _with_others(own, self.options.compare, wrong)
             if not wrong:  # else all that is missing is named at once
-                rows += measure(comparison, measures)
+                rows += measure(comparison, measures, "face_distance" in self.layout.metrics)
                 strip, pixels = draw_strip(comparison, scaled)
                 strips[strip.case] = strip, _as_jpeg(pixels)
         _require_whole(item, rows, wrong)

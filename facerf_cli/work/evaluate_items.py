@@ -131,6 +131,8 @@ def _run(
 ) -> int:
     """Measure items; the exit code. `recipe` has more options that shape the figures."""
     photo = settings.photo
+    if settings.options.measures.face_distance:
+        tables = replace(tables, metrics=tuple(dict.fromkeys((*tables.metrics, "face_distance"))))
     run = Evaluation(tables, compare, (settings, *recipe), settings.options, photo.settings, photo)
     return run.run(items, partial(_prepare, settings))
 
@@ -283,7 +285,8 @@ def run_pairs(compared: PairsOptions, options: EvaluateOptions, settings: Settin
     pairs = collect_pairs(compared.predictions, truth, compared.masks, compared.facts)
     facts = (fact for pair in pairs for fact in pair.case.facts.items())
     by = dict.fromkeys(name for name, value in facts if isinstance(value, str))
-    asked = {"lpips": options.measures.vgg_weights is not None, "face_distance": compared.face_distance}
+    measures = options.measures
+    asked = {"lpips": measures.vgg_weights is not None, "face_distance": measures.face_distance}
     metrics = ("si_mse", "mse", "psnr", "ssim", *(name for name, wanted in asked.items() if wanted))
     tables = Layout("pairs", f"Predictions against {folder_name(truth)}", metrics, tuple(by))
     size = math.ceil(len(pairs) / _PARTS)
@@ -291,7 +294,7 @@ def run_pairs(compared: PairsOptions, options: EvaluateOptions, settings: Settin
         f"part-{n:02d}": pairs[start : start + size] for n, start in enumerate(range(0, len(pairs), size))
     }
     items = [Item(truth, options.output / name, name) for name in parts]
-    compare = partial(_compare_part, settings if compared.face_distance else None, parts)
+    compare = partial(_compare_part, settings if measures.face_distance else None, parts)
     return Evaluation(tables, compare, (compared, settings), options, settings).run(items)
 
 

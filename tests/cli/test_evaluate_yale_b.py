@@ -10,6 +10,7 @@ import pytest
 
 from facerf_cli.capture.yale_b import Flash
 from facerf_cli.evaluation import people, yale_b
+from facerf_cli.evaluation.measure import SOURCE
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
 from facerf_cli.work import evaluate_items
@@ -56,6 +57,11 @@ def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> Non
     assert sum(count for (fact, _), count in counts.items() if fact == "angle") == 3
     for kind in ("source", "truth", "mask", "field"):
         assert (out / "pictures" / kind / "yaleB07" / "overhead" / "A+035E+40.exr").is_file()
+    assert "Face dis" not in said
+    assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--face-distance"]) == 0
+    figures = json.loads((out / "summary.json").read_text())["groups"][0]["metrics"]["face_distance"]
+    assert figures[SOURCE]["pictures"] == figures["field"]["pictures"] == 10
+    assert "Face dis" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("toys")

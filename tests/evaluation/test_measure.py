@@ -7,7 +7,7 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import measure as module
-from facerf_cli.evaluation.measure import METRICS, Case, Comparison, measure, shown
+from facerf_cli.evaluation.measure import METRICS, SOURCE, Case, Comparison, measure, shown
 from facerf_cli.evaluation.options import Measures
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
@@ -82,6 +82,25 @@ def test_faces_are_shown_masked_and_at_the_truths_exposure(
     distance = np.linalg.norm(true.mean((0, 1)) - near.mean((0, 1)))
     assert rows[0].values["face_distance"] == pytest.approx(distance)
     assert "face_distance" not in measure(comparison, Measures())[0].values
+    assert (
+        "face_distance"
+        not in measure(replace(comparison, landmarks_px=LANDMARKS), Measures(), False)[0].values
+    )
+
+
+def test_the_source_has_face_dis_as_its_own_face_is_shown(
+    comparison: Comparison, descriptors: list[np.ndarray]
+) -> None:
+    """A row of its own, so that it stands beside the methods'; in its own frame, mask and exposure."""
+    source = np.random.default_rng(1).gamma(1.0, 0.1, (9, 7, 3)).astype(np.float32)
+    mask = np.zeros((9, 7), np.float32)
+    mask[2:8, 1:6] = 1
+    given = replace(comparison, landmarks_px=LANDMARKS, source=source, source_face=(mask, LANDMARKS))
+    *_, row = measure(given, Measures())
+    expected = linear_to_srgb((source * 2 ** auto_exposure_ev(source, mask)).clip(0, 1)) * mask[..., None]
+    np.testing.assert_allclose(descriptors[-1], expected, atol=1e-6)
+    distance = np.linalg.norm(descriptors[0].mean((0, 1)) - expected.mean((0, 1)))
+    assert (row.method, row.values) == (SOURCE, {"face_distance": pytest.approx(distance)})
 
 
 def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -150,6 +150,9 @@ def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> No
     fits = [head.fit for head in heads]
     torch.testing.assert_close(turn @ fits[1].rotation, fits[0].rotation)
     assert first.truth is heads[0].cropped and first.source is heads[1].cropped
+    assert first.landmarks_px is not None and first.source_face is not None
+    assert np.array_equal(first.landmarks_px, heads[0].landmarks_px)
+    assert np.array_equal(first.source_face[1], heads[1].landmarks_px)
     assert second.case.facts["turn"] == "30 to 60 deg"
     for found in (first, second):  # the same face in another image: its texture fits where it is visible
         energy = np.square(found.truth[found.mask > 0.5]).mean()
