@@ -114,7 +114,7 @@ class HeadView:
 
     @property
     def face(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the face is in the head's crop: the mask [S, S] and landmarks [68, 2]."""
+        """Mask [S, S] and landmarks [68, 2] of the face in the head's crop."""
         return self.mask, self.head.landmarks_px
 
     def region(self, name: str) -> np.ndarray:

@@ -107,7 +107,7 @@ class PredictOlat(PhotoWork):
         size_px: Scale larger photos down to this longer side, with --frame photo.
         precision: Compute the network in this precision; bf16 where the device has instructions for it.
         format: Write OpenEXR; or a folder for the web viewers Relight and OpenLIME, front lights only.
-        page: Write the web page of `facerf view`, too.
+        page: Write the web page of `facerf view`, _page.html, too.
     """
 
     lights: str = option("150", metavar="N|FILE|'AZ,EL;...'", panel=LIGHT)
@@ -126,7 +126,7 @@ class PredictOlat(PhotoWork):
     def endings(self) -> tuple[str, ...]:
         """Ends of the stack, its contact sheet and, if wanted, its page."""
         stack = "_olat.exr" if self.format == "exr" else "_relight/info.json"
-        return (stack, "_olat.png", *([".html"] if self.page else []))
+        return (stack, "_olat.png", *(["_page.html"] if self.page else []))
 
     @property
     def networks(self) -> frozenset[str]:
@@ -154,7 +154,7 @@ MOST_ORDER = 20
 LARGEST_MAP_PX = 8192
 _ENDINGS: dict[Form, str] = {
     "latlong": "_latlong.exr",
-    "json": "_light.json",
+    "json": "_rig.json",
     "sh": "_sh.json",
     "dpr": "_dpr.txt",
     "sfsnet": "_sfsnet.txt",

@@ -43,12 +43,12 @@ def brightest(path: Path) -> tuple[float, float]:
 
 def test_a_map_to_json_and_back_to_a_smooth_map(tmp_path: Path) -> None:
     assert convert(a_map(tmp_path), tmp_path, "--to", "json") == 0
-    record = read_light(tmp_path / "spot_light.json")
+    record = read_light(tmp_path / "spot_rig.json")
     weights = envmap_weights(pixels(tmp_path / "spot.exr"), rig_directions())
     torch.testing.assert_close(record.weights, weights)
     assert record.attributes["facerf:input"] == "spot.exr"
-    assert convert(tmp_path / "spot_light.json", tmp_path / "b", "--to", "latlong", "--width", "256") == 0
-    smooth = pixels(tmp_path / "b/spot_light_latlong.exr")
+    assert convert(tmp_path / "spot_rig.json", tmp_path / "b", "--to", "latlong", "--width", "256") == 0
+    smooth = pixels(tmp_path / "b/spot_rig_latlong.exr")
     assert smooth.shape == (128, 256, 3)
     again = envmap_weights(smooth, rig_directions())
     assert float((again - weights).abs().max()) < 0.01 * float(weights.max())
@@ -87,7 +87,7 @@ def test_harmonics_as_json_text_and_maps(tmp_path: Path, capsys: Capture) -> Non
     torch.testing.assert_close(of_drawn.coefficients, of_map.coefficients, rtol=0.02, atol=0.02)
     assert "negative" in capsys.readouterr().err  # a spot's cut series rings
     front = azel_to_direction(54, 36)
-    rig = read_light(tmp_path / "spot_sh_light.json")
+    rig = read_light(tmp_path / "spot_sh_rig.json")
     brightest_light = rig.directions[rig.weights.sum(1).argmax()]
     assert float(brightest_light @ front) > math.cos(math.radians(15))
 
@@ -96,7 +96,7 @@ def test_a_map_of_harmonics_can_shine(tmp_path: Path, capsys: Capture) -> None:
     assert convert(a_map(tmp_path), tmp_path, "--to", "sh") == 0
     assert convert(tmp_path / "spot_sh.json", tmp_path, "--to", "latlong", "--to", "json") == 0
     assert float(pixels(tmp_path / "spot_sh_latlong.exr").min()) >= 0
-    assert float(read_light(tmp_path / "spot_sh_light.json").weights.min()) >= 0
+    assert float(read_light(tmp_path / "spot_sh_rig.json").weights.min()) >= 0
     assert "negative" not in capsys.readouterr().err
     assert convert(tmp_path / "spot_sh_latlong.exr", tmp_path, "--to", "sh") == 0
     before, after = (read_light(tmp_path / f"spot_{name}.json").sh for name in ("sh", "sh_latlong_sh"))
@@ -117,7 +117,7 @@ def test_dprs_example_keeps_its_numbers(tmp_path: Path) -> None:
 def test_another_rig(tmp_path: Path) -> None:
     write_light(tmp_path / "a.json", LightRecord(rig_directions(), torch.full((150, 3), 4 / 150)))
     assert convert(tmp_path / "a.json", tmp_path, "--to", "json", "--lights", "40") == 0
-    record = read_light(tmp_path / "a_light.json")
+    record = read_light(tmp_path / "a_rig.json")
     assert len(record.directions) == 40
     torch.testing.assert_close(record.weights, torch.full((40, 3), 0.1), rtol=0.15, atol=0)
 

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Literal
 
 import pytest
@@ -14,8 +15,10 @@ from facerf_cli.cli.fit_geometry import FitGeometry
 from facerf_cli.cli.options import with_groups
 from facerf_cli.cli.predict_olat import PredictStacks
 from facerf_cli.cli.segment import Segment
+from facerf_cli.cli.view import MakePage
 from facerf_cli.option import Only, Without, attributes_of, option
 from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.verbs import _ENDINGS
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,14 @@ def test_a_verb_may_have_some_of_a_group() -> None:
 
     assert run(verb, "--kind", "ink").exit_code == 0
     assert run(verb, "--size", "4").exit_code == 2
+
+
+def test_no_two_verbs_write_one_name() -> None:
+    photo = PhotoOptions(Settings())
+    works = (Segment, FitGeometry, EstimateLight, MakePage, partial(PredictStacks, page=True))
+    ends = [end for make in works for end in make(photo=photo).endings]
+    ends += ["_relight/info.json", *_ENDINGS.values()]
+    assert len(set(ends)) == len(ends)
 
 
 @dataclass(frozen=True)

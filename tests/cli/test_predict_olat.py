@@ -123,7 +123,7 @@ def test_a_page_is_written_beside_the_stack(
     monkeypatch.setattr("facerf_cli.viewer.basis.rig_directions", lambda: rig_directions(12))
     line = ["--lights", SIDES, "--frame", "photo", "--size", "256", "--page"]
     assert predict(given, tmp_path, *line) == 0
-    made = (tmp_path / "astronaut.html").read_text()
+    made = (tmp_path / "astronaut_page.html").read_text()
     assert strip_of(made) and 'id="data"' in made
     assert (tmp_path / "astronaut_olat.exr").exists()
     assert predict(given, tmp_path / "x", *line, "--network-alone") == 2
