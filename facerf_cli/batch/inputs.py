@@ -10,7 +10,7 @@ import sys
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from string import Formatter
 
@@ -194,6 +194,19 @@ def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
                 "give --name where the verb has it, such as '{dir}/{stem}_{ext}'"
             )
             raise UsageError(f"{other.input_path} and {item.input_path}: {alike if pattern else by_path}")
+
+
+def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:
+    """The one item whose output is the file that `-o` names.
+
+    Raises UsageError where there are several items, or outputs of one, and where the file is the input.
+    """
+    item = items[0]
+    if several or len(items) > 1 or item.frame is not None:
+        raise UsageError(f"-o {output}: is one file; give one photo, face and light, or a folder")
+    if output.exists() and item.input_path.exists() and os.path.samefile(output, item.input_path):
+        raise UsageError(f"-o {output}: is the input; give another name")
+    return replace(item, output_base=output.with_suffix(""), name=output.stem)
 
 
 def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterator[str]:

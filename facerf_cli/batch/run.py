@@ -131,10 +131,15 @@ _FILE_SUFFIX = re.compile(
 )
 
 
-def folder_not_file(output: Path) -> Path:
-    """The folder that `-o` names; raises UsageError for a file's name, unless such a folder is there."""
+def folder_not_file(output: Path, other: str = "") -> Path:
+    """The folder that `-o` names; raises UsageError for a file's name, unless such a folder is there.
+
+    `other` names the suffixes of files that may be given.
+    """
     if _FILE_SUFFIX.fullmatch(output.suffix) and not output.is_dir():
-        raise UsageError(f"-o {output}: is a file's name; give a folder, such as -o {output.with_suffix('')}")
+        kinds = f", or a file as {other}" if other else ""
+        folder = f"give a folder, such as -o {output.with_suffix('')}"
+        raise UsageError(f"-o {output}: is a file's name; {folder}{kinds}")
     return output
 
 

@@ -12,7 +12,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.option import LIGHT, option
 from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.shots import ShotOptions, collect_frames, whole_shots
-from facerf_cli.work.verbs import LARGEST_MAP_PX, MOST_ORDER, PhotoWork, Written, refuse_odd
+from facerf_cli.work.verbs import LARGEST_MAP_PX, MOST_ORDER, FileOrFolder, PhotoWork, Written, refuse_odd
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +29,7 @@ class EstimateLight(PhotoWork, LightOptions):
     verb = "estimate-light"
     endings = ("_light.exr", "_light.json", "_light.png")
     networks = LightOptions.networks
+    alone_as = ("_light.exr", "_light.json")
 
     def run(self, inputs: Sequence[str], batch: BatchOptions, wanted: ShotOptions | None = None) -> int:
         """Estimate the light of photos, and one for each shot; return the exit code."""
@@ -61,7 +62,7 @@ class EstimateLight(PhotoWork, LightOptions):
 
 
 def estimate_light(
-    inputs: FramesArgument, work: EstimateLight, shots: ShotOptions, batch: BatchOptions
+    inputs: FramesArgument, work: EstimateLight, shots: ShotOptions, batch: FileOrFolder
 ) -> None:
     """Estimate the light of photos from the shading of their faces.
 

@@ -7,16 +7,16 @@ facerf relight plate.exr --light key=40,20 --light rim=160,10 --exr single -o re
 facerf view me.jpg -o me.html
 facerf view photos/ -o pages/
 facerf view stacks/me_olat.exr -o me.html
-facerf estimate-light me.jpg -o light/
+facerf estimate-light me.jpg -o light.exr
 facerf estimate-light me.jpg --width 1024 --sh-order 4 -o light/
 facerf estimate-light shot.mp4 -o light/
 facerf predict-olat me.jpg -o stacks/
 facerf predict-olat me.jpg --lights '40,20;-40,20' --frame uv -o stacks/
 facerf predict-olat me.jpg --format relight -o web/
-facerf segment me.jpg -o cut/
+facerf segment me.jpg -o cut.png
 facerf segment group.jpg --face all -o cut/
 facerf segment photos/ --jobs 4 -o cut/
-facerf fit-geometry me.jpg -o fit/
+facerf fit-geometry me.jpg -o me.glb
 facerf fit-geometry me.jpg --face-model ict.npz -o fit/
 facerf fit-geometry photos/ --landmarks points/ -o fit/
 facerf convert-light sky.exr --to sh -o lights/

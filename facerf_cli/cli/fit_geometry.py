@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.work.photo_options import FITTING
-from facerf_cli.work.verbs import PhotoWork, Written
+from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written
 
 _TEXTURES = ("_texture.exr", "_texture.png", "_normals.exr", "_normals.png")
 _MESHES = ("_mesh.glb", "_mesh.mtl", "_mesh.obj")
@@ -19,6 +18,7 @@ class FitGeometry(PhotoWork):
     """`facerf fit-geometry`."""
 
     verb, endings, networks = "fit-geometry", (*_TEXTURES, *_MESHES, "_fit.jpg", "_fit.npz"), FITTING
+    alone_as = ("_mesh.glb",)
 
     def write(self, item: Item) -> Written:
         """Fit every chosen face."""
@@ -27,7 +27,7 @@ class FitGeometry(PhotoWork):
         return write_fits(item, self.photo)
 
 
-def fit_geometry(inputs: InputsArgument, work: FitGeometry, batch: BatchOptions) -> None:
+def fit_geometry(inputs: InputsArgument, work: FitGeometry, batch: FileOrFolder) -> None:
     """Fit the face model to photos: mesh, texture, normals, and an overlay of the fit.
 
     For each photo: _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, the head upright),

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import InputsArgument
-from facerf_cli.work.verbs import PredictOlat, Written
+from facerf_cli.work.verbs import FileOrFolder, PredictOlat, Written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,7 +20,7 @@ class PredictStacks(PredictOlat):
         return write_stacks(item, self)
 
 
-def predict_olat(inputs: InputsArgument, work: PredictStacks, batch: BatchOptions) -> None:
+def predict_olat(inputs: InputsArgument, work: PredictStacks, batch: FileOrFolder) -> None:
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
     Each photo gives an OLAT stack (an OpenEXR file with a part for each light, the person over black;

@@ -325,12 +325,13 @@ def write_display(
     view: View = PLAIN_VIEW,
     share: np.ndarray | None = None,
     bits: Literal[8, 16] = 8,
+    quality: int = JPEG_QUALITY,
 ) -> float:
     """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
 
     "auto" is `colour.auto_exposure_ev` where alpha [H, W] exceeds one half. PNG keeps alpha, with colour that
     is not premultiplied; JPEG has no alpha and shows the image over black. `view` and `share` are those of
-    `colour.encode_display`; `bits` are of a PNG.
+    `colour.encode_display`; `bits` are of a PNG, `quality` (1 to 100) of a JPEG.
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
@@ -348,7 +349,7 @@ def write_display(
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if view.is_srgb:
         spec.attribute("oiio:ColorSpace", "sRGB")
-    spec.attribute("CompressionQuality", JPEG_QUALITY)
+    spec.attribute("CompressionQuality", quality)
     spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
     write_parts(path, [spec], [values], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})

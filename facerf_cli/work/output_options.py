@@ -25,6 +25,7 @@ NEEDS: dict[str, tuple[Format, ...]] = {
     "aov": ("exr",),
     "compression": ("exr",),
     "exr": ("exr",),
+    "quality": ("jpg",),
     "output_colourspace": ("exr", "tiff"),
     "view": _DISPLAYED,
     "display": _DISPLAYED,
@@ -69,6 +70,7 @@ class OutputOptions:
         output_colourspace: Write EXR and TIFF in this space: ACEScg, lin_rec2020, any name of OCIO.
         compression: Compress EXR files: zip, zips, piz, rle (lossless), none, pxr24, b44, b44a, dwaa, dwab.
         exr: Write layers as parts of the EXR, or as channels of a single part, which more programs read.
+        quality: Compress JPEG files by this quality, 1 to 100.
         view: Show PNG and JPEG by sRGB with a soft shoulder, clipped (none), by aces, or a view of OCIO.
         display: Take --view, or the default view, from this display of OCIO.
         config: Use this OpenColorIO configuration.
@@ -86,6 +88,7 @@ class OutputOptions:
     output_colourspace: str | None = option(None, metavar="NAME", shown_default="linear Rec.709", panel=IMAGE)
     compression: Compression = option("zip", metavar="NAME", panel=IMAGE)
     exr: Literal["parts", "single"] = option("parts", panel=IMAGE)
+    quality: int = option(95, metavar="N", least=1, most=100, panel=IMAGE)
     view: str = option("soft", metavar="NAME", panel=IMAGE)
     display: str = option("", metavar="NAME", shown_default="the configuration's", panel=IMAGE)
     config: str = option(

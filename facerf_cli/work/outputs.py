@@ -63,7 +63,9 @@ def write_output(
         else:
             bits: Literal[8, 16] = 16 if name == "png16" else 8
             shown = {"facerf:view": view.name, **(metadata or {})}
-            write_display(target, image.pixels, exposure, image.alpha, shown, view, image.share, bits)
+            write_display(
+                target, image.pixels, exposure, image.alpha, shown, view, image.share, bits, options.quality
+            )
 
     at_once = len(options.formats) if not isinstance(image.pixels, np.memmap) else 1
     with ThreadPoolExecutor(at_once) as pool:

@@ -1,7 +1,6 @@
 """`facerf relight`: its options, what each image is made by, and where it goes. Light to import."""
 
 import itertools
-import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Literal, Self
 
 from facerf_cli.baselines import Kind, RelightKind
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, only_item, split_frame
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
@@ -334,11 +333,8 @@ class Relight:
         A file that -o names is one image, and no input.
         """
         for path in self.outputs_of(items[0]) if self.output.file_suffix else ():
-            faces = 1 + (self.photo.face == "all" and self.composite == "face")
-            if len(items) * len(self.setups) * faces != 1:
-                raise UsageError(f"-o {path}: is one image; give one photo, face and light, or a folder")
-            if path.exists() and os.path.samefile(path, items[0].input_path):
-                raise UsageError(f"-o {path}: is the input; give another name")
+            all_faces = self.photo.face == "all" and self.composite == "face"
+            only_item(items, path, several=all_faces or len(self.setups) > 1)
         paths: set[Path] = set()
         for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
             if path in paths:

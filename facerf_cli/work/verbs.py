@@ -4,20 +4,41 @@ A class has the options of its verb as fields, is sent to the processes that tak
 what the outputs' recipes hold. In the verb's file a subclass imports the work.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, only_item
 from facerf_cli.batch.made_from import DigestOf, Recipe, one_recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items
+from facerf_cli.batch.run import BatchOptions, Outcome, folder_not_file, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.errors import UsageError
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
 from facerf_cli.option import IMAGE, LIGHT, METHOD, option
 from facerf_cli.work.photo_options import PhotoOptions, network_alone_option, networks_of, parse_pose
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, Shot, ShotOptions, collect_frames, recipe_of_shots
+
+
+@dataclass(frozen=True)
+class FileOrFolder(BatchOptions):
+    """The contract of verbs on photos, of which one file may be wanted.
+
+    Attributes:
+        output: Write the results to this folder; or one of them, of one photo, to this file, by its suffix.
+    """
+
+    output: Path = option(
+        Path(),
+        metavar="DIR|FILE",
+        in_recipe=False,
+        flags=("--output", "-o"),
+        shown_default=False,
+        required=True,
+    )
+
 
 Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the faces that were written; facts for the report
 
@@ -28,12 +49,18 @@ class PhotoWork:
 
     photo: PhotoOptions
     shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
+    alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
     verb: ClassVar[str]
 
     @property
     def endings(self) -> tuple[str, ...]:
         """Ends of the names of a face's files."""
         raise NotImplementedError
+
+    @property
+    def alone_as(self) -> tuple[str, ...]:
+        """Those of them that may be written alone, to the file that `-o` names, one for each suffix."""
+        return ()
 
     @property
     def networks(self) -> frozenset[str]:
@@ -62,8 +89,25 @@ class PhotoWork:
         batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1)
         return replace(work, shots=shots).run_on(items, batch)
 
+    def names_file(self, output: Path) -> bool:
+        """True if `-o` names a file; raises UsageError for one that cannot be written alone."""
+        if self._end_of(output.suffix) and not output.is_dir():
+            return True
+        folder_not_file(output, " or ".join(end[end.index(".") :] for end in self.alone_as))
+        return False
+
+    def _end_of(self, suffix: str) -> str:
+        """The end of the file that may be written alone with a suffix; '' where there is none."""
+        return next((end for end in self.alone_as if suffix and end.endswith(suffix.lower())), "")
+
     def run_on(self, items: Sequence[Item], batch: BatchOptions) -> int:
         """Process items; return the exit code."""
+        if self.names_file(batch.output) and not self.alone:
+            if batch.name is not None:
+                raise UsageError(f"--name: is not for -o {batch.output}, one file; leave it out")
+            item = only_item(items, batch.output, several=self.photo.face == "all")
+            work = replace(self, alone=batch.output.suffix)
+            return work.run_on([item], replace(batch, output=batch.output.parent))
 
         def prepare() -> None:
             from facerf_cli.work.photos import prepare_photos
@@ -79,7 +123,7 @@ class PhotoWork:
 
     def files_of(self, item: Item, tag: str) -> list[Path]:
         """Every file of the face with a tag."""
-        return [item.output(tag + ending) for ending in self.endings]
+        return [item.output(tag + ending) for ending in ([self.alone] if self.alone else self.endings)]
 
     def outputs_of(self, item: Item) -> list[Path]:
         """Every file of an item's (first) face."""
@@ -91,8 +135,19 @@ class PhotoWork:
 
     def __call__(self, item: Item) -> Outcome:
         """Write the files of an item."""
+        if self.alone:
+            return self._one_file(item)
         tags, facts = self.write(item)
         return Outcome([path for tag in tags for path in self.files_of(item, tag)], facts)
+
+    def _one_file(self, item: Item) -> Outcome:
+        """Write the files of an item out of sight, and keep one."""
+        (path,) = self.outputs_of(item)
+        with atomic_path(path) as temporary:
+            apart = replace(item, output_base=temporary.parent / "all" / item.name)
+            tags, facts = replace(self, alone="").write(apart)
+            os.replace(apart.output(tags[0] + self._end_of(self.alone)), temporary)
+        return Outcome([path], facts)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +182,11 @@ class PredictOlat(PhotoWork):
         """Ends of the stack, its contact sheet and, if wanted, its page."""
         stack = "_olat.exr" if self.format == "exr" else "_relight/info.json"
         return (stack, "_olat.png", *(["_page.html"] if self.page else []))
+
+    @property
+    def alone_as(self) -> tuple[str, ...]:
+        """The stack."""
+        return self.endings[:1] if self.format == "exr" else ()
 
     @property
     def networks(self) -> frozenset[str]:

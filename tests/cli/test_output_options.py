@@ -70,6 +70,12 @@ def test_every_format_holds_the_same_image(
         assert image.metadata.get("facerf:view", "none") == "none"
     assert "albedo.R" in exr_layers(tmp_path / f"{NAME}.exr")
     assert relight(given, tmp_path, *line) == 0  # finished
+    jpeg = tmp_path / f"{NAME}.jpg"
+    for quality in ("95", "20"):
+        assert relight(given, tmp_path / quality, *LIGHT, "--format", "jpg", "--quality", quality) == 0
+    small, usual = ((tmp_path / quality / jpeg.name).stat().st_size for quality in ("20", "95"))
+    assert 3 * small < usual
+    assert relight(given, tmp_path / "png", *LIGHT, "--format", "png", "--quality", "90") == 2
 
 
 def test_the_soft_view_changes_the_bright_person_alone(given: Path, tmp_path: Path) -> None:

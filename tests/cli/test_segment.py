@@ -39,6 +39,29 @@ def test_every_file_is_there_and_in_the_report(cut: Path) -> None:
     assert set(row["touches_frame"]) == {"bottom"}
 
 
+def test_one_file_is_that_of_the_folder(
+    cut: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / "me.png"
+    for said in ("", "already finished"):
+        assert main(["segment", str(PHOTO), "-o", str(target)]) == 0
+        assert said in capsys.readouterr().err
+    assert target.read_bytes() == (cut / "astronaut_person.png").read_bytes()
+    assert {path.name for path in tmp_path.glob("[!.]*")} == {"me.png", "report.jsonl"}
+    for line, said in (
+        (["-o", "me.jpg"], "or a file as .png or .exr"),
+        (["-o", "me.png", "--face", "all"], "is one file"),
+        (["-o", "me.png", str(cut / "astronaut_person.png")], "is one file"),
+        (["-o", "me.png", "--name", "{stem}"], "--name: is not for"),
+        (["-o", str(PHOTO.with_suffix(".JPG"))], "is a file's name"),
+    ):
+        assert main(["segment", str(PHOTO), *line]) == 2
+        assert said in capsys.readouterr().err
+    assert main(["segment", str(target), "-o", str(target)]) == 2
+    assert "is the input" in capsys.readouterr().err
+    assert main(["segment", str(tmp_path / "none.png"), "-o", str(target)]) == 1
+
+
 def test_classes_sum_to_the_matte_over_the_whole_frame(layers: dict[str, np.ndarray]) -> None:
     matte = layers["person.A"]
     photo = read_image(PHOTO).pixels

@@ -43,7 +43,7 @@ def test_pages_of_a_folder_mirror_its_tree(folder: Path, capsys: pytest.CaptureF
 
 def test_several_photos_are_not_one_page(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(folder / "in"), "-o", str(folder / "me.html")]) == 2
-    assert "is one page" in capsys.readouterr().err
+    assert "is one file" in capsys.readouterr().err
 
 
 def test_a_photo_named_index_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
