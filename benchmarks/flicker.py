@@ -79,7 +79,7 @@ def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | N
     """Relight a frame by the target's light."""
     reflectance = pipeline.reflectance_of(models, head, "portrait", photo=frame, steady=steady)
     light = RigLight(rig_directions(LIGHTS), TARGET)
-    return pipeline.Person(models, frame, head, reflectance).image(light).pixels
+    return pipeline.FittedPerson(models, frame, head, reflectance).image(light).pixels
 
 
 def exposed(results: list[np.ndarray], clip: Clip) -> np.ndarray:

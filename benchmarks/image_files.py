@@ -88,11 +88,9 @@ def write_one_part(path: Path, pixels: np.ndarray, alpha: np.ndarray, layers: di
 
 def report_views(photo: np.ndarray) -> None:
     """Print a row a view: the difference from the photo, and pixels of the person without detail."""
-    models = facerf.load_models()
-    head = facerf.fit_photo(models, photo)
-    own = facerf.relight(models, photo, head, facerf.estimate_light(models, head))
-    warm = facerf.relight(models, photo, head, _WARM)
-    person = facerf.segment(photo)["person.A"] > 0.5
+    fitted = facerf.fit(facerf.load_models(), photo)
+    own, warm = fitted.relight([fitted.light, _WARM])
+    person = fitted.matte > 0.5
     print_header(
         "view", "own light: mean difference, of 255", "own light: grey 0.18", "warm light: a channel is 255"
     )

@@ -23,7 +23,7 @@ from facerf_cli.files.images import read_image, write_display
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.pipeline import Person, find_for, fit, head_of, reflectance_of
+from facerf_cli.pipeline import FittedPerson, find_for, fit, head_of, reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
@@ -84,7 +84,7 @@ def measure(models: Models, paths: list[Path], sheet: Path | None) -> None:
             continue
         found = {"copy": np.repeat(photo[None], len(weights), 0)}
         for kind in ("field", "portrait"):
-            person = Person(models, photo, head, reflectance_of(models, head, kind, photo=photo))
+            person = FittedPerson(models, photo, head, reflectance_of(models, head, kind, photo=photo))
             composition = person.composed(Target(background="none"))
             relit = composition.relit(Lights(rig, weights))
             found[kind] = np.stack([composition.image(one).pixels for one in relit])

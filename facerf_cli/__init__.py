@@ -12,25 +12,23 @@ from facerf_cli._version import __version__ as __version__
 if TYPE_CHECKING:
     from facerf_cli.api import (
         Light,
-        estimate_light,
-        fit_photo,
+        Person,
+        PhotoCamera,
+        fit,
         load_models,
-        predict_olat,
         read_image,
-        relight,
-        segment,
+        rig,
         write_image,
     )
 
 __all__ = [
     "Light",
-    "estimate_light",
-    "fit_photo",
+    "Person",
+    "PhotoCamera",
+    "fit",
     "load_models",
-    "predict_olat",
     "read_image",
-    "relight",
-    "segment",
+    "rig",
     "write_image",
 ]
 

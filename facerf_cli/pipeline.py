@@ -1,6 +1,6 @@
 """The method, one function an arrow: from one photo to the face under any light, from any head pose.
 
-    photo -> fit_photo or regress_photo -> head -> reflectance_of -> Person -> image
+    photo -> fit_photo or regress_photo -> head -> reflectance_of -> FittedPerson -> image
                                             head -> estimate_light -> light
                                             head -> predict_olat -> a texture for each light
 
@@ -152,7 +152,7 @@ def reflectance_of(
 
 
 @dataclass(frozen=True, eq=False)
-class Person:
+class FittedPerson:
     """One face of a photo [H, W, 3], fitted once: each light, pose and layer then costs what itself costs.
 
     Without a photo it is the face alone, in the frame of its crop. The person's matte [H, W] may be given.
@@ -171,7 +171,8 @@ class Person:
         if isinstance(self.reflectance, PortraitField):
             return self.reflectance.person.segmentation
         landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        return segment(self.models.networks.people, to_display(self.photo), landmarks_px)
+        people, matte = self.models.networks.people, self.given_matte
+        return segment(people, to_display(self.photo), landmarks_px, matte)
 
     @property
     def matte(self) -> np.ndarray:
@@ -200,10 +201,10 @@ def fit(
     face: FaceBox,
     kind: RelightKind = "portrait",
     sides: Sides | None = None,
-) -> Person:
+) -> FittedPerson:
     """Fit a face found in a photo [H, W, 3], and read its reflectance."""
     head = head_of(models, photo, face, sides)
-    return Person(models, photo, head, reflectance_of(models, head, kind, photo=photo))
+    return FittedPerson(models, photo, head, reflectance_of(models, head, kind, photo=photo))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import read_image
-from facerf_cli.pipeline import Person, fit
+from facerf_cli.pipeline import FittedPerson, fit
 from facerf_cli.portrait.find import Face, find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.portrait_field import PortraitField
@@ -32,7 +32,7 @@ def face() -> Face:
 
 
 @cache
-def person() -> Person:
+def person() -> FittedPerson:
     """The astronaut with her portrait field."""
     return fit(models(), photo(), face(), sides=models().sides(TEXTURE))
 

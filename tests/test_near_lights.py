@@ -11,7 +11,7 @@ from facerf_cli.image.strips import whole
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
-from facerf_cli.pipeline import Person, reflectance_of
+from facerf_cli.pipeline import FittedPerson, reflectance_of
 from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.portrait_field import PortraitField
 from tests import astronaut
@@ -142,7 +142,7 @@ def test_other_models_have_near_lights_too(person: Shown, kind: str) -> None:
     """Their textures add up, and so does what surrounds the face where it follows the field."""
     models, photo, head = astronaut.models(), astronaut.photo(), astronaut.head()
     reflectance = reflectance_of(models, head, kind)  # type: ignore[arg-type]
-    composition = Person(models, photo, head, reflectance).composed(TARGET)
+    composition = FittedPerson(models, photo, head, reflectance).composed(TARGET)
 
     def image(*lights: StudioLight) -> np.ndarray:
         return over_black(composition, near(*lights))

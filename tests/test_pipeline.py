@@ -14,7 +14,7 @@ from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.pipeline import (
     Estimator,
-    Person,
+    FittedPerson,
     estimate_light,
     fit_photo,
     predict_olat,
@@ -101,7 +101,7 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     turned = replace(head.fit, rotation=pose_to_rotation(30, 0, 0))
     straight = replace(head.fit, rotation=pose_to_rotation(0, 0, 0))
     targets = [Target(fit, "face") for fit in (straight, turned)]
-    person = Person(models, None, head, reflectance_of(models, head))
+    person = FittedPerson(models, None, head, reflectance_of(models, head))
     images = [person.image(light, target) for target in targets]
     for image in images:
         assert image.alpha is not None and image.pixels.shape == (256, 256, 3)

@@ -14,7 +14,7 @@ from facerf_cli.image.strips import filled, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.pipeline import Person, fit, reflectance_of
+from facerf_cli.pipeline import FittedPerson, fit, reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SEEN_PX, wider_square
@@ -37,7 +37,7 @@ def photo() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def person() -> Person:
+def person() -> FittedPerson:
     return astronaut.person()
 
 
@@ -64,7 +64,7 @@ def lamp(azimuth_deg: float, elevation_deg: float = 0.0) -> RigLight:
 
 
 def test_under_its_own_light_the_photo_comes_back(
-    photo: np.ndarray, person: Person, field: PortraitField
+    photo: np.ndarray, person: FittedPerson, field: PortraitField
 ) -> None:
     models, head = person.models, person.head
     image = person.image(own_light(models, head.face).light).pixels
@@ -116,7 +116,7 @@ def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
 
 
 def test_a_lamp_lights_the_side_that_it_is_on(
-    photo: np.ndarray, person: Person, field: PortraitField
+    photo: np.ndarray, person: FittedPerson, field: PortraitField
 ) -> None:
     """Hair, neck and garment, too: halves of the person beside the head's middle."""
     target = Target(background="none")
@@ -132,7 +132,9 @@ def test_a_lamp_lights_the_side_that_it_is_on(
         assert left[on_left].mean() > 1.3 * right[on_left].mean()
 
 
-def test_a_lamp_behind_leaves_the_face_dark(photo: np.ndarray, person: Person, field: PortraitField) -> None:
+def test_a_lamp_behind_leaves_the_face_dark(
+    photo: np.ndarray, person: FittedPerson, field: PortraitField
+) -> None:
     target = Target(background="none")
     behind, ahead = (person.image(lamp(azimuth, 10), target).pixels for azimuth in (180, 0))
     skin = field.person.segmentation.layer("skin")[:] > 0.9
@@ -140,7 +142,7 @@ def test_a_lamp_behind_leaves_the_face_dark(photo: np.ndarray, person: Person, f
 
 
 def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
-    photo: np.ndarray, person: Person, field: PortraitField
+    photo: np.ndarray, person: FittedPerson, field: PortraitField
 ) -> None:
     composition = person.composed()
     relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
@@ -157,7 +159,7 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
 
 
 def test_no_pixel_depends_on_the_strip_that_it_is_in(
-    photo: np.ndarray, person: Person, monkeypatch: pytest.MonkeyPatch
+    photo: np.ndarray, person: FittedPerson, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Image and layers of a photo are the same in one strip and in strips of 32 rows."""
     names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")

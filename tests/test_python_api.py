@@ -5,19 +5,24 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import facerf_cli as facerf
-from facerf_cli.errors import InputError
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.face.crop import from_landmarks
 from facerf_cli.main import main
 from facerf_cli.portrait.confidence import SCALES
+from tests import astronaut
 
 ROOT = Path(__file__).parents[1]
 PHOTO = ROOT / "examples/astronaut.jpg"
+KEY = facerf.Light.single(60, 30)
 
 
 @pytest.fixture(scope="module")
@@ -26,87 +31,228 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder = tmp_path_factory.mktemp("page")
     (folder / "examples").symlink_to(ROOT / "examples")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs/python.md").read_text(), re.S)
-    assert len(blocks) >= 6
+    assert len(blocks) >= 8
     names: dict[str, Any] = {"folder": folder}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        of_map, estimate = facerf.Light.from_envmap, facerf.estimate_light
+        of_map, estimate = facerf.Light.from_envmap, facerf.Person.estimate_light
         few = lambda envmap, rotate_deg=0.0, lights=24: of_map(envmap, rotate_deg, lights)  # noqa: E731
         patch.setattr(facerf.Light, "from_envmap", staticmethod(few))
-        patch.setattr(facerf, "estimate_light", lambda models, head: estimate(models, head, lights=24))
+        patch.setattr(facerf.Person, "estimate_light", lambda person: estimate(person, lights=24))
         for block in blocks:
             exec(compile(block, "docs/python.md", "exec"), names)
     return names
 
 
+@pytest.fixture(scope="module")
+def person() -> facerf.Person:
+    """The astronaut, with a small texture."""
+    return facerf.fit(astronaut.models(), astronaut.photo(), reflectance="field", texture_side=64)
+
+
 def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
-    photo = page["photo"]
-    assert page["image"].shape == photo.shape and np.isfinite(page["image"]).all()
-    assert page["envmap"].shape == (256, 512, 3)
-    assert page["olats"].shape == (24, 256, 256, 3) and page["directions"].shape == (24, 3)
-    assert page["matte"].shape == page["hair"].shape == photo.shape[:2] and 0.1 < page["matte"].mean() < 0.9
-    assert page["turned"].shape == page["alone"].shape == (*photo.shape[:2], 4)
+    photo, size = page["photo"], page["photo"].shape[:2]
+    for name in ("image", "both", "key_alone", "in_the_sun", "before_map", "before_grey", "weighed"):
+        assert page[name].shape == photo.shape and np.isfinite(page[name]).all(), name
+    assert page["images"].shape == (12, *photo.shape) and page["textures"].shape == (12, 256, 256, 3)
+    assert page["cut_out"].shape == page["turned"].shape == page["face"].shape == (*size, 4)
+    assert set(page["layers"]) == {"image", "person.A", "albedo", "specular", "shadow"}
+    assert page["own_map"].shape == (128, 256, 3)
     assert sorted(path.name for path in page["folder"].glob("relit.*")) == ["relit.exr", "relit.png"]
+    one = page["person"]
+    assert one.albedo.shape == one.normals.shape == photo.shape
+    assert one.depth.shape == one.matte.shape == page["hair"].shape == size and 0.1 < one.matte.mean() < 0.9
+    np.testing.assert_allclose(sum(one.classes.values()), one.matte, atol=1e-5)
+    assert one.texture.shape == (256, 256, 3) and one.uv.shape == (len(one.mesh.vertices), 2)
+    inside = one.matte > 0.99
+    np.testing.assert_allclose(np.linalg.norm(one.normals[inside], axis=-1), 1, atol=1e-3)
+    assert one.depth[inside].min() > 0.3 and one.depth[inside].max() < 2
 
 
 def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Path) -> None:
-    line = ["relight", str(PHOTO), "--light", "60,30", "--room", "none", "--exposure", "0"]
+    line = ["relight", str(PHOTO), "--light", "60,30", "--room", "0.06", "--exposure", "0"]
     assert main([*line, "-o", str(tmp_path)]) == 0
     written = facerf.read_image(tmp_path / "astronaut_light_60_30.exr")
-    np.testing.assert_array_equal(written, page["image"].astype(np.float16).astype(np.float32))
+    relit = page["person"].relight(KEY, room=0.06)
+    np.testing.assert_array_equal(written, relit.astype(np.float16).astype(np.float32))
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert set(row["factors"]) == set(SCALES)  # of the face, its fit and the matte
     assert row["certainty"] == "sure" and set(row["touches_frame"]) == {"bottom"}
 
 
-def test_sums_of_lights(page: dict[str, Any]) -> None:
-    first, second = facerf.Light.single(60, 30), facerf.Light.single(-70, 0, (1, 0.1, 0.1))
-    models, photo, head = page["models"], page["photo"], page["head"]
-    apart = sum(facerf.relight(models, photo, head, light, background="none") for light in (first, second))
-    both = facerf.relight(models, photo, head, page["two"], background="none")
-    np.testing.assert_allclose(apart[..., :3], both[..., :3], atol=1e-3 * both[..., :3].mean(), rtol=1e-3)
+def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: Path) -> None:
+    sun = ROOT / "examples/maps/low_sun.exr"
+    line = ["relight", str(PHOTO), "--envmap", str(sun), "--rotate", "40", "--lights", "24"]
+    assert (
+        main(
+            [
+                *line,
+                "--background",
+                "envmap",
+                "--background-blur",
+                "0",
+                "--exposure",
+                "0",
+                "-o",
+                str(tmp_path),
+            ]
+        )
+        == 0
+    )
+    (written,) = tmp_path.glob("*.exr")
+    light = facerf.Light.from_envmap(page["envmap"], rotate_deg=40, lights=24)
+    relit = page["person"].relight(light, background=page["person"].backdrop(page["envmap"], rotate_deg=40))
+    np.testing.assert_allclose(facerf.read_image(written), relit, rtol=2e-3, atol=1e-4)
+
+
+def test_vertices_are_seen_where_the_landmarks_are(page: dict[str, Any]) -> None:
+    one, pixels = page["person"], np.pad(page["pixels"], ((0, 0), (0, 1)))
+    shown = one.models.face.landmarks(torch.from_numpy(pixels[None]).float())[0, :, :2].numpy()
+    inner = slice(17, 68)  # the contour's landmarks slide
+    size_px = from_landmarks(one.landmarks, 1).side_px
+    assert np.linalg.norm(shown[inner] - one.landmarks[inner], axis=1).mean() < 0.02 * size_px
+
+
+def test_lights_add_up(page: dict[str, Any]) -> None:
+    one, rim = page["person"], facerf.Light.single(-70, 0, (1, 0.1, 0.1))
+    first, second, both = one.relight([KEY, rim, sum([KEY, 2 * rim])], background="none")
+    scale = both[..., :3].mean()
+    apart = first[..., :3] + 2 * second[..., :3]
+    np.testing.assert_allclose(apart, both[..., :3], atol=1e-3 * scale, rtol=1e-3)
+    np.testing.assert_allclose(one.relight(KEY, background="none"), first, atol=1e-5 * scale, rtol=1e-4)
+    of_rig = facerf.Light(page["rig"], np.random.default_rng(1).random((12, 3), np.float32))
+    weighed = (page["images"] * of_rig.weights[:, None, None]).sum(0)
+    cut = one.relight(of_rig, background="none")
+    np.testing.assert_allclose(weighed, cut[..., :3] * cut[..., 3:], atol=1e-3 * scale, rtol=1e-3)
 
 
 def test_a_white_map_of_one_gives_the_face_as_bright_as_its_photo(page: dict[str, Any]) -> None:
     """Output is absolute in the light and relative to the photo's exposure (docs/design.md)."""
-    models, photo, head = page["models"], page["photo"], page["head"]
+    head = page["person"].head
     white = facerf.Light.from_envmap(np.ones((32, 64, 3), np.float32), lights=60)
-    seen = head.face.visible.numpy() > 0.9
-    own = head.face.texture.numpy()[:, seen].mean()
-    alone = facerf.relight(models, photo, head, white, alone=True)
+    own = head.face.texture.numpy()[:, head.face.visible.numpy() > 0.9].mean()
+    alone, brighter = page["person"].relight([white, 3 * white], alone=True)
     of_face = alone[alone[..., 3] > 0.9][:, :3].mean()
     assert abs(of_face / own - 1) < 0.1
-    brighter = facerf.relight(
-        models, photo, head, facerf.Light(white.directions, 3 * white.weights), alone=True
-    )
     np.testing.assert_allclose(brighter[..., :3], 3 * alone[..., :3], rtol=1e-3, atol=1e-4)
 
 
-def test_what_cannot_be_used_is_said(page: dict[str, Any]) -> None:
-    models = page["models"]
-    with pytest.raises(InputError, match="no face found"):
-        facerf.fit_photo(models, np.full((200, 300, 3), 0.3, np.float32))
-    with pytest.raises(ValueError, match="200, 300"):
-        facerf.fit_photo(models, np.zeros((200, 300), np.float32))
-    with pytest.raises(InputError):
-        facerf.Light.from_envmap(np.ones((30, 40, 3), np.float32))
+def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What does not depend on the light is made once, whatever the lights."""
+    one = page["person"]
+    one.relight(KEY)
+
+    def made_again(*given: object, **more: object) -> None:
+        raise AssertionError("made again")
+
+    monkeypatch.setattr("facerf_cli.pipeline.Composition", made_again)
+    monkeypatch.setattr("facerf_cli.pipeline.reflectance_of", made_again)
+    assert np.isfinite(one.relight(facerf.Light.single(20, 0))).all()
+    with pytest.raises(AssertionError, match="made again"):
+        one.relight(KEY, pose=(10, 0, 0))
+
+
+def test_a_list_of_photos_gives_a_list_of_people(person: facerf.Person) -> None:
+    photos = [astronaut.photo(), astronaut.photo()[:, ::-1]]
+    first, second = facerf.fit(
+        astronaut.models(), photos, [person.landmarks, None], reflectance="field", texture_side=64
+    )
+    mirrored = astronaut.photo().shape[1] - second.landmarks[30, 0]
+    assert abs(mirrored - first.landmarks[30, 0]) < 3
+    with pytest.raises(InputError, match="photo 1: no face found"):
+        facerf.fit(astronaut.models(), [photos[0], np.full_like(photos[0], 0.3)])
+
+
+def test_a_person_comes_back_from_its_file(person: facerf.Person, tmp_path: Path) -> None:
+    matte = np.zeros(astronaut.photo().shape[:2], np.float32)
+    matte[:350] = 1
+    kept = replace(person, given_matte=matte)
+    kept.save(tmp_path / "person.npz")
+    again = facerf.Person.load(astronaut.models(), tmp_path / "person.npz")
+    np.testing.assert_allclose(again.relight(KEY), kept.relight(KEY), atol=1e-5)
+    np.testing.assert_array_equal(again.matte, matte)
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("visible", np.ones((8, 8))),
+        ("photo", np.ones((20, 20))),
+        ("photo", np.array([{}], object)),
+        ("rotation", np.eye(2)),
+        ("kind", "nonsense"),
+        ("model", "another"),
+        ("matte", np.ones((3, 3))),
+        ("texture", np.full((3, 64, 64), np.nan)),
+    ],
+)
+def test_a_file_that_is_no_person_is_refused(
+    person: facerf.Person, tmp_path: Path, name: str, array: Any
+) -> None:
+    person.save(tmp_path / "person.npz")
+    with np.load(tmp_path / "person.npz") as file:
+        arrays = dict(file) | {name: array}
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(InputError, match=r"other\.npz: not a person"):
+        facerf.Person.load(astronaut.models(), tmp_path / "other.npz")
+
+
+def test_a_given_matte_says_who_is_relit() -> None:
+    photo = astronaut.photo()
+    matte = np.zeros(photo.shape[:2], np.float32)
+    matte[:300, 130:330] = 1
+    one = facerf.fit(astronaut.models(), photo, matte=matte, reflectance="field", texture_side=64)
+    relit = one.relight(KEY)
+    np.testing.assert_array_equal(relit[300:], photo[300:])
+    assert abs(relit - photo)[:300].mean() > 0.01
+
+
+def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
+    models, photo = astronaut.models(), astronaut.photo()
+    with pytest.raises(InputError, match="photo: no face found"):
+        facerf.fit(models, np.full((200, 300, 3), 0.3, np.float32))
+    with pytest.raises(ValueError, match="photo has shape .200, 300., not"):
+        facerf.fit(models, np.zeros((200, 300), np.float32))
     with pytest.raises(ValueError, match="uint8"):
-        facerf.fit_photo(models, np.zeros((200, 300, 3), np.uint8))
+        facerf.fit(models, np.zeros((200, 300, 3), np.uint8))
     with pytest.raises(ValueError, match="not finite"):
-        facerf.segment(np.full((200, 300, 3), np.nan, np.float32))
+        facerf.fit(models, np.full((200, 300, 3), np.nan, np.float32))
+    with pytest.raises(TypeError, match="read a file by read_image"):
+        facerf.fit(models, str(PHOTO))  # type: ignore[call-overload]
+    with pytest.raises(InputError, match="twice as wide as high"):
+        person.relight(np.ones((30, 40, 3), np.float32))
+    with pytest.raises(TypeError, match="light is tuple, not a facerf"):
+        person.relight([(60, 30)])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match="background has shape .4, 4., not"):
+        person.relight(KEY, background=np.ones((4, 4)))
+    with pytest.raises(ValueError, match="not one of photo, none"):
+        person.relight(KEY, background="nonne")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not a list of some of normal"):
+        person.relight(KEY, layers=["depht"])
+    with pytest.raises(ValueError, match="not one of portrait, field"):
+        facerf.fit(models, photo, reflectance="foo")  # type: ignore[call-overload]
+    with pytest.raises(ValueError, match="matte has shape"):
+        facerf.fit(models, photo, matte=np.ones((3, 3)))
+    with pytest.raises(UsageError, match="needs|is of the portrait"):
+        person.albedo.mean()
+    with pytest.raises(UsageError, match="device abacus: torch finds no such device; give cpu"):
+        facerf.load_models(device="abacus")
+    with pytest.raises(ValueError, match="length 1"):
+        person.olat(np.ones((2, 3)))
 
 
 @pytest.mark.parametrize(
     ("light", "said"),
     [
-        (facerf.Light(np.ones((2, 3)), np.ones((3, 3))), "not \\[L, 3\\]"),
+        (facerf.Light(np.ones((2, 3)), np.ones((3, 3))), "not \\[L, 3\\]|length 1"),
+        (facerf.Light(np.eye(3), np.ones((2, 3))), "not \\[L, 3\\]"),
         (facerf.Light(np.ones((2, 3)), np.ones((2, 3))), "length 1"),
         (facerf.Light(np.eye(3), np.full((3, 3), np.nan)), "not all finite"),
     ],
 )
-def test_lights_that_are_none(page: dict[str, Any], light: facerf.Light, said: str) -> None:
+def test_lights_that_are_none(person: facerf.Person, light: facerf.Light, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        facerf.relight(page["models"], page["photo"], page["head"], light)
+        person.relight(light)
     with pytest.raises(ValueError, match=said):
         light.to_envmap(16)
 
@@ -117,34 +263,13 @@ def test_a_single_light_that_is_none(wrong: Any) -> None:
         facerf.Light.single(*wrong)
 
 
-def test_words_and_photos_that_do_not_fit(page: dict[str, Any]) -> None:
-    models, photo, head, light = (page[name] for name in ("models", "photo", "head", "two"))
-    with pytest.raises(ValueError, match="not one of photo, none"):
-        facerf.relight(models, photo, head, light, background="nonne")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="not one of portrait, field"):
-        facerf.relight(models, photo, head, light, reflectance="foo")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="not one of field"):
-        facerf.estimate_light(models, head, reflectance="portrait")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="fit it again"):
-        facerf.relight(models, photo[::2, ::2], head, light)
-    with pytest.raises(ValueError, match="length 1"):
-        facerf.predict_olat(models, head, np.ones((2, 3)))
-
-
-def test_the_person_is_read_once_for_all_lights(
-    page: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    models, photo, head = (page[name] for name in ("models", "photo", "head"))
-    facerf.relight(models, photo, head, facerf.Light.single(0, 0), reflectance="field")
-
-    def read_again(*given: object, **more: object) -> None:
-        raise AssertionError("read again")
-
-    monkeypatch.setattr("facerf_cli.api.reflectance_of", read_again)
-    image = facerf.relight(models, photo.copy(), head, facerf.Light.single(20, 0), reflectance="field")
-    assert np.isfinite(image).all()
-    with pytest.raises(AssertionError, match="read again"):  # of another photo, if only a little
-        facerf.relight(models, photo * np.float32(1.0005), head, page["two"], reflectance="field")
+def test_choices_that_do_not_go_together() -> None:
+    for choice in (
+        {"network_alone": True, "reflectance": "prt"},
+        {"geometry": "network", "landmarks_px": np.zeros((68, 2))},
+    ):
+        with pytest.raises(FacerfError, match="leave"):
+            facerf.fit(astronaut.models(), astronaut.photo(), **choice)  # type: ignore[call-overload]
 
 
 def test_importing_it_loads_nothing_heavy() -> None:

@@ -27,7 +27,7 @@ from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.pipeline import (
     DEFAULT_ESTIMATOR,
     Estimator,
-    Person,
+    FittedPerson,
     explain,
     find_for,
     head_of,
@@ -66,14 +66,14 @@ class Method:
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
         """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
-        return Person(self.models, None, head, reflectance).image(light, target).pixels
+        return FittedPerson(self.models, None, head, reflectance).image(light, target).pixels
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
     ) -> Iterator[np.ndarray]:
         """Yield an image under each weighted sum of lights; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
-        composition = Person(self.models, photo, head, reflectance).composed(target)
+        composition = FittedPerson(self.models, photo, head, reflectance).composed(target)
         for relit in composition.relit(lights):
             yield composition.image(relit).pixels
 

@@ -118,6 +118,20 @@ def resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.ascontiguousarray(plain[..., 0] if image.ndim == 2 else plain)
 
 
+def covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """The middle of an image, scaled to cover a frame."""
+    scale = max(height / image.shape[0], width / image.shape[1])
+    rows, columns = (
+        min(side, round(wanted / scale)) for side, wanted in zip(image.shape, (height, width), strict=False)
+    )
+    top, left = (image.shape[0] - rows) // 2, (image.shape[1] - columns) // 2
+    part = torch.from_numpy(image[top : top + rows, left : left + columns]).permute(2, 0, 1)[None]
+    shrinks = scale < 1
+    sized = F.interpolate(part, (height, width), mode="bilinear", align_corners=False, antialias=shrinks)
+    covered: np.ndarray = sized[0].permute(1, 2, 0).numpy()
+    return covered
+
+
 def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Band:
     """`resized`, by rows; those of a larger image are computed as they are asked for."""
     if size[0] < image.shape[0] or size[1] < image.shape[1]:

@@ -54,20 +54,15 @@ def rays_of_rows(camera: Camera, size: tuple[int, int], rows: slice) -> Tensor:
     return pixel_rays(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1), camera)
 
 
-def pose_to_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Tensor:
-    """Return head_to_camera = Rz(roll) Rx(pitch) Ry(yaw), [3, 3] float32.
+def pose_to_rotation(yaw_deg: float | Tensor, pitch_deg: float | Tensor, roll_deg: float | Tensor) -> Tensor:
+    """Return head_to_camera = Rz(roll) Rx(pitch) Ry(yaw) [3, 3] float32, differentiable in angles of tensors.
 
     yaw > 0 turns the nose to the image's right, pitch > 0 down, roll > 0 counter-clockwise in the image.
     """
-    yaw, pitch, roll = (math.radians(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
-    ry = _matrix([math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)])
-    rx = _matrix([1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)])
-    rz = _matrix([math.cos(roll), -math.sin(roll), 0], [math.sin(roll), math.cos(roll), 0], [0, 0, 1])
+    angles = [torch.as_tensor(angle, dtype=torch.float64) for angle in (yaw_deg, pitch_deg, roll_deg)]
+    about = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
+    ry, rx, rz = so3_exp(torch.stack(angles).deg2rad()[:, None] * about)
     return (rz @ rx @ ry).float()
-
-
-def _matrix(*rows: list[float]) -> Tensor:
-    return torch.tensor(rows, dtype=torch.float64)
 
 
 def rotation_to_pose(head_to_camera: Tensor) -> tuple[float, float, float]:

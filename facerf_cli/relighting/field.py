@@ -39,7 +39,6 @@ class Field:
         """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
         return weighted_sum(self.olats(directions, turn), weights)
 
-    @torch.no_grad()
     def olats(self, lights: Tensor, turn: Tensor | None = None) -> Iterator[Tensor]:
         """Yield OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T].
 

@@ -34,6 +34,7 @@ class OwnLight:
     quotient: Quotient
 
 
+@torch.no_grad()
 def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> OwnLight:
     """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it.
 
@@ -46,6 +47,7 @@ def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -
     return OwnLight(light, Quotient.of(small.texture, explained, small.visible))
 
 
+@torch.no_grad()
 def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
     """Estimate one light, on small textures, from several frames of a shot together."""
     return _estimated([_Frame.of(models, face) for face in faces])

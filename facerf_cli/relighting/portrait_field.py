@@ -140,7 +140,6 @@ class PortraitView:
             some = weights[:, None].expand(-1, len(sent), -1)
             yield _Some(sent * shade, sent * glow, sent * arrives, sent, some)
 
-    @torch.no_grad()
     def lit(
         self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
     ) -> PortraitLight:

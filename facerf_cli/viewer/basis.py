@@ -24,7 +24,7 @@ from facerf_cli.image.colour import (
 from facerf_cli.image.strips import fitted, resized, whole
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.pipeline import Person
+from facerf_cli.pipeline import FittedPerson
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import Models
@@ -157,7 +157,7 @@ def basis_of_photo(
     """
     small_photo, small_head = shrunk_photo(photo, head, RATIO_PX)
     small_field = _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
-    small = Person(models, small_photo, small_head, small_field).composed()
+    small = FittedPerson(models, small_photo, small_head, small_field).composed()
     rig = rig_directions()
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
 from facerf_cli.batch.made_from import recipe_of
@@ -23,10 +22,10 @@ from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
-from facerf_cli.image.strips import Band, filled
+from facerf_cli.image.strips import Band, covering, filled
 from facerf_cli.light.envmap import backdrop
 from facerf_cli.light.studio_points import Lights, intensity_of
-from facerf_cli.pipeline import Person, reflectance_of
+from facerf_cli.pipeline import FittedPerson, reflectance_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, Target
 from facerf_cli.relighting.group import GroupComposition
@@ -114,21 +113,7 @@ def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
     if choice.path is None:
         return None
     with beside_person((height, width), images=1):
-        return _covering(read_image(choice.path, with_alpha=False).pixels, height, width)
-
-
-def _covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The middle of an image, scaled to cover a frame."""
-    scale = max(height / image.shape[0], width / image.shape[1])
-    rows, columns = (
-        min(side, round(wanted / scale)) for side, wanted in zip(image.shape, (height, width), strict=False)
-    )
-    top, left = (image.shape[0] - rows) // 2, (image.shape[1] - columns) // 2
-    part = torch.from_numpy(image[top : top + rows, left : left + columns]).permute(2, 0, 1)[None]
-    shrinks = scale < 1
-    sized = F.interpolate(part, (height, width), mode="bilinear", align_corners=False, antialias=shrinks)
-    covered: np.ndarray = sized[0].permute(1, 2, 0).numpy()
-    return covered
+        return covering(read_image(choice.path, with_alpha=False).pixels, height, width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +283,7 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
         reflectance = reflectance_of(
             models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte
         )
-        person = Person(models, photo, face.head, reflectance, face.matte)
+        person = FittedPerson(models, photo, face.head, reflectance, face.matte)
         if target.composite == "photo" and face.matte is None:
             face.see(person.segmentation)
         return person.composed(target)

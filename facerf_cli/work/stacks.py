@@ -24,7 +24,7 @@ from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
 from facerf_cli.image.strips import filled, resized, whole
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.pipeline import Person, predict_olat, reflectance_of
+from facerf_cli.pipeline import FittedPerson, predict_olat, reflectance_of
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.composition import Target
 from facerf_cli.work.photos import (
@@ -119,7 +119,7 @@ def _of_person(
     memory = prediction_bytes()
     with naming(item.input_path):
         field = reflectance_of(models, head, "portrait", work.network_alone, memory, photo, matte=matte)
-    composition = Person(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
+    composition = FittedPerson(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
     size = composition.size_px
 
     def olats() -> Iterator[Tensor]:

@@ -18,7 +18,7 @@ from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, stream_
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.pipeline import Person, reflectance_of
+from facerf_cli.pipeline import FittedPerson, reflectance_of
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
@@ -72,7 +72,7 @@ def of_photo(
     """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
     field = reflectance_of(models, head, "portrait", photo=photo, matte=matte)
     assert isinstance(field, PortraitField)
-    composition = Person(models, photo, head, field).composed()
+    composition = FittedPerson(models, photo, head, field).composed()
     basis = basis_of_photo(models, photo, head, field, composition)
     matte = composition.matte
     background = photo - matte[..., None] * composition.own[:]

@@ -91,8 +91,7 @@ class FacerfRelight:
         images, mattes = [], []
         for one in image.cpu().numpy()[..., :3]:
             photo = srgb_to_linear(np.ascontiguousarray(one, np.float32))
-            head = facerf.fit_photo(_models(), photo)
-            relit = facerf.relight(_models(), photo, head, light, background="none")
+            relit = facerf.fit(_models(), photo).relight(light, background="none")
             images.append(_shown(relit[..., :3], exposure_ev))
             mattes.append(torch.from_numpy(np.ascontiguousarray(relit[..., 3], np.float32)))
         return torch.stack(images), torch.stack(mattes)

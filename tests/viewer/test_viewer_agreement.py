@@ -19,7 +19,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.main import main
-from facerf_cli.pipeline import Person, find_for, head_of, reflectance_of
+from facerf_cli.pipeline import FittedPerson, find_for, head_of, reflectance_of
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.portrait_field import PortraitField
@@ -71,7 +71,7 @@ def shown() -> Shown:
     assert isinstance(field, PortraitField)
     sun = [one for one in page_maps() if one.name == "sun"]
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), sun)
-    whole = Person(models, photo, head, field).composed()
+    whole = FittedPerson(models, photo, head, field).composed()
     return Shown(whole, page("me", "me.jpg", document, ""))
 
 

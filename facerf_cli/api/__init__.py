@@ -1,0 +1,157 @@
+"""The Python API: what a notebook calls (docs/python.md); the pipeline does the work.
+
+Images are scene-linear Rec.709, float32 [H, W, 3], of numpy or torch; angles in degrees; the units of light
+are those of the command line (docs/design.md).
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli import pipeline
+from facerf_cli.api.light import Array, Light, linear_pixels
+from facerf_cli.api.light import rig as rig_of
+from facerf_cli.api.person import Person, PhotoCamera, one_of, read_person
+from facerf_cli.baselines import RelightKind
+from facerf_cli.errors import UsageError
+from facerf_cli.face.crop import check_in_photo, check_landmarks
+from facerf_cli.face.fit import Geometry
+from facerf_cli.files import images
+from facerf_cli.network.files import checkpoint_file
+from facerf_cli.portrait.find import FaceBox, face_at
+from facerf_cli.portrait.parse import uncovered_by
+from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.models import load_models as load
+
+__all__ = ["Light", "Person", "PhotoCamera", "fit", "load_models", "read_image", "rig", "write_image"]
+
+
+def read_image(path: str | Path, colourspace: str | None = None) -> np.ndarray:
+    """Read an image or a map as scene-linear Rec.709 [H, W, 3]; `colourspace` overrides the file's."""
+    return images.read_image(Path(path), colourspace).pixels
+
+
+def write_image(path: str | Path, pixels: Array, exposure: float | Literal["auto"] = 0.0) -> None:
+    """Write [H, W, 3] or [H, W, 4] as EXR, or at an exposure in EV as 8-bit PNG or JPEG, by the suffix."""
+    values = pixels.detach().cpu().numpy() if isinstance(pixels, Tensor) else pixels
+    path, colour = Path(path), np.ascontiguousarray(values[..., :3], np.float32)
+    alpha = values[..., 3] if values.shape[-1] == 4 else None
+    if path.suffix.lower() == ".exr":
+        images.write_exr(path, colour, alpha)
+    else:
+        images.write_display(path, colour, exposure, alpha)
+
+
+def load_models(
+    checkpoint: str | Path | Sequence[str | Path] | None = None,
+    face_model: str | Path = "builtin",
+    device: str | torch.device = "cpu",
+) -> Models:
+    """Load networks (None: the shipped ones) and a face model; `device` is cpu, cuda, cuda:1, mps.
+
+    Of several checkpoints, or runs' folders, each serves the networks that its last training trained.
+    """
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError):
+        raise UsageError(f"device {device}: torch finds no such device; give cpu, cuda or mps") from None
+    given = [checkpoint] if isinstance(checkpoint, (str, Path)) else checkpoint or ()
+    return load([checkpoint_file(Path(path)) for path in given], face_model, torch.device(device))
+
+
+def rig(lights: int | Array = 150) -> np.ndarray:
+    """Unit directions [L, 3] of a uniform rig of so many lights, camera space."""
+    return rig_of(lights).numpy()
+
+
+@overload
+def fit(
+    models: Models,
+    photo: Array,
+    landmarks_px: Any = ...,
+    geometry: Geometry | None = ...,
+    reflectance: RelightKind = ...,
+    network_alone: bool = ...,
+    matte: Any = ...,
+    texture_side: int | None = ...,
+) -> Person: ...
+@overload
+def fit(
+    models: Models,
+    photo: Sequence[Array],
+    landmarks_px: Any = ...,
+    geometry: Geometry | None = ...,
+    reflectance: RelightKind = ...,
+    network_alone: bool = ...,
+    matte: Any = ...,
+    texture_side: int | None = ...,
+) -> list[Person]: ...
+def fit(
+    models: Models,
+    photo: Array | Sequence[Array],
+    landmarks_px: Any = None,
+    geometry: Geometry | None = None,
+    reflectance: RelightKind = "portrait",
+    network_alone: bool = False,
+    matte: Any = None,
+    texture_side: int | None = None,
+) -> Person | list[Person]:
+    """Fit the person with the largest face of a photo, once for all lights.
+
+    Args:
+        models: The networks and the face model, from `load_models`.
+        photo: Scene-linear [H, W, 3]; a list of photos gives a list of people.
+        landmarks_px: The face's 68 landmarks [68, 2] in the photo's pixels, in place of the detector's.
+        geometry: "landmarks", or "network": the Geometry Network regresses the head, without landmarks; by
+            default as the networks were trained.
+        reflectance: "portrait" relights the whole person, "field" the face and what is around it by the
+            face's light; "diffuse-sh", "specular-sh", "prt" are the paper's baselines.
+        network_alone: Leave out the correction by which the photo's own light gives the photo back.
+        matte: The person's share [H, W] of the photo, in place of the networks'.
+        texture_side: Side of the face's texture in texels; by default that of the networks' training.
+
+    Of a list of photos landmarks and mattes are lists, too. Raises InputError where no face is found or the
+    fit fails.
+    """
+    one_of(RelightKind, "reflectance", reflectance)
+    if geometry is not None:
+        one_of(Geometry, "geometry", geometry)
+    if network_alone and reflectance not in ("field", "portrait"):
+        raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
+    if landmarks_px is not None and geometry == "network":
+        raise UsageError("geometry: 'network' uses no landmarks; leave one out")
+
+    def fitted(name: str, photo: Array, landmarks_px: Any, matte: Any) -> Person:
+        pixels = linear_pixels(name, photo).detach().numpy()
+        people, mask = models.networks.people, _matte(matte, pixels)
+        if landmarks_px is None:
+            face: FaceBox = pipeline.find_for(people, geometry or models.default_geometry, pixels, name)[0]
+        else:
+            face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
+        head = pipeline.head_of(models, pixels, face, models.sides(texture_side))
+        if mask is not None:
+            head = head.without(models.face, uncovered_by(mask, head.fit.crop))
+        return read_person(models, pixels, head, reflectance, network_alone, mask, isinstance(photo, Tensor))
+
+    if not isinstance(photo, Sequence):
+        return fitted("photo", photo, landmarks_px, matte)
+    each = zip(
+        photo,
+        *([None] * len(photo) if given is None else given for given in (landmarks_px, matte)),
+        strict=True,
+    )
+    return [fitted(f"photo {number}", *one) for number, one in enumerate(each)]
+
+
+def _matte(matte: Any, photo: np.ndarray) -> np.ndarray | None:
+    """A matte [H, W] in 0..1 of a photo's size."""
+    if matte is None:
+        return None
+    found: np.ndarray = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
+    if found.shape != photo.shape[:2] or not found.any():
+        raise ValueError(f"matte has shape {list(found.shape)}, or is black; give one of the photo's size")
+    return found

@@ -1,0 +1,175 @@
+"""The light of the Python API, and the arrays that it takes: numpy's or torch's."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.envmap import check_envmap, envmap_weights
+from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.light.studio_points import Lights, far_samples
+
+Array = np.ndarray | Tensor
+Rgb = tuple[float, float, float]
+_UNIT = 1e-3  # how far the length of a unit direction may be from 1
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Single lights that shine together: unit directions toward them [L, 3], rgb weights [L, 3].
+
+    Directions are in camera space. Lights add and scale: `2 * key + sum(rims)`. Either may be a tensor, to
+    which gradients then flow.
+    """
+
+    directions: Array
+    weights: Array
+    __array_ufunc__ = None  # so that numpy leaves `array * light` to the light
+
+    @staticmethod
+    def single(azimuth_deg: float, elevation_deg: float, rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
+        """One light; azimuth > 0 is the image's right, elevation > 0 above.
+
+        Raises ValueError for an elevation beyond 90 degrees, a negative colour or what is no number.
+        """
+        if not (np.isfinite((azimuth_deg, *rgb)).all() and abs(elevation_deg) <= 90 and min(rgb) >= 0):
+            raise ValueError(f"no light from {azimuth_deg}, {elevation_deg} degrees of {rgb}")
+        direction = azel_to_direction(azimuth_deg, elevation_deg)
+        return Light(direction.numpy()[None], np.array([rgb], np.float32))
+
+    @staticmethod
+    def around(rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
+        """Even light from all around, which sends a white surface as much as a single light that it faces."""
+        directions, shares = far_samples(StudioLight())
+        return Light(directions.numpy(), shares[:, None].numpy() * np.array(rgb, np.float32))
+
+    @staticmethod
+    def from_envmap(envmap: Array, rotate_deg: float = 0.0, lights: int = 150) -> "Light":
+        """A lat-long map [H, 2 H, 3] as a rig of lights; `rotate_deg` is added to every azimuth.
+
+        Raises InputError for an array that is not such a map.
+        """
+        linear, directions = linear_pixels("map", envmap), rig_directions(lights)
+        check_envmap(linear)
+        weights = envmap_weights(linear, directions, rotate_deg)
+        return Light(directions.numpy(), like(envmap, weights))
+
+    def to_envmap(self, height: int = 256) -> np.ndarray:
+        """A lat-long map [height, 2 height, 3] with these lights."""
+        return rig_to_latlong(self.on_cpu(), height).numpy()
+
+    def __add__(self, other: "Light") -> "Light":
+        if not isinstance(other, Light):
+            return NotImplemented
+        return Light(
+            _joined(self.directions, other.directions),
+            _joined(self.weights, other.weights),
+        )
+
+    def __radd__(self, other: int) -> "Light":
+        return self if other == 0 else NotImplemented  # where `sum` begins
+
+    def __mul__(self, factor: float | Rgb | Array) -> "Light":
+        """The same lights, so many times as bright: a number, or one for each of red, green and blue."""
+        return Light(
+            self.directions, self.weights * (np.array(factor) if isinstance(factor, tuple) else factor)
+        )
+
+    __rmul__ = __mul__
+
+    @property
+    def tensors(self) -> bool:
+        """True if it holds tensors; then what it lights is tensors, too."""
+        return isinstance(self.directions, Tensor) or isinstance(self.weights, Tensor)
+
+    def on_cpu(self) -> RigLight:
+        """The lights as float32 tensors on the CPU; raises ValueError for what is no light."""
+        directions, weights = unit_directions(self.directions), as_tensor(self.weights)
+        if directions.shape != weights.shape:
+            shapes = f"{list(directions.shape)} and {list(weights.shape)}"
+            raise ValueError(f"directions and weights have shapes {shapes}, not [L, 3]")
+        if not weights.isfinite().all():
+            raise ValueError("weights are not all finite")
+        return RigLight(directions, weights)
+
+
+def as_light(given: Any, room: float = 0.0) -> Light:
+    """A light, or a map's; of lights a white room may send the share `room` back.
+
+    Raises TypeError for what is neither.
+    """
+    if isinstance(given, Light):
+        return given + Light.around() * (room * given.weights.sum(0)) if room else given
+    if isinstance(given, np.ndarray | Tensor):
+        return Light.from_envmap(given)
+    raise TypeError(
+        f"light is {type(given).__name__}, not a facerf.Light or a map [H, 2 H, 3]; read a file by read_image"
+    )
+
+
+def sums_of(lights: Sequence[Light]) -> Lights:
+    """Each of M lights as one sum; directions that they share are one light."""
+    rigs = [light.on_cpu() for light in lights]
+    if len(rigs) == 1:
+        return Lights.of_rig(rigs[0])
+    every = torch.cat([rig.directions for rig in rigs])
+    directions, places = torch.unique(every.detach(), dim=0, return_inverse=True)
+    each = zip(rigs, places.split([len(rig.directions) for rig in rigs]), strict=True)
+    nothing = torch.zeros(len(directions), 3)
+    return Lights(directions, torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each]))
+
+
+def rig(lights: int | Array) -> Tensor:
+    """Unit directions [L, 3]: given ones, or those of a uniform rig of so many lights."""
+    return rig_directions(int(lights)) if np.ndim(lights) == 0 else unit_directions(lights)
+
+
+def unit_directions(values: Any) -> Tensor:
+    """Directions [L, 3] on the CPU; raises ValueError unless they are of length 1."""
+    directions = as_tensor(values)
+    if directions.ndim != 2 or directions.shape[1] != 3:
+        raise ValueError(f"directions have shape {list(directions.shape)}, not [L, 3]")
+    if not ((directions.norm(dim=1) - 1).abs() < _UNIT).all():
+        raise ValueError("directions are not all of length 1")
+    return directions
+
+
+def linear_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> Tensor:
+    """Scene-linear pixels [H, W, 3] or [H, W] on the CPU; raises ValueError for others, with their name."""
+    if not isinstance(pixels, np.ndarray | Tensor):
+        raise TypeError(f"{name} is {type(pixels).__name__}, not an array {shape}; read a file by read_image")
+    if pixels.ndim != shape.count(",") + 1 or (shape.endswith("3]") and pixels.shape[2] != 3):
+        raise ValueError(f"{name} has shape {list(pixels.shape)}, not {shape}")
+    if not (pixels.is_floating_point() if isinstance(pixels, Tensor) else pixels.dtype.kind == "f"):
+        raise ValueError(f"{name} holds {pixels.dtype}; give scene-linear floats, as read_image does")
+    linear = as_tensor(pixels)
+    if not linear.isfinite().all():
+        raise ValueError(f"{name} holds values that are not finite")
+    return linear
+
+
+def as_tensor(values: Any) -> Tensor:
+    """Values as a float32 tensor on the CPU, to which gradients flow if it was a tensor."""
+    return (
+        (values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32)))
+        .float()
+        .cpu()
+    )
+
+
+def like(given: Any, values: Tensor) -> Array:
+    """Values as what was given: a tensor on its device, or an array."""
+    return values.to(given.device) if isinstance(given, Tensor) else values.numpy()
+
+
+def _joined(one: Array, two: Array) -> Array:
+    """Arrays or tensors one after the other; a tensor where either is."""
+    if isinstance(one, Tensor) or isinstance(two, Tensor):
+        device = one.device if isinstance(one, Tensor) else two.device
+        return torch.cat([torch.as_tensor(x).to(device) for x in (one, two)])
+    return np.concatenate([one, two])
