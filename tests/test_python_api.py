@@ -211,7 +211,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
     models, photo = astronaut.models(), astronaut.photo()
     with pytest.raises(InputError, match="photo: no face found"):
         facerf.fit(models, np.full((200, 300, 3), 0.3, np.float32))
-    with pytest.raises(ValueError, match="photo has shape .200, 300., not"):
+    with pytest.raises(ValueError, match=r"photo has shape .200, 300., not"):
         facerf.fit(models, np.zeros((200, 300), np.float32))
     with pytest.raises(ValueError, match="uint8"):
         facerf.fit(models, np.zeros((200, 300, 3), np.uint8))
@@ -223,7 +223,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
         person.relight(np.ones((30, 40, 3), np.float32))
     with pytest.raises(TypeError, match="light is tuple, not a facerf"):
         person.relight([(60, 30)])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match="background has shape .4, 4., not"):
+    with pytest.raises(ValueError, match=r"background has shape .4, 4., not"):
         person.relight(KEY, background=np.ones((4, 4)))
     with pytest.raises(ValueError, match="not one of photo, none"):
         person.relight(KEY, background="nonne")  # type: ignore[arg-type]
@@ -233,7 +233,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
         facerf.fit(models, photo, reflectance="foo")  # type: ignore[call-overload]
     with pytest.raises(ValueError, match="matte has shape"):
         facerf.fit(models, photo, matte=np.ones((3, 3)))
-    with pytest.raises(UsageError, match="needs|is of the portrait"):
+    with pytest.raises(UsageError, match="albedo: is of the portrait"):
         person.albedo.mean()
     with pytest.raises(UsageError, match="device abacus: torch finds no such device; give cpu"):
         facerf.load_models(device="abacus")
