@@ -22,14 +22,16 @@ def sampled(*entries: int) -> bytes:
     return b"curv" + bytes(4) + struct.pack(f">I{len(entries)}H", len(entries), *entries)
 
 
-def profile(tags: Mapping[bytes, bytes], kind: bytes = b"RGB ") -> bytes:
-    """A display profile (version 4) with these tags."""
+def profile(
+    tags: Mapping[bytes, bytes], kind: bytes = b"RGB ", made_for: bytes = b"mntr", connection: bytes = b"XYZ "
+) -> bytes:
+    """A profile (version 4) with these tags."""
     table, body, start = b"", b"", 132 + 12 * len(tags)
     for name, content in tags.items():
         table += name + struct.pack(">II", start + len(body), len(content))
         body += content + bytes(-len(content) % 4)
     header = bytearray(128)
-    header[8:12], header[12:24], header[36:40] = b"\x04\x30\0\0", b"mntr" + kind + b"XYZ ", b"acsp"
+    header[8:12], header[12:24], header[36:40] = b"\x04\x30\0\0", made_for + kind + connection, b"acsp"
     header[68:80] = fixed(0.9642, 1.0, 0.8249)
     whole = bytes(header) + struct.pack(">I", len(tags)) + table + body
     return struct.pack(">I", len(whole)) + whole[4:]
@@ -51,6 +53,15 @@ def rgb_profile(name: str, colorants: Sequence[Sequence[float]], curve: bytes) -
     for letter, colorant in zip((b"r", b"g", b"b"), colorants, strict=True):
         tags |= {letter + b"XYZ": b"XYZ " + bytes(4) + fixed(*colorant), letter + b"TRC": curve}
     return profile(tags)
+
+
+def press_profile() -> bytes:
+    """A profile of inks, a table of 2^4 corners: cyan halves L*, black removes it, others print nothing."""
+    corners = [(50 if cyan else 100) * (1 - black) for cyan in (0, 1) for _ in range(4) for black in (0, 1)]
+    table = b"".join(bytes([round(lightness * 2.55), 128, 128]) for lightness in corners)
+    ramp, unit = bytes(range(256)), fixed(1, 0, 0, 0, 1, 0, 0, 0, 1)
+    content = b"mft1" + bytes(4) + bytes([4, 3, 2, 0]) + unit + 4 * ramp + table + 3 * ramp
+    return profile({**described("press"), b"A2B0": content}, b"CMYK", b"prtr", b"Lab ")
 
 
 DISPLAY_P3 = rgb_profile("Display P3", _P3_COLORANTS, parametric(3, *_SRGB_CURVE))

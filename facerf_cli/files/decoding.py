@@ -1,9 +1,11 @@
 """Image files to their values as they are stored: one layer, upright, its colour apart from alpha."""
 
+import io
 import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -20,7 +22,7 @@ from facerf_cli.files.image_parts import (
     shown_size,
 )
 from facerf_cli.files.radiance import read_old_runs
-from facerf_cli.files.stated_space import is_ultra_hdr
+from facerf_cli.files.stated_space import by_pillow, is_ultra_hdr
 from facerf_cli.files.texts import require_regular
 from facerf_cli.image.colour import unit_floats
 from facerf_cli.run import memory
@@ -99,6 +101,9 @@ def _decode_by_oiio(
     first, past = (0, spec.nchannels) if has_inks else (min(used), max(used) + 1)
     kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
     _require_room(path, spec, limit_px, (past - first) * kind.size(), kept_px)
+    if not has_inks and (rgb := _by_profile_of_inks(path, spec)) is not None:
+        spec.erase_attribute("ICCProfile.*")
+        return Decoded(rgb, spec, [0, 1, 2], None)
     values = _stored_values(path, opened, first, past, kind)
     if has_inks:
         spec.attribute("oiio:ColorSpace", "")
@@ -134,6 +139,28 @@ def _black_is_zero(values: np.ndarray, alpha: int | None) -> np.ndarray:
     ]
     values[..., channels] = white - values[..., channels]
     return values
+
+
+def _by_profile_of_inks(path: Path, spec: oiio.ImageSpec) -> np.ndarray | None:
+    """Convert a JPEG or TIFF of four inks to sRGB [H, W, 3] uint8 by its profile; None where it has none.
+
+    OpenImageIO multiplies the inks, without the profile. As Photoshop does: relative colorimetric, with
+    compensation of the black point.
+    """
+    profile = spec.getattribute("ICCProfile")
+    stated = [spec.getattribute(f"{kind}:ColorSpace") for kind in ("jpeg", "tiff")]
+    if profile is None or "CMYK" not in stated:
+        return None
+    from PIL import ImageCms  # few files need it
+
+    def converted(image: Any) -> np.ndarray:
+        source = ImageCms.getOpenProfile(io.BytesIO(bytes(profile)))
+        intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
+        target = ImageCms.createProfile("sRGB")
+        return np.asarray(ImageCms.profileToProfile(image, source, target, intent, "RGB", flags=flags))
+
+    found: np.ndarray | None = by_pillow(path, converted)
+    return found
 
 
 def _extra_channel(path: Path) -> int:

@@ -14,7 +14,7 @@ from typing import Any
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.radiance import RadianceHeader, read_radiance_header
+from facerf_cli.files.radiance import RadianceHeader, read_radiance_header, require_rgb
 from facerf_cli.run.logs import one_line
 
 _RAW = (
@@ -88,8 +88,9 @@ def open_image(path: Path, layer: str | None = None) -> OpenedImage:
     settings.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(utf8_path(path), settings)
     if stream is None:
-        advice = f"save it again as EXR, PNG or JPEG ({reason(path, oiio_error())})"
-        raise InputError(f"{path}: not a readable image; {advice}")
+        said = reason(path, oiio_error())
+        require_rgb(path)
+        raise InputError(f"{path}: not a readable image; save it again as EXR, PNG or JPEG ({said})")
     try:
         return _at_layer(path, stream, layer)
     except InputError:

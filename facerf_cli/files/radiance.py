@@ -70,6 +70,14 @@ def read_radiance_header(path: Path) -> RadianceHeader:
     return RadianceHeader(values_from, size, scale, orientation, aspect, primaries or None)
 
 
+def require_rgb(path: Path) -> None:
+    """Raise InputError for a Radiance file of CIE XYZ, which OpenImageIO does not read."""
+    with path.open("rb") as stream:
+        header = stream.read(_LIMIT_BYTES).partition(b"\n\n")[0]
+    if header.startswith(b"#?") and b"FORMAT=32-bit_rle_xyze" in header:
+        raise InputError(f"{path}: a Radiance file in XYZ is not read; convert it, as by ra_xyze -r")
+
+
 def read_old_runs(path: Path, header: RadianceHeader) -> np.ndarray | None:
     """Decode values [H, W, 3] float32 of runs of pixels; None for the forms that OpenImageIO reads.
 

@@ -96,7 +96,7 @@ def _space_of_exif(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
     stated = spec.get_int_attribute("Exif:ColorSpace", _EXIF_SRGB)
     if stated == _EXIF_SRGB:
         return None
-    index = _by_pillow(path, lambda image: image.getexif().get_ifd(_INTEROPERABILITY).get(_INDEX))
+    index = by_pillow(path, lambda image: image.getexif().get_ifd(_INTEROPERABILITY).get(_INDEX))
     return ADOBE_RGB if stated == _EXIF_ADOBE or str(index).startswith("R03") else None
 
 
@@ -104,7 +104,7 @@ def _space_of_png(path: Path) -> ColourSpace | None:
     """Return the space of a PNG's gAMA and cHRM; None without them, and where it says sRGB."""
     with path.open("rb") as stream:
         is_png = stream.read(len(_PNG_START)) == _PNG_START
-    info = (_by_pillow(path, lambda image: dict(image.info)) if is_png else None) or {}
+    info = (by_pillow(path, lambda image: dict(image.info)) if is_png else None) or {}
     if "srgb" in info or not {"gamma", "chromaticity"} & info.keys():
         return None
     white_first = info.get("chromaticity")
@@ -119,7 +119,7 @@ def _space_of_png(path: Path) -> ColourSpace | None:
     return ColourSpace("PNG gAMA and cHRM", linear.chromaticities, curve)
 
 
-def _by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
+def by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
     """Read what OpenImageIO leaves out of a header from the file as opened by Pillow; None if it cannot."""
     from PIL import Image  # few files need it
 
@@ -163,6 +163,6 @@ def _space_of_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
         return bytes(image.info.get("icc_profile", b""))
 
     stored = spec.getattribute("ICCProfile")
-    profile = _by_pillow(path, of_second) or (b"" if stored is None else bytes(stored))
+    profile = by_pillow(path, of_second) or (b"" if stored is None else bytes(stored))
     space = space_of_profile(profile, "") or SRGB
     return (space.chromaticities and linear_space(space.chromaticities)) or LINEAR

@@ -18,6 +18,7 @@ from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import read_map_file
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
+from tests.icc_profiles import press_profile
 
 H, W = 16, 24
 CORNERS = np.array([[200, 60, 40], [40, 180, 60], [50, 70, 200], [128, 128, 128]], np.uint8)
@@ -275,6 +276,21 @@ def test_inks_with_alpha(tmp_path: Path, bits: int, kind: str) -> None:
     assert image.alpha == pytest.approx(alpha, abs=0.003)
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "tif"])
+def test_inks_with_a_profile(tmp_path: Path, suffix: str) -> None:
+    """Of a press whose cyan is grey: L* 50 where the product of the inks is cyan."""
+    inks = np.zeros((H, W, 4), np.uint8)
+    inks[:, W // 2 :, 0] = 255
+    path = tmp_path / f"a.{suffix}"
+    more = {"quality": 100} if suffix == "jpg" else {}
+    Image.fromarray(inks, "CMYK").save(path, icc_profile=press_profile(), **more)
+    linear = read_image(path).pixels
+    np.testing.assert_allclose(linear[:, : W // 2 - 1], 1, atol=0.02)
+    np.testing.assert_allclose(linear[:, W // 2 + 1 :], ((50 + 16) / 116) ** 3, atol=0.006)
+    Image.fromarray(inks, "CMYK").save(path, icc_profile=b"broken" * 50, **more)
+    np.testing.assert_allclose(read_image(path).pixels[0, -1], (0, 1, 1), atol=0.02)
+
+
 @pytest.mark.parametrize("kind", ["uint8", "uint16", "uint32", "float16", "float32"])
 @pytest.mark.parametrize("alpha", [None, 0.25])
 def test_white_is_zero(tmp_path: Path, kind: str, alpha: float | None) -> None:
@@ -368,6 +384,13 @@ def test_a_header_of_nonsense_is_damaged(tmp_path: Path, line: str) -> None:
 
 
 # What is refused
+
+
+def test_radiance_in_xyz_says_so(tmp_path: Path) -> None:
+    path = write_hdr(tmp_path / "a.hdr", MAP)
+    path.write_bytes(path.read_bytes().replace(b"rgbe", b"xyze"))
+    with pytest.raises(InputError, match=r"a\.hdr: a Radiance file in XYZ is not read; convert it"):
+        read_image(path)
 
 
 def test_a_raw_file_is_never_read_as_its_thumbnail(tmp_path: Path) -> None:
