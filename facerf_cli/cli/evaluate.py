@@ -59,11 +59,12 @@ def olat(
 
     In each source of the split's pairs the face is found and fitted, as in any photo, and relit by the light
     that the pair names, in the pose of the target camera; the truth is that light of the target's stack. That
-    pose is fitted to the target camera's image under all lights. In the same pose the image
-    is that of `facerf relight`, in another one the face alone, as with --pose. Tables are by pose, by the
-    angle of the light, and by skin tone if the capture holds it. The row 'lambert' is the source's own
-    texture under the cosine of the light: the least that a method must beat. A second checkpoint, --against
-    without_normals.safetensors, gives the paper's Table 3.
+    pose is fitted to the target camera's image under all lights. The image is the rendered face alone, as in
+    the paper. In the same pose a row 'composite' is that of `facerf relight`, with the photo's detail. Tables
+    are by pose, by the angle of the light, and by skin tone if the capture holds it. The row 'lambert' is the
+    source's own texture under the cosine of the light: the least that a method must beat. A second
+    checkpoint, --against without_normals.safetensors, gives the paper's Table 3. DIR/pairs.json lists the
+    pairs, for --pairs.
     """
     settings = FaceSettings("olat", options, photo, data, field.network_alone)
     _check(context, settings, photos=False)
@@ -130,7 +131,7 @@ def geometry(
     inputs: PhotosOrDatasetArgument,
     *,
     mean: GeometryOptions,
-    data: Annotated[SplitOptions, Only("split", "every")],
+    data: Annotated[SplitOptions, Only("split", "every", "pairs")],
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
@@ -239,7 +240,9 @@ def _check(context: typer.Context, settings: FaceSettings, photos: bool) -> None
     """Raise UsageError for options that would fail every item, or that would do nothing."""
     settings.check()
     if photos:
-        refuse_given(context, ("split", "every", "joint_fit"), "is for a prepared dataset; leave it out here")
+        refuse_given(
+            context, ("split", "every", "pairs", "joint_fit"), "is for a prepared dataset; leave it out here"
+        )
     else:
         refuse_given(
             context, ("face", "landmarks", "colourspace", "layer"), "is for photos; leave it out here"

@@ -69,10 +69,20 @@ class Pair:
         return self.subject, self.index
 
 
-def draw_pairs(dataset: Dataset, maps: Sequence[str], per_subject: int, seed: int) -> list[Pair]:
-    """Draw `per_subject` pairs of every subject in a split, sorted, with exposures still 0."""
+def draw_pairs(
+    dataset: Dataset, maps: Sequence[str], per_subject: int, seed: int, test_maps: Sequence[str] = ()
+) -> list[Pair]:
+    """Draw `per_subject` pairs of every subject in a split, sorted, with exposures still 0.
+
+    The split test is lit by `test_maps`, if there are any, all others by `maps`.
+    """
+    of = {_TEST: test_maps or maps}
     placed = sorted(subject for subject in dataset.subjects if dataset.split_of(subject))
-    return [draw_pair(dataset, maps, seed, subject, i) for subject in placed for i in range(per_subject)]
+    return [
+        draw_pair(dataset, of.get(dataset.split_of(subject), maps), seed, subject, index)
+        for subject in placed
+        for index in range(per_subject)
+    ]
 
 
 def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, index: int) -> Pair:
@@ -120,7 +130,7 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
     for number, line in enumerate(text_of(path.read_bytes(), "replace").splitlines(), 1):
         try:
             pair = checked(Pair, parse_json(line), f"line {number}")
-            _check_pair(dataset, pair)
+            check_pair(dataset, pair)
             if pairs and pair.key <= pairs[-1].key:
                 raise ValueError("not sorted, or repeated")
         except (ValueError, KeyError, InputError):
@@ -132,7 +142,7 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
     return pairs
 
 
-def _check_pair(dataset: Dataset, pair: Pair) -> None:
+def check_pair(dataset: Dataset, pair: Pair) -> None:
     """Raise KeyError or ValueError where a pair does not fit the dataset."""
     if not {pair.source_camera, pair.target_camera} <= set(dataset.cameras[pair.subject]):
         raise ValueError("unknown camera")

@@ -31,11 +31,17 @@ class PairSettings:
 
     Attributes:
         envmaps: Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), a
-            file, or N maps drawn from --seed.
+            file, or N maps drawn from --seed. People of the split test get maps of their own.
+        envmaps_test: Relight the people of the split test with these maps, which no other split may have.
         per_subject: Make so many images of each subject.
         lazy: Write the recipes alone; training relights when it needs them.
     """
 
     envmaps: str = option(..., metavar="DIR|FILE|procedural:N", shown_default=False)
+    envmaps_test: str | None = option(
+        None,
+        metavar="DIR|FILE|procedural:N",
+        shown_default="every tenth map of --envmaps, which no other split then has",
+    )
     per_subject: int = option(1000, metavar="N", panel=_PAIRS, least=1, most=100_000)
     lazy: bool = option(False, panel=_PAIRS)

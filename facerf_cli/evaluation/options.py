@@ -27,12 +27,15 @@ class SplitOptions:
     Attributes:
         split: Measure this split of DATASET; all if no network was trained on it.
         every: Measure every Nth pair of DATASET's split only.
+        pairs: Measure the pairs of a frozen list, the pairs.json of another run, and no others. Sources that
+            DATASET lacks are made from its lights and the list's maps.
         joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
             instead of each image alone.
     """
 
     split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA)
     every: int = option(1, metavar="N", least=1, panel=DATA)
+    pairs: Path | None = option(None, metavar="FILE", shown_default="those of the split", panel=DATA)
     joint_fit: bool = option(False, panel=DATA)
 
 

@@ -194,6 +194,7 @@ class DatasetPerson:
     dataset: Dataset
     name: str
     reading: Reading
+    strangers: frozenset[Pair] = frozenset()  # of a frozen list, which the dataset's own pairs lack
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
@@ -234,14 +235,15 @@ class DatasetPerson:
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
         path = image_path(self.dataset, *pair.key)
-        if path.is_file():
+        if path.is_file() and pair not in self.strangers:
             return read_image(path).pixels
         return render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
 
     def light(self, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
         """The true light of a pair's source: camera-space directions [L, 3], rgb weights [L, 3]."""
         directions = self.header(pair.source_camera).directions
-        if not weights_path(self.dataset).is_file():  # nothing is written into a dataset that is measured on
+        # Nothing is written into a dataset that is measured on.
+        if pair in self.strangers or not weights_path(self.dataset).is_file():
             return directions, pair_weights(self.dataset, pair).numpy()
         pairs, weights = load_pairs(self.dataset)[self.name]
         return directions, np.array(weights[pairs.index(pair)])

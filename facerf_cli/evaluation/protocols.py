@@ -2,8 +2,8 @@
 
 - `compare_olats` (Tables 1 and 3): single lights of held-out people. The source of each pair of a dataset is
   a user's photo: the face is found in it, fitted or regressed, and relit by one light of the target camera's
-  stack. In the same pose the image is that of `facerf relight`, the photo with its face relit; in another
-  pose it is the face alone, as with `--pose`.
+  stack. The image is the rendered face alone; in the same pose the photo with its face relit, the image of
+  `facerf relight`, has a row of its own.
 - `reconstruct` (Table 2, and 4 with the fitted and the mean face): photos explained by a method's reflectance
   and light, and rendered again, the face alone.
 - `transfer` (Table 2): two images of one person with their reflectances exchanged, so that a reflectance is
@@ -31,6 +31,7 @@ from facerf_cli.relighting.composition import Composition, Relit, Target
 from facerf_cli.relighting.models import Models
 
 LAMBERT = "lambert"  # the source's texture under the cosine of the light: the least a method must beat
+COMPOSITE = "composite"  # the face back in its photo, with its detail
 FULL, MEAN = "all components", "mean face"  # the forms of Table 4
 LAYOUTS = {
     "olat": Layout(
@@ -72,23 +73,21 @@ def compare_olats(faces: Sequence[SourceFace], methods: Sequence[Method]) -> Ite
     person, pair = face.origin
     light = torch.from_numpy(person.header(pair.target_camera).directions[pair.target_light]).float()
     lights = Lights.each(light[None])
-    target = None if pair.source_camera == pair.target_camera else person.lit(pair.target_camera)
-    predictions, views = {}, []
+    same = pair.source_camera == pair.target_camera
+    target = face.portrait if same else person.lit(pair.target_camera)
+    predictions, views, composites = {}, [], {}
     for method in methods:
-        view = face.portrait.by(method.models)
-        if target is None:  # the image of `facerf relight`, cropped as the truth is
+        view = target.pose_of(face.portrait.by(method.models), method.models)
+        predictions[method.name] = next(method.images(None, view.head, lights, Target(view.fit, "face")))
+        if same:  # the image of `facerf relight`, cropped as the truth is
             whole = next(method.images(face.portrait.photo.pixels, view.head, lights, Target()))
-            image = view.fit.crop.apply(whole)
-        else:
-            view = target.pose_of(view, method.models)
-            image = next(method.images(None, view.head, lights, Target(view.fit, "face")))
-        predictions[method.name] = image
+            composites[_composite(method, methods)] = view.fit.crop.apply(whole)
         views.append(view)
     first = views[0]
-    predictions[LAMBERT] = _lambert(methods[0].models, light, first)
+    predictions |= {LAMBERT: _lambert(methods[0].models, light, first)} | composites
     stack = person.dataset.stack_path(pair.subject, pair.target_camera)
     truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
-    pose = "same pose" if target is None else "different pose"
+    pose = "same pose" if same else "different pose"
     comparison = Comparison(
         replace(face.case, facts={"pose": pose, **_angles(light, first), **face.case.facts}),
         first.fit.crop.apply(truth.permute(1, 2, 0).numpy()),
@@ -99,6 +98,11 @@ def compare_olats(faces: Sequence[SourceFace], methods: Sequence[Method]) -> Ite
         source_face=face.portrait.by(methods[0].models).face,
     )
     yield _with_drift(comparison, person.albedo, first.region("skin"))
+
+
+def _composite(method: Method, methods: Sequence[Method]) -> str:
+    """The row of a method's face back in its photo."""
+    return COMPOSITE if len(methods) == 1 else f"{method.name}, {COMPOSITE}"
 
 
 def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:

@@ -1,23 +1,35 @@
-"""The images that are measured: pairs of a dataset, and couples of photos; all, every Nth, or a preset's."""
+"""The images that are measured: pairs of a dataset, and couples of photos.
 
-import math
+All, every Nth, as many as the paper measured, or a frozen list, which each run leaves as DIR/pairs.json.
+"""
+
+import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import Field
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
 from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, read_pairs
-from facerf_cli.errors import UsageError
+from facerf_cli.dataset.pairs import Pair, check_pair, read_pairs
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.documents import Document, checked, read_document, write_document
+from facerf_cli.run.logs import LOGGER_NAME
 
 Groups = Mapping[str, Sequence[Sequence[Pair]]]  # by person: pairs whose sources are compared together
 T = TypeVar("T")
+log = logging.getLogger(LOGGER_NAME)
 
 # The paper's numbers of images ('Quantitative Evaluations', Tables 1, 2 and 4).
 PAPER_PHOTOS = 130
 _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT, _PAPER_COUPLES = 160, 3900, 8100, 43
+
+ListFormat = Literal["facerf-pairs-1"]
+LIST_FORMAT: ListFormat = "facerf-pairs-1"
+PAIRS_LIST = "pairs.json"
 
 
 def pairs_of_split(dataset: Dataset, split: str) -> dict[str, list[Pair]]:
@@ -34,51 +46,89 @@ def pairs_of_split(dataset: Dataset, split: str) -> dict[str, list[Pair]]:
     return pairs
 
 
-def choose_sources(folder: Path, pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
+def choose_sources(pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
     """Choose every Nth pair of a dataset, or as many sources as the paper measured, evenly over people."""
     if preset:
-        _require_enough(_count(pairs), PAPER_PHOTOS, "sources", folder, PAPER_PHOTOS / len(pairs))
-        return _alone(evenly(pairs, PAPER_PHOTOS))
+        return _alone(evenly(pairs, _up_to(PAPER_PHOTOS, _count(pairs), "sources")))
     numbered = [pair for members in pairs.values() for pair in members][::every]
     return _alone({name: [pair for pair in numbered if pair.subject == name] for name in pairs})
 
 
-def choose_olats(folder: Path, pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
-    """Choose every Nth pair, or the paper's number of pairs and of maps, evenly over people."""
+def choose_olats(pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
+    """Choose every Nth pair, or up to the paper's number of pairs and of maps, evenly over people."""
     if not preset:
-        return choose_sources(folder, pairs, every, preset)
-    maps = dict.fromkeys(pair.envmap for members in pairs.values() for pair in members)
-    per_subject = 2 * _PAPER_DIFFERENT / len(pairs)  # half of the pairs change the camera
-    _require_enough(len(maps), _PAPER_MAPS, "maps", folder, per_subject)
-    kept = set(list(maps)[:_PAPER_MAPS])
+        return choose_sources(pairs, every, preset)
+    maps = list(dict.fromkeys(pair.envmap for members in pairs.values() for pair in members))
+    kept = set(maps[: _up_to(_PAPER_MAPS, len(maps), "maps")])
     chosen: dict[str, list[Pair]] = {name: [] for name in pairs}
     for same, most in ((True, _PAPER_SAME), (False, _PAPER_DIFFERENT)):
         groups = {
             name: [p for p in members if p.envmap in kept and (p.source_camera == p.target_camera) is same]
             for name, members in pairs.items()
         }
-        found = evenly(groups, most)
         kind = "pairs of the same pose" if same else "pairs of different poses"
-        _require_enough(_count(found), most, kind, folder, per_subject)
-        for name, members in found.items():
+        for name, members in evenly(groups, _up_to(most, _count(groups), kind)).items():
             chosen[name] += members
     return _alone({name: sorted(members, key=lambda pair: pair.index) for name, members in chosen.items()})
 
 
-def choose_couples(folder: Path, pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
-    """Choose every Nth couple of each person, or the paper's number evenly over people."""
-    couples = {name: couples_of(members) for name, members in pairs.items()}
-    if preset:
-        most = 2 * _PAPER_COUPLES
-        _require_enough(2 * _count(couples), most, "images in couples", folder, most / len(pairs))
-        return evenly(couples, _PAPER_COUPLES)
-    chosen = {name: members[::every] for name, members in couples.items() if members}
-    if not chosen:
+def choose_couples(pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
+    """Choose every Nth couple of each person, or up to the paper's number evenly over people."""
+    couples = {name: members for name, own in pairs.items() if (members := couples_of(own))}
+    if not couples:
         raise UsageError(
-            f"{folder}: no two sources of one person with different cameras and maps; run relight-dataset "
-            "with more"
+            "no two sources of one person with different cameras and maps; run relight-dataset with more"
         )
-    return chosen
+    if preset:
+        return evenly(couples, _up_to(_PAPER_COUPLES, _count(couples), "couples of images"))
+    return {name: members[::every] for name, members in couples.items()}
+
+
+class _PairList(Document):
+    format: ListFormat
+    groups: Annotated[
+        list[Annotated[list[dict[str, Any]], Field(min_length=1, max_length=2)]], Field(min_length=1)
+    ]
+
+
+def write_list(path: Path, groups: Groups) -> None:
+    """Freeze the pairs of a run, with the recipes of their sources, for `--pairs` of any other run."""
+    rows = [[asdict(pair) for pair in group] for members in groups.values() for group in members]
+    write_document(path, {"format": LIST_FORMAT, "groups": rows})
+
+
+def read_list(path: Path, dataset: Dataset, size: int) -> Groups:
+    """Read a frozen list of groups of `size` pairs of a dataset; a map that has moved may lie next to it.
+
+    Raises InputError where a pair's person, camera or light is not the dataset's, or in another split.
+    """
+    content = read_document(path, _PairList, "give the pairs.json of another run of facerf evaluate")
+    listed = [
+        [checked(Pair, row, f"{path}: groups[{number}]") for row in group]
+        for number, group in enumerate(content.groups)
+    ]
+    keys = [pair.key for group in listed for pair in group]
+    if len(set(keys)) < len(keys):
+        raise InputError(f"{path}: lists a pair twice; remove one")
+    groups: dict[str, list[tuple[Pair, ...]]] = {}
+    for number, group in enumerate(listed):
+        try:
+            for pair in group:
+                check_pair(dataset, pair)
+            if len(group) != size or len({pair.subject for pair in group}) > 1:
+                raise ValueError(f"{size} of one person are needed")
+        except (KeyError, ValueError) as error:
+            raise InputError(
+                f"{path}: groups[{number}] does not fit {dataset.folder} ({error}); prepare the dataset with "
+                "the people, splits, cameras and lights of the list"
+            ) from None
+        groups.setdefault(group[0].subject, []).append(tuple(_with_map(pair, path.parent) for pair in group))
+    return groups
+
+
+def _with_map(pair: Pair, folder: Path) -> Pair:
+    near = folder / Path(pair.envmap).name
+    return replace(pair, envmap=str(near)) if near.is_file() and not Path(pair.envmap).is_file() else pair
 
 
 def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
@@ -114,24 +164,16 @@ def _count(groups: Mapping[str, Sequence[object]]) -> int:
     return sum(map(len, groups.values()))
 
 
-def _require_enough(found: int, needed: int, what: str, dataset: Path, per_subject: float) -> None:
-    """Raise UsageError where a preset needs more than a split has; `per_subject` pairs are enough."""
-    if found < needed:
-        enough = math.ceil(1.1 * per_subject)
-        raise UsageError(
-            f"{dataset}: the split has {found} {what}, --preset paper measures {needed}; run facerf "
-            f"relight-dataset {dataset} --envmaps procedural:160 --per-subject {enough} --overwrite always, "
-            "or prepare more people"
-        )
+def _up_to(paper: int, found: int, what: str) -> int:
+    """The paper's number, or what there is; a line says where that is less."""
+    if found < paper:
+        log.warning("%d %s are measured, all there are; the paper measured %d", found, what, paper)
+    return min(paper, found)
 
 
 def choose_photos(items: list[Item], preset: bool) -> list[Item]:
-    """Choose all photos, or the paper's number of them."""
-    if preset and len(items) < PAPER_PHOTOS:
-        raise UsageError(
-            f"{len(items)} photos, --preset paper measures {PAPER_PHOTOS}; give a folder of more"
-        )
-    return items[:PAPER_PHOTOS] if preset else items
+    """Choose all photos, or up to the paper's number of them."""
+    return items[: _up_to(PAPER_PHOTOS, len(items), "photos")] if preset else items
 
 
 @dataclass(frozen=True)
@@ -152,19 +194,16 @@ class Couple:
 def couples_of_photos(inputs: Sequence[str], output: Path, preset: bool) -> list[Couple]:
     """Pair up photos: two files each as they are named, and two each of a folder in its order.
 
-    A preset takes the paper's number of couples evenly over people.
+    A preset takes up to the paper's number of couples, evenly over people.
     """
     couples = list(_couples(inputs, output))
     if not preset:
         return couples
-    if len(couples) < _PAPER_COUPLES:
-        raise UsageError(
-            f"{2 * len(couples)} photos in couples, --preset paper measures {2 * _PAPER_COUPLES}; give more"
-        )
+    most = _up_to(_PAPER_COUPLES, len(couples), "couples of photos")
     of_person: dict[str, list[Couple]] = {}
     for couple in couples:
         of_person.setdefault(couple.person, []).append(couple)
-    return [couple for members in evenly(of_person, _PAPER_COUPLES).values() for couple in members]
+    return [couple for members in evenly(of_person, most).values() for couple in members]
 
 
 def _couples(inputs: Sequence[str], output: Path) -> Iterable[Couple]:

@@ -11,7 +11,7 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
 from facerf_cli.batch.settings import Settings
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.pairs import Pair, pairs_path
+from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import (
@@ -32,13 +32,17 @@ from facerf_cli.evaluation.people import (
 )
 from facerf_cli.evaluation.protocols import LAYOUTS, compare_olats, fitted_and_mean, reconstruct, transfer
 from facerf_cli.evaluation.selection import (
+    PAIRS_LIST,
     Couple,
+    Groups,
     choose_couples,
     choose_olats,
     choose_photos,
     choose_sources,
     couples_of_photos,
     pairs_of_split,
+    read_list,
+    write_list,
 )
 from facerf_cli.evaluation.summary import Layout, published
 from facerf_cli.evaluation.yale_b import compare_subject, layout
@@ -143,17 +147,25 @@ def run_on_people(settings: FaceSettings, folder: Path) -> int:
     if data.joint_fit and load_face_model(settings.photo.face_model).name != dataset.face_model:
         raise UsageError(f"--joint-fit: {folder} has fits of {dataset.face_model}; give it as --face-model")
     choose = {"olat": choose_olats, "transfer": choose_couples}.get(settings.protocol, choose_sources)
-    groups = choose(folder, pairs_of_split(dataset, data.split), data.every, bool(options.preset))
+    strangers: frozenset[Pair] = frozenset()
+    if data.pairs:
+        groups = read_list(data.pairs, dataset, 2 if settings.protocol == "transfer" else 1)
+        listed = {pair for members in groups.values() for group in members for pair in group}
+        strangers = frozenset(listed.difference(read_pairs(dataset)))
+    else:
+        groups = choose(pairs_of_split(dataset, data.split), data.every, bool(options.preset))
+    if not options.dry_run:
+        write_list(options.output / PAIRS_LIST, groups)
     items = [Item(folder / "olat" / name, options.output / "cases" / name, name) for name in sorted(groups)]
-    settings = replace(settings, files=(folder / "dataset.json", pairs_path(dataset)))
+    settings = replace(settings, files=(folder / "dataset.json", data.pairs or pairs_path(dataset)))
     tables = _tables(settings, sum(map(len, groups.values())))
-    return _run(settings, tables, items, partial(_compare_person, settings, dataset, groups))
+    return _run(settings, tables, items, partial(_compare_person, settings, dataset, groups, strangers))
 
 
 def _compare_person(
-    settings: FaceSettings, dataset: Dataset, groups: Mapping[str, Sequence[Sequence[Pair]]], item: Item
+    settings: FaceSettings, dataset: Dataset, groups: Groups, strangers: frozenset[Pair], item: Item
 ) -> Iterator[Comparison]:
-    person = DatasetPerson(dataset, item.name, reading_of(settings))
+    person = DatasetPerson(dataset, item.name, reading_of(settings), strangers)
     return compare_people(person, groups[item.name], _comparison(settings))
 
 

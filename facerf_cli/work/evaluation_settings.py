@@ -34,5 +34,7 @@ class FaceSettings:
                 "--preset and --every exclude each other: a preset has a fixed number of images; leave one "
                 "out"
             )
+        if self.data.pairs and (self.options.preset or self.data.every > 1):
+            raise UsageError("--pairs: is a list of its own; leave --preset and --every out")
         if self.protocol == "geometry" and self.options.against:
             raise UsageError("--against: does not apply to geometry; give --checkpoint and --mean-checkpoint")

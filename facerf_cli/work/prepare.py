@@ -1,6 +1,7 @@
 """Work of `facerf prepare-dataset`: draft a stage.json, or check and prepare the subjects of a capture."""
 
 import logging
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -80,6 +81,8 @@ from facerf_cli.work.light_setups import MAP_SUFFIXES
 
 T = TypeVar("T")
 R = TypeVar("R")
+_DRAWN = "procedural:"
+_TEST_MAPS_OF = 10  # one in so many maps is for the split test alone
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -308,12 +311,14 @@ def _write_dataset(
 def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, settings: Settings) -> int:
     """Write the pairs and, unless lazy, the sources of the dataset in a folder; return the exit code."""
     dataset, overwrite = read_dataset(folder), batch.overwrite == "always"
-    names = _envmap_names(wanted.envmaps, batch.output, settings.seed)
-    pairs = draw_pairs(dataset, names, wanted.per_subject, settings.seed)
+    maps, test_maps = _maps_of_splits(dataset, wanted, batch.output, settings.seed)
+    pairs = draw_pairs(dataset, maps, wanted.per_subject, settings.seed, test_maps)
     if not pairs:
         raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
     if not batch.dry_run:
         write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
+        if test_maps != maps:
+            log.info("maps: %d, and %d others for the split test alone", len(maps), len(test_maps))
     if wanted.lazy:
         print(pairs_path(dataset))
         return 0
@@ -323,11 +328,43 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     return run_items("relight-dataset", items, work, work.outputs_of, batch, settings)
 
 
-def _envmap_names(envmaps: str, output: Path, seed: int) -> list[str]:
-    if envmaps.startswith("procedural:"):
-        return envmap_names(parse_envmaps(envmaps, seed))
+def _maps_of_splits(
+    dataset: Dataset, wanted: PairSettings, output: Path, seed: int
+) -> tuple[list[str], list[str]]:
+    """Names of the maps of training and validation, and those of the test; UsageError where they share one.
+
+    Drawn maps of the test follow those of --envmaps in their sequence.
+    """
+    maps = _envmap_names("--envmaps", wanted.envmaps, output, seed)
+    if wanted.envmaps_test is not None:
+        drawn = len(maps) if wanted.envmaps.startswith(_DRAWN) else 0
+        test_maps = _envmap_names("--envmaps-test", wanted.envmaps_test, output, seed, drawn)
+        if shared := sorted(
+            {os.path.realpath(name) for name in maps} & set(map(os.path.realpath, test_maps))
+        ):
+            raise UsageError(
+                f"--envmaps-test {wanted.envmaps_test}: has {len(shared)} maps of --envmaps, such as "
+                f"{Path(shared[0]).name}; give the test maps of its own"
+            )
+        return maps, test_maps
+    if not dataset.splits["test"] or not (dataset.splits["train"] or dataset.splits["validation"]):
+        return maps, maps
+    if len(maps) < 2:
+        raise UsageError(
+            f"--envmaps {wanted.envmaps}: is one map, and the split test needs others; give it some by "
+            "--envmaps-test"
+        )
+    test_maps = maps[::_TEST_MAPS_OF]
+    return [name for index, name in enumerate(maps) if index % _TEST_MAPS_OF], test_maps
+
+
+def _envmap_names(option: str, envmaps: str, output: Path, seed: int, first: int = 0) -> list[str]:
+    """Names of the maps of an option; drawn ones begin at number `first` of their sequence."""
+    if envmaps.startswith(_DRAWN):
+        maps = parse_envmaps(envmaps, seed)
+        return envmap_names(replace(maps, maps=first + len(maps)))[first:]
     if not Path(envmaps).exists():
-        raise UsageError(f"--envmaps {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
+        raise UsageError(f"{option} {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
     return envmap_names([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
 
 

@@ -76,7 +76,11 @@ def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: pytest
     assert run("olat", folder, "-o", out, "--every", "4", "--network-alone", "--joint-fit") == 0
     assert "lambert" in capsys.readouterr().out
     found = json.loads((out / "summary.json").read_text())
-    assert (found["pictures"], found["persons"], found["methods"]) == (3, 2, ["field", "lambert"])
+    assert (found["pictures"], found["persons"], found["methods"]) == (
+        3,
+        2,
+        ["field", "lambert", "composite"],
+    )
     held_out = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][::4]
     assert {row["case"] for row in images(out)} == {f"{p.subject}/{p.index:05d}" for p in held_out}
     assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
@@ -97,16 +101,11 @@ def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = "-o", tmp_path / "out"
-    line = refused(capsys, "olat", folder, *out, "--preset", "paper")
-    assert "3 maps" in line and "160" in line and "relight-dataset" in line and "--per-subject" in line
-    assert "12 sources" in refused(capsys, "reconstruction", folder, *out, "--preset", "paper")
-    assert "images in couples" in refused(capsys, "transfer", folder, *out, "--preset", "paper")
     assert "exclude" in refused(capsys, "olat", folder, *out, "--preset", "paper", "--every", "2")
     assert "validation" in refused(capsys, "olat", folder, *out, "--split", "validation")
     assert "one dataset among several inputs" in refused(capsys, "geometry", folder, PHOTO, *out)
     assert "--photos" in refused(capsys, "transfer", PHOTO, *out)
     assert "two of each person" in refused(capsys, "transfer", "--photos", PHOTO, *out)
-    assert "1 photos" in refused(capsys, "reconstruction", PHOTO, *out, "--preset", "paper")
     assert "--mean-checkpoint" in refused(capsys, "geometry", PHOTO, *out, "--against", PHOTO)
     assert not (tmp_path / "out" / "summary.json").exists()
 
@@ -199,13 +198,52 @@ def test_a_folder_is_a_person_whose_photos_are_taken_two_by_two(tmp_path: Path) 
     assert run("transfer", "--photos", person, "-o", tmp_path / "alone") == 2
 
 
+def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for protocol, says in (
+        ("olat", "1 maps are measured, all there are; the paper measured 160"),
+        ("reconstruction", "12 sources are measured"),
+        ("geometry", "12 sources are measured"),
+    ):
+        capsys.readouterr()
+        assert run(protocol, folder, "-o", tmp_path / "out", "--preset", "paper", "--dry-run") == 0
+        assert says in capsys.readouterr().err
+    assert run("reconstruction", PHOTO, "-o", tmp_path / "out", "--preset", "paper", "--dry-run") == 0
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.usefixtures("doubles")
+def test_a_frozen_list_gives_the_same_figures_on_a_dataset_without_its_pairs(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, again, bare = (tmp_path / name for name in ("first", "again", "bare"))
+    assert run("reconstruction", folder, "-o", first, "--preset", "paper", "--joint-fit") == 0
+    shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("relit"))
+    assert run("reconstruction", bare, "-o", again, "--pairs", first / "pairs.json", "--joint-fit") == 0
+    assert images(first) == images(again) and len(images(first)) == 12
+    assert (first / "pairs.json").read_text() == (again / "pairs.json").read_text()
+    content = json.loads((first / "pairs.json").read_text())
+    for key, value in (("target_camera", "C9"), ("split", "train"), ("subject", "../x")):
+        wrong = tmp_path / "wrong.json"
+        group = [content["groups"][0][0] | {key: value}]
+        wrong.write_text(json.dumps(content | {"groups": [group]}))
+        assert run("reconstruction", bare, "-o", tmp_path / "w", "--pairs", wrong) == 1
+        assert "groups[0] does not fit" in capsys.readouterr().err
+    assert run("transfer", bare, "-o", tmp_path / "w", "--pairs", first / "pairs.json") == 1
+    assert "2 of one person" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("doubles")
 def test_people_of_a_dataset_by_every_protocol(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run("reconstruction", folder, "-o", tmp_path / "r", "--every", "6", "--joint-fit") == 0
     assert all(float(row["light_error_deg"]) <= 180 for row in images(tmp_path / "r"))
-    assert run("transfer", folder, "-o", tmp_path / "t", "--every", "9", "--joint-fit") == 0
+    two_maps = shutil.copytree(folder, tmp_path / "d", ignore=shutil.ignore_patterns("relit"))
+    words = ["--envmaps", "procedural:3", "--envmaps-test", "procedural:3", "--per-subject", "9", "--lazy"]
+    assert main(["relight-dataset", str(two_maps), *words]) == 0
+    assert run("transfer", two_maps, "-o", tmp_path / "t", "--every", "9", "--joint-fit") == 0
     assert {row["person"] for row in images(tmp_path / "t")} <= {"0001", "0002"}
     dataset = read_dataset(folder)
     cameras = {f"{p.subject}/{p.index:05d}": (p.subject, p.source_camera) for p in read_pairs(dataset)}

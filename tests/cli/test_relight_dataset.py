@@ -106,6 +106,35 @@ def test_maps_of_a_folder(dataset: Path, tmp_path: Path) -> None:
     }
 
 
+def test_the_test_has_maps_that_no_other_split_has(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def maps_of(*options: str, maps: str) -> dict[str, set[str]]:
+        assert main(line(dataset, "--lazy", "--overwrite", "always", *options, maps=maps, images=40)) == 0
+        found: dict[str, set[str]] = {"train": set(), "validation": set(), "test": set()}
+        for row in map(json.loads, (dataset / "relit" / "pairs.jsonl").read_text().splitlines()):
+            found[row["split"]].add(row["envmap"])
+        return found
+
+    held_out = maps_of(maps="procedural:5")
+    assert held_out["train"] == held_out["validation"] == {f"procedural:{n}:0:256" for n in (1, 2, 3, 4)}
+    assert held_out["test"] == {"procedural:0:0:256"}
+    given = maps_of("--envmaps-test", "procedural:2", maps="procedural:3")
+    assert given["train"] == {f"procedural:{n}:0:256" for n in (0, 1, 2)}
+    assert given["test"] == {"procedural:3:0:256", "procedural:4:0:256"}
+    for name in ("one.exr", "two.exr"):
+        write_exr(tmp_path / "maps" / name, np.ones((5, 10, 3), np.float32))
+    (tmp_path / "link.exr").symlink_to(tmp_path / "maps" / "two.exr")
+    for maps, test, says in (
+        (tmp_path / "maps", tmp_path / "link.exr", "1 maps of --envmaps, such as two.exr"),
+        (tmp_path / "maps", tmp_path / "nowhere", "--envmaps-test"),
+    ):
+        assert main(line(dataset, "--envmaps-test", str(test), maps=str(maps))) == 2
+        assert says in capsys.readouterr().err
+    assert main(line(dataset, maps=str(tmp_path / "link.exr"))) == 2
+    assert "--envmaps-test" in capsys.readouterr().err
+
+
 def test_what_cannot_be_used_is_one_line(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
