@@ -36,7 +36,7 @@ def synth_stage(
     ] = False,
     batch: Annotated[BatchOptions, Without("name")],
 ) -> None:
-    """Photograph synthetic people in a light stage: one light at a time, eight cameras, one exposure.
+    """Photograph synthetic people in a light stage: one light at a time, several cameras, one exposure.
 
     Writes a capture for `facerf prepare-dataset`: stage.json, and SUBJECT/CAMERA/LIGHT.exr in half floats,
     scene-linear Rec.709. SUBJECT/truth/CAMERA.exr has the true matte, classes, surface and material.

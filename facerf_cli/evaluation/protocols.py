@@ -2,8 +2,8 @@
 
 - `compare_olats` (Tables 1 and 3): single lights of held-out people. The source of each pair of a dataset is
   a user's photo: the face is found in it, fitted or regressed, and relit by one light of the target camera's
-  stack. The image is the rendered face alone; in the same pose the photo with its face relit, the image of
-  `facerf relight`, has a row of its own.
+  stack. The image is the rendered face alone; in the same pose the photo with its face relit by the first
+  method, the image of `facerf relight`, has a row of its own.
 - `reconstruct` (Table 2, and 4 with the fitted and the mean face): photos explained by a method's reflectance
   and light, and rendered again, the face alone.
 - `transfer` (Table 2): two images of one person with their reflectances exchanged, so that a reflectance is
@@ -31,7 +31,7 @@ from facerf_cli.relighting.composition import Composition, Relit, Target
 from facerf_cli.relighting.models import Models
 
 LAMBERT = "lambert"  # the source's texture under the cosine of the light: the least a method must beat
-COMPOSITE = "composite"  # the face back in its photo, with its detail
+COMPOSITE = "composite"  # the first method's face back in its photo, with its detail
 FULL, MEAN = "all components", "mean face"  # the forms of Table 4
 LAYOUTS = {
     "olat": Layout(
@@ -75,16 +75,16 @@ def compare_olats(faces: Sequence[SourceFace], methods: Sequence[Method]) -> Ite
     lights = Lights.each(light[None])
     same = pair.source_camera == pair.target_camera
     target = face.portrait if same else person.lit(pair.target_camera)
-    predictions, views, composites = {}, [], {}
+    predictions, views = {}, []
     for method in methods:
         view = target.pose_of(face.portrait.by(method.models), method.models)
         predictions[method.name] = next(method.images(None, view.head, lights, Target(view.fit, "face")))
-        if same:  # the image of `facerf relight`, cropped as the truth is
-            whole = next(method.images(face.portrait.photo.pixels, view.head, lights, Target()))
-            composites[_composite(method, methods)] = view.fit.crop.apply(whole)
         views.append(view)
     first = views[0]
-    predictions |= {LAMBERT: _lambert(methods[0].models, light, first)} | composites
+    predictions[LAMBERT] = _lambert(methods[0].models, light, first)
+    if same:  # the image of `facerf relight`, cropped as the truth is
+        whole = next(methods[0].images(face.portrait.photo.pixels, first.head, lights, Target()))
+        predictions[COMPOSITE] = first.fit.crop.apply(whole)
     stack = person.dataset.stack_path(pair.subject, pair.target_camera)
     truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
     pose = "same pose" if same else "different pose"
@@ -98,11 +98,6 @@ def compare_olats(faces: Sequence[SourceFace], methods: Sequence[Method]) -> Ite
         source_face=face.portrait.by(methods[0].models).face,
     )
     yield _with_drift(comparison, person.albedo, first.region("skin"))
-
-
-def _composite(method: Method, methods: Sequence[Method]) -> str:
-    """The row of a method's face back in its photo."""
-    return COMPOSITE if len(methods) == 1 else f"{method.name}, {COMPOSITE}"
 
 
 def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:

@@ -43,11 +43,15 @@ def light_directions(settings: StageSettings) -> np.ndarray:
     return rig_directions(settings.lights).numpy().astype(np.float64)
 
 
+def _cameras(settings: StageSettings) -> tuple[StageCamera, ...]:
+    return stage_cameras(settings.size_px, settings.frame)[: settings.cameras]
+
+
 def describe_stage(settings: StageSettings) -> dict[str, Any]:
     """Build the content of stage.json, without subjects."""
     flip = np.diag([1.0, -1.0, -1.0])  # to OpenCV axes
     cameras = []
-    for index, view in enumerate(stage_cameras(settings.size_px, settings.frame)):
+    for index, view in enumerate(_cameras(settings)):
         pose = np.column_stack([view.head_to_camera.double().numpy(), view.translation_m.double().numpy()])
         focal, centre = view.camera.focal_px, view.camera.cx_px
         cameras.append(
@@ -107,7 +111,7 @@ def photograph_subject(
     subject: Subject, settings: StageSettings
 ) -> tuple[Iterator[Tensor], MeshTransport | None]:
     """Render linear images [L, 3, H, W], one camera at a time; return them and the bake, if there is one."""
-    directions, cameras = light_directions(settings), stage_cameras(settings.size_px, settings.frame)
+    directions, cameras = light_directions(settings), _cameras(settings)
     mesh, appearance = subject.mesh, subject.appearance
     if settings.renderer == "mitsuba":
         images = (path_tracer.photograph(mesh, appearance, directions, camera)[0] for camera in cameras)
@@ -155,7 +159,7 @@ def write_subject(
     with atomic_path(folder) as unfinished:
         for camera, images in enumerate(cameras):
             even = images.sum(0).permute(1, 2, 0).numpy() * (EVEN_LIGHT / len(images))
-            view = stage_cameras(settings.size_px, settings.frame)[camera]
+            view = _cameras(settings)[camera]
             truth = truth_of(subject.mesh, subject.appearance, view)
             write_exr(unfinished / TRUTH / f"C{camera}.exr", even, layers=truth.layers(), metadata=metadata)
             for light, image in enumerate(images.permute(0, 2, 3, 1).numpy()):

@@ -20,6 +20,7 @@ class StageSettings:
         renderer: Render with light transport baked once a person (bake), or by path tracing, slow and
             accurate (mitsuba).
         lights: Use so many lights, uniform on the sphere.
+        cameras: Use so many cameras, the first of eight: from the front, then ever more from the sides.
         frame: Show the head down to the collar, or a bust down to the chest.
     """
 
@@ -27,5 +28,6 @@ class StageSettings:
     face_model: str = option("builtin", metavar="NAME|PATH", panel=_STAGE)
     renderer: Renderer = option("bake", panel=_IMAGE)
     lights: int = option(150, metavar="N", panel=_STAGE, least=4, most=1000)
+    cameras: int = option(8, metavar="N", panel=_STAGE, least=1, most=8)
     seed: int = 0
     frame: Frame = option("head", panel=_IMAGE)

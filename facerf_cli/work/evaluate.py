@@ -43,7 +43,7 @@ from facerf_cli.files.images import write_exr
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import checkpoint_file, serving_files
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line
-from facerf_cli.work.photo_options import PhotoOptions, networks_of
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import face_model
 
 CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
@@ -69,6 +69,7 @@ class Evaluation:
     recipe: tuple[Any, ...]  # dataclasses whose fields shape the figures, besides the options
     options: EvaluateOptions
     settings: Settings
+    uses: frozenset[str] = frozenset()  # names of the networks that make the images
     photo: PhotoOptions | None = None  # has the face model of the images; they and the summary name it
 
     @property
@@ -235,11 +236,11 @@ class Evaluation:
     def _about(self) -> About:
         """The run's command and networks, without the time: equal runs give equal files."""
         facts: dict[str, str] = {}
-        if kinds := self.options.reflectance:
-            for own in serving_files(self.settings.checkpoints, networks_of(kinds)).values():
+        if self.uses:
+            for own in serving_files(self.settings.checkpoints, self.uses).values():
                 facts[f"checkpoint {own.stem}"] = f"SHA-256 {file_sha256(own)}"
-            for path in self.options.against:
-                facts[f"checkpoint against {path.stem}"] = f"SHA-256 {file_sha256(checkpoint_file(path))}"
+        for path in self.options.against:
+            facts[f"checkpoint against {path.stem}"] = f"SHA-256 {file_sha256(checkpoint_file(path))}"
         spaces = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}
         facts["values compared"] = spaces[self.options.measures.space]
         if self.photo:

@@ -114,12 +114,14 @@ def _comparison(settings: FaceSettings) -> Compare:
     return partial(reconstruct, methods=both, with_light=False)
 
 
+def _networks_used(settings: FaceSettings) -> frozenset[str]:
+    refined = settings.solve.refine == "features" and settings.options.measures.vgg_weights is None
+    return networks_of(settings.options.reflectance) | ({"light_features"} if refined else set())
+
+
 def _prepare(settings: FaceSettings) -> None:
     """Load what all items need; raises UsageError or InputError for what would fail each."""
-    uses = networks_of(settings.options.reflectance)
-    if settings.solve.refine == "features" and settings.options.measures.vgg_weights is None:
-        uses |= {"light_features"}
-    prepare_photos(settings.photo, uses, with_networks=not settings.options.dry_run)
+    prepare_photos(settings.photo, _networks_used(settings), with_networks=not settings.options.dry_run)
     if not settings.options.dry_run:
         methods_of(settings)
         if settings.protocol == "geometry":
@@ -135,9 +137,10 @@ def _run(
 ) -> int:
     """Measure items; the exit code. `recipe` has more options that shape the figures."""
     photo = settings.photo
+    uses = _networks_used(settings)
     if settings.options.measures.face_distance:
         tables = replace(tables, metrics=tuple(dict.fromkeys((*tables.metrics, "face_distance"))))
-    run = Evaluation(tables, compare, (settings, *recipe), settings.options, photo.settings, photo)
+    run = Evaluation(tables, compare, (settings, *recipe), settings.options, photo.settings, uses, photo)
     return run.run(items, partial(_prepare, settings))
 
 

@@ -18,7 +18,7 @@ from facerf_cli.files.images import read_image
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.main import main
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
-from facerf_cli.synth import stage, views
+from facerf_cli.synth import stage
 from facerf_cli.synth.stage_settings import Frame
 from facerf_cli.synth.subjects import draw_subject, subject_model
 from facerf_cli.synth.views import stage_cameras, truth_of
@@ -29,18 +29,15 @@ Said = pytest.CaptureFixture[str]
 
 
 def photograph(folder: Path, *line: str) -> int:
-    size = ["--size", "64", "--lights", str(LIGHTS)]
+    size = ["--size", "64", "--lights", str(LIGHTS), "--cameras", str(CAMERAS)]
     return main(["synth-stage", "-o", str(folder), *size, *line])
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _few_rays_and_cameras() -> Iterator[None]:
-    stage_cameras.cache_clear()
+def _few_rays() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stage, "_BAKE", BakeSettings(light_samples=1, bounce_samples=2))
-        patch.setattr(views, "_CAMERAS_DEG", views._CAMERAS_DEG[:CAMERAS])
         yield
-    stage_cameras.cache_clear()
 
 
 @pytest.fixture(scope="module")
