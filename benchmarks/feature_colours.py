@@ -1,4 +1,4 @@
-"""Colours in the feature losses of a run of examples/train_paper.sh: the cost of changes, and pushes.
+"""Colours in the feature losses of a run of examples/paper/tables.sh: the cost of changes, and pushes.
 
     python benchmarks/feature_colours.py --run RUN
 
@@ -40,7 +40,7 @@ def main() -> None:
     """Print both tables."""
     parser = arguments(__doc__)
     parser.add_argument("--run", type=Path)
-    run = required(parser.parse_args().run, "a run of examples/train_paper.sh", "--run")
+    run = required(parser.parse_args().run, "a run of examples/paper/tables.sh", "--run")
     torch.set_num_threads(1)
     dataset = read_dataset(run / "dataset")
     training, validation = (open_pairs(dataset, split, SIDE) for split in ("train", "validation"))

@@ -52,7 +52,7 @@ joint() {  # NAME OPTIONS...: the paper's training, or an ablation of it
 joint paper
 joint without-normals --without-normals
 joint mean-face --mean-face
-$train -o "$run/diffuse-sh" --stage diffuse-sh --dataset "$run/dataset" --preset "${form[1]}" --resume "${length[@]}"
+$train -o "$run/diffuse-sh" --stage diffuse-sh "${data[@]}" --resume "${length[@]}"
 
 # The tables. Each run leaves the list of its pairs, pairs.json, for --pairs of anybody else's run.
 measure=(facerf --checkpoint "$run/paper.safetensors" evaluate)

@@ -31,8 +31,8 @@ class PairSettings:
 
     Attributes:
         envmaps: Relight with these lat-long maps (.exr, .hdr) of any size: a folder (walked recursively), a
-            file, or N maps drawn from --seed. People of the split test get maps of their own.
-        envmaps_test: Relight the people of the split test with these maps, which no other split may have.
+            file, or N maps drawn from --seed.
+        envmaps_test: Relight the people of the split test with these maps, which no other split has.
         per_subject: Make so many images of each subject.
         lazy: Write the recipes alone; training relights when it needs them.
     """
@@ -41,7 +41,8 @@ class PairSettings:
     envmaps_test: str | None = option(
         None,
         metavar="DIR|FILE|procedural:N",
-        shown_default="every tenth map of --envmaps, which no other split then has",
+        shown_default="one in ten of --envmaps",
+        panel=_PAIRS,
     )
     per_subject: int = option(1000, metavar="N", panel=_PAIRS, least=1, most=100_000)
     lazy: bool = option(False, panel=_PAIRS)

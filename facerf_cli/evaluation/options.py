@@ -27,8 +27,7 @@ class SplitOptions:
     Attributes:
         split: Measure this split of DATASET; all if no network was trained on it.
         every: Measure every Nth pair of DATASET's split only.
-        pairs: Measure the pairs of a frozen list, the pairs.json of another run, and no others. Sources that
-            DATASET lacks are made from its lights and the list's maps.
+        pairs: Measure the pairs of a list, the pairs.json of another run.
         joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
             instead of each image alone.
     """
