@@ -55,7 +55,7 @@ def relight(
     FILE.mov joins frames to a film, with the sound of the film that they come from.
 
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
-    --light takes the nearest of them.
+    --light between them is a sum of the three around it.
     """
     file, formats = format_of_file(output), work.output.formats
     film = None if file else film_output(output, work.fps)

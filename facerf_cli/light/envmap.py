@@ -23,6 +23,7 @@ from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong
 Sampling = Literal["cell", "smooth", "paper"]
 _DIRECTIONS_AT_ONCE = 1 << 12  # that are compared with all triangles of a rig
 _OUTSIDE = -1e-4  # a share below it: the rig does not surround this direction
+_FLAT = 1e-6  # the least distance of a triangle's plane from the middle
 _COLUMNS_AT_ONCE = 1 << 10  # of a map, which are integrated in float64
 _LEAST_CELL_ROWS = 256  # of the grid on which cells are found
 _BALL_SAMPLES = 3  # along each side of a pixel of a ball
@@ -208,7 +209,7 @@ def lights_around(directions: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
 
     A light that moves passes from one cell of the rig to the next in a step; between the lights of a triangle
     it is shared by barycentric coordinates, so that an image under it changes without steps. Shares are
-    float64. Where a rig surrounds no such direction, its nearest light has all.
+    float64. The nearest light has all of a direction that lies beyond a rig that is open to a side.
     """
     nearest = (directions.double() @ lights.double().T).argmax(1)
     index = nearest[:, None].expand(-1, 3).clone()
@@ -217,16 +218,19 @@ def lights_around(directions: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
         hull = ConvexHull(lights.double().numpy())
     except (QhullError, ValueError):  # fewer than four lights, or all in a plane
         return index, share
-    corners = torch.from_numpy(hull.simplices).long()  # [F, 3]
     planes = torch.from_numpy(hull.equations)  # [F, 4]: n . x + d = 0, n outward
+    cap = planes[:, 3] < -_FLAT  # not the sides that an open rig shows its middle
+    if not cap.any():
+        return index, share
+    corners, planes = torch.from_numpy(hull.simplices).long()[cap], planes[cap]  # [F, 3]
     around = torch.linalg.pinv(lights.double()[corners].mT)  # [F, 3, 3]: from a direction to its shares
-    reciprocal = planes[:, :3] / -planes[:, 3:].clamp(max=-1e-9)  # of the distance along a ray
+    reciprocal = planes[:, :3] / -planes[:, 3:]  # of the distance along a ray
     for first in range(0, len(directions), _DIRECTIONS_AT_ONCE):
         rows = slice(first, first + _DIRECTIONS_AT_ONCE)
         toward = directions[rows].double()
         triangle = (toward @ reciprocal.T).argmax(1)
         found = torch.einsum("pij,pj->pi", around[triangle], toward)
-        inside = (found > _OUTSIDE).all(1) & (planes[triangle, 3] < 0)
+        inside = (found > _OUTSIDE).all(1)
         found = found.clamp(min=0)
         index[rows][inside] = corners[triangle][inside]
         share[rows][inside] = (found / found.sum(1, keepdim=True).clamp_min(1e-12))[inside]

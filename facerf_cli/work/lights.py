@@ -14,7 +14,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.entries import MapSource, StudioLight
-from facerf_cli.light.envmap import ball, rotated_weights
+from facerf_cli.light.envmap import ball, lights_around, rotated_weights
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
@@ -132,11 +132,11 @@ def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
 
 
 def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Lights:
-    """The lights of M setups by a stack's own [L, 3]; single lights are moved to the nearest."""
+    """The lights of M setups by a stack's own [L, 3]; single lights are shared by those around."""
     weights = _map_weights(setups, directions, sampling)
     for row, towards, rgb in _far_lights(setups):
-        nearest = (towards @ directions.T).argmax(1)
-        weights[row].index_add_(0, nearest, rgb)
+        index, share = lights_around(towards, directions)
+        weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
     return Lights(directions, weights)
 
 

@@ -318,7 +318,9 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
     header = read_olat_header(item.input_path)
     own = torch.from_numpy(header.directions).float()
     if (off_deg := off_rig_deg(work.setups, own)) > _OFF_RIG_DEG:
-        said = "%s: lacks a light that is asked for; the nearest is %.1f degrees off (give the photo)"
+        said = (
+            "%s: lacks a light (its nearest is %.1f degrees off): mixed of those around it; or give the photo"
+        )
         log.warning(said, item.input_path, off_deg)
     lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
     composer: Composer

@@ -14,7 +14,7 @@ from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.light.entries import parse_lights
 from facerf_cli.light.sh import CONVENTION
-from facerf_cli.light.sphere import azel_to_direction, latlong_solid_angles, rig_directions
+from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
 from facerf_cli.work.lights import lights_over_rig, lights_over_stack, off_rig_deg, readable, write_balls
@@ -182,15 +182,21 @@ def test_lamps_shine_together_with_their_colours() -> None:
     torch.testing.assert_close(weights[1, 2], torch.ones(3))
 
 
-def test_lamps_of_a_stack_go_to_its_nearest_light() -> None:
+def test_lamps_of_a_stack_are_shared_by_the_lights_around_them() -> None:
+    """Three at most, whose sum lies where the lamp is; a light of the stack is itself."""
     directions = rig_directions(50)
-    setups = collect_setups(LightSources(light=["30,20,1,2,3"]), Path("out"))
-    weights = lights_over_stack(setups, directions, "cell").weights
-    nearest = int((directions - azel_to_direction(30.0, 20.0)).norm(dim=-1).argmin())
-    torch.testing.assert_close(weights[0, nearest], torch.tensor([1.0, 2, 3]))
-    apart = directions[nearest] @ azel_to_direction(30.0, 20.0)
+    azimuth, elevation = direction_to_azel(directions[7])
+    own = f"{float(azimuth)},{float(elevation)},1,2,3"
+    setups = collect_setups(LightSources(light=["30,20,1,2,3", own]), Path("out"))
+    mixed, exact = lights_over_stack(setups, directions, "cell").weights
+    lamp = azel_to_direction(30.0, 20.0)
+    torch.testing.assert_close(mixed.sum(0), torch.tensor([1.0, 2, 3]))
+    middle = torch.nn.functional.normalize(mixed[:, 0] @ directions, dim=0)
+    torch.testing.assert_close(middle, lamp, atol=1e-5, rtol=0)
+    assert 2 <= int((mixed != 0).any(-1).sum()) <= 3 and (mixed >= 0).all()
+    torch.testing.assert_close(exact[7], torch.tensor([1.0, 2, 3]), atol=1e-4, rtol=0)
+    apart = (directions @ lamp).max()
     assert math.isclose(math.cos(math.radians(off_rig_deg(setups, directions))), float(apart), rel_tol=1e-5)
-    assert int((weights != 0).any(-1).sum()) == 1
 
 
 def balls(setups: Sequence[LightSetup], output: Path, exposure_ev: float | None) -> None:

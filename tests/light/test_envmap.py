@@ -214,6 +214,19 @@ def test_shares_of_a_direction_point_to_it() -> None:
     assert best.tolist() == list(range(40))
 
 
+def test_lights_around_in_a_rig_that_is_open_to_the_back() -> None:
+    """As a light stage of a front half is: inside its triangles a direction is shared as in a whole rig."""
+    rig = rig_directions(80)
+    front = rig[rig[:, 2] > 0.3]
+    inner = front[front[:, 2] > 0.75]
+    towards = torch.nn.functional.normalize((inner[:, None] + inner[None]).flatten(0, 1), dim=1)
+    index, share = lights_around(towards, front)
+    mean = torch.nn.functional.normalize((share[..., None] * front.double()[index]).sum(1), dim=1)
+    torch.testing.assert_close(mean, towards.double(), atol=1e-6, rtol=0)
+    index, share = lights_around(torch.tensor([[0.0, 0, -1]]), front)
+    assert share[0].tolist() == [1, 0, 0]
+
+
 @pytest.mark.parametrize("lights", [[[0.0, 0, 1]], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.6, 0.53]]])
 def test_directions_that_no_rig_surrounds_go_to_the_nearest_light(lights: list[list[float]]) -> None:
     rig = torch.tensor(lights)
