@@ -175,7 +175,7 @@ class FittedPerson:
         return segment(people, to_display(self.photo), landmarks_px, matte)
 
     @property
-    def matte(self) -> np.ndarray:
+    def share(self) -> np.ndarray:
         """The person's share [H, W] of the photo."""
         return self.segmentation.matte if self.given_matte is None else self.given_matte
 
@@ -186,7 +186,7 @@ class FittedPerson:
         """
         if self.photo is not None and target.composite == "photo":
             part = target.matte
-            target = replace(target, matte=self.matte if part is None else self.matte * part)
+            target = replace(target, matte=self.share if part is None else self.share * part)
         return Composition(self.models.face, self.photo, self.head, target, self.reflectance)
 
     def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:

@@ -69,27 +69,9 @@ def rig(lights: int | Array = 150) -> np.ndarray:
 
 
 @overload
-def fit(
-    models: Models,
-    photo: Array,
-    landmarks_px: Any = ...,
-    geometry: Geometry | None = ...,
-    reflectance: RelightKind = ...,
-    network_alone: bool = ...,
-    matte: Any = ...,
-    texture_side: int | None = ...,
-) -> Person: ...
+def fit(models: Models, photo: Array, *choices: Any, **more: Any) -> Person: ...
 @overload
-def fit(
-    models: Models,
-    photo: Sequence[Array],
-    landmarks_px: Any = ...,
-    geometry: Geometry | None = ...,
-    reflectance: RelightKind = ...,
-    network_alone: bool = ...,
-    matte: Any = ...,
-    texture_side: int | None = ...,
-) -> list[Person]: ...
+def fit(models: Models, photo: Sequence[Array], *choices: Any, **more: Any) -> list[Person]: ...
 def fit(
     models: Models,
     photo: Array | Sequence[Array],

@@ -117,9 +117,11 @@ def sums_of(lights: Sequence[Light]) -> Lights:
     rigs = [light.on_cpu() for light in lights]
     if len(rigs) == 1:
         return Lights.of_rig(rigs[0])
-    every = torch.cat([rig.directions for rig in rigs])
-    directions, places = torch.unique(every.detach(), dim=0, return_inverse=True)
-    each = zip(rigs, places.split([len(rig.directions) for rig in rigs]), strict=True)
+    directions = torch.cat([rig.directions for rig in rigs])
+    places = torch.arange(len(directions))
+    if not directions.requires_grad:
+        directions, places = torch.unique(directions, dim=0, return_inverse=True)
+    each = zip(rigs, torch.split(places, [len(rig.directions) for rig in rigs]), strict=True)
     nothing = torch.zeros(len(directions), 3)
     return Lights(directions, torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each]))
 

@@ -49,8 +49,8 @@ class PhotoCamera(NamedTuple):
     (K @ (x, -y, -z)) / -z.
     """
 
-    K: np.ndarray
-    head_to_camera: np.ndarray
+    K: Array
+    head_to_camera: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,10 +151,15 @@ class Person(pipeline.FittedPerson):
         """The light of the photo, estimated over a rig of 150 lights."""
         return self.estimate_light()
 
+    @property
+    def matte(self) -> Array:
+        """The person's share [H, W] of the photo."""
+        return self._out(self.share)
+
     @cached_property
     def classes(self) -> dict[str, Array]:
         """Share [H, W] of each class of the person (hair, skin, ...), which sum to the matte."""
-        layers = filled(self.segmentation.layers(), *self.matte.shape)
+        layers = filled(self.segmentation.layers(), *self.share.shape)
         return {name: self._out(layers[f"class.{name}"]) for name in CLASSES[1:]}
 
     @cached_property
@@ -173,9 +178,9 @@ class Person(pipeline.FittedPerson):
         return self._layer("depth")[..., 0]
 
     @property
-    def landmarks(self) -> np.ndarray:
+    def landmarks(self) -> Array:
         """The 68 landmarks [68, 2] in the photo's pixels, centres at index + 0.5."""
-        return self.head.fit.crop.to_photo(self.head.landmarks_px)
+        return self._out(self.head.fit.crop.to_photo(self.head.landmarks_px))
 
     @property
     def camera(self) -> PhotoCamera:
@@ -185,12 +190,12 @@ class Person(pipeline.FittedPerson):
         matrix = np.array([[focal, 0, camera.cx_px], [0, focal, camera.cy_px], [0, 0, 1]])
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = fit.rotation.numpy(), fit.translation_m.numpy()
-        return PhotoCamera(matrix, pose)
+        return PhotoCamera(self._out(matrix), self._out(pose))
 
     @property
     def mesh(self) -> trimesh.Trimesh:
         """The fitted face with its texture, head frame, m: `.vertices` [V, 3], `.faces`, `.export(path)`."""
-        fit, (u, v) = self.head.fit, self.uv.T
+        fit, (u, v) = self.head.fit, grid_uv().numpy().T
         texture = Image.fromarray(to_display(np.asarray(_by_pixel(self.head.face.texture))))
         return trimesh.Trimesh(
             self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy(),
@@ -200,9 +205,9 @@ class Person(pipeline.FittedPerson):
         )
 
     @property
-    def uv(self) -> np.ndarray:
+    def uv(self) -> Array:
         """The (u, v) [V, 2] of the mesh's vertices, v down."""
-        return grid_uv().numpy()
+        return self._out(grid_uv())
 
     @property
     def texture(self) -> Array:
@@ -260,6 +265,8 @@ class Person(pipeline.FittedPerson):
         composition, behind = self._behind(background)
         for part in batches(len(lights), composition.nbytes):
             some = sums_of(lights[part])
+            if some.directions.requires_grad:
+                raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
             with torch.no_grad():
                 relit = list(composition.relit(some))
             for number, one in enumerate(relit):
@@ -362,10 +369,14 @@ class _OfWeights(torch.autograd.Function):
     def backward(ctx: Any, *of_image: Tensor) -> tuple[Tensor, None, None, None]:
         """Sum the gradient [H, W, 3] over the image of each light."""
         composition, slope = ctx.composition, of_image[0].cpu()
+
+        def image(relit: Relit) -> Tensor:
+            bands = composition.bands(relit)
+            band = bands["rgb"] if "A" in bands else composition.light_layer(relit)
+            return torch.from_numpy(whole(band, *composition.size_px))
+
         found = [
-            (slope * torch.from_numpy(whole(composition.light_layer(relit), *composition.size_px))).sum(
-                (0, 1)
-            )
+            (slope * image(relit)).sum((0, 1))
             for some in torch.split(ctx.directions, _LIGHTS_AT_ONCE)
             for relit in composition.relit(Lights.each(some))
         ]

@@ -73,12 +73,14 @@ def rotated_weights(
         index = nearest_light(directions, height, 2 * height).reshape(-1, 1)
         share = torch.ones(index.shape, dtype=torch.float64)
     rows = _RowIntegrals(envmap, height)
-    weights = torch.zeros(len(rotations_deg), len(directions), 3, dtype=torch.float64)
-    for weight, rotation_deg in zip(weights, rotations_deg, strict=True):
+    found = []
+    for rotation_deg in rotations_deg:
         power = rows.rotated(2 * height, rotation_deg).reshape(-1, 3) / math.pi
+        weights = torch.zeros(len(directions), 3, dtype=torch.float64)
         for light, part in zip(index.unbind(1), share.unbind(1), strict=True):
-            weight.index_add_(0, light, part[:, None] * power)
-    return weights.float()
+            weights = weights.index_add(0, light, part[:, None] * power)
+        found.append(weights)
+    return torch.stack(found).float()
 
 
 def cell_rows(lights: int) -> int:

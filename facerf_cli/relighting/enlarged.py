@@ -17,7 +17,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
-from facerf_cli.relighting.portrait_field import PortraitView
+from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
@@ -106,7 +106,7 @@ class Enlarged:
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [9, S, S]."""
         view = self._view
-        relit = (view.maps.albedo[0] * lit[:3] + lit[3:6]) * view.exposure
+        (relit,) = view.relit(PortraitLight(lit[:3], lit[3:6], lit[6:]))
         skin = view.person.classes[class_index("skin")].numpy()
         image = view.person.image.permute(1, 2, 0).numpy()
         return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())

@@ -126,7 +126,7 @@ class PortraitView:
                 torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
                 strict=True,
             ):
-                maps = self._shaded(lights, self.person.visibility(lights))
+                maps = self._shaded(lights, self.person.visibility(lights.detach()))
                 yield _Some(*maps, torch.ones(len(lights), 1, 1), some)
 
     def _near(self, points: PointLights, weights: Tensor) -> Iterator[_Some]:
@@ -161,6 +161,10 @@ class PortraitView:
             reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
         return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6))
+
+    def relit(self, lit: PortraitLight) -> Tensor:
+        """Radiance [M, 3, S, S] of the person in the square, at the resolution of the maps."""
+        return (self.maps.albedo * lit.shading + lit.highlights) * self.exposure
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +225,6 @@ class PortraitField:
         return torch.lerp(textures, own, _SHARE)
 
 
-@torch.no_grad()
 def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """The light transport of a person, as the Portrait Network sees it.
 

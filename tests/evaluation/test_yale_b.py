@@ -153,7 +153,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "_CORE", (Flash(0, 0), Flash(-70, 0)))
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     monkeypatch.setattr(
-        pipeline.FittedPerson, "matte", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
+        pipeline.FittedPerson, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
     )
     monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own

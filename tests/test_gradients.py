@@ -1,0 +1,211 @@
+"""Gradients of the Python API against finite differences; the page in the docs runs."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from scipy.ndimage import binary_erosion
+from torch import Tensor
+
+import facerf_cli as facerf
+from facerf_cli.errors import UsageError
+from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.portrait_field import PortraitField, maps_of
+from tests import astronaut
+
+ROOT = Path(__file__).parents[1]
+POSE = torch.tensor([5.0, 3.0, 1.0])
+LINEAR = 1e-4  # the image is linear in them; single precision is left
+# Texels are sampled bilinearly, so steps of the pose cross kinks; and at the nose pixels change triangles.
+SMOOTH = 0.03
+Loss = Callable[[Any], Tensor]
+
+
+@pytest.fixture(scope="module")
+def models() -> Models:
+    """Models whose Reflectance and Portrait Networks are no other test's."""
+    return facerf.load_models()
+
+
+@pytest.fixture(scope="module")
+def person(models: Models) -> facerf.Person:
+    return facerf.fit(models, astronaut.photo(), texture_side=64)
+
+
+@pytest.fixture(scope="module")
+def light() -> facerf.Light:
+    rig = torch.from_numpy(facerf.rig(40))
+    return facerf.Light(
+        rig[rig[:, 2] > 0.2][:3], torch.tensor([[0.8, 0.7, 0.3], [0.2, 0.4, 0.9], [0.5, 0.5, 0.1]])
+    )
+
+
+@pytest.fixture(scope="module")
+def loss(person: facerf.Person, light: facerf.Light) -> Loss:
+    """The sum of an image under smooth random weights, well inside the face."""
+    alpha = person.relight(light, pose=POSE)[..., 3]
+    inside = torch.from_numpy(binary_erosion((alpha > 0.99).numpy(), iterations=6))
+    random = torch.rand(1, 3, 12, 12, generator=torch.Generator().manual_seed(1))
+    marks = F.interpolate(random, alpha.shape, mode="bicubic")[0].permute(1, 2, 0)
+    return lambda image: (image[..., :3].double() * marks * inside[..., None]).sum()
+
+
+def compared(function: Loss, at: Tensor, step: float, along: Tensor | None = None) -> tuple[float, float]:
+    """The slope of a function at a tensor, in a direction of length 1, by its gradient and by two values."""
+    at = at.detach().clone().requires_grad_()
+    function(at).backward()
+    assert at.grad is not None
+    along = torch.randn(at.shape) if along is None else along
+    along = along / along.norm()
+    with torch.no_grad():
+        difference = function(at + step * along) - function(at - step * along)
+    return float((at.grad * along).sum()), float(difference) / (2 * step)
+
+
+@pytest.mark.parametrize(
+    "shown",
+    [{"alone": True}, {"pose": (5, 3, 1)}, {}, {"background": "none"}, {"background": (0.1, 0.2, 0.3)}],
+)
+def test_of_the_weights_of_a_light(person: facerf.Person, light: facerf.Light, shown: dict[str, Any]) -> None:
+    directions, weights = light.directions, torch.as_tensor(light.weights)
+    rows = torch.linspace(-1, 2, astronaut.photo().shape[0], dtype=torch.float64)[:, None, None]
+
+    def lit(weights: Tensor) -> Tensor:
+        return (person.relight(facerf.Light(directions, weights), **shown)[..., :3] * rows).sum()
+
+    found, expected = compared(lit, weights, 0.1)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
+
+
+def test_of_the_weights_of_lights_in_a_list(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
+    def both(weights: Tensor) -> Tensor:
+        one, two = facerf.Light(light.directions, weights), facerf.Light.single(40, 10)
+        first, second = person.relight([one, two + 2 * one])
+        return loss(first) + 3 * loss(second)
+
+    found, expected = compared(both, torch.as_tensor(light.weights), 0.1)
+    assert found == pytest.approx(expected, rel=LINEAR)
+
+
+def test_of_the_pixels_of_a_map(person: facerf.Person, loss: Loss) -> None:
+    def lit(envmap: Tensor) -> Tensor:
+        return loss(person.relight(facerf.Light.from_envmap(envmap, lights=6), alone=True))
+
+    found, expected = compared(lit, torch.rand(8, 16, 3), 0.1, torch.rand(8, 16, 3))
+    assert abs(expected) > 0.1 and found == pytest.approx(expected, rel=LINEAR)
+
+
+def test_of_the_pose(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
+    along = torch.eye(3)
+    pairs = [compared(lambda x: loss(person.relight(light, pose=x)), POSE, 0.1, axis) for axis in along]
+    found, expected = torch.tensor(pairs).T
+    assert expected.norm() > 10 and (found - expected).norm() < SMOOTH * expected.norm()
+
+
+@pytest.mark.parametrize("pose", [None, POSE])
+def test_of_the_texture(person: facerf.Person, light: facerf.Light, loss: Loss, pose: Tensor | None) -> None:
+    texture = torch.from_numpy(person.texture)
+
+    def lit(texture: Tensor) -> Tensor:
+        return loss(person.with_texture(texture).relight(light, pose=pose, alone=True))
+
+    found, expected = compared(lit, texture, 0.1, texture)  # brighter by a share
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+
+
+def test_of_the_directions_of_a_light(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
+    directions = torch.as_tensor(light.directions)
+
+    def lit(x: Tensor) -> Tensor:
+        return loss(person.relight(facerf.Light(F.normalize(x, dim=1), light.weights), pose=POSE))
+
+    found, expected = compared(lit, directions, 0.02)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+    with pytest.raises(UsageError, match="directions: have no gradient in the photo"):
+        person.relight(facerf.Light(directions.clone().requires_grad_(), light.weights))
+
+
+def slopes(value: Callable[[], Tensor], weight: Tensor, step: float) -> tuple[float, float]:
+    """The slope of a value in a network's weight, as `compared` gives it."""
+    (gradient,) = torch.autograd.grad(value(), weight)
+    along = torch.randn(weight.shape)
+    along = along / along.norm()
+    with torch.no_grad():
+        ends = []
+        for change in (step, -2 * step, step):
+            weight.add_(change * along)
+            ends.append(float(value()))
+    return float((gradient * along).sum()), (ends[0] - ends[1]) / (2 * step)
+
+
+def test_of_the_weights_of_the_reflectance_network(
+    models: Models, person: facerf.Person, light: facerf.Light, loss: Loss
+) -> None:
+    network: Any = models.networks.reflectance
+    weight = network.head.weight.requires_grad_(True)
+    found, expected = slopes(lambda: loss(person.relight(light, alone=True)), weight, 0.03)
+    weight.requires_grad_(False)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+
+
+def test_of_the_maps_of_the_portrait(models: Models, person: facerf.Person, light: facerf.Light) -> None:
+    assert isinstance(person.reflectance, PortraitField)
+    view, portrait = person.reflectance.views[0], models.networks.portrait
+    directions, weights = torch.as_tensor(light.directions), torch.as_tensor(light.weights)
+    marks = F.interpolate(torch.rand(1, 3, 8, 8), view.person.image.shape[1:], mode="bicubic")
+
+    def shown(weights: Tensor) -> Tensor:
+        return (view.relit(view.lit(directions, weights[None])).double() * marks).sum()
+
+    found, expected = compared(shown, weights, 0.1)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
+
+    weight = next(portrait.parameters()).requires_grad_(True)
+
+    def seen() -> Tensor:
+        again = replace(view, maps=maps_of(portrait, view.person))
+        return (again.relit(again.lit(directions, weights[None])).double() * marks).sum()
+
+    found, expected = slopes(seen, weight, 0.01)
+    weight.requires_grad_(False)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+
+
+def test_tensors_in_tensors_out(models: Models) -> None:
+    photo = torch.from_numpy(astronaut.photo())
+    one = facerf.fit(models, photo, reflectance="field", texture_side=64)
+    key = facerf.Light.single(60, 30)
+    for found in (one.relight(key), one.texture, one.matte, one.normals, one.olat(2), one.uv_olat(2)):
+        assert isinstance(found, Tensor) and found.device == models.device
+    layers = one.relight(key, layers=["depth"], background=torch.full((4, 4, 3), 0.2))
+    assert set(layers) == {"image", "person.A", "depth"} and not layers["image"].requires_grad
+    rig = torch.from_numpy(facerf.rig(4))
+    arrays = facerf.fit(models, astronaut.photo(), reflectance="field", texture_side=64)
+    assert isinstance(arrays.relight(key), np.ndarray) and isinstance(arrays.uv_olat(rig), Tensor)
+    np.testing.assert_array_equal(one.relight(key).numpy(), arrays.relight(key))
+
+
+@pytest.mark.filterwarnings("ignore:No complete tensor found")
+def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs/gradients.md").read_text(), re.S):
+        exec(compile(block, "docs/gradients.md", "exec"), names)
+    light, toward = names["light"], torch.from_numpy(facerf.Light.single(60, 30).directions)[0]
+    brightest = names["directions"][light.weights.sum(1).argmax()]
+    assert float(brightest @ toward) > 0.6  # the nearest of the rig
+    assert names["loss"].item() < 1e-3
+    vertices = names["vertices"].grad
+    assert vertices[:, 2].sum() == pytest.approx(-1, abs=1e-4)  # depth falls as all of it comes nearer
+    network, face = names["network"], names["face"]
+    with torch.no_grad():
+        normals = face.normals[None]
+        own = network.decode(network.encode(*names["source"]), normals, names["directions"][None, :5])
+    torch.testing.assert_close(names["olats"], own)
