@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights
+from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights, on_device
 from facerf_cli.run.logs import one_line
 
 BUILTIN = "builtin"
@@ -100,8 +100,8 @@ class MorphableModel:
 
     def landmarks(self, vertices: Tensor) -> Tensor:
         """The 68 landmarks [B, 68, 3] of vertices [B, V, 3]."""
-        corners, weights = landmark_weights()
-        return (vertices[:, corners] * weights[..., None].to(vertices)).sum(2)
+        corners, weights = on_device(vertices.device, landmark_weights)
+        return (vertices[:, corners] * weights[..., None].to(vertices.dtype)).sum(2)
 
     def pose_only(self) -> "MorphableModel":
         """The model with shapes of zero, so that its fit is a pose alone (paper, 'Ablative Study')."""

@@ -15,7 +15,9 @@ The interior of the face is the mask M_t(omega_h) of the paper's 'Photometric lo
 its soft rim, where the mesh faces the camera. It includes brows, eyes and mouth, as in the paper.
 """
 
+from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -125,6 +127,13 @@ def grid_triangles() -> Tensor:
     rising = torch.stack([top_left, bottom_left, top_right, top_right, bottom_left, bottom_right], -1)
     left_half = (col < GRID // 2).reshape(-1, 1)
     return torch.where(left_half, falling, rising).reshape(-1, 3)
+
+
+@cache
+def on_device(device: torch.device, constant: Callable[..., Any], *arguments: Any) -> Any:
+    """A constant tensor, such as `grid_triangles`, or some of them, on a device; they are sent there once."""
+    found = constant(*arguments)
+    return found.to(device) if isinstance(found, Tensor) else tuple(part.to(device) for part in found)
 
 
 def locate(uv: np.ndarray) -> tuple[Tensor, Tensor]:
@@ -240,14 +249,14 @@ def interior_texture(side: int) -> Tensor:
 
 @torch.no_grad()
 def interior_mask(vertices_camera: Tensor, fragments: Fragments, uv: Tensor, texture_side: int) -> Tensor:
-    """The interior M_t [1, H, W] in 0..1 of a rendered mesh.
+    """The interior M_t [..., 1, H, W] in 0..1 of a rendered mesh.
 
-    vertices_camera [V, 3] is the mesh, fragments and uv [H, W, 2] what each pixel sees of it.
+    vertices_camera [..., V, 3] is the mesh, fragments and uv [..., H, W, 2] what each pixel sees of it.
     """
-    front = front_facing(vertices_camera, grid_triangles().to(vertices_camera.device))
-    seen = fragments.covered & front[fragments.triangle]  # fragments.triangle is -1 off the mesh
-    inside = sample_texture(interior_texture(texture_side).to(uv.device), uv)[..., 0]
-    return (inside * seen)[None]
+    front = front_facing(vertices_camera, on_device(uv.device, grid_triangles))
+    of_pixels = front.gather(-1, fragments.triangle.flatten(-2).clamp_min(0)).view_as(fragments.triangle)
+    inside = sample_texture(on_device(uv.device, interior_texture, texture_side), uv)[..., 0]
+    return (inside * (fragments.covered & of_pixels)).unsqueeze(-3)
 
 
 @cache
@@ -273,8 +282,8 @@ def silhouette_ids(vertices_px: Tensor, head_to_camera: Tensor) -> Tensor:
 
     vertices_px [B, V, 2] are the mesh's pixels, head_to_camera [B, 3, 3] the poses. Indices have no gradient.
     """
-    rays = contour_rays().to(vertices_px.device)
-    outward = _outward().to(head_to_camera) @ head_to_camera.mT  # [B, R, 3]
+    rays = on_device(vertices_px.device, contour_rays)
+    outward = on_device(vertices_px.device, _outward).to(head_to_camera) @ head_to_camera.mT  # [B, R, 3]
     furthest = outermost(vertices_px[:, rays], outward)
     return rays.expand(len(vertices_px), -1, -1).gather(2, furthest[..., None])[..., 0]
 

@@ -87,7 +87,7 @@ class GeometryNetwork(SavedNetwork):
 
 def _rotation(columns: Tensor) -> Tensor:
     """Rotations [B, 3, 3] from the differences [B, 6] of their first two columns to the identity's."""
-    identity = columns.new_tensor([1.0, 0, 0, 0, 1.0, 0])
+    identity = torch.eye(2, 3, device=columns.device).flatten()
     first, second = (columns + identity).chunk(2, 1)
     x = F.normalize(first, dim=1)
     y = F.normalize(second - (x * second).sum(1, keepdim=True) * x, dim=1)

@@ -81,9 +81,11 @@ def colour_cast(texture: Tensor, visible: Tensor, trained: SourceColours) -> Ten
     mean: the less usual the colour, the more certainly it is the light's.
     """
     mean = mean_colours(texture, visible)
-    chroma = _chroma(mean) - mean.new_tensor(trained.mean)
-    spread = torch.linalg.cholesky(mean.new_tensor(trained.covariance))
-    distance = torch.linalg.solve_triangular(spread, chroma.T, upper=False).norm(dim=0)
+    red, blue = (part - middle for part, middle in zip(_chroma(mean).unbind(1), trained.mean, strict=True))
+    (a, b), (_, c) = trained.covariance
+    # Mahalanobis distance, by the Cholesky factor of the covariance
+    distance = torch.hypot(red / a**0.5, (blue - red * (b / a)) / (c - b * b / a) ** 0.5)
+    chroma = torch.stack([red, blue], 1)
     inside = (_ORDINARY_CAST / distance.clamp_min(1e-6)) ** 2
     excess = chroma * (1 - inside).clamp_min(0)[:, None]
     cast = torch.stack([excess[:, 0], torch.zeros_like(excess[:, 0]), excess[:, 1]], 1).exp()
@@ -108,7 +110,7 @@ def mean_colours(texture: Tensor, visible: Tensor) -> Tensor:
 
 
 def _chroma(colours: Tensor) -> Tensor:
-    return (colours[:, [0, 2]] / colours[:, 1:2]).log()
+    return (colours[:, ::2] / colours[:, 1:2]).log()
 
 
 def to_root(radiance: Tensor) -> Tensor:
@@ -191,8 +193,16 @@ class Batch:
         return type(self)(*(x.each(function) if isinstance(x, Batch) else function(x) for x in values))
 
     def to(self, device: torch.device) -> Self:
-        """Copy all tensors to `device`."""
-        return self.each(lambda values: values.to(device))
+        """Copy all tensors to `device`; a GPU goes on with its work meanwhile if they are pinned."""
+        return self.each(lambda values: values.to(device, non_blocking=device.type == "cuda"))
+
+    def pin_memory(self) -> Self:
+        """The tensors in memory that a GPU reads by itself; the data loader calls this."""
+        return self.each(torch.Tensor.pin_memory)
+
+    def parts(self, count: int) -> list[Self]:
+        """The samples in `count` batches of the same size."""
+        return [self.each(lambda values: values.chunk(count)[part]) for part in range(count)]  # noqa: B023
 
 
 Samples = TypeVar("Samples", bound=Batch)

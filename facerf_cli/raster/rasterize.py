@@ -1,13 +1,15 @@
 """A z-buffer in plain torch: the visible triangle of each pixel, its barycentric weights and its depth.
 
 All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with the
-covered area and not with the bounding boxes. A pixel belongs to a triangle if its centre lies inside. A run
+covered area and not with the bounding boxes. Meshes of a batch share these steps, so that a device waits for the
+host as often for many as for one. A pixel belongs to a triangle if its centre lies inside. A run
 includes its left end and excludes its right, a triangle includes its upper end and excludes its lower, and
 both triangles of a shared edge compute the same crossing, so each pixel on an edge is covered exactly once.
 Visibility has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle
 have one. All arithmetic is elementwise, so the result does not depend on how triangles are split into parts.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -24,15 +26,16 @@ _FAR_KEY = torch.iinfo(torch.int64).max  # of a pixel without a triangle
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """The visible point of each pixel of an image."""
+    """The visible point of each pixel of an image, or of the images of a batch."""
 
-    triangle: Tensor  # [H, W] int64, -1 for none
-    barycentric: Tensor  # [H, W, 3] perspective-correct, differentiable in the vertices; 0 for none
-    depth_m: Tensor  # [H, W] distance along the viewing axis (-z), differentiable; inf for none
+    triangle: Tensor  # [..., H, W] int64, -1 for none
+    barycentric: Tensor  # [..., H, W, 3] perspective-correct, differentiable in the vertices; 0 for none
+    depth_m: Tensor  # [..., H, W] distance along the viewing axis (-z), differentiable; inf for none
+    pixel: Tensor  # [P] places of the covered pixels in the flat images
 
     @property
     def covered(self) -> Tensor:
-        """Pixels [H, W] bool with a visible triangle."""
+        """Pixels [..., H, W] bool with a visible triangle."""
         return self.triangle >= 0
 
 
@@ -40,7 +43,8 @@ class Fragments:
 class _Screen:
     """Triangles [N] inside the image, projected in float64; float32 is too coarse for slivers."""
 
-    triangle: Tensor  # [N] index in the mesh
+    triangle: Tensor  # [N] index in the mesh, or in all meshes one after another
+    first_px: Tensor  # [N] place of the first pixel of the triangle's image in the flat images
     corners_px: Tensor  # [N, 3, 2]
     inverse_depth: Tensor  # [N, 3]
     first_row: Tensor  # [N] int64
@@ -53,70 +57,71 @@ class _Screen:
 
 
 def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fragments:
-    """Rasterize vertices [V, 3] and triangles [F, 3] of either winding; at equal depth the lower index wins.
+    """Rasterize vertices [..., V, 3] and triangles [F, 3] of either winding; at equal depth the lower index wins.
 
     The barycentric weights and the depth have gradients to the vertices; the choice of triangle has none.
     """
+    size = (*vertices_camera.shape[:-2], camera.height_px, camera.width_px)
+    vertices, corners = vertices_camera.flatten(0, -2), _of_each_mesh(triangles, vertices_camera)
     with torch.no_grad():
-        triangle = _visible_triangles(vertices_camera.detach(), triangles, camera)
-    height, width = camera.height_px, camera.width_px
+        triangle = _visible_triangles(vertices.detach(), corners, camera, math.prod(size[:-2]))
     pixel = torch.nonzero(triangle >= 0).squeeze(-1)
-    weights, depth = _hit(vertices_camera, triangles, triangle[pixel], pixel, camera)
-    dtype, device = vertices_camera.dtype, vertices_camera.device
-    nothing = torch.zeros(height * width, 3, dtype=dtype, device=device)
-    far = torch.full((height * width,), torch.inf, dtype=dtype, device=device)
+    weights, depth = _hit(vertices, corners, triangle[pixel], pixel, camera)
+    nothing, far = vertices.new_zeros(len(triangle), 3), vertices.new_full((len(triangle),), torch.inf)
     return Fragments(
-        triangle.view(height, width),
-        nothing.index_copy(0, pixel, weights.to(dtype)).view(height, width, 3),
-        far.index_copy(0, pixel, depth.to(dtype)).view(height, width),
+        torch.where(triangle < 0, -1, triangle % max(len(triangles), 1)).view(size),
+        nothing.index_copy(0, pixel, weights.to(vertices.dtype)).view(*size, 3),
+        far.index_copy(0, pixel, depth.to(vertices.dtype)).view(size),
+        pixel,
     )
 
 
+def _of_each_mesh(triangles: Tensor, vertices: Tensor) -> Tensor:
+    """Vertex ids [M F, 3] of the triangles of M meshes [..., V, 3], whose vertices follow each other."""
+    *batch, count, _ = vertices.shape
+    first = torch.arange(math.prod(batch), device=triangles.device) * count
+    return (triangles + first[:, None, None]).flatten(0, 1)
+
+
 def interpolate(attributes: Tensor, triangles: Tensor, fragments: Fragments) -> Tensor:
-    """Interpolate vertex attributes [V, C] to pixels [H, W, C]; pixels without a triangle are zero.
+    """Interpolate vertex attributes [V, C] to pixels [..., H, W, C]; pixels without a triangle are zero.
 
     Differentiable in the attributes and, through the barycentric weights, in the vertices.
     """
-    height, width = fragments.triangle.shape
-    triangle = fragments.triangle.reshape(-1)
-    pixel = torch.nonzero(triangle >= 0).squeeze(-1)
-    corners = triangles[triangle[pixel]]  # [P, 3]
-    weights = fragments.barycentric.reshape(-1, 3)[pixel].to(attributes.dtype)
+    corners = triangles[fragments.triangle.flatten()[fragments.pixel]]  # [P, 3]
+    weights = fragments.barycentric.reshape(-1, 3)[fragments.pixel].to(attributes.dtype)
     a, b, c = (weights[:, k, None] * attributes[corners[:, k]] for k in range(3))
-    values = a + b + c
-    out = torch.zeros(height * width, attributes.shape[1], dtype=attributes.dtype, device=attributes.device)
-    return out.index_copy(0, pixel, values).view(height, width, -1)
+    out = attributes.new_zeros(fragments.triangle.numel(), attributes.shape[1])
+    return out.index_copy(0, fragments.pixel, a + b + c).view(*fragments.triangle.shape, -1)
 
 
 def front_facing(vertices_camera: Tensor, triangles: Tensor) -> Tensor:
-    """Return [F] bool: whether a triangle's counter-clockwise side faces the camera."""
-    a, b, c = vertices_camera[triangles].unbind(1)
+    """Tell of each triangle [..., F] of meshes [..., V, 3] if its counter-clockwise side faces the camera."""
+    a, b, c = vertices_camera[..., triangles, :].unbind(-2)
     return (torch.linalg.cross(b - a, c - a) * a).sum(-1) < 0
 
 
-def _visible_triangles(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Tensor:
-    """Return the index of the nearest triangle at each pixel [H * W] int64, -1 for none."""
-    screen = _on_screen(vertices_camera, triangles, camera)
-    pixels = camera.height_px * camera.width_px
+def _visible_triangles(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshes: int) -> Tensor:
+    """Return the index of the nearest triangle at each pixel [M * H * W] int64 of M meshes, -1 for none."""
+    screen = _on_screen(vertices_camera, triangles, camera, meshes)
+    pixels = meshes * camera.height_px * camera.width_px
     nearest = torch.full((pixels,), _FAR_KEY, dtype=torch.int64, device=vertices_camera.device)
     for part in _chunks(screen):
         owner, pixel = _cover(part, camera.width_px)
-        depth_bits = _fragment_depth(part, owner, pixel, camera.width_px).view(torch.int32)
+        depth_bits = _fragment_depth(part, owner, pixel, camera).view(torch.int32)
         # Bits of positive floats sort like the floats, so an integer minimum finds both depth and triangle.
         key = (depth_bits.long() << 32) | part.triangle[owner]
         nearest.scatter_reduce_(0, pixel, key, "amin")
     return torch.where(nearest == _FAR_KEY, -1, nearest & 0xFFFFFFFF)
 
 
-def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> _Screen:
-    """Project the mesh and drop triangles that cover no pixel."""
+def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshes: int) -> _Screen:
+    """Project the meshes and drop triangles that cover no pixel."""
     vertices = vertices_camera.double()
     px = project(vertices, camera)
     in_front = (vertices[:, 2] < -NEAR_M) & px.isfinite().all(-1)
     corners_px = px[triangles]  # [F, 3, 2]
-    limit = torch.tensor([camera.width_px, camera.height_px], dtype=torch.float64, device=px.device)
-    low = _first_centre(corners_px.amin(1)).clamp(min=0).minimum(limit)
-    high = _first_centre(corners_px.amax(1)).clamp(min=0).minimum(limit)
+    low, high = (_within(_first_centre(end), camera) for end in (corners_px.amin(1), corners_px.amax(1)))
     a, b, c = corners_px.unbind(1)
     area2_px = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     seen = in_front[triangles].all(-1) & (high > low).all(-1) & (area2_px.abs() > _SLIVER_PX2)
@@ -124,7 +129,14 @@ def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> _S
     first, last = low[keep].long(), high[keep].long()
     size = last - first
     inverse_depth = -1 / vertices[:, 2][triangles[keep]]
-    return _Screen(keep, corners_px[keep], inverse_depth, first[:, 1], size[:, 1], size.prod(-1))
+    first_px = keep * meshes // max(len(triangles), 1) * (camera.width_px * camera.height_px)
+    return _Screen(keep, first_px, corners_px[keep], inverse_depth, first[:, 1], size[:, 1], size.prod(-1))
+
+
+def _within(px: Tensor, camera: Camera) -> Tensor:
+    """Positions [..., 2], none of them outside the image."""
+    x, y = px.unbind(-1)
+    return torch.stack([x.clamp(0, camera.width_px), y.clamp(0, camera.height_px)], -1)
 
 
 def _first_centre(position_px: Tensor) -> Tensor:
@@ -134,14 +146,13 @@ def _first_centre(position_px: Tensor) -> Tensor:
 
 def _chunks(screen: _Screen) -> Iterator[_Screen]:
     """Split the triangles, in order, into parts of limited bounding-box area."""
-    if len(screen.triangle) == 0:
-        return
-    chunk = screen.box_px.cumsum(0) // _CHUNK_PX
-    if chunk[-1] == 0:
+    end_px = screen.box_px.cumsum(0)
+    chunks = int(end_px[-1]) // _CHUNK_PX if len(end_px) else -1
+    if chunks == 0:
         yield screen
         return
-    for number in torch.unique(chunk):
-        yield screen.part(torch.nonzero(chunk == number).squeeze(-1))
+    for number in range(chunks + 1):
+        yield screen.part(torch.nonzero(end_px // _CHUNK_PX == number).squeeze(-1))
 
 
 def _cover(screen: _Screen, width_px: int) -> tuple[Tensor, Tensor]:
@@ -151,7 +162,7 @@ def _cover(screen: _Screen, width_px: int) -> tuple[Tensor, Tensor]:
     first = _first_centre(left).clamp(0, width_px).long()
     last = _first_centre(right).clamp(0, width_px).long()
     run, column = _expand(first, last - first)
-    return owner[run], row[run] * width_px + column
+    return owner[run], screen.first_px[owner[run]] + row[run] * width_px + column
 
 
 def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
@@ -179,7 +190,7 @@ def _row_crossings(corners_px: Tensor, owner: Tensor, y_px: Tensor) -> tuple[Ten
     return left, right
 
 
-def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, width_px: int) -> Tensor:
+def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, camera: Camera) -> Tensor:
     """Return the depth [P] float32 of each pair; 1 / depth is linear in the image."""
     a, b, c = screen.corners_px.unbind(1)
     (abx, aby), (acx, acy) = (b - a).unbind(-1), (c - a).unbind(-1)
@@ -188,7 +199,7 @@ def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, width_px: int
     slope_x = ((ib - ia) * acy - (ic - ia) * aby) / area2
     slope_y = ((ic - ia) * abx - (ib - ia) * acx) / area2
     base = ia - slope_x * (a[:, 0] - PIXEL_CENTRE) - slope_y * (a[:, 1] - PIXEL_CENTRE)
-    column, row = pixel % width_px, pixel // width_px
+    column, row = _column_row(pixel, camera)
     inverse = base[owner] + slope_x[owner] * column + slope_y[owner] * row
     low, high = (
         screen.inverse_depth.amin(-1),
@@ -208,12 +219,17 @@ def _hit(
     corners = vertices_camera.double().nan_to_num()[triangles].permute(1, 2, 0).contiguous()  # [3, xyz, F]
     a, b, c = corners
     cofactors = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)])  # [3, xyz, F]
-    column_row = torch.stack([pixel % camera.width_px, pixel // camera.width_px], -1)
+    column_row = torch.stack(_column_row(pixel, camera), -1)
     ray = pixel_rays(column_row.double() + PIXEL_CENTRE, camera).T.contiguous()
     parts = [_dot(cofactor.index_select(1, seen), ray) for cofactor in cofactors]
     total = parts[0] + parts[1] + parts[2]
     volume = _dot(a, cofactors[0])
     return torch.stack([part / total for part in parts], -1), volume[seen] / total
+
+
+def _column_row(pixel: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Column and row of pixels of flat images of the camera."""
+    return pixel % camera.width_px, pixel // camera.width_px % camera.height_px
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ with its head, relit by the Reflectance Network, rendered with the target's head
 (paper, 'Loss Functions'). A share of the batches are photos, for the geometry terms alone ('Training').
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,16 +27,17 @@ from facerf_cli.face.topology import (
     grid_triangles,
     grid_uv,
     interior_mask,
+    on_device,
     silhouette_ids,
 )
 from facerf_cli.network.checkpoint import VGG16_LICENCE
-from facerf_cli.network.features import VggFeatures, layer_powers
+from facerf_cli.network.features import FEATURE_LAYERS, VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize, without_cast
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
-from facerf_cli.training.loop import Objective, Validation, seeded
+from facerf_cli.training.loop import Objective, Validation, broadcast_from_first, process_rank, seeded
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -52,6 +54,12 @@ from facerf_cli.training.sheets import tiled
 
 FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)
 LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011), the contour's first
+
+
+def chosen(points: Tensor, landmarks: tuple[int, ...]) -> Tensor:
+    """Some of the 68 landmarks [B, 68, C]."""
+    return points.index_select(1, on_device(points.device, torch.tensor, landmarks))
+
 
 # Side of the depth map of unwrapping: so many times the crop's, but at most _DEPTH_PX.
 _DEPTH_PX, _DEPTH_PER_PX = 512, 3
@@ -70,7 +78,7 @@ class PosedHeads(Batch):
         px = project(self.vertices, camera)
         outline = silhouette_ids(px, self.rotation)
         outline_px = px.gather(1, outline[..., None].expand(-1, -1, 2))
-        contour_px = slid_contour(outline_px, detected_px[:, list(CONTOUR)])
+        contour_px = slid_contour(outline_px, chosen(detected_px, CONTOUR))
         return torch.cat([contour_px, project(self.fixed_landmarks, camera)], 1)
 
 
@@ -79,7 +87,7 @@ def pose_heads(model: MorphableModel, estimate: GeometryEstimate) -> PosedHeads:
     head = leading(model, estimate.alpha.shape[1], estimate.beta.shape[1])
     turned = head.vertices(estimate.alpha, estimate.beta) @ estimate.rotation.mT
     vertices = turned + estimate.translation_m[:, None]
-    return PosedHeads(vertices, estimate.rotation, head.landmarks(vertices)[:, list(FIXED_LANDMARKS)])
+    return PosedHeads(vertices, estimate.rotation, chosen(head.landmarks(vertices), FIXED_LANDMARKS))
 
 
 def leading(model: MorphableModel, identities: int, expressions: int) -> MorphableModel:
@@ -90,7 +98,7 @@ def leading(model: MorphableModel, identities: int, expressions: int) -> Morphab
 
 
 @dataclass(frozen=True)
-class UnwrappedHeads:
+class UnwrappedHeads(Batch):
     """Textures [B, 3, T, T] with unseen texels filled, visibility [B, 1, T, T] and normals [B, 3, T, T]."""
 
     texture: Tensor
@@ -100,39 +108,30 @@ class UnwrappedHeads:
 
 def unwrap_images(images: Tensor, heads: PosedHeads, camera: Camera, side: int) -> UnwrappedHeads:
     """Unwrap images [B, 3, S, S] of the heads: T_s and N_s."""
-    triangles = grid_triangles().to(images.device)
-    settings = UnwrapSettings(depth_side_px=min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px))
-    faces = []
-    for image, vertices in zip(images, heads.vertices, strict=True):
-        texture, visible = unwrap(image, vertices, triangles, camera, side, settings)
-        faces.append((inpaint(texture, visible), visible[None], normal_map(vertices, triangles, side)))
-    textures, seen, normals = (torch.stack(parts) for parts in zip(*faces, strict=True))
-    return UnwrappedHeads(textures, seen, normals)
+    triangles = on_device(images.device, grid_triangles)
+    depth_px, samples = min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px), math.ceil(camera.width_px / side)
+    settings = UnwrapSettings(depth_side_px=depth_px, samples=samples, measured=False)
+    texture, visible = unwrap(images, heads.vertices, triangles, camera, side, settings)
+    return UnwrappedHeads(inpaint(texture, visible), visible[:, None], head_normals(heads, side))
 
 
 def head_normals(heads: PosedHeads, side: int) -> Tensor:
     """Camera-space normal maps [B, 3, T, T] of the heads: N_t."""
-    triangles = grid_triangles().to(heads.vertices.device)
-    return torch.stack([normal_map(vertices, triangles, side) for vertices in heads.vertices])
+    return normal_map(heads.vertices, on_device(heads.vertices.device, grid_triangles), side)
 
 
 def render_textures(textures: Tensor, heads: PosedHeads, camera: Camera) -> tuple[Tensor, Tensor]:
     """Render textures [B, C, T, T] on the heads: images [B, C, S, S] and masks M_t [B, 1, S, S] in 0..1."""
-    device = textures.device
-    triangles, uv = grid_triangles().to(device), grid_uv().to(device)
-    images, masks = [], []
-    for texture, vertices in zip(textures, heads.vertices, strict=True):
-        fragments = rasterize(vertices, triangles, camera)
-        seen_uv = interpolate(uv, triangles, fragments)
-        covered = fragments.covered[..., None].to(texture.dtype)
-        images.append((sample_texture(texture, seen_uv) * covered).permute(2, 0, 1))
-        masks.append(interior_mask(vertices, fragments, seen_uv, texture.shape[-1]))
-    return torch.stack(images), torch.stack(masks)
+    triangles, uv = (on_device(textures.device, constant) for constant in (grid_triangles, grid_uv))
+    fragments = rasterize(heads.vertices, triangles, camera)
+    seen_uv = interpolate(uv, triangles, fragments)
+    images = (sample_texture(textures, seen_uv) * fragments.covered[..., None]).permute(0, 3, 1, 2)
+    return images, interior_mask(heads.vertices, fragments, seen_uv, textures.shape[-1])
 
 
 _PAPER = PaperWeights()
 _DARKEST = 1e-4  # least radiance; networks take square roots, whose slope at 0 is infinite
-_COLOURS_MEASURED, _TARGETS_MEASURED = 192, 24  # sources and targets
+_COLOURS_MEASURED, _TARGETS_MEASURED = 192, 8  # sources and targets
 _SHEET_ROWS, _SHEET_PX = 8, 256
 
 
@@ -156,6 +155,7 @@ class _Relit:
     texture: Tensor  # [B, 3, T, T] predicted
     image: Tensor  # [B, 3, S, S] the texture rendered
     mask: Tensor  # [B, 1, S, S] M_t
+    truth: UnwrappedHeads  # the targets unwrapped, where a loss compares textures
 
 
 class JointObjective(Objective):
@@ -200,7 +200,6 @@ class JointObjective(Objective):
         sides = {"texture_side": settings.texture_side, "crop_px": settings.crop_px}
         self.inputs = {"geometry": "landmarks" if geometry is None else "network", **sides}
         self.source_colours = SourceColours.of(self._train.source_colours(_COLOURS_MEASURED))
-        self._measure_features()
         self._validation: dict[str, list[CropPairs]] | None = None
         network: Any = reflectance  # of any form (`network/reflectance.py`)
         if network.rig_lights and not network.has_mean_face:
@@ -260,7 +259,7 @@ class JointObjective(Objective):
         """L_l and L_r of each image [B]."""
         weights = self.settings.weights
         found_px = heads.landmarks_px(detected_px, self.camera)
-        landmarks = landmark_loss(found_px, detected_px[:, list(LANDMARKS)], self.settings.crop_px)
+        landmarks = landmark_loss(found_px, chosen(detected_px, LANDMARKS), self.settings.crop_px)
         terms = {"landmarks": weights.landmarks * landmarks}
         if estimate.alpha.shape[1] + estimate.beta.shape[1]:  # none with the mean face
             prior = regularisation(estimate.alpha, estimate.beta, weights)
@@ -268,18 +267,23 @@ class JointObjective(Objective):
         return terms
 
     def _relit(self, batch: CropPairs, heads: PosedHeads) -> _Relit:
-        """Relight and pose the sources of pairs as their targets; `heads` are of both, sources first."""
+        """Relight and pose the sources of pairs as their targets; `heads` are of both, sources first.
+
+        Sources and targets are unwrapped together, for the device then waits once for the host.
+        """
         side, count = self.settings.texture_side, len(batch.source)
-        source, target = heads.each(lambda x: x[:count]), heads.each(lambda x: x[count:])
-        face = unwrap_images(batch.source, source, self.camera, side)
-        normals = head_normals(target, side)
+        target = heads.each(lambda x: x[count:])
+        images = torch.cat([batch.source, batch.target]) if self.feature_networks else batch.source
+        faces = unwrap_images(images, heads.each(lambda x: x[: len(images)]), self.camera, side)
+        face = faces.each(lambda x: x[:count])
         network: Any = self.networks["reflectance"]
         with self.mixed_precision():
             plain = without_cast(face.texture.clamp_min(_DARKEST), face.visible, self.source_colours)
             encoded = network.encode(plain, face.normals, face.visible)
-            texture = network.decode(encoded, normals, batch.light[:, None])[:, 0]
+            texture = network.decode(encoded, head_normals(target, side), batch.light[:, None])[:, 0]
         image, mask = render_textures(texture.float(), target, self.camera)
-        return _Relit(target, texture.float(), image, mask)
+        truth = faces.each(lambda x: x[count:].detach())
+        return _Relit(target, texture.float(), image, mask, truth)
 
     def _image_terms(self, batch: CropPairs, relit: _Relit) -> dict[str, Tensor]:
         """L_p, L_I and L_L of each pair [B]."""
@@ -288,9 +292,7 @@ class JointObjective(Objective):
         terms = {"photometric": weights.photometric * photometric}
         if not self.feature_networks:
             return terms
-        with torch.no_grad():
-            truth = unwrap_images(batch.target, relit.target, self.camera, self.settings.texture_side)
-        texture = MaskedPair(relit.texture, truth.texture, (truth.visible > 0).float())
+        texture = MaskedPair(relit.texture, relit.truth.texture, (relit.truth.visible > 0).float())
         with self.mixed_precision():
             if "appearance" in self.feature_networks:
                 image = MaskedPair(relit.image, batch.target, relit.mask)
@@ -300,17 +302,23 @@ class JointObjective(Objective):
                 terms["light_features"] = weights.features * light_loss(self._features("light"), texture)
         return terms
 
-    def _measure_features(self) -> None:
-        """Measure the powers of the feature networks' layers, on targets spread over the training pairs."""
-        if self.feature_networks:
-            pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
-            targets = torch.cat([self._train.read(pair).target for pair in pairs])
-            networks: Any = self.feature_networks.items()
-            self.feature_powers = {name: layer_powers(network, targets) for name, network in networks}
+    def measure(self) -> None:
+        """Measure the powers of the feature networks' layers, on targets spread over the training pairs.
+
+        The first process alone measures.
+        """
+        networks: Any = self.feature_networks.items()
+        for name, network in networks:
+            powers = torch.zeros(len(FEATURE_LAYERS), device=self.device)
+            if process_rank() == 0:
+                pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
+                targets = (self._train.read(pair).target.to(self.device) for pair in pairs)
+                powers = torch.stack([layer_powers(network, target) for target in targets]).mean(0)
+            self.feature_powers[name] = broadcast_from_first(powers)
 
     def _features(self, name: str) -> Features:
         network: Any = self.feature_networks[name]
-        return Features(network, self.feature_powers[name].to(self.device))
+        return Features(network, self.feature_powers[name])
 
     @torch.no_grad()
     def validate(self) -> Validation:
@@ -359,7 +367,7 @@ class JointObjective(Objective):
 def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tensor:
     """Mean landmark error over the distance of the outer eye corners, of sources and targets [2 B]."""
     detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
-    distance_px = (heads.landmarks_px(detected_px, camera) - detected_px[:, list(LANDMARKS)]).norm(dim=-1)
+    distance_px = (heads.landmarks_px(detected_px, camera) - chosen(detected_px, LANDMARKS)).norm(dim=-1)
     left, right = (detected_px[:, corner] for corner in OUTER_EYE_CORNERS)
     return distance_px.mean(1) / (left - right).norm(dim=-1)
 

@@ -134,7 +134,7 @@ class AppearanceObjective(Objective):
         self._left_out = pairs.of(pairs.pairs[:: settings.every])
         self._held_out = open_pairs(dataset, "validation", network.settings.side)
         self.settings = settings
-        self._validation: tuple[CropPairs, CropPairs] | None = None
+        self._validation: list[list[CropPairs]] | None = None  # of people that are known, and of others
 
     def draw_one(self, generator: torch.Generator) -> CropPairs:
         """Draw a pair."""
@@ -160,18 +160,21 @@ class AppearanceObjective(Objective):
         if self._validation is None:
             count = self.settings.held_out_pairs
             readers = (self._left_out, self._held_out)
-            self._validation = tuple(  # type: ignore[assignment]
-                concatenate([reader.read(pair) for pair in spread_pairs(reader, count, lambda pair: True)])
+            self._validation = [
+                [reader.read(pair) for pair in spread_pairs(reader, count, lambda pair: True)]
                 for reader in readers
-            )
-        assert self._validation
-        known, strangers = (batch.to(self.device) for batch in self._validation)
-        scores, _ = self._found(known)
-        right = scores.argmax(1) == torch.cat([known.people, known.people])
-        _, lights = self._found(strangers)
-        cosines = (lights[len(strangers.light) :] * strangers.light).sum(-1).double().clamp(-1, 1)
+            ]
+        known, strangers = self._validation
+        right, angles = [], []
+        for pair in known:
+            scores, _ = self._found(pair.to(self.device))
+            right.append(scores.argmax(1).cpu() == pair.people)
+        for pair in strangers:
+            _, lights = self._found(pair.to(self.device))
+            cosine = (lights[1:].cpu() * pair.light).sum(-1).double().clamp(-1, 1)
+            angles.append(torch.rad2deg(cosine.acos()))
         metrics = {
-            "angle_deg": float(torch.rad2deg(cosines.acos()).mean()),
-            "recognised": float(right.double().mean()),
+            "angle_deg": float(torch.cat(angles).mean()),
+            "recognised": float(torch.cat(right).double().mean()),
         }
         return Validation(metrics, None)

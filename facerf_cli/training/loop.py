@@ -107,6 +107,9 @@ class Objective(nn.Module):
             ]
         return self._held_out_samples
 
+    def measure(self) -> None:
+        """Measure what the losses need by the networks, once all processes have them on their device."""
+
     def forward(self, batch: Any) -> dict[str, Tensor]:
         """Compute the weighted terms of the loss, each a mean over samples; the loop minimises their sum."""
         raise NotImplementedError
@@ -207,7 +210,7 @@ def distributed(objective: nn.Module, skips_networks: bool) -> nn.Module:
 
 
 def broadcast_from_first(values: Tensor) -> Tensor:
-    """Values of process 0, on the CPU: clocks differ between processes, and all must end at one step."""
+    """The values of process 0."""
     if process_count() > 1:
         dist.broadcast(values, 0)
     return values
@@ -256,6 +259,8 @@ def train(
     objective.to(device)
     objective.networks.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     objective.bf16 = settings.bf16
+    torch.backends.cudnn.benchmark = True  # the sides of images stay as they are
+    objective.measure()
     state = begin(objective.networks, settings, start.metadata, objective.provenance)
     if resume and (folder / "state.pt").exists():
         load_state(folder / "state.pt", state, settings)
@@ -293,6 +298,7 @@ def _loop(run: _Run) -> None:
     with stop_on_signals() as stop:
         for drawn in _draws(run):
             clock.waited_s += drawn.waited_s
+            # clocks differ between processes, and all must end at one step
             local = torch.tensor([clock.seconds(), stop.signal]).double()
             seconds, signal = broadcast_from_first(local).tolist()
             row = {"step": drawn.step, "seconds": seconds}
@@ -311,13 +317,16 @@ def _loop(run: _Run) -> None:
 
 def _draws(run: _Run) -> "Iterator[Drawn]":
     """This process's share of every batch after the state's step."""
-    processes, batch = process_count(), run.settings.batch
-    if batch % processes:
+    processes, settings = process_count(), run.settings
+    parts = processes * settings.accumulate
+    if settings.batch % parts:
         raise UsageError(
-            f"--batch {batch}: {processes} processes cannot share it; give a multiple of {processes}"
+            f"--batch {settings.batch}: {processes} processes cannot share it in parts of --accumulate "
+            f"{settings.accumulate}; give a multiple of {parts}"
         )
-    share, seed, workers = batch // processes, run.settings.seed, run.settings.workers
-    return drawn_batches(run.objective, run.state.step + 1, share, process_rank() * share, seed, workers)
+    share, pinned = settings.batch // processes, run.device.type == "cuda"
+    mine, first = range(settings.batch)[process_rank() * share :][:share], run.state.step + 1
+    return drawn_batches(run.objective, first, mine, settings.seed, settings.workers, pinned)
 
 
 @dataclass(frozen=True)
@@ -330,18 +339,19 @@ class Drawn:
 
 
 def drawn_batches(
-    objective: Objective, first_step: int, count: int, first_index: int, seed: int, workers: int
+    objective: Objective, first_step: int, samples: range, seed: int, workers: int, pinned: bool = False
 ) -> Iterator[Drawn]:
-    """Yield samples `first_index` to `first_index + count` of the batch of every step from `first_step` on.
+    """Yield some samples of the batch of every step from `first_step` on.
 
     `workers` processes draw ahead. Each sample depends on (seed, step, index) alone.
     """
     steps = range(first_step, _ENDLESS)
     loader = DataLoader(
-        _Draws(objective, count, first_index, seed),
+        _Draws(objective, samples, seed),
         batch_size=None,
         sampler=steps,
         num_workers=workers,
+        pin_memory=pinned,
         generator=torch.Generator(),  # not the global one, which would differ in a resumed run
     )
     batches = iter(loader)
@@ -356,18 +366,18 @@ def drawn_batches(
 class _Draws(Dataset[Batch | FacerfError]):
     """An objective's batches by step, for data-loading workers."""
 
-    def __init__(self, objective: Objective, count: int, first_index: int, seed: int) -> None:
+    def __init__(self, objective: Objective, samples: range, seed: int) -> None:
         self.objective = copy.copy(objective)
         # Drawing needs no networks, so none are sent to the workers.
         self.objective.__dict__ |= {"_modules": {}, "_buffers": {}}
-        self.count, self.first_index, self.seed = count, first_index, seed
+        self.samples, self.seed = samples, seed
 
     def __getitem__(self, step: int) -> Batch | FacerfError:
         def generator_of(index: int) -> torch.Generator:
-            return seeded(self.seed, step, self.first_index + index)
+            return seeded(self.seed, step, self.samples[index])
 
         try:
-            return self.objective.draw(self.count, generator_of, step)
+            return self.objective.draw(len(self.samples), generator_of, step)
         except FacerfError as error:  # returned, for the loader would turn it into a traceback
             return error
 
@@ -380,18 +390,31 @@ def _step(run: _Run, model: nn.Module, drawn: Drawn, done: float) -> Row:
         group["lr"] = rate
     torch.manual_seed(seeded(settings.seed, drawn.step, process_rank(), 0).initial_seed())  # for dropout
     state.optimizer.zero_grad(set_to_none=True)
-    terms = model(drawn.batch.to(run.device))
+    terms = _gradients(model, drawn.batch, settings.accumulate, run.device)
     loss = torch.stack(list(terms.values())).sum()
-    loss.backward()  # type: ignore[no-untyped-call]
     clip = settings.gradient_clip or math.inf
     norm = nn.utils.clip_grad_norm_(state.networks.parameters(), clip)
-    values = mean_over_processes(torch.stack([loss, *terms.values()]).detach())
+    values = mean_over_processes(torch.stack([loss, *terms.values()]))
     total, gradient, *parts = torch.cat([values[:1], norm[None], values[1:]]).tolist()
     _require_finite(run, drawn, total, gradient)
     state.optimizer.step()
     if settings.ema_decay:
         update_average(state, settings.ema_decay, drawn.step)
     return {"loss": total, "terms": dict(zip(terms, parts, strict=True)), "gradient": gradient, "rate": rate}
+
+
+def _gradients(model: nn.Module, batch: Batch, parts: int, device: torch.device) -> dict[str, Tensor]:
+    """Add the gradients of a batch, part by part, and return the terms of its loss.
+
+    Processes exchange the gradients once, with the last part.
+    """
+    totals: dict[str, Tensor] = {}
+    for number, part in enumerate(batch.parts(parts), 1):
+        with model.no_sync() if isinstance(model, DistributedDataParallel) and number < parts else nullcontext():
+            terms = {name: term / parts for name, term in model(part.to(device)).items()}
+            torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
+        totals = {name: totals.get(name, 0) + term.detach() for name, term in terms.items()}
+    return totals
 
 
 def _require_finite(run: _Run, drawn: Drawn, loss: float, gradient: float) -> None:

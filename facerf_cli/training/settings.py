@@ -88,6 +88,7 @@ class TrainSettings:
     max_seconds: float | None = _may_change(None)
     workers: int = _may_change(0)  # processes that draw batches; 0: the training process itself
     compile: bool = _may_change(False)
+    accumulate: int = _may_change(1)  # parts of a step's batch, one after another in each process
 
     def done(self, step: int, seconds: float) -> float:
         """Share of the run that is over before a step, counted from 0."""

@@ -108,7 +108,7 @@ _SIZES: dict[Preset, _PresetSizes] = {
 def run_training(options: TrainOptions) -> None:
     """Train in this process or, under torchrun, in several, and print the path of the last checkpoint."""
     with joined_processes(), ExitStack() as stack:
-        device, first = torch_device(options.settings), process_rank() == 0
+        device, first = _device(options.settings), process_rank() == 0
         if first:
             stack.enter_context(alone_in(options.output, ".facerf-lock"))
         workers = options.workers
@@ -128,6 +128,16 @@ def run_training(options: TrainOptions) -> None:
             )
         if first:
             print(checkpoint)
+
+
+def _device(settings: Settings) -> torch.device:
+    """The device of --device; `auto` passes Apple's GPUs by."""
+    device: torch.device = torch_device(settings)
+    if device.type != "mps":
+        return device
+    if settings.device == "auto":
+        return torch.device("cpu")
+    raise UsageError("--device mps: training needs float64, which Apple's GPUs lack; give --device cpu")
 
 
 def _networks(options: TrainOptions, device: torch.device) -> Networks:

@@ -127,6 +127,7 @@ class PaceOptions:
         validate_every: Validate on held-out people, and save, every so many steps.
         batch: Use so many samples a step, of all processes together.
         bf16: Train in mixed precision (bfloat16), where the device has instructions for it.
+        accumulate: Take a process's share of a batch in so many parts, one after another, for less memory.
         compile: Compile the networks with torch; the first steps take minutes.
     """
 
@@ -160,6 +161,7 @@ class PaceOptions:
         shown_default="on; presets paper and tiny, and --form paper, off",
         panel=SPEED,
     )
+    accumulate: int = option(1, least=1, panel=SPEED)
     compile: bool = option(False, panel=SPEED)
 
     def of_run(self, options: TrainOptions) -> TrainSettings:
@@ -173,6 +175,7 @@ class PaceOptions:
             max_seconds=max_seconds,
             seed=options.settings.seed,
             compile=self.compile,
+            accumulate=self.accumulate,
             optimizer=replace(optimizer, learning_rate=self.learning_rate or optimizer.learning_rate),
             batch=self.batch or training.batch,
             validate_every=self.validate_every or training.validate_every,

@@ -23,6 +23,7 @@ from facerf_cli.training.joint import (
 )
 from facerf_cli.training.loop import seeded
 from facerf_cli.training.losses import PaperWeights
+from tests import fake_device
 from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 
 SETTINGS = JointSettings(crop_px=CROP_PX, texture_side=SIDE, validation_pairs=2)
@@ -66,7 +67,7 @@ def objective_of(
     dataset: Dataset, reflectance: nn.Module | None = None, **settings: object
 ) -> JointObjective:
     torch.manual_seed(1)
-    return JointObjective(
+    objective = JointObjective(
         dataset,
         load_face_model(),
         reflectance or PaperReflectanceNetwork(PAPER),
@@ -76,6 +77,8 @@ def objective_of(
         FakePhotos(),  # type: ignore[arg-type]
         replace(SETTINGS, **settings),  # type: ignore[arg-type]
     )
+    objective.measure()
+    return objective
 
 
 def batch_of(
@@ -94,6 +97,24 @@ def gradients(objective: JointObjective, term: Tensor) -> dict[str, float]:
         name: sum(float(p.grad.abs().sum()) for p in network.parameters() if p.grad is not None)
         for name, network in objective.networks.items()
     }
+
+
+@pytest.mark.parametrize("photos", [False, True])
+def test_a_step_stays_on_the_device(dataset: Dataset, photos: bool) -> None:
+    """It mixes no devices, copies nothing but its batch, and waits a few times for each rasterization."""
+    objective = objective_of(dataset)
+    batch = batch_of(objective, photos).each(fake_device.OnDevice)
+    fake_device.moved(objective)
+    powers = objective.feature_powers.items()
+    objective.feature_powers = {name: fake_device.OnDevice(values) for name, values in powers}
+    with fake_device.counted() as counts:
+        for _ in range(2):
+            counts.copies.clear()  # of constants, which are sent once
+            counts.waits.clear()
+            torch.stack(list(objective(batch).values())).sum().backward()
+    assert not counts.copies
+    assert {line.split(":")[0] for line in counts.waits} <= {"raster/rasterize.py"}
+    assert counts.waits.total() == (0 if photos else 10)
 
 
 @pytest.fixture(scope="module")

@@ -235,7 +235,7 @@ def test_other_networks_and_their_past_are_carried_over(tmp_path: Path, whole: P
 
 
 def first_draws(count: int) -> list[Any]:
-    draws = drawn_batches(toy_objective(), 1, TINY.batch, 0, seed=0, workers=0)
+    draws = drawn_batches(toy_objective(), 1, range(TINY.batch), seed=0, workers=0)
     return [next(draws) for _ in range(count)]
 
 
@@ -270,6 +270,14 @@ def test_two_processes_learn_what_one_does(tmp_path: Path, monkeypatch: pytest.M
     for name, weights in one.items():
         if weights.is_floating_point():
             assert float((two[name] - weights).norm()) < 3e-5 * float(weights.norm()) + 1e-12, name
+
+
+def test_a_batch_in_parts_has_the_gradients_of_the_whole(tmp_path: Path) -> None:
+    settings = replace(TINY, batch=4, steps=6, optimizer=Adadelta(learning_rate=2.0))
+    train(toy_objective(), tmp_path / "whole", settings)
+    train(toy_objective(), tmp_path / "parts", replace(settings, accumulate=4))
+    assert losses_of(tmp_path / "parts") == pytest.approx(losses_of(tmp_path / "whole"), rel=1e-5)
+    assert losses_of(tmp_path / "parts")[-1] < 0.97 * losses_of(tmp_path / "parts")[0]
 
 
 def _free_port() -> int:
