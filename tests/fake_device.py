@@ -1,8 +1,8 @@
 """A device that computes on the CPU and counts what a GPU would wait for.
 
 Its tensors say that they are on the device `meta`, which code that asks `tensor.device` passes on. Within
-`counted()` an operator that mixes them with tensors of the CPU is refused, as CUDA would, and copies and waits
-are counted by the line of facerf that asks for them.
+`counted()` an operator that mixes them with tensors of the CPU is refused, as CUDA would, and copies and
+waits are counted by the line of facerf that asks for them.
 """
 
 import traceback
@@ -87,7 +87,12 @@ def counted() -> Iterator[Counts]:
 
     # autocast does not know the device
     plain = patch("torch.autocast", lambda *arguments, **settings: nullcontext())
-    with _Counting(counts), patch("torch.tensor", tensor), plain, patch("torch.Tensor.new_tensor", new_tensor):
+    with (
+        _Counting(counts),
+        patch("torch.tensor", tensor),
+        plain,
+        patch("torch.Tensor.new_tensor", new_tensor),
+    ):
         yield counts
 
 
@@ -126,7 +131,9 @@ def _computed(counts: Counts, function: Any, args: Any, kwargs: dict[str, Any]) 
     if name == "copy_" or (there and name.endswith("_") and not name.endswith("__")):
         return args[0]
     if copies:
-        return found if asked not in (None, DEVICE) or (asked is None and not there) else tree_map(_held, found)
+        return (
+            found if asked not in (None, DEVICE) or (asked is None and not there) else tree_map(_held, found)
+        )
     return tree_map(_held, found) if there or asked == DEVICE else found
 
 

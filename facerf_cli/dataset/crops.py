@@ -1,7 +1,8 @@
 """Crops of a prepared dataset for the joint stage: a relit source and a light of a stack (paper, 'Dataset').
 
 Each line of relit/pairs.jsonl gives a pair of crops. The source is the image that `relight-dataset` wrote, or
-else the weighted sum of the whole stack, which takes a hundred times as long. The target is one part of a
+else the weighted sum of the whole stack, which takes a hundred times as long: a stack that is opened gives
+the sources of many steps. The target is one part of a
 stack. Both have the exposure of the texture stages: the source so that the face's mean radiance is
 `MEAN_RADIANCE`, the target so that the mean would be that under a constant map of radiance 1.
 
@@ -13,9 +14,11 @@ cameras (`benchmarks/crop_boxes.py`): a detector's box is off to the side where 
 """
 
 import logging
+import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +36,7 @@ from facerf_cli.face.fit import load_fit
 from facerf_cli.files.documents import Document, Points68, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, resize
+from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, concatenate, resize
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME
@@ -78,6 +81,9 @@ class CropMove:
 UNMOVED = CropMove()
 
 
+_STACKS_OPEN, _SOURCES_EACH = 4, 32  # stacks that take turns to give lazy sources, and how many each gives
+_LAZY_CACHED = 64  # stacks' lazy sources, as half floats: that is so for 16 samples of a step
+_STACKS_MEASURED = 24  # whose lazy sources show the colours of all
 _STACKS_CACHED = 2048  # at most 32 KiB each at 512 pixels
 _SUBJECTS_AVERAGED = 16  # enough for the mean position of heads
 _DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not divide by 0
@@ -111,17 +117,54 @@ class PairReader:
         """A reader of these pairs."""
         return replace(self, pairs=pairs)
 
-    def draw(self, generator: torch.Generator) -> CropPairs:
-        """Read a random pair, B = 1, each crop as a detector's box would cut it."""
-        pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-        return self.read(pair, (CropMove.draw(generator), CropMove.draw(generator)))
+    @cached_property
+    def _lazy(self) -> bool:
+        return not image_path(self.dataset, *self.pairs[0].key).is_file()
 
-    def read(self, pair: Pair, moves: tuple[CropMove, CropMove] = (UNMOVED, UNMOVED)) -> CropPairs:
-        """Read the crops of a pair, B = 1, the source's and the target's moved."""
+    @cached_property
+    def _by_stack(self) -> dict[tuple[str, str], list[Pair]]:
+        """The pairs by their source's subject and camera."""
+        found: dict[tuple[str, str], list[Pair]] = defaultdict(list)
+        for pair in self.pairs:
+            found[pair.subject, pair.source_camera].append(pair)
+        return found
+
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
+        """Read random pairs, each crop as a detector's box would cut it.
+
+        Sample i depends on `generator_of(i)`, and on `generator_of(i, earlier step)`: of lazy pairs the
+        sources of `_SOURCES_EACH` steps come from one stack, and some stacks take turns.
+        """
+        turn = step // _STACKS_OPEN % _SOURCES_EACH
+        drawn = []
+        for i in range(count):
+            generator, source = generator_of(i), None
+            if self._lazy:
+                pair, source = self._draw_lazy(generator_of(i, step - turn * _STACKS_OPEN), turn)
+            else:
+                pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+            drawn.append(self.read(pair, (CropMove.draw(generator), CropMove.draw(generator)), source))
+        return concatenate(drawn)
+
+    def _draw_lazy(self, generator: torch.Generator, turn: int) -> tuple[Pair, Tensor]:
+        """The pair and source of a turn, of a random stack that gives as many as there are turns."""
+        any_pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
+        of_stack = self._by_stack[any_pair.subject, any_pair.source_camera]
+        chosen = torch.randint(len(of_stack), (_SOURCES_EACH,), generator=generator).tolist()
+        pairs = tuple(of_stack[place] for place in chosen)
+        return pairs[turn], _lazy_sources(self.dataset, pairs)[turn].float()
+
+    def read(
+        self,
+        pair: Pair,
+        moves: tuple[CropMove, CropMove] = (UNMOVED, UNMOVED),
+        source: Tensor | None = None,
+    ) -> CropPairs:
+        """Read the crops of a pair, B = 1, the source's and the target's moved; its source may be given."""
         source_stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
         path = self.dataset.stack_path(pair.subject, pair.target_camera)
         target_stack = _stack_info(path)
-        source = self._read_source(pair)
+        source = self._read_source(pair) if source is None else source
         target = read_olats(path, slice(pair.target_light, pair.target_light + 1))[0].float()
         if source.shape[-1] != source_stack.side_px or target.shape[-1] != target_stack.side_px:
             raise InputError(
@@ -141,11 +184,23 @@ class PairReader:
 
     def source_colours(self, count: int) -> Tensor:
         """Mean colours [N, 3] of the face in `count` sources, spread over the pairs."""
-        colours = []
-        for pair in spread_pairs(self, count, lambda pair: True):
-            stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
-            colours.append(stack.colour_on_face(self._read_source(pair)))
-        return torch.stack(colours)
+        if self._lazy:
+            stacks = list(self._by_stack.values())
+            groups = stacks[:: math.ceil(len(stacks) / _STACKS_MEASURED)]
+            chosen = [tuple(pairs[: math.ceil(count / len(groups))]) for pairs in groups]
+            sources = [
+                part
+                for pairs in chosen
+                for part in zip(pairs, _lazy_sources(self.dataset, pairs), strict=True)
+            ]
+        else:
+            spread = spread_pairs(self, count, lambda pair: True)
+            sources = [(pair, self._read_source(pair)) for pair in spread]
+        return torch.stack([self._colour(*one) for one in sources])
+
+    def _colour(self, pair: Pair, source: Tensor) -> Tensor:
+        stack = _stack_info(self.dataset.stack_path(pair.subject, pair.source_camera))
+        return stack.colour_on_face(source.float())
 
     def _landmarks_px(self, stack: "_StackInfo", moved: CropMove) -> Tensor:
         return moved.points(stack.landmarks_px / stack.side_px)[None] * self.side_px
@@ -154,10 +209,17 @@ class PairReader:
         path = image_path(self.dataset, *pair.key)
         if path.is_file():
             return torch.from_numpy(read_image(path).pixels).permute(2, 0, 1)
-        rows, weights = load_pairs(self.dataset)[pair.subject]
-        row = torch.from_numpy(np.array(weights[[other.index for other in rows].index(pair.index)]))
-        stack = self.dataset.stack_path(pair.subject, pair.source_camera)
-        return next(relit_images(stack, row[None])).float()
+        return _lazy_sources(self.dataset, (pair,))[0].float()
+
+
+@lru_cache(maxsize=_LAZY_CACHED)
+def _lazy_sources(dataset: Dataset, pairs: tuple[Pair, ...]) -> list[Tensor]:
+    """Sources [3, H, W] of pairs of one stack, summed from it."""
+    rows, weights = load_pairs(dataset)[pairs[0].subject]
+    places = {row.index: place for place, row in enumerate(rows)}
+    chosen = torch.from_numpy(np.array(weights[[places[pair.index] for pair in pairs]]))
+    stack = dataset.stack_path(pairs[0].subject, pairs[0].source_camera)
+    return list(relit_images(stack, chosen))
 
 
 def open_pairs(dataset: Dataset, split: str, side_px: int) -> PairReader:

@@ -1,10 +1,10 @@
 """A z-buffer in plain torch: the visible triangle of each pixel, its barycentric weights and its depth.
 
 All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with the
-covered area and not with the bounding boxes. Meshes of a batch share these steps, so that a device waits for the
-host as often for many as for one. A pixel belongs to a triangle if its centre lies inside. A run
-includes its left end and excludes its right, a triangle includes its upper end and excludes its lower, and
-both triangles of a shared edge compute the same crossing, so each pixel on an edge is covered exactly once.
+covered area and not with the bounding boxes. Meshes of a batch share these steps, so that a device waits for
+the host as often for many as for one. A pixel belongs to a triangle if its centre lies inside. A run includes
+its left end and excludes its right, a triangle includes its upper end and excludes its lower, and both
+triangles of a shared edge compute the same crossing, so each pixel on an edge is covered exactly once.
 Visibility has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle
 have one. All arithmetic is elementwise, so the result does not depend on how triangles are split into parts.
 """
@@ -57,9 +57,9 @@ class _Screen:
 
 
 def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fragments:
-    """Rasterize vertices [..., V, 3] and triangles [F, 3] of either winding; at equal depth the lower index wins.
+    """Rasterize vertices [..., V, 3] and triangles [F, 3] of either winding.
 
-    The barycentric weights and the depth have gradients to the vertices; the choice of triangle has none.
+    At equal depth the lower index wins. The barycentric weights and the depth have gradients to the vertices; the choice of triangle has none.
     """
     size = (*vertices_camera.shape[:-2], camera.height_px, camera.width_px)
     vertices, corners = vertices_camera.flatten(0, -2), _of_each_mesh(triangles, vertices_camera)

@@ -1,8 +1,8 @@
 """Textures in UV space: render to an image, unwrap from an image, inpaint, and bake normals.
 
 A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid is at
-(j, i) / (side - 1). Meshes, images and textures may be those of a batch. Textures are [C, T, T]; u runs right, v down, and the centre of texel (row i, column j)
-is at ((j + 0.5) / T, (i + 0.5) / T).
+(j, i) / (side - 1). Meshes, images and textures may be those of a batch. Textures are [C, T, T]; u runs
+right, v down, and the centre of texel (row i, column j) is at ((j + 0.5) / T, (i + 0.5) / T).
 """
 
 import math
@@ -29,7 +29,9 @@ class UnwrapSettings:
     seen_cosine: float = 0.35  # fully visible at and above this, smooth in between
     depth_side_px: int = 512  # least length of the depth map's longer side
     samples: int = 4  # at most samples x samples in a texel; a larger image is scaled down first
-    measured: bool = True  # the texels' sizes in the image choose its scale and the samples; else all are taken
+    measured: bool = (
+        True  # the texels' sizes in the image choose its scale and the samples; else all are taken
+    )
 
 
 def vertex_normals(vertices: Tensor, triangles: Tensor) -> Tensor:
@@ -115,9 +117,9 @@ def unwrap(
     texture_side: int,
     settings: UnwrapSettings = UnwrapSettings(),
 ) -> tuple[Tensor, Tensor]:
-    """Unwrap an image [..., C, H, W] to a uniform grid mesh's texture [..., C, T, T] and visibility [..., T, T].
+    """Unwrap an image [..., C, H, W] to a uniform grid mesh's texture [..., C, T, T].
 
-    A texel is the weighted mean of up to samples x samples points in it, so that it averages over the pixels
+    Also return its visibility [..., T, T]. A texel is the weighted mean of up to samples x samples points in it, so that it averages over the pixels
     that it covers. A point's weight is 0 if it is hidden, and falls with the angle between normal and viewing
     ray. The texture is 0 where visibility is 0. Differentiable in the image and the vertices; visibility is
     constant.

@@ -214,14 +214,13 @@ class JointObjective(Objective):
                 setattr(network, function, torch.compile(getattr(network, function), *args, **kwargs))
 
     def draw(
-        self, count: int, generator_of: Callable[[int], torch.Generator], step: int
+        self, count: int, generator_of: Callable[..., torch.Generator], step: int
     ) -> CropPairs | PhotoCrops:
         """Draw `count` pairs or, on `photos_share` of the steps, photos."""
-        generators = [generator_of(i) for i in range(count)]
         chance = torch.rand((), generator=seeded(self.settings.seed, step))
         if self.photos is not None and chance < self.settings.photos_share:
-            return concatenate([self.photos.draw(generator) for generator in generators])
-        return concatenate([self._train.draw(generator) for generator in generators])
+            return concatenate([self.photos.draw(generator_of(i)) for i in range(count)])
+        return self._train.draw(count, generator_of, step)
 
     def forward(self, batch: CropPairs | PhotoCrops) -> dict[str, Tensor]:
         """Compute the weighted terms: landmarks and regularisation for both, the others for pairs alone."""

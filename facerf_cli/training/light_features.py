@@ -6,6 +6,7 @@ L_L compares. Textures are the Reflectance Network's targets, of one light each,
 does not see the face.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,9 +137,9 @@ class AppearanceObjective(Objective):
         self.settings = settings
         self._validation: list[list[CropPairs]] | None = None  # of people that are known, and of others
 
-    def draw_one(self, generator: torch.Generator) -> CropPairs:
-        """Draw a pair."""
-        return self._train.draw(generator)
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
+        """Draw pairs."""
+        return self._train.draw(count, generator_of, step)
 
     def forward(self, batch: CropPairs) -> dict[str, Tensor]:
         """Compute the terms `people` and `light`, means over images."""

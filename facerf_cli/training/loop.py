@@ -81,10 +81,11 @@ class Objective(nn.Module):
         self.inputs: dict[str, Any] = {}  # entries of `INPUTS`
         self._held_out_samples: list[Any] = []
 
-    def draw(self, count: int, generator_of: Callable[[int], torch.Generator], step: int) -> Batch:
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
         """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.
 
-        A choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
+        `generator_of(i, step)` is that of another step, for samples that share what costs much to read. A
+        choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
         CPU and without the networks.
         """
         return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
@@ -373,7 +374,7 @@ class _Draws(Dataset[Batch | FacerfError]):
         self.samples, self.seed = samples, seed
 
     def __getitem__(self, step: int) -> Batch | FacerfError:
-        def generator_of(index: int) -> torch.Generator:
+        def generator_of(index: int, step: int = step) -> torch.Generator:
             return seeded(self.seed, step, self.samples[index])
 
         try:
@@ -410,7 +411,11 @@ def _gradients(model: nn.Module, batch: Batch, parts: int, device: torch.device)
     """
     totals: dict[str, Tensor] = {}
     for number, part in enumerate(batch.parts(parts), 1):
-        with model.no_sync() if isinstance(model, DistributedDataParallel) and number < parts else nullcontext():
+        with (
+            model.no_sync()
+            if isinstance(model, DistributedDataParallel) and number < parts
+            else nullcontext()
+        ):
             terms = {name: term / parts for name, term in model(part.to(device)).items()}
             torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
         totals = {name: totals.get(name, 0) + term.detach() for name, term in terms.items()}

@@ -3,6 +3,8 @@
 import json
 import logging
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,7 @@ from facerf_cli.dataset.crops import (
 )
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, draw_pairs, image_path, load_pairs, relight_subject, write_pairs
-from facerf_cli.dataset.weights import envmap_names
+from facerf_cli.dataset.weights import envmap_names, relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.topology import LANDMARKS_M
@@ -141,10 +143,35 @@ def test_sources_that_were_not_written_are_weighed(
         hidden.rename(path)
 
 
+def _generator_of(step: int, seed: int = 0) -> Callable[..., torch.Generator]:
+    return lambda index, step=step: torch.Generator().manual_seed(hash((seed, step, index)))
+
+
 def test_drawing_depends_on_the_generator_alone(reader: PairReader) -> None:
-    one, again, other = (reader.draw(torch.Generator().manual_seed(seed)) for seed in (1, 1, 2))
+    one, again, other = (reader.draw(1, _generator_of(0, seed), 0) for seed in (1, 1, 2))
     assert torch.equal(one.source, again.source) and torch.equal(one.target, again.target)
     assert not torch.equal(one.target, other.target)
+
+
+def test_a_stack_gives_the_lazy_sources_of_many_steps(
+    dataset: Dataset, reader: PairReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are those that reading gives, whatever the step that drawing begins at."""
+    opened: list[Path] = []
+    monkeypatch.setattr(
+        module, "relit_images", lambda path, rows: opened.append(path) or relit_images(path, rows)
+    )
+    monkeypatch.setattr(module, "image_path", lambda *key: Path("none"))
+    lazy = replace(reader)
+    module._lazy_sources.cache_clear()
+    drawn = [lazy.draw(1, _generator_of(step), step) for step in range(130)]
+    assert len(opened) <= 6  # 4 stacks for 32 steps each, and 2 more; one of a single pair is opened once
+    module._lazy_sources.cache_clear()
+    resumed = replace(reader).draw(1, _generator_of(70), 70)
+    assert torch.equal(resumed.source, drawn[70].source) and torch.equal(resumed.target, drawn[70].target)
+    sources = {float(batch.source.sum()) for batch in drawn}
+    assert len(sources) > 100  # each crop is moved in its own way, and there are many pairs
+    module._lazy_sources.cache_clear()
 
 
 def test_spread_is_over_subjects_and_always_the_same(reader: PairReader) -> None:

@@ -152,7 +152,7 @@ def test_photos_reach_the_geometry_alone(objective: JointObjective) -> None:
 def test_a_fifth_of_the_batches_are_photos(objective: JointObjective) -> None:
     kinds = []
     reader, drawn = objective._train, objective.draw(1, seeded, 0)
-    objective._train = type("Quick", (), {"draw": lambda self, generator: drawn})()  # type: ignore[assignment]
+    objective._train = type("Quick", (), {"draw": lambda self, *wanted: drawn})()  # type: ignore[assignment]
     try:
         kinds = [isinstance(objective.draw(1, seeded, step), PhotoCrops) for step in range(2000)]
     finally:
