@@ -59,7 +59,8 @@ class _Screen:
 def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fragments:
     """Rasterize vertices [..., V, 3] and triangles [F, 3] of either winding.
 
-    At equal depth the lower index wins. The barycentric weights and the depth have gradients to the vertices; the choice of triangle has none.
+    At equal depth the lower index wins. The barycentric weights and the depth have gradients to the vertices;
+    the choice of triangle has none.
     """
     size = (*vertices_camera.shape[:-2], camera.height_px, camera.width_px)
     vertices, corners = vertices_camera.flatten(0, -2), _of_each_mesh(triangles, vertices_camera)
