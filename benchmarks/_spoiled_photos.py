@@ -82,7 +82,9 @@ class Scene:
         columns, rows = (slice(max(0, a), max(0, b)) for a, b in zip(low, high, strict=True))
         image, ignored = self.image.copy(), self.ignored.copy()
         part = image[rows, columns]
-        part[:] = resized(heaps_of(1, SEED)[0].permute(1, 2, 0).numpy().astype(np.float32), *part.shape[:2])
+        if part.size:  # the photo shows the place
+            heap = heaps_of(1, SEED)[0].permute(1, 2, 0).numpy().astype(np.float32)
+            part[:] = resized(heap, *part.shape[:2])
         ignored[rows, columns] = True
         return replace(self, image=image, ignored=ignored)
 

@@ -120,9 +120,9 @@ def unwrap(
     """Unwrap an image [..., C, H, W] to a uniform grid mesh's texture [..., C, T, T].
 
     Also return its visibility [..., T, T]. A texel is the weighted mean of up to samples x samples points in
-    it, so that it averages over the pixels that it covers. A point's weight is 0 if it is hidden, and falls with the angle between normal and viewing
-    ray. The texture is 0 where visibility is 0. Differentiable in the image and the vertices; visibility is
-    constant.
+    it, so that it averages over the pixels that it covers. A point's weight is 0 if it is hidden, and falls
+    with the angle between normal and viewing ray. The texture is 0 where visibility is 0. Differentiable in
+    the image and the vertices; visibility is constant.
     """
     if image.shape[-2:] != (camera.height_px, camera.width_px):
         raise ValueError(f"image {tuple(image.shape)}: the camera's is {camera.height_px, camera.width_px}")
