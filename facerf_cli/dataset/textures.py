@@ -47,7 +47,7 @@ from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_targe
 # Images unwrapped together: so many, but no more samples in memory than _VALUES_AT_ONCE.
 _IMAGES_AT_ONCE = 16
 _VALUES_AT_ONCE = 1 << 25
-_LEAST_INSIDE = 0.9  # share of a texel's pixels that must lie on the face and inside the photo
+LEAST_INSIDE = 0.9  # share of a texel's pixels that must lie on the face and inside the photo
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -123,7 +123,7 @@ def _unwrap_stack(dataset: Dataset, model: MorphableModel, side: int, subject: s
     vertices = fit.vertices_camera(model)
     planes = torch.from_numpy(np.dstack([header.source, header.seen])).permute(2, 0, 1)
     texture, visible = unwrap(planes, vertices, grid_triangles(), fit.camera, side)
-    visible = visible * (texture[3] > _LEAST_INSIDE)
+    visible = visible * (texture[3] > LEAST_INSIDE)
     if visible.max() < 0.5:
         raise InputError(f"{path}: the fit lies outside the visible face; {PREPARE_AGAIN}")
     at_once = _at_once(side)
@@ -186,6 +186,20 @@ def _read_source(dataset: Dataset, pair: Pair, fit: FaceFit) -> Tensor:
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
+def heads_of(dataset: Dataset, held_out: int) -> tuple[Tensor, Tensor]:
+    """Places in `subjects` of the split train, and of at most `held_out` of the split validation."""
+    places = {subject: place for place, subject in enumerate(dataset.subjects)}
+    for split in ("train", "validation"):
+        if not dataset.splits[split]:
+            advice = "run prepare-dataset with another --split"
+            raise InputError(f"{dataset.folder}: no subject in the split {split}; {advice}")
+    train, validation = (
+        torch.tensor([places[subject] for subject in dataset.splits[split]])
+        for split in ("train", "validation")
+    )
+    return train, validation[:held_out]
+
+
 _SAME_POSE_SHARE = 0.5  # of samples without pairs
 _MEAN_SIDE = 64  # texels along a side of the mean face's shadows, as in the network
 
@@ -203,16 +217,7 @@ class DatasetTextures:
 
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
         """Heads of the split train, and at most `held_out` of the split validation."""
-        places = {subject: place for place, subject in enumerate(self.dataset.subjects)}
-        for split in ("train", "validation"):
-            if not self.dataset.splits[split]:
-                advice = "run prepare-dataset with another --split"
-                raise InputError(f"{self.dataset.folder}: no subject in the split {split}; {advice}")
-        train, validation = (
-            torch.tensor([places[subject] for subject in self.dataset.splits[split]])
-            for split in ("train", "validation")
-        )
-        return train, validation[:held_out]
+        return heads_of(self.dataset, held_out)
 
     def mean_face(self) -> tuple[Tensor, Tensor, Tensor]:
         """Normals [3, T, T], visibility [L, T, T] and its directions [L, 3] of the face model's mean."""
@@ -343,15 +348,21 @@ def _weighted_sum(file: Any, weights: Tensor) -> Tensor:
     return torch.stack(channels).view(olats.shape[1:])
 
 
+def model_of(dataset: Dataset, face_model: str) -> MorphableModel:
+    """Load the face model that a dataset was fitted with; raise InputError where another is given."""
+    model = load_face_model(face_model)
+    if model.name != dataset.face_model:
+        fitted = f"fitted with the face model {dataset.face_model}, not {model.name}"
+        raise InputError(f"{dataset.folder}: {fitted}; give --fit-with")
+    return model
+
+
 def open_dataset_textures(
     folder: Path, face_model: str, side: int, jobs: int, rig_lights: int = RIG_LIGHTS
 ) -> DatasetTextures:
     """Open the dataset in a folder and make missing textures of its splits train and validation."""
-    dataset, model = read_dataset(folder), load_face_model(face_model)
-    if model.name != dataset.face_model:
-        raise InputError(
-            f"{folder}: fitted with the face model {dataset.face_model}, not {model.name}; give --fit-with"
-        )
+    dataset = read_dataset(folder)
+    model = model_of(dataset, face_model)
     subjects = [*dataset.splits["train"], *dataset.splits["validation"]]
     textures = DatasetTextures(dataset, model, side, provenance_of(dataset, model), {}, rig_lights)
     textures.heads(1)  # raises for a split without subjects before anything is unwrapped

@@ -16,29 +16,18 @@ from torch import Tensor
 
 from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
+from facerf_cli.dataset.light_crops import LightCrops, LightStacks, LightTextures
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
-from facerf_cli.network.inputs import Batch, concatenate, head_rotation, resize
+from facerf_cli.network.inputs import concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.training.loop import Objective, Validation
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 
 _NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
-_SHEET_FACES = 6
+_SHEET_FACES, _CPU = 6, torch.device("cpu")
 _HEADS = HeadsSettings()
-
-
-@dataclass(frozen=True)
-class LightTextures(Batch):
-    """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
-
-    The lights are unit vectors in the head's frame; `heads` [B] are the heads' indices.
-    """
-
-    textures: Tensor
-    lights_head: Tensor
-    heads: Tensor
 
 
 class LightFeaturesObjective(HeadsObjective):
@@ -47,37 +36,47 @@ class LightFeaturesObjective(HeadsObjective):
     chooses_by = "angle_deg"
 
     def __init__(
-        self, source: SampleSource, network: LightNetwork | None = None, settings: HeadsSettings = _HEADS
+        self,
+        source: SampleSource | LightStacks,
+        network: LightNetwork | None = None,
+        settings: HeadsSettings = _HEADS,
     ) -> None:
         super().__init__("light_features", network or LightNetwork(), source, settings)
-        self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
+        if not isinstance(source, LightStacks):
+            self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures:
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LightCrops:
         """Draw a face."""
+        if isinstance(self.source, LightStacks):
+            return self.source.draw(head, self.settings.lights, generator)
         sample = self.source.draw(head, self.settings.lights, generator)
         seen = (sample.weight > 0).float()
         head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
         lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
         return LightTextures(sample.target * seen[:, None], lights_head, head)
 
-    def forward(self, batch: LightTextures) -> dict[str, Tensor]:
+    def _unwrapped(self, batch: LightTextures | LightCrops) -> LightTextures:
+        return batch.unwrapped(self.network.settings.side) if isinstance(batch, LightCrops) else batch
+
+    def forward(self, batch: LightTextures | LightCrops) -> dict[str, Tensor]:
         """Compute the term `light`, a mean over faces and lights."""
+        faces = self._unwrapped(batch)
         with self.mixed_precision():
-            return {"light": 1 - _cosines(self.network, batch).mean()}
+            return {"light": 1 - _cosines(self.network, faces).mean()}
 
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure mean and median angles in degrees to the true light, also for front and back lights."""
-        faces = self.held_out_samples()
-        cosines = torch.cat([_cosines(self.network, face.to(self.device)) for face in faces])
-        batch = concatenate(faces).to(self.device)
+        faces = [self._unwrapped(face.to(self.device)) for face in self.held_out_samples()]
+        cosines = torch.cat([_cosines(self.network, face) for face in faces])
+        batch = concatenate(faces)
         angles = torch.rad2deg(cosines.double().clamp(-1, 1).acos())
         metrics = {"angle_deg": float(angles.mean()), "angle_median_deg": float(angles.median())}
         front = batch.lights_head[..., 2] > 0  # of the plane of the face
         for name, lights in (("angle_front_deg", front), ("angle_behind_deg", ~front)):
             if lights.any():
                 metrics[name] = float(angles[lights].mean())
-        return Validation(metrics, _sheet(self.network, concatenate(faces)))
+        return Validation(metrics, _sheet(self.network, concatenate(faces[:_SHEET_FACES]).to(_CPU)))
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:

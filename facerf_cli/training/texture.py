@@ -35,7 +35,8 @@ class HeadsSettings:
 class HeadsObjective(Objective):
     """A stage that trains one network on textures of heads."""
 
-    def __init__(self, name: str, network: nn.Module, source: SampleSource, settings: HeadsSettings) -> None:
+    def __init__(self, name: str, network: nn.Module, source: Any, settings: HeadsSettings) -> None:
+        """Train a network `name` on a `SampleSource`, or what has its heads and provenance."""
         super().__init__({name: network}, source.provenance)
         self.source, self.settings = source, settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)

@@ -15,6 +15,7 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.dataset.crops import mean_translation_m, open_photos
 from facerf_cli.dataset.dataset import read_dataset
+from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import InputError, UsageError
@@ -177,9 +178,10 @@ class _TrainedStage:
     def light_features(self) -> Objective:
         """S_f on textures."""
         side = self._texture_side
-        network = self._features("light_features", side)
+        network, options = self._features("light_features", side), self.options
         settings = HeadsSettings(held_out_heads=self._sizes.held_out_heads)
-        return LightFeaturesObjective(self._samples(), network, settings)
+        stacks = open_light_stacks(options.dataset, options.fit_with) if options.dataset else None
+        return LightFeaturesObjective(stacks or self._samples(), network, settings)
 
     def appearance_features(self) -> Objective:
         """V_f on a dataset's crops."""

@@ -1,8 +1,11 @@
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.light_crops import open_light_stacks
+from facerf_cli.dataset.textures import UnwrappedView, open_dataset_textures
 from facerf_cli.network.features import LightNetwork, LightSettings
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
@@ -11,6 +14,7 @@ from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.loop import seeded
 from facerf_cli.training.texture import HeadsSettings
+from tests.dataset.dataset_fixture import write_small_dataset
 from tests.toy_faces import ToyFaces
 
 SETTINGS = HeadsSettings(lights=4, held_out_heads=2, held_out_draws=3)
@@ -63,6 +67,30 @@ def test_textures_are_black_where_unseen_and_lit_from_the_lights_side(bank: Bank
 def test_lights_of_a_real_direction_stay_unit_vectors(bank: Bank) -> None:
     lights = objective(bank).draw(4, lambda i: seeded(3, i), 0).lights_head
     assert torch.allclose(lights.norm(dim=-1), torch.ones(4, 4), atol=1e-5)
+
+
+def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
+    """Unwrapped in the step: those of the texture cache, but for the camera's colours, and its lights."""
+    dataset = write_small_dataset(tmp_path, lights=20, crop_px=48)
+    stacks = open_light_stacks(dataset.folder, "builtin")
+    head, camera = torch.tensor([0]), dataset.cameras[dataset.subjects[0]]
+    batch = stacks.draw(head, 5, torch.Generator().manual_seed(2))  # a camera that sees colours
+    faces = batch.unwrapped(32)
+    cached = open_dataset_textures(dataset.folder, "builtin", 32, 1, 20)
+    errors = []
+    for one in camera:
+        with cached._open(dataset.subjects[0], one) as file:
+            view, olats = UnwrappedView.read(file), file.get_tensor("olats").float()
+        directions = view.directions @ view.rotation
+        light = (faces.lights_head[0] @ directions.T).argmax(1)
+        found, wanted = faces.textures[0], olats[light]
+        scale = found.mean((0, 2, 3)) / wanted.mean((0, 2, 3))  # exposure and colours of the camera
+        errors.append(float((found - wanted * scale[:, None, None]).abs().mean() / found.mean()))
+    assert min(errors) < 1e-3 < 0.3 < max(errors)  # another camera's view of the face
+    stage = LightFeaturesObjective(stacks, LightNetwork(LightSettings(1 / 16, 4, 8, 32)), SETTINGS)  # type: ignore[arg-type]
+    drawn = stage.draw(2, lambda i: seeded(5, i), 0)
+    assert float(stage(drawn)["light"]) > 0 and "angle_deg" in stage.validate().metrics
+    assert not any(dataset.folder.glob("textures-32/*/relit*"))
 
 
 def test_the_heads_turn_is_found_from_its_normals() -> None:

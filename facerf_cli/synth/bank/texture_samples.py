@@ -130,6 +130,13 @@ def simulate_camera(
     return source / _mean(source, visible) * MEAN_RADIANCE, target
 
 
+def cast_and_greyed(images: Tensor, generator: torch.Generator) -> Tensor:
+    """Images [..., 3, H, W] with the colours of one simulated camera, or of one without colours."""
+    uniform = Uniform(generator, (1, 1, 1, 1))
+    balance = torch.exp(uniform(-0.12, 0.12, 1, 3, 1, 1))[0]
+    return _greyed(images * balance, (uniform(0, 1) < 0.25).float())
+
+
 def _greyed(field: Tensor, grey: Tensor) -> Tensor:
     """Remove the colour of the faces [B, ..., 3, T, T] where grey [B, 1, 1, 1] is 1."""
     mixed = field.mean(-3, keepdim=True)

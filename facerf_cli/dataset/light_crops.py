@@ -1,0 +1,101 @@
+"""Faces of a prepared dataset under single lights, for S_f: read from their stacks, unwrapped in the step.
+
+Workers read the crops of a few lights; the device unwraps them. Nothing is unwrapped or written before.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset, read_stack
+from facerf_cli.dataset.textures import LEAST_INSIDE, heads_of, model_of
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.topology import grid_triangles, on_device
+from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
+from facerf_cli.raster.camera import crop_camera
+from facerf_cli.raster.texture import UnwrapSettings, unwrap
+from facerf_cli.synth.bank.texture_samples import cast_and_greyed, draw_target_lights
+
+_DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not divide by 0
+
+
+@dataclass(frozen=True)
+class LightTextures(Batch):
+    """B faces under L single lights: textures [B, L, 3, T, T] linear, zero where unseen; lights [B, L, 3].
+
+    The lights are unit vectors in the head's frame; `heads` [B] are the heads' indices.
+    """
+
+    textures: Tensor
+    lights_head: Tensor
+    heads: Tensor
+
+
+@dataclass(frozen=True)
+class LightCrops(Batch):
+    """B faces under L single lights as cameras saw them: images [B, L, 3, S, S] float16, exposed.
+
+    `seen` [B, 1, S, S] in 0..1 shows the face, `vertices` [B, V, 3] is its fitted mesh in the crop's camera.
+    """
+
+    images: Tensor
+    seen: Tensor
+    vertices: Tensor
+    lights_head: Tensor
+    heads: Tensor
+
+    def unwrapped(self, side: int) -> LightTextures:
+        """The textures of the faces, where most of a texel's pixels lie on the face."""
+        faces, lights = self.images.shape[:2]
+        planes = torch.cat([self.images.flatten(1, 2).float(), self.seen], 1)
+        camera, triangles = crop_camera(planes.shape[-1]), on_device(planes.device, grid_triangles)
+        settings = UnwrapSettings(samples=math.ceil(camera.width_px / side), measured=False)
+        found, _ = unwrap(planes, self.vertices, triangles, camera, side, settings)
+        textures = found[:, :-1] * (found[:, -1:] > LEAST_INSIDE)
+        textures = textures.view(faces, lights, 3, side, side)
+        return LightTextures(textures, self.lights_head, self.heads)
+
+
+@dataclass(frozen=True, eq=False)
+class LightStacks:
+    """The stacks of a prepared dataset; heads are indices of `dataset.subjects`."""
+
+    dataset: Dataset
+    model: MorphableModel
+    provenance: dict[str, Any]
+
+    def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
+        """Heads of the split train, and at most `held_out` of the split validation."""
+        return heads_of(self.dataset, held_out)
+
+    def draw(self, head: Tensor, lights: int, generator: torch.Generator) -> LightCrops:
+        """Read a head [1] under random lights of one of its cameras; the camera's colours are random, too."""
+        subject = self.dataset.subjects[int(head)]
+        cameras = self.dataset.cameras[subject]
+        camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
+        path = self.dataset.stack_path(subject, camera)
+        header, fit = read_stack(path)
+        directions = torch.from_numpy(header.directions).float()
+        chosen = draw_target_lights(directions, min(lights, len(directions)), generator).tolist()
+        images = torch.cat([read_olats(path, slice(light, light + 1)) for light in chosen]).float()
+        seen = torch.from_numpy(header.seen)
+        exposure = MEAN_RADIANCE / max(float(header.source[header.seen > 0.5].mean()), _DARKEST)
+        return LightCrops(
+            cast_and_greyed(images * exposure, generator)[None].half(),
+            seen[None, None],
+            fit.vertices_camera(self.model)[None],
+            (directions[chosen] @ torch.from_numpy(header.rotation).float())[None],  # R^T w, of row vectors
+            head,
+        )
+
+
+def open_light_stacks(folder: Path, face_model: str) -> LightStacks:
+    """Open the stacks of a prepared dataset whose fits are of a face model."""
+    dataset = read_dataset(folder)
+    model = model_of(dataset, face_model)
+    return LightStacks(dataset, model, provenance_of(dataset, model))
