@@ -89,7 +89,7 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
     assert min(errors) < 1e-3 < 0.3 < max(errors)  # another camera's view of the face
     stage = LightFeaturesObjective(stacks, LightNetwork(LightSettings(1 / 16, 4, 8, 32)), SETTINGS)  # type: ignore[arg-type]
     drawn = stage.draw(2, lambda i: seeded(5, i), 0)
-    assert float(stage(drawn)["light"]) > 0 and "angle_deg" in stage.validate().metrics
+    assert stage(drawn)["light"].item() > 0 and "angle_deg" in stage.validate().metrics
     assert not any(dataset.folder.glob("textures-32/*/relit*"))
 
 
