@@ -11,6 +11,7 @@ scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,11 +22,12 @@ from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
 from facerf_cli.baselines.prt import explain_by_prt
 from facerf_cli.baselines.specular_sh import explain_by_specular_sh
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import FitStart, Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
+from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.image.colour import without_fireflies
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.sphere import RigLight, rig_directions
@@ -111,9 +113,19 @@ def head_of(models: Models, photo: np.ndarray, face: FaceBox, sides: Sides | Non
 
 @torch.no_grad()
 def regress_head(models: Models, cropped: np.ndarray) -> FitStart:
-    """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network."""
+    """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network.
+
+    Raises InputError where its coefficients are of a face model that is not at hand.
+    """
+    network: Any = models.networks.geometry
+    name = network.settings.face_model
+    if name not in (BUILTIN, models.face.name):
+        raise InputError(
+            f"the Geometry Network regresses heads of the face model {name}; give that with --face-model"
+        )
     image = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
-    return FitStart(*(tensor.cpu() for tensor in models.networks.geometry(image)))
+    found = (tensor.cpu() for tensor in network(image))
+    return FitStart(*found, model=None if name == BUILTIN else models.face)
 
 
 def reflectance_of(

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import nn
 
+from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_box, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
@@ -63,6 +64,7 @@ class Knows(nn.Module):
 
     def __init__(self, yaw_deg: float) -> None:
         super().__init__()
+        self.settings = GeometryNetworkSettings()
         generator = torch.Generator().manual_seed(1)
         alpha, beta = (0.5 * torch.randn(1, count, generator=generator) for count in (5, 3))
         rotation = pose_to_rotation(yaw_deg, 4.0, 2.0)[None]
@@ -106,6 +108,21 @@ def test_another_face_model_gets_the_same_surface(models: Models) -> None:
     other = replace(models.with_networks(geometry=network), face=twice)
     found = regress_photo(other, PHOTO, BOX, SIDES).fit.vertices_camera(twice)
     assert (found - vertices_of(models, network.head)).norm(dim=-1).max() < 1e-3
+
+
+def test_a_network_of_another_face_model_needs_that_model(models: Models) -> None:
+    """Its coefficients are then that model's, in the fit that starts from it, too."""
+    network, face = Knows(15.0), models.face
+    network.settings = GeometryNetworkSettings(face_model="other")
+    with pytest.raises(InputError, match="heads of the face model other; give that with --face-model"):
+        regress_photo(models.with_networks(geometry=network), PHOTO, BOX, SIDES)
+    twice = replace(face, name="other", identity=2 * face.identity, expression=-face.expression)
+    other = replace(models.with_networks(geometry=network), face=twice)
+    fit = regress_photo(other, PHOTO, BOX, SIDES).fit
+    torch.testing.assert_close(fit.vertices_camera(twice), vertices_of(other, network.head))
+    landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
+    fitted = fit_photo(other, PHOTO, landmarks_px, SIDES).fit
+    assert fitted.error_iod < 0.02
 
 
 def test_a_box_gives_about_the_crop_of_its_landmarks() -> None:

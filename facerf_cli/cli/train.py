@@ -26,7 +26,7 @@ _STAGES = {  # the stages that an option applies to
     "views": _TEXTURE_STAGES,
     "texture_size": (*_TEXTURE_STAGES, *_CROP_STAGES),
     "dataset": (*_TEXTURE_STAGES, *_CROP_STAGES, "portrait"),
-    "fit_with": _TEXTURE_STAGES,
+    "fit_with": (*_TEXTURE_STAGES, "joint"),
     "heads_from": _HEAD_STAGES,
     "heads": _HEAD_STAGES,
     "bank": _HEAD_STAGES,

@@ -6,7 +6,7 @@ alone constrain identity little and most of the surface not at all, so the prior
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Literal
@@ -114,15 +114,18 @@ class FaceFit:
 
 @dataclass(frozen=True)
 class FitStart:
-    """Heads of B faces to start from, in the space of the fit's camera; coefficients of the built-in model.
+    """Heads of B faces to start from, in the space of the fit's camera.
 
-    alpha and beta may have fewer coefficients than the model; the missing ones are zero.
+    alpha and beta may have fewer coefficients than their model; the missing ones are zero.
     """
 
     rotation: Tensor  # [B, 3, 3] head_to_camera
     translation_m: Tensor  # [B, 3]
     alpha: Tensor  # [B, Ki]
     beta: Tensor  # [B, Ke]
+    model: MorphableModel | None = field(
+        default=None, kw_only=True
+    )  # theirs; None: the built-in
 
 
 @dataclass(frozen=True)
@@ -176,10 +179,9 @@ def fit_landmarks(
 def regressed_fit(model: MorphableModel, regressed: FitStart, crop: Crop) -> FaceFit:
     """The head that a Geometry Network regressed [1, ...] from a crop (paper, 'Network Architecture').
 
-    The network's coefficients are those of the built-in model; another model gets the head closest to it by
-    least squares over the mesh.
+    A model other than that of its coefficients gets the head closest to it by least squares over the mesh.
     """
-    if model.name == BUILTIN:
+    if model.name == (regressed.model.name if regressed.model else BUILTIN):
         alpha, beta = (
             torch.nn.functional.pad(found[0].float(), (0, len(basis) - found.shape[1]))
             for found, basis in ((regressed.alpha, model.identity), (regressed.beta, model.expression))
@@ -325,7 +327,7 @@ def _weights() -> Tensor:
 
 def _points_camera(start: FitStart) -> Tensor:
     """The points of `fit_points` [B, N, 3] on the start's heads, camera space, float64."""
-    mean, identity, expression = _builtin_points()
+    mean, identity, expression = _points_of(start.model)
     alpha, beta = start.alpha.double(), start.beta.double()
     offset = torch.einsum("bk,knc->bnc", alpha, identity[: alpha.shape[1]])
     offset = offset + torch.einsum("bk,knc->bnc", beta, expression[: beta.shape[1]])
@@ -333,9 +335,9 @@ def _points_camera(start: FitStart) -> Tensor:
 
 
 @cache
-def _builtin_points() -> tuple[Tensor, Tensor, Tensor]:
-    """Mean [N, 3], identity [Ki, N, 3] and expression [Ke, N, 3] of the built-in model at `fit_points`."""
-    model, (corners, weights) = load_face_model(), fit_points()
+def _points_of(model: MorphableModel | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean [N, 3], identity [Ki, N, 3] and expression [Ke, N, 3] of a model at `fit_points`."""
+    model, (corners, weights) = model or load_face_model(), fit_points()
     mean, identity, expression = (
         (basis[..., corners, :].double() * weights[..., None].double()).sum(-2)
         for basis in (model.mean, model.identity, model.expression)

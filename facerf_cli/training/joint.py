@@ -162,7 +162,7 @@ class JointObjective(Objective):
     """The paper's loss on a prepared dataset's pairs, and on photos.
 
     Without `geometry` heads are fitted to the crops' landmarks, and the geometry terms are left out. `model`
-    is the face model of the coefficients: the built-in one, from which the fit starts (`face/fit.py`).
+    is the face model of the coefficients.
     `appearance` is V_f, `light` S_f; the term of one that is missing is left out. They are frozen and not
     saved.
     """

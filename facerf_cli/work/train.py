@@ -19,13 +19,14 @@ from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.morphable import load_face_model, save_face_model
+from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import alone_in
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.checkpoint import load_networks, load_vgg, new_network
 from facerf_cli.network.files import serving_files
+from facerf_cli.network.geometry import GeometryNetworkSettings
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
@@ -202,7 +203,7 @@ class _TrainedStage:
         images = folder / "pictures"
         add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
         faces = RenderedFaces(images, provenance)
-        network = self._geometry(faces.mean_translation_m())
+        network = self._geometry(faces.mean_translation_m(), load_face_model())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
         return GeometryObjective(faces, network, settings)
 
@@ -218,15 +219,15 @@ class _TrainedStage:
                 "`facerf train --stage light-features`, or another preset"
             )
         reflectance, geometry = self._reflectance(side), None  # heads are fitted to landmarks
+        model = load_face_model(options.fit_with)  # of the Geometry Network, whatever fitted the dataset
         if options.geometry == "network":
-            geometry = self._geometry(mean_translation_m(dataset))
+            geometry = self._geometry(mean_translation_m(dataset), model)
         light, photos = self._frozen_light_features(side), None
         if options.photos:
             items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
             paths, cache = [item.input_path for item in items], options.output / "photos"
             photos = open_photos(paths, cache, self.networks, side, options.jobs)
         settings = JointSettings(side, side, seed=options.settings.seed)
-        model = load_face_model()  # the built-in one, of the Geometry Network, whatever fitted the dataset
         return JointObjective(dataset, model, reflectance, geometry, appearance, light, photos, settings)
 
     def parsing(self) -> Objective:
@@ -354,11 +355,24 @@ class _TrainedStage:
                 f"--without-normals: the form {form} has no setting normals; leave it out"
             ) from None
 
-    def _geometry(self, mean_translation_m: tuple[float, float, float]) -> Any:
-        """The Geometry Network; with --mean-face of the pose alone (paper, 'Ablative Study')."""
-        form = "paper" if self.options.preset == "paper" else "default"
-        none = {"identity": 0, "expression": 0} if self.options.mean_face else {}
-        return self._network("geometry", form, mean_translation_m=mean_translation_m, **none)
+    def _geometry(self, mean_translation_m: tuple[float, float, float], model: MorphableModel) -> Any:
+        """The Geometry Network; with --mean-face of the pose alone (paper, 'Ablative Study').
+
+        Raises InputError for one of --start-from whose coefficients are another model's.
+        """
+        form, most = "paper" if self.options.preset == "paper" else "default", GeometryNetworkSettings()
+        shapes = {
+            "identity": min(most.identity, len(model.identity)),
+            "expression": min(most.expression, len(model.expression)),
+        }
+        if self.options.mean_face:
+            shapes = dict.fromkeys(shapes, 0)
+        settings = {"mean_translation_m": mean_translation_m, "face_model": model.name, **shapes}
+        network = self._network("geometry", form, **settings)
+        if network.settings.face_model != model.name:
+            trained = f"its Geometry Network was trained with the face model {network.settings.face_model}"
+            raise InputError(f"{self.options.start_from}: {trained}, not {model.name}; give --fit-with")
+        return network
 
     def _samples(self) -> SampleSource:
         """Open a dataset's textures, or the bank of synthetic heads, whose missing views are fitted first."""

@@ -46,7 +46,8 @@ class TrainOptions:
             read its crops at this side, too.
         photos: Train on photos of faces, too, in a fifth of the batches of the stage joint.
         heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
-        fit_with: Fit this face model to the heads; a dataset's own model.
+        fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint, the one whose
+            coefficients the Geometry Network learns.
         heads: Bake so many synthetic heads.
         views: Fit so many views of each head.
         bank: Keep baked heads in this folder.

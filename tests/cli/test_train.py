@@ -109,8 +109,8 @@ def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
             "--heads: does not apply to the stage",
         ),
         (
-            ["--stage", "joint", "--dataset", "d", "--fit-with", "m"],
-            "--fit-with: does not apply to the stage joint",
+            ["--stage", "appearance-features", "--dataset", "d", "--fit-with", "m"],
+            "--fit-with: does not apply to the stage appearance-features",
         ),
         (["--stage", "geometry", "--dataset", "d"], "--dataset: does not apply to the stage geometry"),
         (["--vgg-weights", "imagenet"], "--vgg-weights: does not apply to the stage reflectance"),
