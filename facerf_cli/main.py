@@ -27,7 +27,7 @@ from facerf_cli.cli import evaluate, face_model
 from facerf_cli.cli.convert_light import convert_light
 from facerf_cli.cli.envmap import envmap
 from facerf_cli.cli.estimate_light import estimate_light
-from facerf_cli.cli.examples import epilog_of
+from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.fit_geometry import fit_geometry
 from facerf_cli.cli.installation import check, config, doctor, read_config
 from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups
@@ -331,7 +331,10 @@ def repeat_options(arguments: Sequence[str]) -> list[str]:
 
 def _see_help(error: Any) -> str:
     context = getattr(error, "ctx", None)
-    return f"(see '{context.command_path if context else 'facerf'} --help')"
+    path = context.command_path if context else "facerf"
+    is_no_verb = path == "facerf" and "No such command" in error.format_message()
+    advice = f"a verb comes first, as in {examples_of('relight')[0]}; " if is_no_verb else ""
+    return f"({advice}see '{path} --help')"
 
 
 def _fail(error: BaseException | None, message: str, code: int) -> int:

@@ -20,7 +20,7 @@ MOST_FRAMES = 9999
 _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
 _MOST_DIGITS = 9  # of a count; Python refuses to read thousands
-_FORMS = ("AZ,EL", "AZ,EL,R,G,B")
+_FORMS = ("AZ,EL", "AZ,EL,STRENGTH", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of lights: what a room sends back, by the background
@@ -341,7 +341,7 @@ def named_map(entry: str, turns: Sequence[float], is_numbered: bool) -> LitImage
 
 
 def _short(text: str) -> LitImage:
-    """Parse `az,el[,r,g,b][;...]`: lights that shine together."""
+    """Parse `az,el[,strength or r,g,b][;...]`: lights that shine together."""
     parts = [part for part in text.split(";") if part.strip()] or [""]
     given = [azel(part, _FORMS, "--light") for part in parts]
     name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
@@ -349,13 +349,13 @@ def _short(text: str) -> LitImage:
 
 
 def _short_named(part: str) -> LitImage:
-    """Parse `NAME=az,el[,r,g,b]`."""
+    """Parse `NAME=az,el[,strength or r,g,b]`."""
     name, _, text = part.partition("=")
     return LitImage(((_far(azel(text, _FORMS, "--light")),),), names=(name.strip(),))
 
 
 def _far(values: Sequence[float]) -> StudioLight:
-    red, green, blue = values[2:] or (1.0, 1.0, 1.0)
+    red, green, blue = (3 * list(values[2:] or [1.0]))[:3]
     return StudioLight(azel_deg=(values[0], values[1]), rgb=(red, green, blue))
 
 

@@ -373,7 +373,7 @@ class Relight:
             return self
         setups = readable(self.setups)
         if not setups:
-            raise FacerfError("no map can be read; give others")
+            raise FacerfError("no map can be read; give others, or procedural:8 to draw some")
         return replace(self, setups=setups)
 
 

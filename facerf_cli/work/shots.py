@@ -256,7 +256,7 @@ def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
             raise UsageError(f"-o {output}: films are written as .mp4 or .mov; give one of these")
         if rate is not None:
             raise UsageError("--fps: is for -o FILE.mp4 or FILE.mov; leave it out")
-        folder_not_file(output)
+        folder_not_file(output, ".exr, .png, .jpg, .tif, .mp4 or .mov")
         return None
     from facerf_cli.files.film import require_av
 

@@ -17,7 +17,14 @@ from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
-from facerf_cli.work.lights import lights_over_rig, lights_over_stack, off_rig_deg, readable, write_balls
+from facerf_cli.work.lights import (
+    lights_over_rig,
+    lights_over_stack,
+    off_rig_deg,
+    readable,
+    single_lights,
+    write_balls,
+)
 from facerf_cli.work.output_options import OutputOptions
 
 HEIGHT_PX = 16
@@ -100,14 +107,16 @@ def test_wrong_rotations(text: str) -> None:
         parse_rotations(text)
 
 
-@pytest.mark.parametrize("text", ["", ";", "1", "1,2,3", "a,b", "1,2,3,4,5,6", "1,inf", "0,91", "0,0,1,-1,0"])
+@pytest.mark.parametrize(
+    "text", ["", ";", "1", "1,2,3,4", "0,0,-1", "a,b", "1,2,3,4,5,6", "1,inf", "0,91", "0,0,1,-1,0"]
+)
 def test_wrong_lamps(text: str) -> None:
     with pytest.raises(UsageError, match="--light"):
         collect_setups(LightSources(light=[text]), Path("out"))
 
 
 def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="give AZ,EL or AZ,EL,R,G,B, numbers separated by commas"):
+    with pytest.raises(UsageError, match="give AZ,EL or AZ,EL,STRENGTH or AZ,EL,R,G,B, numbers sep"):
         collect_setups(LightSources(light=["60"]), Path("out"))
     with pytest.raises(UsageError, match=r"give DEG or FROM:TO:N, a number"):
         parse_rotations("left")
@@ -180,6 +189,8 @@ def test_lamps_shine_together_with_their_colours() -> None:
     torch.testing.assert_close(directions[0], torch.tensor([1.0, 0, 0]), atol=1e-6, rtol=0)
     torch.testing.assert_close(weights[0], torch.tensor([[1.0, 0, 0], [0, 0, 2], [0, 0, 0]]))
     torch.testing.assert_close(weights[1, 2], torch.ones(3))
+    fill = single_lights(collect_setups(LightSources(light=["90,0,0.3"]), Path("out")))
+    torch.testing.assert_close(fill.weights, torch.full((1, 1, 3), 0.3))
 
 
 def test_lamps_of_a_stack_are_shared_by_the_lights_around_them() -> None:
