@@ -173,6 +173,13 @@ def test_a_person_comes_back_from_its_file(person: facerf.Person, tmp_path: Path
     np.testing.assert_array_equal(again.matte, matte)
 
 
+def test_every_key_of_its_file_is_in_the_docs(person: facerf.Person, tmp_path: Path) -> None:
+    replace(person, given_matte=person.share).save(tmp_path / "person.npz")
+    documented = set(re.findall(r"`(\w+)`", (ROOT / "docs/formats.md").read_text()))
+    with np.load(tmp_path / "person.npz", allow_pickle=False) as file:
+        assert set(file) <= documented
+
+
 @pytest.mark.parametrize(
     ("name", "array"),
     [
@@ -221,6 +228,8 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
         facerf.fit(models, str(PHOTO))  # type: ignore[call-overload]
     with pytest.raises(InputError, match="twice as wide as high"):
         person.relight(np.ones((30, 40, 3), np.float32))
+    with pytest.raises(TypeError, match=r"light has shape .3., not a facerf.Light or a map"):
+        person.relight(np.array([60.0, 30.0, 1.0]))
     with pytest.raises(TypeError, match="light is tuple, not a facerf"):
         person.relight([(60, 30)])  # type: ignore[list-item]
     with pytest.raises(ValueError, match=r"background has shape .4, 4., not"):

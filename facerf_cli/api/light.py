@@ -105,11 +105,10 @@ def as_light(given: Any, room: float = 0.0) -> Light:
     """
     if isinstance(given, Light):
         return given + Light.around() * (room * given.weights.sum(0)) if room else given
-    if isinstance(given, np.ndarray | Tensor):
+    if isinstance(given, np.ndarray | Tensor) and given.ndim == 3:
         return Light.from_envmap(given)
-    raise TypeError(
-        f"light is {type(given).__name__}, not a facerf.Light or a map [H, 2 H, 3]; read a file by read_image"
-    )
+    what = f"has shape {list(given.shape)}" if hasattr(given, "shape") else f"is {type(given).__name__}"
+    raise TypeError(f"light {what}, not a facerf.Light or a map [H, 2 H, 3]; read a file by read_image")
 
 
 def sums_of(lights: Sequence[Light]) -> Lights:

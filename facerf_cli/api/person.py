@@ -185,12 +185,10 @@ class Person(pipeline.FittedPerson):
     @property
     def camera(self) -> PhotoCamera:
         """The photo's camera and the pose of the head."""
-        camera, fit = self._photo_camera, self.head.fit
+        camera = self._photo_camera
         focal = camera.focal_px
         matrix = np.array([[focal, 0, camera.cx_px], [0, focal, camera.cy_px], [0, 0, 1]])
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = fit.rotation.numpy(), fit.translation_m.numpy()
-        return PhotoCamera(self._out(matrix), self._out(pose))
+        return PhotoCamera(self._out(matrix), self._out(self.head.fit.head_to_camera))
 
     @property
     def mesh(self) -> trimesh.Trimesh:

@@ -87,6 +87,13 @@ class FaceFit:
         return self.crop.camera
 
     @property
+    def head_to_camera(self) -> np.ndarray:
+        """The pose [4, 4], m."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.rotation.numpy(), self.translation_m.numpy()
+        return pose
+
+    @property
     def quality(self) -> Quality:
         """'good' up to an error of `GOOD_ERROR_IOD`, 'fair' up to `FAIR_ERROR_IOD`, else 'poor'.
 

@@ -25,12 +25,18 @@ class TexturedMesh:
     metadata: dict[str, Any]  # provenance
 
 
-def write_glb(path: Path, mesh: TexturedMesh) -> None:
-    """Write one file that contains the texture, as a rough dielectric."""
+def write_glb(path: Path, mesh: TexturedMesh, camera: tuple[float, np.ndarray] | None = None) -> None:
+    """Write one file that contains the texture, as a rough dielectric.
+
+    The camera, if any, is square: its angle of view in degrees, and camera_to_mesh [4, 4]; it looks along -z.
+    """
     image = Image.fromarray(mesh.texture_srgb)
     material = PBRMaterial("face", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
     scene = trimesh.Scene(metadata=mesh.metadata)
     scene.add_geometry(_with_material(mesh, material), geom_name="face")
+    if camera is not None:
+        scene.camera = trimesh.scene.Camera("photo", fov=(camera[0], camera[0]))
+        scene.camera_transform = camera[1]
     with atomic_path(path) as temporary:
         temporary.write_bytes(scene.export(file_type="glb", include_normals=True))
 

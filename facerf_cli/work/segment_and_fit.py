@@ -1,7 +1,7 @@
 """Files of one photo: its person cut out (`segment`), its fitted face (`fit-geometry`)."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
@@ -140,16 +141,14 @@ def _write_fit(item: Item, image: LinearImage, face: FittedFace, options: PhotoO
     write_display(path("_texture.png"), texture, "auto", metadata=metadata)
     write_exr(path("_normals.exr"), normals, metadata=metadata)
     write_display(path("_normals.png"), srgb_to_linear(0.5 + 0.5 * normals), metadata=metadata)
-    _write_mesh(path, _mesh(face, to_display(texture), options, metadata))
+    mesh = _mesh(face, to_display(texture), options, metadata)
+    fov_deg = math.degrees(2 * math.atan(0.5 / CROP_FOCAL_PER_SIDE))
+    write_glb(path("_mesh.glb"), mesh, (fov_deg, np.linalg.inv(face.fit.head_to_camera)))
+    write_obj(path("_mesh.obj"), mesh, path("_texture.png").name)
     overlay = draw_fit(image.pixels, face.fit, face_model(options))
     write_display(path("_fit.jpg"), overlay, metadata=metadata)
     with atomic_path(path("_fit.npz")) as temporary:
         save_fit(temporary, face.fit, metadata)
-
-
-def _write_mesh(path: Callable[[str], Path], mesh: TexturedMesh) -> None:
-    write_glb(path("_mesh.glb"), mesh)
-    write_obj(path("_mesh.obj"), mesh, path("_texture.png").name)
 
 
 def _mesh(

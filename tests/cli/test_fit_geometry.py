@@ -13,6 +13,7 @@ from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.main import main
+from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import render_texture
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
@@ -70,6 +71,24 @@ def test_the_mesh_seen_by_the_fit_is_the_photo(fitted: Path, kind: str) -> None:
     assert peak_signal_noise_ratio(cropped[inside], image.numpy()[inside], data_range=1) > 25
     material_image = getattr(mesh.visual.material, "baseColorTexture", None) or mesh.visual.material.image
     assert material_image.size == (256, 256)
+
+
+def test_the_camera_of_the_glb_sees_what_the_crop_shows(fitted: Path) -> None:
+    """As glTF has it: the camera's node holds its pose, and it looks along its -z."""
+    content = (fitted / "astronaut_mesh.glb").read_bytes()
+    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    (node,) = (node for node in document["nodes"] if "camera" in node)
+    lens = document["cameras"][node["camera"]]["perspective"]
+    assert lens["aspectRatio"] == 1
+    fit = fit_of(fitted)
+    vertices = fit.vertices_camera(load_face_model())
+    camera_to_head = np.array(node["matrix"]).reshape(4, 4).T  # by columns
+    in_head = (vertices.numpy() - fit.translation_m.numpy()) @ fit.rotation.numpy()
+    x, y, z = ((in_head - camera_to_head[:3, 3]) @ camera_to_head[:3, :3]).T
+    half = fit.crop.size_px / 2
+    scale = half / np.tan(lens["yfov"] / 2)
+    seen = np.stack([half - scale * x / z, half + scale * y / z], -1)
+    np.testing.assert_allclose(seen, project(vertices, fit.camera).numpy(), atol=0.05)
 
 
 def test_texture_says_what_was_seen_and_normals_are_of_unit_length(fitted: Path) -> None:
