@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, Outcome
+from facerf_cli.batch.run import Outcome
 from facerf_cli.cli.options import refuse_given, settings_of
 from facerf_cli.option import Without
-from facerf_cli.work.verbs import ConvertLight, Form
+from facerf_cli.work.verbs import ConvertLight, FileOrFolder, Form
 
 _MAPS: tuple[Form, ...] = ("latlong", "blender", "mitsuba")
 _MADE_FOR: dict[str, tuple[Form, ...]] = {  # the forms that an option is for
@@ -43,7 +43,7 @@ def convert_light(
         ),
     ],
     work: ConvertLights,
-    batch: Annotated[BatchOptions, Without("name")],
+    batch: Annotated[FileOrFolder, Without("name")],
 ) -> None:
     """Convert lights between maps, weights of a rig, spherical harmonics, and the axes of other programs.
 

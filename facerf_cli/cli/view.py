@@ -12,7 +12,7 @@ from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import UsageError
 from facerf_cli.option import IMAGE, Without, option
 from facerf_cli.work.photo_options import PhotoOptions, networks_of
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written
+from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written, end_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
 
@@ -50,7 +50,7 @@ def view(
     """
     photo, output = work.checked().photo, batch.output
     items = collect_items(inputs, output, PHOTO_SUFFIXES, null_separated=photo.settings.null_separated)
-    many = not work.names_file(output)
+    many = not end_of_file(output, work.alone_as)
     if many and any(item.name == Path(_INDEX).stem for item in items):
         raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
     code = work.run_on(items, batch)

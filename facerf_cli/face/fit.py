@@ -130,9 +130,7 @@ class FitStart:
     translation_m: Tensor  # [B, 3]
     alpha: Tensor  # [B, Ki]
     beta: Tensor  # [B, Ke]
-    model: MorphableModel | None = field(
-        default=None, kw_only=True
-    )  # theirs; None: the built-in
+    model: MorphableModel | None = field(default=None, kw_only=True)  # theirs; None: the built-in
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,10 @@ from facerf_cli.work.shots import FRAMES_IN_A_ROW, Shot, ShotOptions, collect_fr
 
 @dataclass(frozen=True)
 class FileOrFolder(BatchOptions):
-    """The contract of verbs on photos, of which one file may be wanted.
+    """The contract of verbs of which one file may be wanted.
 
     Attributes:
-        output: Write the results to this folder; or one of them, of one photo, to this file, by its suffix.
+        output: Write the results to this folder; or one of them, of one input, to this file, by its suffix.
     """
 
     output: Path = option(
@@ -38,6 +38,18 @@ class FileOrFolder(BatchOptions):
         shown_default=False,
         required=True,
     )
+
+
+def end_of_file(output: Path, ends: Sequence[str]) -> str:
+    """The end of the name of the result that `-o` wants as this file, by its suffix; '' for a folder.
+
+    Raises UsageError for a file that has the suffix of none of the `ends` that may be written alone.
+    """
+    found = next((end for end in ends if output.suffix and end.endswith(output.suffix.lower())), "")
+    if output.is_dir() or not found:
+        folder_not_file(output, " or ".join(end[end.index(".") :] for end in ends))
+        return ""
+    return found
 
 
 Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the faces that were written; facts for the report
@@ -89,20 +101,9 @@ class PhotoWork:
         batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1)
         return replace(work, shots=shots).run_on(items, batch)
 
-    def names_file(self, output: Path) -> bool:
-        """True if `-o` names a file; raises UsageError for one that cannot be written alone."""
-        if self._end_of(output.suffix) and not output.is_dir():
-            return True
-        folder_not_file(output, " or ".join(end[end.index(".") :] for end in self.alone_as))
-        return False
-
-    def _end_of(self, suffix: str) -> str:
-        """The end of the file that may be written alone with a suffix; '' where there is none."""
-        return next((end for end in self.alone_as if suffix and end.endswith(suffix.lower())), "")
-
     def run_on(self, items: Sequence[Item], batch: BatchOptions) -> int:
         """Process items; return the exit code."""
-        if self.names_file(batch.output) and not self.alone:
+        if end_of_file(batch.output, self.alone_as):
             if batch.name is not None:
                 raise UsageError(f"--name: is not for -o {batch.output}, one file; leave it out")
             item = only_item(items, batch.output, several=self.photo.face == "all")
@@ -146,7 +147,7 @@ class PhotoWork:
         with atomic_path(path) as temporary:
             apart = replace(item, output_base=temporary.parent / "all" / item.name)
             tags, facts = replace(self, alone="").write(apart)
-            os.replace(apart.output(tags[0] + self._end_of(self.alone)), temporary)
+            os.replace(apart.output(tags[0] + end_of_file(path, self.alone_as)), temporary)
         return Outcome([path], facts)
 
 
@@ -264,6 +265,7 @@ class ConvertLight:
         None, metavar="N|FILE", shown_default="the input's own, else 150", panel=LIGHT
     )
     signed: bool = option(False, panel=LIGHT)
+    alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
 
     def run(self, inputs: Sequence[str], batch: BatchOptions, settings: Settings) -> int:
         """Convert the inputs; return the exit code."""
@@ -272,11 +274,16 @@ class ConvertLight:
         if self.lights is not None:
             parse_lights(self.lights)  # a wrong one fails the call, not every item
         items = collect_items(inputs, batch.output, _LIGHT_SUFFIXES, null_separated=settings.null_separated)
-        return run_items("convert-light", items, self, self.outputs_of, batch, settings, one_recipe(self))
+        work, ends = self, [_ENDINGS[form] for form in self.forms]
+        if end_of_file(batch.output, ends):
+            items = [only_item(items, batch.output, several=len(ends) > 1)]
+            work = replace(self, alone=batch.output.suffix)
+            batch = replace(batch, output=batch.output.parent)
+        return run_items("convert-light", items, work, work.outputs_of, batch, settings, one_recipe(work))
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file for each form."""
-        return [item.output(_ENDINGS[form]) for form in self.forms]
+        return [item.output(self.alone or _ENDINGS[form]) for form in self.forms]
 
     def __call__(self, item: Item) -> Outcome:
         """Write the light in every form."""

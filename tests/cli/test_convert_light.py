@@ -114,6 +114,17 @@ def test_dprs_example_keeps_its_numbers(tmp_path: Path) -> None:
     torch.testing.assert_close(back, torch.tensor(numbers), rtol=0, atol=1e-5)
 
 
+def test_one_form_to_a_file(tmp_path: Path, capsys: Capture) -> None:
+    write_light(tmp_path / "a.json", LightRecord(rig_directions(), torch.full((150, 3), 4 / 150)))
+    assert convert(tmp_path / "a.json", tmp_path / "sky.EXR", "--to", "latlong", "--width", "32") == 0
+    assert pixels(tmp_path / "sky.EXR").shape == (16, 32, 3)
+    both = ["--to", "latlong", "--to", "blender"]
+    for line, said in ((["--to", "dpr"], "or a file as .txt"), (both, "is one file")):
+        assert convert(tmp_path / "a.json", tmp_path / "b.exr", *line) == 2
+        assert said in capsys.readouterr().err
+    assert convert(tmp_path / "a.json", tmp_path / "a.json", "--to", "json") == 2
+
+
 def test_another_rig(tmp_path: Path) -> None:
     write_light(tmp_path / "a.json", LightRecord(rig_directions(), torch.full((150, 3), 4 / 150)))
     assert convert(tmp_path / "a.json", tmp_path, "--to", "json", "--lights", "40") == 0
