@@ -15,6 +15,7 @@ from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_toml
 from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.training.settings import KINDS
 from facerf_cli.work.installed import MISSING, Facts, installation
 
 GLOBAL = "global"  # the table of options before the verb
@@ -165,6 +166,9 @@ def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
     values = {}
     for key, value in table.items():
         name = key.replace("-", "_")
+        if verb == "train" and name in KINDS:  # which `training/config_file.py` reads
+            values[name] = value
+            continue
         if name not in names:
             of_verb = "" if verb == GLOBAL else f"{verb} ".replace(".", " ")
             raise UsageError(f"--config {path}: [{verb}] {key}: no such option; see `facerf {of_verb}--help`")

@@ -1,13 +1,14 @@
 """`facerf train`: train the networks on synthetic heads or on a prepared dataset."""
 
 from dataclasses import replace
+from typing import Any
 
 import typer
 
-from facerf_cli.cli.options import is_default, was_given
+from facerf_cli.cli.options import is_default
 from facerf_cli.errors import UsageError
 from facerf_cli.option import flag
-from facerf_cli.training.settings import Stage
+from facerf_cli.training.settings import KINDS, TrainSettings
 from facerf_cli.work.train_options import PaceOptions, TrainOptions
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
@@ -57,15 +58,41 @@ def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> N
         options = replace(
             options, stage="joint" if joint else options.stage, form="paper" if paper else options.form
         )
-    _refuse_conflicts(context, options.stage)
+    _refuse_conflicts(context, options)
+    of_file = (context.find_root().default_map or {}).get("train", {})
+    tables = {name: table for name, table in of_file.items() if name in KINDS}
+    if "loss" in tables and options.stage != "joint":
+        raise UsageError(f"--config: [train.loss] does not apply to the stage {options.stage}; leave it out")
+    training = pace.of_run(options, tables)
     from facerf_cli.work.train import run_training
 
-    run_training(replace(options, training=pace.of_run(options)))
+    run_training(replace(options, training=training, typed=_typed(context, options, training)))
 
 
-def _refuse_conflicts(context: typer.Context, stage: Stage) -> None:
+def _typed(context: typer.Context, options: TrainOptions, training: TrainSettings) -> dict[str, Any]:
+    """The options that were given, by name, and values in force that a preset gave."""
+    names = {parameter.name: parameter.opts[0].lstrip("-") for parameter in context.command.params}
+    given = {
+        names[name]: list(value) if isinstance(value, tuple) else value
+        for name, value in context.params.items()
+        if name not in ("resume", "learning_rate") and not is_default(context, name)
+    }
+    in_force: dict[str, Any] = {
+        "stage": options.stage,
+        "validate-every": training.validate_every,
+        "batch": training.batch,
+        "gradient-clip": training.gradient_clip or 0,
+        "ema-decay": training.ema_decay or 0,
+        "bf16": training.bf16,
+    }
+    if training.max_seconds:
+        in_force["max-time"] = f"{training.max_seconds:.3f}s"
+    return given | in_force
+
+
+def _refuse_conflicts(context: typer.Context, options: TrainOptions) -> None:
     """Raise UsageError for options that do not apply to the stage or contradict each other."""
-    given = {name for name in context.params if was_given(context, name)}
+    stage, given = options.stage, {name for name in context.params if not is_default(context, name)}
     for name, stages in _STAGES.items():
         if name in given and stage not in stages:
             raise UsageError(f"{flag(name)}: does not apply to the stage {stage}; leave it out")

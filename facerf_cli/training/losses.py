@@ -22,10 +22,12 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_networks
 from facerf_cli.network.features import FeatureNetwork, feature_distance
 from facerf_cli.network.inputs import from_root, to_root
+from facerf_cli.training.settings import PaperWeights as PaperWeights
 
 _SLOPE_WEIGHT = 0.6  # of differences between neighbouring texels
 _RADIANCE_WEIGHT = 16.0  # of squared errors of radiance, as in Si-MSE, against L1 on roots
 _WHITE = 1.0  # radiance at which a camera clips, at the exposure of samples
+_PAPER = PaperWeights()
 _BRIGHTEST_ROOT = 1.25  # above it a photograph clips
 
 
@@ -65,18 +67,6 @@ def clipped_si_mse(prediction: Tensor, target: Tensor, weight: Tensor) -> Tensor
     return si_mse(prediction.clamp(max=_WHITE), target.clamp(max=_WHITE), weight)
 
 
-@dataclass(frozen=True)
-class PaperWeights:
-    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r."""
-
-    landmarks: float = 25.0
-    regularisation: float = 1.0
-    photometric: float = 5.0
-    features: float = 1.0
-    alpha: float = 0.4
-    beta: float = 0.002
-
-
 def landmark_loss(found_px: Tensor, detected_px: Tensor, side_px: int) -> Tensor:
     """L_l [B]: mean squared distance of the mesh's and the detector's landmarks [B, N, 2].
 
@@ -101,7 +91,7 @@ def slid_contour(candidates_px: Tensor, detected_px: Tensor) -> Tensor:
     return candidates_px.gather(1, ids[..., None].expand(-1, -1, 2))
 
 
-def regularisation(alpha: Tensor, beta: Tensor, weights: PaperWeights = PaperWeights()) -> Tensor:
+def regularisation(alpha: Tensor, beta: Tensor, weights: PaperWeights = _PAPER) -> Tensor:
     """L_r [B]: weighted means of squared identity [B, Ki] and expression coefficients [B, Ke]."""
     return weights.alpha * alpha.square().mean(1) + weights.beta * beta.square().mean(1)
 

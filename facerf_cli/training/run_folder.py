@@ -3,6 +3,7 @@
 Ctrl-C and SIGTERM end a run between two steps, so that nothing is lost; a second one ends it at once.
 """
 
+import csv
 import json
 import logging
 import math
@@ -30,13 +31,14 @@ from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.stopping import unhurried
 from facerf_cli.training.settings import Adadelta, AdamW, TrainSettings
 
+LOG, CURVES = "log.jsonl", "curves.csv"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 log = logging.getLogger(LOGGER_NAME)
 
 
 def refuse_another_run(folder: Path) -> None:
     """Raise UsageError where a folder holds a run already, which training would overwrite."""
-    if any((folder / name).exists() for name in ("state.pt", "log.jsonl", "last.safetensors")):
+    if any((folder / name).exists() for name in ("state.pt", LOG, "last.safetensors")):
         raise UsageError(f"{folder}: holds a run already; give --resume to continue it, or another folder")
 
 
@@ -46,7 +48,7 @@ class RunLog:
     def __init__(self, folder: Path, step: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.folder = folder
-        path = folder / "log.jsonl"
+        path = folder / LOG
         if path.exists():
             rows = [line for line in path.read_text().splitlines() if _step_of(line) <= step]
             with atomic_path(path) as temporary:
@@ -59,6 +61,7 @@ class RunLog:
 
     def __exit__(self, *_: Any) -> None:
         self.file.close()
+        write_curves(self.folder)
         if self.board:
             self.board.close()
 
@@ -76,6 +79,18 @@ class RunLog:
         write_display(path, sheet.astype(np.float32), exposure=1.0)  # EV
         if self.board:
             self.board.add_image("sheet", linear_to_srgb(sheet.clip(0, 1)), step, dataformats="HWC")
+
+
+def write_curves(folder: Path) -> None:
+    """Write curves.csv, a row for each of log.jsonl's, with a column for each value of any row."""
+    rows = [
+        _flat(row) | {"step": row["step"]} for row in map(parse_json, (folder / LOG).read_text().splitlines())
+    ]
+    names = dict.fromkeys(["step", *(name for row in rows for name in row)])
+    with atomic_path(folder / CURVES) as temporary, temporary.open("w", newline="") as file:
+        table = csv.DictWriter(file, list(names))
+        table.writeheader()
+        table.writerows(rows)
 
 
 def _step_of(line: str) -> float:

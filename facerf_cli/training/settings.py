@@ -67,6 +67,26 @@ class Constant:
         return 1.0
 
 
+@dataclass(frozen=True)
+class PaperWeights:
+    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r."""
+
+    landmarks: float = 25.0
+    regularisation: float = 1.0
+    photometric: float = 5.0
+    features: float = 1.0
+    alpha: float = 0.4
+    beta: float = 0.002
+
+
+# The groups of settings that a configuration file may change, and their kinds by name.
+KINDS: dict[str, dict[str, Any]] = {
+    "loss": {"PaperWeights": PaperWeights},
+    "optimizer": {"AdamW": AdamW, "Adadelta": Adadelta},
+    "schedule": {"Cosine": Cosine, "Constant": Constant},
+}
+
+
 def _may_change(default: Any) -> Any:
     return field(default=default, metadata=NOT_IN_RECIPE)
 
@@ -81,6 +101,7 @@ class TrainSettings:
     gradient_clip: float | None = 1.0  # largest norm; None: no clipping
     ema_decay: float | None = 0.998  # of the weights that are validated and saved; None: not averaged
     bf16: bool = True
+    loss: PaperWeights = PaperWeights()  # of the stage joint
     seed: int = 0
     # What may differ between a run and its resumption.
     validate_every: int = _may_change(500)  # steps

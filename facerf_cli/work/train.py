@@ -2,8 +2,10 @@
 
 import logging
 import os
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +16,11 @@ from torch import Tensor
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.dataset.crops import mean_translation_m, open_photos
-from facerf_cli.dataset.dataset import read_dataset
+from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.dataset.textures import open_dataset_textures
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import alone_in
@@ -50,6 +52,7 @@ from facerf_cli.synth.bank.transport import (
     add_transport,
 )
 from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
+from facerf_cli.training.config_file import CONFIG, write_config
 from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.joint import JointObjective, JointSettings
@@ -123,6 +126,8 @@ def run_training(options: TrainOptions) -> None:
                 refuse_another_run(options.output)  # before hours of baking
             stage = _TrainedStage(options, trained, networks)
             objective: Objective = getattr(stage, options.stage.replace("-", "_"))()
+        if first and not (options.resume and (options.output / CONFIG).exists()):
+            write_config(options.output, options.typed, training, options.settings.seed)
         progress = TrainProgress(training, options.settings, first)
         with progress.bar:
             checkpoint = train(
@@ -212,22 +217,21 @@ class _TrainedStage:
         options, side = self.options, self._joint_side
         assert options.dataset
         dataset = read_dataset(options.dataset)
-        appearance = self._frozen_appearance(side)
-        if options.preset == "paper" and options.light_features is None:
-            raise UsageError(
-                "--preset paper: its loss needs S_f; give --light-features FILE, a checkpoint of "
-                "`facerf train --stage light-features`, or another preset"
-            )
+        appearance, light, _ = _all_or_none(
+            partial(self._frozen_appearance, side),
+            partial(self._frozen_light_features, side),
+            partial(_require_crops, dataset, side),
+        )
         reflectance, geometry = self._reflectance(side), None  # heads are fitted to landmarks
         model = load_face_model(options.fit_with)  # of the Geometry Network, whatever fitted the dataset
         if options.geometry == "network":
             geometry = self._geometry(mean_translation_m(dataset), model)
-        light, photos = self._frozen_light_features(side), None
+        photos = None
         if options.photos:
             items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
             paths, cache = [item.input_path for item in items], options.output / "photos"
             photos = open_photos(paths, cache, self.networks, side, options.jobs)
-        settings = JointSettings(side, side, seed=options.settings.seed)
+        settings = JointSettings(side, side, weights=options.training.loss, seed=options.settings.seed)
         return JointObjective(dataset, model, reflectance, geometry, appearance, light, photos, settings)
 
     def parsing(self) -> Objective:
@@ -315,13 +319,24 @@ class _TrainedStage:
         options = self.options
         if options.appearance_features:
             return load_features(options.appearance_features, "appearance_features", side)
-        if options.vgg_weights is None and options.preset != "paper":
-            return None
+        if options.vgg_weights is None:
+            if options.preset != "paper":
+                return None
+            raise UsageError(
+                "the paper's loss needs V_f; give --vgg-weights imagenet (553 MB), a file of it, or "
+                "--appearance-features FILE, a checkpoint of `facerf train --stage appearance-features "
+                f"--texture-size {side}`"
+            )
         return load_vgg(options.vgg_weights)
 
     def _frozen_light_features(self, side: int) -> Any:
         """S_f for images of a side; None without one."""
-        path = self.options.light_features
+        path, options = self.options.light_features, self.options
+        if path is None and options.preset == "paper" and options.stage == "joint":
+            raise UsageError(
+                "the paper's loss needs S_f; give --light-features FILE, a checkpoint of `facerf train "
+                f"--stage light-features --texture-size {side}`"
+            )
         return load_features(path, "light_features", side) if path else None
 
     def _network(self, name: str, form: str = "default", **settings: Any) -> Any:
@@ -407,6 +422,30 @@ class _TrainedStage:
             "heads": f"{found} synthetic heads drawn from {drawn.credit}",
             "licence": f"MIT; the heads' shapes: {drawn.licence}",
         }
+
+
+def _require_crops(dataset: Dataset, side: int) -> None:
+    """Raise InputError where all crops are smaller than the networks need."""
+    if dataset.crop_px < side:
+        raise InputError(
+            f"{dataset.folder}: its crops have {dataset.crop_px} px, the networks need {side}; run "
+            f"prepare-dataset with --crop {side}, or train with --texture-size {dataset.crop_px}"
+        )
+
+
+def _all_or_none(*loads: Callable[[], Any]) -> list[Any]:
+    """Load what a stage needs; where some is missing or unfit, one error names all of it."""
+    found, wrong = [], []
+    for load in loads:
+        try:
+            found.append(load())
+        except FacerfError as error:
+            wrong.append(error)
+    if len(wrong) > 1:
+        raise UsageError("; ".join(map(str, wrong)))
+    if wrong:
+        raise wrong[0]
+    return found
 
 
 class TrainProgress:

@@ -1,7 +1,7 @@
 """The options of `facerf train`. Light to import."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -9,6 +9,7 @@ from typing import Any, get_args
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.option import DATA, LENGTH, LOSSES, RUN, SPEED, option
+from facerf_cli.training.config_file import with_tables
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
 from facerf_cli.work.photo_options import Geometry
 
@@ -20,6 +21,11 @@ def _by_preset(value: Callable[[TrainSettings], Any]) -> str:
     """Defaults of an option in all presets, for the help."""
     default, paper, tiny = (value(PRESETS[name]) for name in ("default", "paper", "tiny"))
     return f"{default}; paper {paper}, tiny {tiny}"
+
+
+def _or_none(given: float | None, default: float | None) -> float | None:
+    """The default where none is given; None for 0."""
+    return (default if given is None else given) or None
 
 
 def _seconds(text: str) -> float:
@@ -115,6 +121,7 @@ class TrainOptions:
         None, shown_default="1 on a CPU of more than one core, 4 on a GPU", least=0, panel=SPEED
     )
     training: TrainSettings = field(default_factory=TrainSettings)
+    typed: dict[str, Any] = field(default_factory=dict)  # the options that were given, by name
 
 
 @dataclass(frozen=True)
@@ -127,6 +134,8 @@ class PaceOptions:
         max_time: Stop after a time, such as 90s, 45m or 2h, summed over all resumptions.
         validate_every: Validate on held-out people, and save, every so many steps.
         batch: Use so many samples a step, of all processes together.
+        gradient_clip: Scale a larger norm of the gradient down to this; 0 does not.
+        ema_decay: Validate and save the weights averaged over steps with this decay; 0 does not.
         bf16: Train in mixed precision (bfloat16), where the device has instructions for it.
         accumulate: Take a process's share of a batch in so many parts, one after another, for less memory.
         compile: Compile the networks with torch; the first steps take minutes.
@@ -164,10 +173,20 @@ class PaceOptions:
     )
     accumulate: int = option(1, least=1, panel=SPEED)
     compile: bool = option(False, panel=SPEED)
+    gradient_clip: float | None = option(
+        None, shown_default=_by_preset(lambda settings: settings.gradient_clip or 0), least=0, panel=RUN
+    )
+    ema_decay: float | None = option(
+        None,
+        shown_default=_by_preset(lambda settings: settings.ema_decay or 0),
+        least=0,
+        most=0.99999,
+        panel=RUN,
+    )
 
-    def of_run(self, options: TrainOptions) -> TrainSettings:
-        """The preset's settings with these."""
-        training = preset_of(options.preset, options.stage)
+    def of_run(self, options: TrainOptions, tables: Mapping[str, Any]) -> TrainSettings:
+        """The preset's settings with those of a configuration file's tables, then with these."""
+        training = with_tables(preset_of(options.preset, options.stage), tables)
         optimizer = training.optimizer
         max_seconds = _seconds(_DEFAULT_TIME) if self.max_time is self.steps is None else self.max_time
         return replace(
@@ -180,6 +199,8 @@ class PaceOptions:
             optimizer=replace(optimizer, learning_rate=self.learning_rate or optimizer.learning_rate),
             batch=self.batch or training.batch,
             validate_every=self.validate_every or training.validate_every,
+            gradient_clip=_or_none(self.gradient_clip, training.gradient_clip),
+            ema_decay=_or_none(self.ema_decay, training.ema_decay),
             # the gradients of the form paper overflow
             bf16=training.bf16 and options.form != "paper" if self.bf16 is None else self.bf16,
         )

@@ -189,7 +189,7 @@ def test_a_folder_is_a_person_whose_photos_are_taken_two_by_two(tmp_path: Path) 
         shutil.copy(PHOTO, person / name)
     assert run("transfer", "--photos", person, "-o", tmp_path / "out") == 0
     rows = images(tmp_path / "out")
-    assert [row["case"] for row in rows] == ["a_by_b", "b_by_a"]
+    assert list(dict.fromkeys(row["case"] for row in rows)) == ["a_by_b", "b_by_a"]
     assert {row["person"] for row in rows} == {"ann"}
     shutil.copy(PHOTO, person / "c.jpg")
     assert run("transfer", "--photos", person, "-o", tmp_path / "odd") == 2

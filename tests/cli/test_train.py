@@ -1,3 +1,4 @@
+import csv
 import json
 import shutil
 from collections.abc import Iterator
@@ -14,12 +15,12 @@ from facerf_cli.files.images import read_image
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
-from facerf_cli.network.features import VggFeatures
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import seen_path
+from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
 from facerf_cli.work import train as train_work
 from facerf_cli.work.train_options import TrainOptions
 from tests.dataset.dataset_fixture import write_small_dataset
@@ -171,11 +172,72 @@ def test_the_papers_preset_says_what_it_wants(tmp_path: Path, capsys: pytest.Cap
     dataset = write_small_dataset(tmp_path / "dataset", counts=(1, 1, 0), cameras=1, lights=4, crop_px=32)
     line = ["train", "--preset", "paper", "--dataset", str(dataset.folder), "-o", str(tmp_path / "run")]
     assert main(line) == 2
-    assert "give --vgg-weights imagenet" in capsys.readouterr().err
-    vgg = tmp_path / "vgg.safetensors"
-    save_file(VggFeatures().state_dict(), vgg)
-    assert main([*line, "--vgg-weights", str(vgg)]) == 2
-    assert "give --light-features FILE" in capsys.readouterr().err
+    (said,) = capsys.readouterr().err.strip().splitlines()
+    assert all(part in said for part in ("--vgg-weights imagenet", "--light-features FILE", "--crop 512"))
+    assert not (tmp_path / "run" / "last.safetensors").exists()
+
+
+def test_the_configuration_of_a_run_repeats_it(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its weights to the last digit, from nothing but RUN/config.toml; the command line comes first."""
+    text = (run / "config.toml").read_text()
+    assert "learning_rate = 0.002" in text
+    config = ["--config", str(run / "config.toml")]
+    bank = ["--bank", str(run / "bank")]
+    assert main(["train", *config, "-o", str(tmp_path / "again"), *bank]) == 0
+    first, again = (load_checkpoint(folder / "last.safetensors")[0] for folder in (run, tmp_path / "again"))
+    assert all(torch.equal(again[name], tensor) for name, tensor in first.items())
+    line = ["train", *config, "-o", str(tmp_path / "other"), *bank, "--steps", "1", "--learning-rate", "0.5"]
+    assert main(line) == 0
+    _, metadata = load_checkpoint(tmp_path / "other/last.safetensors")
+    assert metadata["training"][-1]["optimizer"]["learning_rate"] == 0.5
+    capsys.readouterr()
+    assert main(["train", *config]) == 2
+    assert "give --resume" in capsys.readouterr().err
+
+
+def test_curves_are_a_table_of_all_steps(run: Path) -> None:
+    rows = list(csv.DictReader((run / "curves.csv").read_text().splitlines()))
+    assert [int(row["step"]) for row in rows] == [1, 2, 3, 4]
+    assert [bool(row["validation/si_mse"]) for row in rows] == [False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[train.loss]\nphotometric = 9", "[train.loss] does not apply to the stage reflectance"),
+        ("[train]\nstage = 'joint'", "--stage joint: needs a prepared dataset"),
+        ("[train.optimizer]\nname = 'SGD'", "name is 'SGD'; give one of AdamW, Adadelta"),
+        ("[train.optimizer]\nrho = 0.5", "[train.optimizer] rho: no such setting; give one of learning_rate"),
+        ("[train.optimizer]\nname = 'Adadelta'\nrho = 1", "rho is 1; give a number from 0 to below 1"),
+        ("[train.optimizer]\nbetas = [0.9]", "betas is [0.9]; give 2 numbers"),
+        ("[train.schedule]\nwarmup_steps = 1.5", "warmup_steps is 1.5; give a whole number"),
+        ("[train]\nschedule = 3", "[train.schedule] is no table"),
+    ],
+)
+def test_a_wrong_table_of_a_configuration_is_refused(
+    text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.toml").write_text(text)
+    assert main(["train", "-o", str(tmp_path / "run"), "--config", str(tmp_path / "c.toml")]) == 2
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_configuration_changes_losses_and_optimizer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[TrainOptions] = []
+    monkeypatch.setattr(train_work, "run_training", seen.append)
+    (tmp_path / "c.toml").write_text(
+        "[train]\nstage = 'joint'\ndataset = 'd'\nema-decay = 0\n[train.loss]\nfeatures = 0.1\n"
+        "[train.optimizer]\nname = 'Adadelta'\neps = 1e-6\n[train.schedule]\nname = 'Constant'\n"
+    )
+    assert main(["--config", str(tmp_path / "c.toml"), "train", "-o", str(tmp_path / "run")]) == 0
+    training = seen[0].training
+    assert training.loss == PaperWeights(features=0.1) and training.ema_decay is None
+    assert training.optimizer == Adadelta(eps=1e-6) and training.schedule == Constant()
 
 
 TINY = ["--preset", "tiny", "--heads", "7", "--validate-every", "3", "--device", "cpu"]
