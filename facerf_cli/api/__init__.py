@@ -50,17 +50,19 @@ def load_models(
     checkpoint: str | Path | Sequence[str | Path] | None = None,
     face_model: str | Path = "builtin",
     device: str | torch.device = "cpu",
+    form: str | None = None,
 ) -> Models:
     """Load networks (None: the shipped ones) and a face model; `device` is cpu, cuda, cuda:1, mps.
 
     Of several checkpoints, or runs' folders, each serves the networks that its last training trained.
+    `form` is package.module:Class, an installed class of a Reflectance Network of your own.
     """
     try:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError):
         raise UsageError(f"device {device}: torch finds no such device; give cpu, cuda or mps") from None
     given = [checkpoint] if isinstance(checkpoint, (str, Path)) else checkpoint or ()
-    return load([checkpoint_file(Path(path)) for path in given], face_model, torch.device(device))
+    return load([checkpoint_file(Path(path)) for path in given], face_model, torch.device(device), form)
 
 
 def rig(lights: int | Array = 150) -> np.ndarray:

@@ -22,6 +22,7 @@ from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork, VggFeatures
 from facerf_cli.network.files import FORMAT, read_metadata, title_of
 from facerf_cli.network.geometry import GeometryNetwork
+from facerf_cli.network.installed import installed, is_installed_name
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import REFLECTANCE_FORMS
@@ -43,6 +44,22 @@ _CLASSES: dict[tuple[str, str], type[Any]] = {
 }
 
 
+def use_form(form: str | None) -> None:
+    """Let checkpoints hold Reflectance Networks of a form package.module:Class that the user has installed.
+
+    Names of facerf's own forms change nothing. Raises UsageError where there is no such class.
+    """
+    if form and is_installed_name(form):
+        _CLASSES["reflectance", form] = installed(form, "--form")
+
+
+def _described(network: Any) -> dict[str, Any]:
+    """Form and settings of a network; a class that the user has installed does not know its name."""
+    forms = (form for (_, form), known in _CLASSES.items() if known is type(network))
+    own = next(filter(is_installed_name, forms), None)
+    return {**network.as_metadata(), **({"form": own} if own else {})}
+
+
 def new_network(name: str, form: str, settings: Mapping[str, Any]) -> Any:
     """Make an untrained network of a form; settings that are missing have their defaults.
 
@@ -57,7 +74,7 @@ def new_network(name: str, form: str, settings: Mapping[str, Any]) -> Any:
 def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[str, Any]) -> None:
     """Write networks by name, with their form and settings and further metadata."""
     tensors = {f"{name}.{key}": t for name, net in networks.items() for key, t in net.state_dict().items()}
-    described = {name: network.as_metadata() for name, network in networks.items()}  # type: ignore[operator]
+    described = {name: _described(network) for name, network in networks.items()}
     save_checkpoint(path, tensors, {"networks": described, **metadata})
 
 
@@ -66,7 +83,8 @@ def load_networks(
 ) -> tuple[dict[str, nn.Module], dict[str, Any]]:
     """Read the networks of a checkpoint, or those of some names, on the CPU, and its metadata.
 
-    Raises InputError if it is not a checkpoint of this UV layout and of this version's networks.
+    Raises InputError if it is not a checkpoint of this UV layout and of this version's networks, or of one
+    of the user's own that `use_form` does not know. Nothing is imported because a file names it.
     """
     tensors, metadata = load_checkpoint(path)
     if metadata.get("layout_version") != layout_version:
@@ -77,6 +95,8 @@ def load_networks(
             for name, described in metadata["networks"].items()
             if names is None or name in names
         }
+    except UsageError as error:
+        raise InputError(f"{path}: {error}") from None
     except (LookupError, ArithmeticError, TypeError, RuntimeError, ValueError, AttributeError):
         raise InputError(f"{path}: its weights do not fit this version's network; train it again") from None
     return networks, metadata
@@ -107,7 +127,10 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
     """Make the network that metadata describe and load its tensors; raises ValueError if they do not fit."""
-    network_class = _CLASSES[name, described["form"]]
+    form = described["form"]
+    if (name, form) not in _CLASSES and is_installed_name(form):
+        raise UsageError(f"its network is {form}, code of your own; give --form {form}")
+    network_class = _CLASSES[name, form]
     with torch.device("meta"), _Unfilled():  # takes no memory, whatever sizes the file demands
         shapes = network_class.from_metadata(described).state_dict().items()
         expected = {key: tensor.shape for key, tensor in shapes}

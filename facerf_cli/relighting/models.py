@@ -14,7 +14,7 @@ from facerf_cli.face.fit import Geometry
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.network.checkpoint import load_networks
+from facerf_cli.network.checkpoint import load_networks, use_form
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.network.files import SHIPPED, read_metadata, serving_files
@@ -146,11 +146,14 @@ def load_models(
     checkpoints: Sequence[Path] = (),
     face_model: str | Path = BUILTIN,
     device: torch.device = _CPU,
+    form: str | None = None,
 ) -> Models:
     """Load a face model (its name or file); the networks of checkpoints, else the shipped ones, follow.
 
-    A network is loaded when it is first needed. Raises InputError for what is no checkpoint.
+    A network is loaded when it is first needed. Its form may be package.module:Class of code that is
+    installed. Raises InputError for what is no checkpoint.
     """
+    use_form(form)
     files = serving_files(checkpoints, user="facerf")
     path = files["reflectance"]
     metadata = read_metadata(path)

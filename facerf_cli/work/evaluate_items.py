@@ -72,7 +72,7 @@ def methods_of(settings: FaceSettings) -> tuple[Method, ...]:
     estimator = Estimator(solve.non_negative, features)
     alone = settings.network_alone
     others = [
-        (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device))
+        (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device, photo.form))
         for path in options.against
     ]
     return (
@@ -88,7 +88,8 @@ def mean_methods(settings: FaceSettings) -> tuple[Method, ...]:
     for method in methods_of(settings):
         models, checkpoint = method.models, settings.mean_checkpoint
         if checkpoint is not None and method.kind == "field":
-            models = load_models((checkpoint_file(checkpoint),), settings.photo.face_model, models.device)
+            photo, file = settings.photo, checkpoint_file(checkpoint)
+            models = load_models((file,), photo.face_model, models.device, photo.form)
         found.append(replace(method, models=replace(models, face=models.face.pose_only())))
     return tuple(found)
 

@@ -141,7 +141,8 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
 @cache
 def load_models_once(options: PhotoOptions) -> Models:
     """The face model and the networks of the checkpoint, on the device, once a process."""
-    return load_models(options.settings.checkpoints, options.face_model, torch_device(options.settings))
+    settings = options.settings
+    return load_models(settings.checkpoints, options.face_model, torch_device(settings), options.form)
 
 
 @cache

@@ -26,9 +26,10 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import alone_in
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.checkpoint import load_networks, load_vgg, new_network
+from facerf_cli.network.checkpoint import load_networks, load_vgg, new_network, use_form
 from facerf_cli.network.files import serving_files
 from facerf_cli.network.geometry import GeometryNetworkSettings
+from facerf_cli.network.installed import installed
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
@@ -114,6 +115,7 @@ def run_training(options: TrainOptions) -> None:
     """Train in this process or, under torchrun, in several, and print the path of the last checkpoint."""
     with joined_processes(), ExitStack() as stack:
         device, first = _device(options.settings), process_rank() == 0
+        use_form(options.form)
         if first:
             stack.enter_context(alone_in(options.output, ".facerf-lock"))
         workers = options.workers
@@ -179,7 +181,7 @@ class _TrainedStage:
         side = self._texture_side
         light, network = self._frozen_light_features(side), self._reflectance(side)
         settings = TextureObjectiveSettings(held_out_heads=self._sizes.held_out_heads)
-        return TextureObjective(self._samples(), network, light, settings)
+        return self._kind(TextureObjective)(self._samples(), network, light, settings)
 
     def light_features(self) -> Objective:
         """S_f on textures."""
@@ -187,19 +189,19 @@ class _TrainedStage:
         network, options = self._features("light_features", side), self.options
         settings = HeadsSettings(held_out_heads=self._sizes.held_out_heads)
         stacks = open_light_stacks(options.dataset, options.fit_with) if options.dataset else None
-        return LightFeaturesObjective(stacks or self._samples(), network, settings)
+        return self._kind(LightFeaturesObjective)(stacks or self._samples(), network, settings)
 
     def appearance_features(self) -> Objective:
         """V_f on a dataset's crops."""
         assert self.options.dataset
         dataset, side = read_dataset(self.options.dataset), self._joint_side
         network = self._features("appearance_features", side, people=len(dataset.subjects))
-        return AppearanceObjective(dataset, load_face_model(dataset.face_model), network)
+        return self._kind(AppearanceObjective)(dataset, load_face_model(dataset.face_model), network)
 
     def diffuse_sh(self) -> Objective:
         """The network of the baseline diffuse-sh, on textures."""
         settings = SumSettings(held_out_heads=self._sizes.held_out_heads)
-        return DiffuseObjective(self._samples(), self._network("diffuse_sh"), settings)
+        return self._kind(DiffuseObjective)(self._samples(), self._network("diffuse_sh"), settings)
 
     def geometry(self) -> Objective:
         """The Geometry Network on rendered heads."""
@@ -210,7 +212,7 @@ class _TrainedStage:
         faces = RenderedFaces(images, provenance)
         network = self._geometry(faces.mean_translation_m(), load_face_model())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
-        return GeometryObjective(faces, network, settings)
+        return self._kind(GeometryObjective)(faces, network, settings)
 
     def joint(self) -> Objective:
         """Both networks through the rasterizer."""
@@ -232,7 +234,8 @@ class _TrainedStage:
             paths, cache = [item.input_path for item in items], options.output / "photos"
             photos = open_photos(paths, cache, self.networks, side, options.jobs)
         settings = JointSettings(side, side, weights=options.training.loss, seed=options.settings.seed)
-        return JointObjective(dataset, model, reflectance, geometry, appearance, light, photos, settings)
+        kind = self._kind(JointObjective)
+        return kind(dataset, model, reflectance, geometry, appearance, light, photos, settings)
 
     def parsing(self) -> Objective:
         """The Parsing Network on photos of synthetic people, which are taken first where they are missing."""
@@ -242,7 +245,7 @@ class _TrainedStage:
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
         objective = ParsingObjectiveSettings(held_out_people=self._sizes.held_out_heads)
-        return ParsingObjective(stored, self._network("parsing"), objective)
+        return self._kind(ParsingObjective)(stored, self._network("parsing"), objective)
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""
@@ -255,7 +258,7 @@ class _TrainedStage:
         else:
             source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
         settings = PortraitObjectiveSettings(held_out_people=self._sizes.held_out_heads, targets=targets)
-        return PortraitObjective(source, network, settings)
+        return self._kind(PortraitObjective)(source, network, settings)
 
     def _stored_transport(self) -> StoredTransport:
         """Synthetic people; those that are missing in the bank are baked and looked at first."""
@@ -313,6 +316,17 @@ class _TrainedStage:
         if self.options.preset == "tiny":
             return HeadBakeSettings(32, _TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
         return HeadBakeSettings()
+
+    def _kind(self, objective: type[Objective]) -> Any:
+        """The class of the stage's objective, or the subclass of --objective."""
+        name = self.options.objective
+        if name is None:
+            return objective
+        kind = installed(name, "--objective")
+        if not issubclass(kind, objective):
+            needed = f"{objective.__module__}:{objective.__name__}"
+            raise UsageError(f"--objective {name}: is no subclass of {needed}, the stage's own")
+        return kind
 
     def _frozen_appearance(self, side: int) -> Any:
         """V_f; None without one."""

@@ -43,8 +43,9 @@ class TrainOptions:
         output: Write the run to this folder.
         preset: Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or
             small ones for trials (tiny).
-        form: Train this form of the Reflectance Network: default, paper, or a form of your own
-            (docs/design.md).
+        form: Train this form of the Reflectance Network: default, paper, or package.module:Class, a class
+            of your own that is installed (docs/training.md).
+        objective: Train by package.module:Class, an installed subclass of the stage's own objective.
         resume: Continue the run in DIR from its last save; give the same options.
         start_from: Start from a checkpoint; networks that the stage does not train are copied.
         dataset: Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.
@@ -78,6 +79,9 @@ class TrainOptions:
         shown_default="paper with --preset paper, else default",
         typed=str | None,
         panel=RUN,
+    )
+    objective: str | None = option(
+        None, metavar="PACKAGE.MODULE:CLASS", shown_default="the stage's", panel=LOSSES
     )
     stage: Stage = option(
         "reflectance",

@@ -14,6 +14,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.images import read_image
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
+from facerf_cli.network import checkpoint
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_checkpoint
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
@@ -24,6 +25,7 @@ from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
 from facerf_cli.work import train as train_work
 from facerf_cli.work.train_options import TrainOptions
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.network.test_own_forms import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -295,6 +297,33 @@ def test_a_stage_carries_over_the_networks_of_others(run: Path, tmp_path: Path, 
     after, _ = load_checkpoint(tmp_path / "run" / "last.safetensors")
     same = all(torch.equal(after[name], tensor) for name, tensor in before.items())
     assert same != (stage == "reflectance")
+
+
+def test_own_networks_and_losses_of_an_installed_package(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They train, are saved, and are refused where --form does not name them."""
+    write_own_package(tmp_path / "site", monkeypatch)
+    line = ["train", *TINY, "--bank", str(run / "bank"), "--steps", "1"]
+    own = ["--form", "my_lab.networks:Darker"]
+    assert main([*line, "-o", str(tmp_path / "plain")]) == 0
+    assert main([*line, "-o", str(tmp_path / "run"), *own, "--objective", "my_lab.networks:Doubled"]) == 0
+    first = [
+        json.loads((tmp_path / name / "log.jsonl").read_text().splitlines()[0]) for name in ("plain", "run")
+    ]
+    assert first[1]["loss"] > 1.2 * first[0]["loss"]  # of other first weights, twice
+    networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
+    assert type(networks["reflectance"]).__name__ == "Darker"
+    assert metadata["training"][-1]["objective"] == "Doubled"
+    monkeypatch.setattr(checkpoint, "_CLASSES", FORMS)
+    relight = ["relight", str(PHOTO), "--light", "40,20", "-o", str(tmp_path / "out")]
+    relight += ["--checkpoint", str(tmp_path / "run/last.safetensors"), "--reflectance", "field"]
+    capsys.readouterr()
+    assert main(relight) == 1
+    assert "its network is my_lab.networks:Darker, code of your own; give --form" in capsys.readouterr().err
+    assert main([*relight, *own]) == 0
+    assert main([*line, "-o", str(tmp_path / "other"), "--objective", "my_lab.networks:Darker"]) == 2
+    assert "is no subclass of facerf_cli.training.texture:TextureObjective" in capsys.readouterr().err
 
 
 def test_the_mean_faces_fits_are_poses_and_its_runs_have_no_normals(run: Path, tmp_path: Path) -> None:

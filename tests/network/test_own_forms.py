@@ -1,0 +1,94 @@
+"""Networks and objectives of code that the user has installed."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.network import checkpoint
+from facerf_cli.network.checkpoint import load_networks, new_network, save_networks, use_form
+from facerf_cli.network.installed import installed
+
+OWN = """
+from dataclasses import dataclass
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from facerf_cli.training.texture import TextureObjective
+
+@dataclass(frozen=True)
+class Small(DefaultReflectanceSettings):
+    side: int = 32
+    encoder_widths: tuple[int, ...] = (8, 12, 16)
+    decoder_widths: tuple[int, ...] = (8, 12, 16)
+    template_channels: int = 2
+    rig_lights: int = 20
+
+class Darker(DefaultReflectanceNetwork):
+    kind_of_settings = Small
+
+    def decode_root(self, *given):
+        return 0.5 * super().decode_root(*given)
+
+class Doubled(TextureObjective):
+    def forward(self, batch):
+        return {name: 2 * term for name, term in super().forward(batch).items()}
+
+number = 3
+"""
+NAME = "my_lab.networks:Darker"
+FORMS = dict(checkpoint._CLASSES)
+
+
+def write_own_package(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Install a package in a folder, and forget its forms afterwards."""
+    (site / "my_lab").mkdir(parents=True)
+    (site / "my_lab/__init__.py").touch()
+    (site / "my_lab/networks.py").write_text(OWN)
+    monkeypatch.syspath_prepend(site)
+    monkeypatch.setattr(checkpoint, "_CLASSES", dict(FORMS))
+    for name in ("my_lab", "my_lab.networks"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with an installed package."""
+    write_own_package(tmp_path / "site", monkeypatch)
+    return tmp_path / "site"
+
+
+def test_an_own_network_is_saved_and_needs_its_name(package: Path, tmp_path: Path) -> None:
+    use_form(NAME)
+    network = new_network("reflectance", NAME, {})
+    path = tmp_path / "own.safetensors"
+    save_networks(path, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
+    loaded = load_networks(path, LAYOUT_VERSION)[0]["reflectance"]
+    assert type(loaded) is type(network) and type(loaded).__name__ == "Darker"
+    del checkpoint._CLASSES["reflectance", NAME]
+    with pytest.raises(
+        InputError, match=f"own.safetensors: its network is {NAME}, code of your own; give --form"
+    ):
+        load_networks(path, LAYOUT_VERSION)
+
+
+def test_nothing_comes_from_the_working_directory(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(package)
+    with pytest.raises(UsageError, match="install the package that has it"):
+        installed("my_lab.networks:Darker", "--form")
+
+
+@pytest.mark.parametrize(
+    "name", ["my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"]
+)
+def test_what_is_not_there_is_one_line(package: Path, name: str) -> None:
+    with pytest.raises(UsageError, match=f"--objective {name}: "):
+        installed(name, "--objective")
+
+
+def test_facerfs_own_forms_import_nothing() -> None:
+    use_form("paper")
+    use_form(None)
+    assert checkpoint._CLASSES == FORMS
+    with pytest.raises(UsageError, match="no such Reflectance Network"):
+        new_network("reflectance", "os:system", {})
