@@ -63,7 +63,7 @@ class PhotoOptions:
             pattern (points/{stem}.pts).
         geometry: Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.
         texture_side: Side of the UV texture; a multiple of 256.
-        form: Take a Reflectance Network of --checkpoint that is code of your own, an installed class.
+        form: Class of a Reflectance Network of your own.
         landmarks_from: Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence
             excludes commercial use).
         person: Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies
@@ -88,9 +88,7 @@ class PhotoOptions:
         shown_default="the checkpoint's; 256 for the shipped one",
         panel=METHOD,
     )
-    form: str | None = option(
-        None, metavar="PACKAGE.MODULE:CLASS", shown_default="facerf's own forms", panel=METHOD
-    )
+    form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
     landmarks_from: LandmarksFrom = option("facerf", panel=FACE)
     person: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default=False, panel=FACE)
     matte_from: MatteModel | None = option(

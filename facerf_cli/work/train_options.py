@@ -43,9 +43,8 @@ class TrainOptions:
         output: Write the run to this folder.
         preset: Use networks, losses and optimizer of the shipped checkpoint (default), of the paper, or
             small ones for trials (tiny).
-        form: Train this form of the Reflectance Network: default, paper, or package.module:Class, a class
-            of your own that is installed (docs/training.md).
-        objective: Train by package.module:Class, an installed subclass of the stage's own objective.
+        form: Train this form of the Reflectance Network: default, paper, or a class that you have installed.
+        objective: Train by an installed subclass of the stage's objective (docs/training.md).
         resume: Continue the run in DIR from its last save; give the same options.
         start_from: Start from a checkpoint; networks that the stage does not train are copied.
         dataset: Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.
@@ -75,14 +74,12 @@ class TrainOptions:
     preset: Preset = option("default", panel=RUN)
     form: str = option(
         "default",
-        metavar="NAME",
+        metavar="NAME|MODULE:CLASS",
         shown_default="paper with --preset paper, else default",
         typed=str | None,
         panel=RUN,
     )
-    objective: str | None = option(
-        None, metavar="PACKAGE.MODULE:CLASS", shown_default="the stage's", panel=LOSSES
-    )
+    objective: str | None = option(None, metavar="MODULE:CLASS", shown_default="the stage's", panel=LOSSES)
     stage: Stage = option(
         "reflectance",
         f"Train the networks of a stage: {', '.join(get_args(Stage))}.",
