@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from facerf_cli.capture.distortion import Coefficients, undistorted
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import is_name
@@ -75,6 +76,9 @@ class Capture:
     subtract_ambient: bool = False
     # By subject, the ids of the lights whose frames the capture itself declares damaged.
     marked: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    distortion: Mapping[str, Coefficients] = field(
+        default_factory=dict
+    )  # of the cameras whose lenses distort
     align: bool = False  # whether to undo head motion: `shifts` are then found for each subject
     charts: tuple[ChartCorrection, ...] = ()  # corrections of the cameras by photographed colour charts
     # Pixels down and right that undo the head motion of a frame, by subject, camera and light.
@@ -87,10 +91,10 @@ class Capture:
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
         """Read a frame [H, W, 3] as under a light of rgb 1, linear Rec.709, float32.
 
-        The colour chart's correction and the shift of the frame are applied. NaN and infinite values become
-        0, with a warning. Values below the black level, from noise or a wide gamut, stay negative here so
-        that sums have no bias. InputError for a file that cannot be read, FrameSizeError for one that has not
-        the camera's size.
+        The colour chart's correction is applied, the lens's distortion undone, and the frame shifted. NaN and
+        infinite values become 0, with a warning. Values below the black level, from noise or a wide gamut,
+        stay negative here so that sums have no bias. InputError for a file that cannot be read,
+        FrameSizeError for one that has not the camera's size.
         """
         path = self.frame_path(subject, camera, self.light_ids[light])
         pixels = read_frame(path, self.colour_space)
@@ -104,7 +108,10 @@ class Capture:
         dark = np.float32(self.black_level) if ambient is None else ambient
         shift_px = self.shifts.get((subject, camera, self.light_ids[light]), (0.0, 0.0))
         lit = (pixels - dark) / self.intensities[light].astype(np.float32)
-        return shift_image(correct_colours(self.charts, camera, lit), *shift_px)
+        lit = correct_colours(self.charts, camera, lit)
+        if camera in self.distortion:
+            lit = undistorted(lit, posed, self.distortion[camera])
+        return shift_image(lit, *shift_px)
 
     def ambient(self, subject: str, camera: str) -> np.ndarray | None:
         """Read a subject's image without any light [H, W, 3], black level included.

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
-from facerf_cli.capture.stage_json import STAGE_FORMAT
+from facerf_cli.capture.stage_json import FACING, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
@@ -35,8 +35,6 @@ _LEAST_LIGHTS = 3  # fewer determine no normals
 _HEADERS = 12  # read per camera, spread over the capture
 _FOCAL = 4  # times the longer side: the crop camera's focal length, and about what stages use
 _DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # with 8 bits a value, sRGB unless a profile says else
-# A world that equals the camera's space (y up, z toward the camera), in OpenCV's axes (y down, z forward).
-_FACING = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _LISTED = 3  # names of a note
 _WANTED = {
     "direction": "a unit vector in world space, toward the light",
@@ -48,6 +46,7 @@ _WANTED = {
 # Files.
 _EXAMPLE = "{subject}/{camera}/{light}.exr"
 _LAYOUTS = ("{light}", "{subject}/{light}", "{subject}/{camera}/{light}")  # by the number of folders
+_CAMERA_IN_NAME = re.compile(r"((?:c|cam|camera|view)[-_ ]?\d+)([-_ ])(.+)", re.IGNORECASE)
 _DEEPEST = 8  # folders below the capture that are searched
 _LEAST_SHARE = 0.5  # of the expected frames: with fewer, the layout is another one
 # Lists of lights.
@@ -207,7 +206,7 @@ def _camera(name: str, sizes: list[tuple[int, int]], alone: bool) -> dict[str, o
         focal = float(_FOCAL * max(width, height))
         k = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
         entry |= {"width": width, "height": height, "K": k}
-    return entry | {"world_to_camera": _FACING if alone else None}
+    return entry | {"world_to_camera": FACING if alone else None}
 
 
 def _summary(pattern: str, frames: Frames) -> str:
@@ -324,12 +323,23 @@ def frames_by_depth(images: Sequence[str]) -> tuple[Frames, str]:
     elif len(suffixes) > 1:
         reason = f"images end in {' and '.join(suffixes)}"
     else:
-        pattern = _LAYOUTS[depths[0]] + suffixes[0]
+        pattern = _with_cameras_of_names(images, _LAYOUTS[depths[0]]) + suffixes[0]
         frames = sort_frames(images, pattern)
         if len(frames.paths) >= max(_LEAST_SHARE * frames.expected, 1):
             return frames, pattern
         reason = f"by {pattern}, {len(frames.paths)} of {frames.expected} frames exist"
     raise UsageError(f"the layout of the images is unknown ({reason}); give --pattern, such as '{_EXAMPLE}'")
+
+
+def _with_cameras_of_names(images: Sequence[str], layout: str) -> str:
+    """The layout with {camera} in front of {light}, if all names begin with a camera's, as in cam2_L017."""
+    named = [_CAMERA_IN_NAME.fullmatch(PurePosixPath(path).stem) for path in images]
+    if "{camera}" in layout or not all(named):
+        return layout
+    by_name = layout.replace("{light}", f"{{camera}}{named[0][2] if named[0] else ''}{{light}}")
+    frames = sort_frames(images, by_name + PurePosixPath(images[0]).suffix)
+    cameras = {match[1] for match in named if match}
+    return by_name if len(cameras) > 1 and set(frames.ids("camera")) == cameras else layout
 
 
 def read_light_list(path: Path) -> list[ListedLight]:

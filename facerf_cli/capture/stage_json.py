@@ -13,6 +13,9 @@ world_to_camera has OpenCV's axes (y down, z forward); only this file converts i
 (y up, z toward the camera). Intensities are linear Rec.709: a light of rgb 1 gives a white surface that faces
 it radiance 1. The black level is linear too.
 
+A camera may have "distortion": OpenCV's k1, k2, p1, p2 and k3, which is undone in every frame. A single
+camera without a pose is the world: x right, y up, z toward the camera.
+
 Without `subjects`, every name that the pattern finds on disk is a subject. "ambient", for example
 "{subject}/{camera}/ambient.exr", is optional: images without any light, which --subtract-ambient subtracts in
 place of the black level. A pattern may lack {camera} if there is one camera, and {subject} if `subjects`
@@ -29,6 +32,7 @@ import torch
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
 from facerf_cli.capture.capture import FIELDS, Capture, find_subjects, require_pattern
+from facerf_cli.capture.distortion import Coefficients, folds
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.yale_b import read_yale_capture
 from facerf_cli.errors import InputError, UsageError
@@ -44,6 +48,8 @@ _LONGEST_SIDE_PX = 65_536
 _ORTHONORMAL_OFF = 1e-3  # of a singular value from 1, in rotations written with few digits
 _LEAST_INTENSITY = 1e-12  # frames are divided by it, in float32
 _ASPECT_OFF = 0.01  # of fx / fy from 1: a face crop has square pixels
+# A world that equals the camera's space (y up, z toward the camera), in OpenCV's axes (y down, z forward).
+FACING = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 _OPENCV_TO_OURS = np.diag([1.0, -1.0, -1.0])
 
 
@@ -86,6 +92,16 @@ def _pose(value: Any) -> tuple[np.ndarray, np.ndarray]:
     return u @ vh, matrix[:3, 3]
 
 
+def _coefficients(value: Any) -> Coefficients:
+    try:
+        numbers = tuple(float(number) for number in value)
+    except (ValueError, TypeError):
+        numbers = ()
+    if len(numbers) not in (4, 5) or not np.isfinite(numbers).all():
+        raise ValueError("k1, k2, p1, p2, k3 of OpenCV are needed; undistort images of other lenses first")
+    return numbers
+
+
 Side = Annotated[int, Field(ge=1, le=_LONGEST_SIDE_PX)]
 
 
@@ -104,7 +120,14 @@ class CameraEntry(Document):
     width: Side
     height: Side
     K: Annotated[Matrix3, AfterValidator(_intrinsics)]
-    world_to_camera: Annotated[tuple[np.ndarray, np.ndarray], PlainValidator(_pose)]
+    world_to_camera: Annotated[tuple[np.ndarray, np.ndarray], PlainValidator(_pose)] = _pose(FACING)
+    distortion: Annotated[Coefficients, PlainValidator(_coefficients)] = ()
+
+    @model_validator(mode="after")
+    def _can_be_undistorted(self) -> "CameraEntry":
+        if self.distortion and folds(self.posed(), self.distortion):
+            raise ValueError("distortion folds the image within the frame; check its order k1 k2 p1 p2 k3")
+        return self
 
     def posed(self) -> PosedCamera:
         """The camera with the axes of the package."""
@@ -138,6 +161,9 @@ class StageDocument(Document):
     def _has_distinct_ids(self) -> "StageDocument":
         distinct([light.id for light in self.lights], "the light")
         distinct([camera.id for camera in self.cameras], "the camera")
+        posed = [camera.id for camera in self.cameras if "world_to_camera" in camera.model_fields_set]
+        if len(self.cameras) > 1 and (without := sorted({one.id for one in self.cameras} - set(posed))):
+            raise ValueError(f"camera {without[0]} has no 'world_to_camera'; only a single camera needs none")
         return self
 
     def needed_fields(self) -> set[str]:
@@ -162,6 +188,7 @@ def read_stage(folder: Path) -> Capture:
         directions_world=np.stack([light.direction for light in stage.lights]),
         intensities=np.stack([light.intensity for light in stage.lights]),
         cameras={camera.id: camera.posed() for camera in stage.cameras},
+        distortion={camera.id: camera.distortion for camera in stage.cameras if any(camera.distortion)},
         subjects=(
             {name: {} for name in find_subjects(folder, pattern, camera_ids, light_ids)}
             if stage.subjects is None

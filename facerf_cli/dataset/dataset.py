@@ -327,6 +327,7 @@ def _calibration(capture: Capture) -> dict[str, Any]:
                 "focal_px": posed.focal_px,
                 "centre_px": posed.centre_px,
                 "world_to_camera": torch.cat([posed.rotation, posed.translation_m[:, None]], 1).tolist(),
+                **({"undistorted": capture.distortion[name]} if name in capture.distortion else {}),
             }
             for name, posed in capture.cameras.items()
         ],

@@ -12,7 +12,7 @@ import numpy as np
 from rich.progress import track
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.made_from import Recipe, require_same
+from facerf_cli.batch.made_from import Recipe, json_rows, require_same
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture
@@ -41,6 +41,8 @@ from facerf_cli.dataset.dataset import (
     read_dataset,
 )
 from facerf_cli.dataset.pairs import (
+    PAIRS_NAME,
+    RELIT,
     draw_pairs,
     image_path,
     load_pairs,
@@ -92,9 +94,9 @@ def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: b
     UsageError where the file exists. A dry run prints the notes only.
     """
     path = folder / STAGE_FILE if output is None else output
-    if path.is_dir():
+    if path.is_dir() and not dry_run:
         raise UsageError(f"-o {path}: is a folder; give the draft's name, such as {path / STAGE_FILE}")
-    if path.exists() or path.is_symlink():
+    if not dry_run and (path.exists() or path.is_symlink()):
         raise UsageError(
             f"{path}: is there already, and a draft replaces nothing; move it, or give -o another name"
         )
@@ -306,6 +308,15 @@ def _write_dataset(
         temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
     write_document(folder / DATASET_FILE, dataset)
     print(folder / DATASET_FILE)
+    split_of = {subject: name for name, members in dataset["splits"].items() for subject in members}
+    pairs = json_rows(folder / RELIT / PAIRS_NAME)
+    if moved := {row.get("subject") for row in pairs if split_of.get(row.get("subject")) != row.get("split")}:
+        log.warning(
+            "%s: the pairs of %d subjects are of another split; draw and relight all again by "
+            "relight-dataset --overwrite always, or give the --split and --seed of before",
+            folder / RELIT,
+            len(moved),
+        )
 
 
 def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, settings: Settings) -> int:

@@ -48,6 +48,21 @@ def noted(stage: dict[str, object], words: str) -> bool:
     return any(words in note for note in notes)
 
 
+@pytest.mark.parametrize(
+    ("form", "pattern"),
+    [
+        ("s{}/cam{}_L{}.exr", "{subject}/{camera}_{light}.exr"),
+        ("s{}/C{}-{}.exr", "{subject}/{camera}-{light}.exr"),
+        ("s{}/az{}_el{}.exr", "{subject}/{light}.exr"),  # a grid of lights
+    ],
+)
+def test_cameras_are_seen_in_the_prefixes_of_names(tmp_path: Path, form: str, pattern: str) -> None:
+    stage = draft_stage(stage_at(tmp_path, form=form), SUFFIXES)
+    assert stage["pattern"] == pattern
+    assert len(stage["cameras"]) == (2 if "{camera}" in pattern else 1)
+    assert len(stage["lights"]) == (4 if "{camera}" in pattern else 8)
+
+
 def test_the_draft_has_what_files_say_and_null_for_the_rest(tmp_path: Path) -> None:
     stage = draft_stage(stage_at(tmp_path), SUFFIXES)
     assert [light["id"] for light in stage["lights"]] == ["L1", "L2", "L3", "L10"]

@@ -319,6 +319,20 @@ def changed(given: Given, capture: Path, **changes: object) -> Path:
     return capture
 
 
+def test_a_new_split_says_that_old_pairs_are_of_another(
+    given: Given, prepared: Dataset, tmp_path: Path, capsys: Said
+) -> None:
+    """And a dataset of old stages is not prepared again: only its description is written."""
+    out = Path(shutil.copytree(prepared.folder, tmp_path / "out"))
+    assert (
+        main(["relight-dataset", str(out), "--envmaps", "procedural:2", "--per-subject", "1", "--lazy"]) == 0
+    )
+    assert prepare(given.folder, out) == 0
+    assert "another split" not in capsys.readouterr().err
+    assert prepare(given.folder, out, "--split", "0/1/1") == 0
+    assert "pairs of 1 subjects are of another split" in capsys.readouterr().err
+
+
 def test_a_camera_behind_the_head_is_left_out(given: Given, tmp_path: Path, capsys: Said) -> None:
     cameras = json.loads((given[0] / "stage.json").read_text())["cameras"]
     pose, head = np.array(cameras[1]["world_to_camera"]), np.array([0.01, 1.3, 0.02])

@@ -75,10 +75,13 @@ def test_nothing_is_overwritten(bare: Path, capsys: Said) -> None:
 
 
 def test_a_dry_run_writes_nothing(bare: Path, capsys: Said) -> None:
-    assert main(["prepare-dataset", str(bare), "--describe", "--dry-run"]) == 0
-    said = capsys.readouterr()
-    assert said.out == f"{bare} -> {bare / 'stage.json'}\n" and "fill in: direction" in said.err
-    assert not (bare / "stage.json").exists()
+    for there in (False, True):  # it refuses nothing, either
+        assert main(["prepare-dataset", str(bare), "--describe", "--dry-run"]) == 0
+        said = capsys.readouterr()
+        assert said.out == f"{bare} -> {bare / 'stage.json'}\n" and "fill in: direction" in said.err
+        assert (bare / "stage.json").exists() == there
+        (bare / "stage.json").write_text("mine")
+    assert (bare / "stage.json").read_text() == "mine"
 
 
 @pytest.mark.parametrize(
