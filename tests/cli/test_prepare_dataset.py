@@ -327,10 +327,10 @@ def test_a_new_split_says_that_old_pairs_are_of_another(
     assert (
         main(["relight-dataset", str(out), "--envmaps", "procedural:2", "--per-subject", "1", "--lazy"]) == 0
     )
-    assert prepare(given.folder, out) == 0
+    assert prepare(given[0], out) == 0
     assert "another split" not in capsys.readouterr().err
-    assert prepare(given.folder, out, "--split", "0/1/1") == 0
-    assert "pairs of 1 subjects are of another split" in capsys.readouterr().err
+    assert prepare(given[0], out, "--split", "0/0/2") == 0
+    assert "pairs of 2 subjects are of another split" in capsys.readouterr().err
 
 
 def test_a_camera_behind_the_head_is_left_out(given: Given, tmp_path: Path, capsys: Said) -> None:
