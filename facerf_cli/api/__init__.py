@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli import pipeline
-from facerf_cli.api.light import Array, Light, linear_pixels
-from facerf_cli.api.light import rig as rig_of
+from facerf_cli.api.light import Array, Light, linear_pixels, rig
 from facerf_cli.api.person import Person, PhotoCamera, one_of, read_person
 from facerf_cli.baselines import RelightKind
 from facerf_cli.errors import UsageError
@@ -65,11 +64,6 @@ def load_models(
     return load([checkpoint_file(Path(path)) for path in given], face_model, torch.device(device), form)
 
 
-def rig(lights: int | Array = 150) -> np.ndarray:
-    """Unit directions [L, 3] of a uniform rig of so many lights, camera space."""
-    return rig_of(lights).numpy()
-
-
 @overload
 def fit(models: Models, photo: Array, *choices: Any, **more: Any) -> Person: ...
 @overload
@@ -110,32 +104,21 @@ def fit(
         raise UsageError("geometry: 'network' uses no landmarks; leave one out")
 
     def fitted(name: str, photo: Array, landmarks_px: Any, matte: Any) -> Person:
-        pixels = linear_pixels(name, photo).detach().numpy()
-        people, mask = models.networks.people, _matte(matte, pixels)
+        pixels = linear_pixels(name, photo).detach().clone().numpy()
         if landmarks_px is None:
-            face: FaceBox = pipeline.find_for(people, geometry or models.default_geometry, pixels, name)[0]
+            chosen = geometry or models.default_geometry
+            face: FaceBox = pipeline.find_for(models.networks.people, chosen, pixels, name)[0]
         else:
             face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
         head = pipeline.head_of(models, pixels, face, models.sides(texture_side))
-        if mask is not None:
-            head = head.without(models.face, uncovered_by(mask, head.fit.crop))
-        return read_person(models, pixels, head, reflectance, network_alone, mask, isinstance(photo, Tensor))
+        if matte is not None:
+            matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
+            if matte.shape != pixels.shape[:2]:
+                raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
+            head = head.without(models.face, uncovered_by(matte, head.fit.crop))
+        return read_person(models, pixels, head, reflectance, network_alone, matte, isinstance(photo, Tensor))
 
     if not isinstance(photo, Sequence):
         return fitted("photo", photo, landmarks_px, matte)
-    each = zip(
-        photo,
-        *([None] * len(photo) if given is None else given for given in (landmarks_px, matte)),
-        strict=True,
-    )
-    return [fitted(f"photo {number}", *one) for number, one in enumerate(each)]
-
-
-def _matte(matte: Any, photo: np.ndarray) -> np.ndarray | None:
-    """A matte [H, W] in 0..1 of a photo's size."""
-    if matte is None:
-        return None
-    found: np.ndarray = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
-    if found.shape != photo.shape[:2] or not found.any():
-        raise ValueError(f"matte has shape {list(found.shape)}, or is black; give one of the photo's size")
-    return found
+    more = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte))
+    return [fitted(f"photo {number}", *one) for number, one in enumerate(zip(photo, *more, strict=True))]

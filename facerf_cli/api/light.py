@@ -57,7 +57,7 @@ class Light:
         linear, directions = linear_pixels("map", envmap), rig_directions(lights)
         check_envmap(linear)
         weights = envmap_weights(linear, directions, rotate_deg)
-        return Light(directions.numpy(), like(envmap, weights))
+        return Light(directions.numpy(), weights if isinstance(envmap, Tensor) else weights.numpy())
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
         """A lat-long map [height, 2 height, 3] with these lights."""
@@ -66,26 +66,19 @@ class Light:
     def __add__(self, other: "Light") -> "Light":
         if not isinstance(other, Light):
             return NotImplemented
-        return Light(
-            _joined(self.directions, other.directions),
-            _joined(self.weights, other.weights),
-        )
+        directions = _joined(self.directions, other.directions)
+        return Light(directions, _joined(self.weights, other.weights))
 
     def __radd__(self, other: int) -> "Light":
         return self if other == 0 else NotImplemented  # where `sum` begins
 
     def __mul__(self, factor: float | Rgb | Array) -> "Light":
-        """The same lights, so many times as bright: a number, or one for each of red, green and blue."""
+        """The same lights, so many times as bright: by a number, or by one for each colour."""
         return Light(
             self.directions, self.weights * (np.array(factor) if isinstance(factor, tuple) else factor)
         )
 
     __rmul__ = __mul__
-
-    @property
-    def tensors(self) -> bool:
-        """True if it holds tensors; then what it lights is tensors, too."""
-        return isinstance(self.directions, Tensor) or isinstance(self.weights, Tensor)
 
     def on_cpu(self) -> RigLight:
         """The lights as float32 tensors on the CPU; raises ValueError for what is no light."""
@@ -125,8 +118,13 @@ def sums_of(lights: Sequence[Light]) -> Lights:
     return Lights(directions, torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each]))
 
 
-def rig(lights: int | Array) -> Tensor:
-    """Unit directions [L, 3]: given ones, or those of a uniform rig of so many lights."""
+def rig(lights: int = 150) -> np.ndarray:
+    """Unit directions [L, 3] of a uniform rig of so many lights, camera space."""
+    return rig_directions(lights).numpy()
+
+
+def directions_of(lights: int | Array) -> Tensor:
+    """Unit directions [L, 3] that are given, or of a rig of so many lights."""
     return rig_directions(int(lights)) if np.ndim(lights) == 0 else unit_directions(lights)
 
 
@@ -163,14 +161,8 @@ def as_tensor(values: Any) -> Tensor:
     )
 
 
-def like(given: Any, values: Tensor) -> Array:
-    """Values as what was given: a tensor on its device, or an array."""
-    return values.to(given.device) if isinstance(given, Tensor) else values.numpy()
-
-
 def _joined(one: Array, two: Array) -> Array:
-    """Arrays or tensors one after the other; a tensor where either is."""
-    if isinstance(one, Tensor) or isinstance(two, Tensor):
-        device = one.device if isinstance(one, Tensor) else two.device
-        return torch.cat([torch.as_tensor(x).to(device) for x in (one, two)])
-    return np.concatenate([one, two])
+    """Arrays one after the other; tensors where either is one."""
+    if isinstance(one, np.ndarray) and isinstance(two, np.ndarray):
+        return np.concatenate([one, two])
+    return torch.cat([as_tensor(one), as_tensor(two)])

@@ -14,22 +14,22 @@ from torch import Tensor
 from trimesh.visual import TextureVisuals
 
 from facerf_cli import pipeline
-from facerf_cli.api.light import Array, Light, as_light, as_tensor, linear_pixels, rig, sums_of
+from facerf_cli.api.light import Array, Light, as_light, as_tensor, directions_of, linear_pixels, sums_of
 from facerf_cli.baselines import RelightKind
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import fit_from_arrays, fit_to_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.landmarks import to_display
-from facerf_cli.face.morphable import read_npz
+from facerf_cli.face.morphable import floats, read_npz
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.image.strips import Band, covering, filled, whole
+from facerf_cli.image.strips import covering, filled, whole
 from facerf_cli.light.envmap import backdrop, check_envmap
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.raster.camera import pose_to_rotation, rays_of_rows
+from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
 from facerf_cli.relighting.composition import FACE_LAYERS, PERSON_LAYERS, Composition, Relit, Target
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
@@ -39,7 +39,6 @@ from facerf_cli.work.plan import batches
 Pose = tuple[float, float, float] | Tensor  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"] | Array | tuple[float, float, float]
 _LIGHTS_AT_ONCE = 8
-_FILE = "not a person that facerf wrote"
 
 
 class PhotoCamera(NamedTuple):
@@ -88,43 +87,39 @@ class Person(pipeline.FittedPerson):
         A light or pose of tensors gives tensors, through which gradients flow (docs/gradients.md).
         """
         lights = [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
-        tensors = self.tensors or isinstance(pose, Tensor) or any(one.tensors for one in lights)
-        with torch.set_grad_enabled(tensors and torch.is_grad_enabled()):
+        given = [pose, *(array for one in lights for array in (one.directions, one.weights))]
+        with self._gradients(*given):
             if alone or pose is not None:
                 shown = self._faces(lights, pose, layers)
             else:
                 shown = self._photos(lights, background, layers)
-            images = [self._given(image, tensors, bool(layers)) for image in shown]
-        return images if isinstance(light, Sequence) else images[0]
+            images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
+        found = images if layers else [one["image"] for one in images]
+        return found if isinstance(light, Sequence) else found[0]
 
     def olat(self, lights: int | Array = 150) -> Array:
         """The person over black under each light alone [L, H, W, 3]; the images add up by a light's weights.
 
         `lights` are unit directions [L, 3], or the size of a uniform rig, `facerf.rig(lights)`.
         """
-        directions, composition = rig(lights), self._composition("photo")
-        with torch.no_grad():
-            images = [
-                whole(composition.light_layer(relit), *composition.size_px)
-                for some in torch.split(directions, _LIGHTS_AT_ONCE)
-                for relit in composition.relit(Lights.each(some))
-            ]
-        return self._out(np.stack(images), isinstance(lights, Tensor))
+        layer, size = self._composition.light_layer, self._composition.size_px
+        found = [
+            whole(layer(relit), *size) for relit in _one_by_one(self._composition, directions_of(lights))
+        ]
+        return self._out(np.stack(found), lights)
 
     def uv_olat(self, lights: int | Array = 150, pose: Pose | None = None) -> Array:
         """The face's UV texture under each light alone [L, T, T, 3], by the neural field; see `olat`."""
-        directions, turn = rig(lights), None
-        if pose is not None:
-            turn = self.head.fit.turn_to(_rotation(pose))
+        directions = directions_of(lights)
+        turn = None if pose is None else self.head.fit.turn_to(_rotation(pose))
         field = self.reflectance.field if isinstance(self.reflectance, PortraitField) else self.reflectance
-        tensors = isinstance(lights, Tensor) or isinstance(pose, Tensor)
-        with torch.set_grad_enabled(tensors and torch.is_grad_enabled()):
+        with self._gradients(lights, pose):
             if isinstance(field, Field):
                 textures = torch.cat(list(field.olats(directions, turn)))
             else:
                 each = Lights.each(directions)
                 textures = field.relit(each.directions, each.weights, turn)
-        return self._out(textures.permute(0, 2, 3, 1).contiguous(), tensors)
+        return self._out(textures.permute(0, 2, 3, 1).contiguous(), lights, pose)
 
     def estimate_light(self, lights: int = 150) -> Light:
         """Estimate the light of the photo over a rig; the models of the paper's baselines have their own.
@@ -194,13 +189,10 @@ class Person(pipeline.FittedPerson):
     def mesh(self) -> trimesh.Trimesh:
         """The fitted face with its texture, head frame, m: `.vertices` [V, 3], `.faces`, `.export(path)`."""
         fit, (u, v) = self.head.fit, grid_uv().numpy().T
-        texture = Image.fromarray(to_display(np.asarray(_by_pixel(self.head.face.texture))))
-        return trimesh.Trimesh(
-            self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy(),
-            grid_triangles().numpy(),
-            visual=TextureVisuals(np.stack([u, 1 - v], -1), image=texture),
-            process=False,
-        )
+        texture = Image.fromarray(to_display(_by_pixel(self.head.face.texture).numpy()))
+        vertices = self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy()
+        visual = TextureVisuals(np.stack([u, 1 - v], -1), image=texture)
+        return trimesh.Trimesh(vertices, grid_triangles().numpy(), visual=visual, process=False)
 
     @property
     def uv(self) -> Array:
@@ -214,11 +206,10 @@ class Person(pipeline.FittedPerson):
 
     def with_texture(self, texture: Array) -> "Person":
         """The person with another texture [T, T, 3] of the face, to which gradients flow; the rest stays."""
-        planes = as_tensor(texture).permute(2, 0, 1)
+        planes, reflectance = as_tensor(texture).permute(2, 0, 1), self.reflectance
         if planes.shape != self.head.face.texture.shape:
             raise ValueError(f"texture has shape {list(texture.shape)}, not {list(self.texture.shape)}")
         face = replace(self.head.face, texture=planes)
-        reflectance = self.reflectance
         if isinstance(reflectance, PortraitField):
             reflectance = replace(reflectance, field=replace(reflectance.field, face=face))
         elif isinstance(reflectance, Field):
@@ -244,37 +235,48 @@ class Person(pipeline.FittedPerson):
         """
         try:
             arrays = read_npz(Path(path))
-            fit = fit_from_arrays(arrays)
-            photo, cropped = (linear_pixels(name, arrays[name]).numpy() for name in ("photo", "cropped"))
-            face = FaceTexture(**{name: as_tensor(arrays[name]) for name in FaceTexture.__dataclass_fields__})
-            matte = linear_pixels("matte", arrays["matte"], "[H, W]").numpy() if "matte" in arrays else None
-            _require_shapes(photo, cropped, face, fit.crop.size_px, matte)
+            fit, side = fit_from_arrays(arrays), min(arrays["visible"].shape[-1], LARGEST_TEXTURE)
+            maps = {"texture": (3, side, side), "visible": (side, side), "normals": (3, side, side)}
+            face = FaceTexture(**{name: floats(arrays, name, shape) for name, shape in maps.items()})
+            photo = linear_pixels("photo", arrays["photo"]).numpy()
+            cropped = floats(arrays, "cropped", (fit.crop.size_px, fit.crop.size_px, 3)).numpy()
+            matte = floats(arrays, "matte", photo.shape[:2]).numpy() if "matte" in arrays else None
             fit.vertices_camera(models.face)
             one_of(RelightKind, "kind", kind := str(arrays["kind"]))
             alone = bool(arrays["network_alone"])
-        except (ValueError, TypeError, KeyError, OverflowError) as error:
-            raise InputError(f"{path}: {_FILE} ({error}); fit the photo again") from None
+        except (ValueError, TypeError, LookupError, OverflowError) as error:
+            said = f"{path}: not a person that facerf wrote ({error}); fit the photo again"
+            raise InputError(said) from None
         return read_person(models, photo, Head(cropped, fit, face), kind, alone, matte)  # type: ignore[arg-type]
 
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
     ) -> Iterator[Any]:
         """The photo under each light, as dicts of arrays; gradients reach the weights alone."""
-        composition, behind = self._behind(background)
+        composition, behind = self._composition, None
+        if not isinstance(background, str):
+            pixels = np.array(background)[None, None] if isinstance(background, tuple) else background
+            linear = linear_pixels("background", pixels).detach().numpy()
+            behind = covering(linear, *composition.size_px).__getitem__
+        else:
+            one_of(Literal["photo", "none"], "background", background)
+        cut_out = isinstance(background, str) and background == "none"
+        layer_of = composition.cut_out if cut_out else composition.light_layer
         for part in batches(len(lights), composition.nbytes):
             some = sums_of(lights[part])
             if some.directions.requires_grad:
                 raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
             with torch.no_grad():
                 relit = list(composition.relit(some))
-            for number, one in enumerate(relit):
-                arrays = self._layers(composition, one, layers, composition.bands(one, behind=behind))
-                if some.weights.requires_grad:
-                    rgb = torch.from_numpy(arrays["rgb"])
-                    arrays["rgb"] = _OfWeights.apply(  # type: ignore[no-untyped-call]
-                        some.weights[number], some.directions, composition, rgb
-                    )
-                yield arrays
+            for weights, one in zip(some.weights, relit, strict=True):
+                bands = {"rgb": layer_of(one)} if cut_out else composition.bands(one, behind=behind)
+                arrays = self._with_layers(composition, one, layers, bands)
+                image = torch.from_numpy(arrays.pop("rgb"))
+                if weights.requires_grad:
+                    image = _OfWeights.apply(weights, some.directions, composition, layer_of, image)  # type: ignore[no-untyped-call]
+                if cut_out:
+                    image = torch.cat([image, torch.from_numpy(composition.matte)[..., None]], -1)
+                yield {"image": image, **arrays}
 
     def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
         """The face alone under each light; gradients reach all that it is made of."""
@@ -286,10 +288,11 @@ class Person(pipeline.FittedPerson):
             for one in composition.relit(sums_of(lights[part])):
                 image = torch.zeros(view.height_px, view.width_px, 4)
                 image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
-                yield {"rgb": image, **self._layers(composition, one, layers, {})}
+                yield {"image": image, **self._with_layers(composition, one, layers, {})}
 
-    def _layers(
-        self, composition: Composition, relit: Relit, layers: Sequence[str], bands: dict[str, Any]
+    @staticmethod
+    def _with_layers(
+        composition: Composition, relit: Relit, layers: Sequence[str], bands: dict[str, Any]
     ) -> dict[str, Any]:
         if isinstance(layers, str) or not set(layers) <= {*FACE_LAYERS, *PERSON_LAYERS}:
             known = ", ".join(dict.fromkeys((*FACE_LAYERS, *PERSON_LAYERS)))
@@ -297,88 +300,66 @@ class Person(pipeline.FittedPerson):
         wanted = composition.layers(layers, relit) if layers else {}
         return filled({**bands, **wanted}, *composition.size_px)
 
-    def _behind(self, background: Background) -> tuple[Composition, Band | None]:
-        """The composition before a background, and the image that is given as one."""
-        if isinstance(background, str):
-            one_of(Literal["photo", "none"], "background", background)
-            return self._composition(background), None
-        composition = self._composition("photo")
-        if isinstance(background, tuple):
-            colour = np.array(background, np.float32)
-            image = np.broadcast_to(
-                linear_pixels("background", colour[None, None]), (*composition.size_px, 3)
-            )
-        else:
-            image = covering(linear_pixels("background", background).detach().numpy(), *composition.size_px)
-        return composition, image.__getitem__
-
-    def _composition(self, background: str) -> Composition:
-        """All that does not depend on the light, made once for each kind of background."""
-        kept: dict[str, Composition] = self.__dict__.setdefault("_compositions", {})
-        if background not in kept:
-            with torch.no_grad():
-                kept[background] = self.composed(Target(background=background))  # type: ignore[arg-type]
-        return kept[background]
+    @cached_property
+    def _composition(self) -> Composition:
+        """The person in the photo, with all that does not depend on the light."""
+        with torch.no_grad():
+            return self.composed()
 
     def _layer(self, name: str) -> Any:
         if name == "albedo" and self.kind != "portrait":
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
-        composition = self._composition("photo")
-        with torch.no_grad():
-            relit = next(composition.relit(Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
-            return self._out(filled(composition.layers([name], relit), *composition.size_px)[name])
+        relit = next(_one_by_one(self._composition, torch.tensor([[0.0, 0.0, 1.0]])))
+        return self._out(self._with_layers(self._composition, relit, [name], {})[name])
 
     @property
-    def _photo_camera(self) -> Any:
-        return photo_camera(self.head.fit.crop, *self._size_px)
-
-    @property
-    def _size_px(self) -> tuple[int, int]:
+    def _photo_camera(self) -> Camera:
         assert self.photo is not None
-        return self.photo.shape[0], self.photo.shape[1]
+        return photo_camera(self.head.fit.crop, self.photo.shape[0], self.photo.shape[1])
 
-    def _given(self, arrays: dict[str, Any], tensors: bool, layers: bool) -> Any:
-        """An image with alpha if it has that, or a dict of it and its layers."""
-        image, alpha = arrays.pop("rgb"), arrays.pop("A", None)
-        if alpha is not None:
-            image = torch.cat([torch.as_tensor(image), torch.from_numpy(alpha)[..., None]], -1)
-        found = {name: self._out(values, tensors) for name, values in {"image": image, **arrays}.items()}
-        return found if layers else found["image"]
+    def _gradients(self, *given: Any) -> torch.set_grad_enabled:
+        """Gradients where tensors are given."""
+        return torch.set_grad_enabled(
+            torch.is_grad_enabled() and any(isinstance(one, Tensor) for one in given)
+        )
 
-    def _out(self, values: Array, tensors: bool = False) -> Any:
-        """Values as tensors on the models' device, if they or the photo's arrays are to be, or as arrays."""
-        if self.tensors or tensors:
+    def _out(self, values: Array, *given: Any) -> Any:
+        """Values as arrays, or as tensors on the models' device where the photo or what was given is one."""
+        if self.tensors or any(isinstance(one, Tensor) for one in given):
             return torch.as_tensor(values).to(self.models.device)
         return values.detach().numpy() if isinstance(values, Tensor) else values
+
+
+def _one_by_one(composition: Composition, directions: Tensor) -> Iterator[Relit]:
+    """The person under each light [L, 3] alone, some at a time."""
+    with torch.no_grad():
+        for some in torch.split(directions, _LIGHTS_AT_ONCE):
+            yield from composition.relit(Lights.each(some))
 
 
 class _OfWeights(torch.autograd.Function):
     """An image [H, W, 3] as a function of the weights [L, 3] of lights [L, 3], in which it is linear."""
 
     @staticmethod
-    def forward(
-        ctx: Any, weights: Tensor, directions: Tensor, composition: Composition, image: Tensor
-    ) -> Tensor:
-        """The image, which is composed already."""
-        ctx.directions, ctx.composition = directions, composition
+    def forward(ctx: Any, weights: Tensor, directions: Tensor, composition: Composition, *more: Any) -> Any:
+        """The image, which is composed already; `layer_of` gives that of each light."""
+        (ctx.layer_of, image), ctx.directions, ctx.composition = more, directions, composition
         return image
 
     @staticmethod
-    def backward(ctx: Any, *of_image: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """Sum the gradient [H, W, 3] over the image of each light."""
-        composition, slope = ctx.composition, of_image[0].cpu()
-
-        def image(relit: Relit) -> Tensor:
-            bands = composition.bands(relit)
-            band = bands["rgb"] if "A" in bands else composition.light_layer(relit)
-            return torch.from_numpy(whole(band, *composition.size_px))
-
-        found = [
-            (slope * image(relit)).sum((0, 1))
-            for some in torch.split(ctx.directions, _LIGHTS_AT_ONCE)
-            for relit in composition.relit(Lights.each(some))
-        ]
-        return torch.stack(found), None, None, None
+        images = (
+            torch.from_numpy(whole(ctx.layer_of(relit), *ctx.composition.size_px))
+            for relit in _one_by_one(ctx.composition, ctx.directions)
+        )
+        return (
+            torch.stack([(slopes[0].cpu() * image).sum((0, 1)) for image in images]),
+            None,
+            None,
+            None,
+            None,
+        )
 
 
 def read_person(
@@ -412,18 +393,3 @@ def _rotation(pose: Pose) -> Tensor:
 
 def _by_pixel(texture: Tensor) -> Tensor:
     return texture.permute(1, 2, 0).contiguous()
-
-
-def _require_shapes(
-    photo: np.ndarray, cropped: np.ndarray, face: FaceTexture, crop_px: int, matte: np.ndarray | None
-) -> None:
-    side = face.visible.shape[-1]
-    shapes = [face.texture.shape, face.visible.shape, face.normals.shape, cropped.shape]
-    if shapes != [(3, side, side), (side, side), (3, side, side), (crop_px, crop_px, 3)]:
-        raise ValueError("its texture has another shape")
-    if side > LARGEST_TEXTURE or not all(
-        x.isfinite().all() for x in (face.texture, face.visible, face.normals)
-    ):
-        raise ValueError("its texture is too large, or holds values that are not finite")
-    if matte is not None and matte.shape != photo.shape[:2]:
-        raise ValueError("its matte has another shape than its photo")

@@ -171,7 +171,7 @@ def _head(arrays: Mapping[str, np.ndarray], identities: int, expressions: int) -
     mean, identity, expression = _shapes(arrays, _HEAD_PREFIX, vertices, identities, expressions)
     triangles = _indices(arrays, "triangles", (faces, 3), vertices).long()
     part = _indices(arrays, "part", (vertices,), len(HEAD_PARTS)).byte()
-    return HeadModel(mean, identity, expression, triangles, part, _floats(arrays, "head_uv", (vertices, 2)))
+    return HeadModel(mean, identity, expression, triangles, part, floats(arrays, "head_uv", (vertices, 2)))
 
 
 def _shapes(
@@ -182,12 +182,12 @@ def _shapes(
     expressions: int | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean [N, 3] and shapes [Ki, N, 3] and [Ke, N, 3] of a file's arrays."""
-    mean = _floats(arrays, prefix + "mean", (vertices, 3))
-    identity = _floats(arrays, prefix + "identity", (identities, vertices, 3))
-    return mean, identity, _floats(arrays, prefix + "expression", (expressions, vertices, 3))
+    mean = floats(arrays, prefix + "mean", (vertices, 3))
+    identity = floats(arrays, prefix + "identity", (identities, vertices, 3))
+    return mean, identity, floats(arrays, prefix + "expression", (expressions, vertices, 3))
 
 
-def _floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
+def floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
     """An array as float32; raises ValueError for another shape (None: any of a basis), NaN or infinity."""
     array = arrays[key]
     expected = (len(array), *shape[1:]) if shape[0] is None else shape

@@ -280,6 +280,10 @@ class Composition:
         pixels, share = self._relit_pixels(relit), by_rows(self._share)
         return lambda rows: pixels(rows) * share(rows)[..., None]
 
+    def cut_out(self, relit: Relit) -> Band:
+        """Pixels [H, W, 3] of the person or the face alone, not multiplied by the matte; see `bands`."""
+        return self._relit_pixels(relit)
+
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
 
