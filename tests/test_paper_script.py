@@ -30,6 +30,7 @@ def test_from_a_capture_to_the_papers_tables_and_figures(tmp_path: Path) -> None
             json.loads((run / "tables" / table / "summary.json").read_text())["methods"][: len(methods)]
             == methods
         )
+    assert list((run / "photos/.facerf-faces").glob("*.json")) and not (run / "mean-face/photos").exists()
     both = [(run / "tables" / table / "pairs.json").read_text() for table in "13"]
     assert both[0] == both[1]
     assert list((run / "figures").glob("olat-*.png")) and (run / "figures/transfer.png").exists()

@@ -67,7 +67,7 @@ two=(facerf --checkpoint "$run/paper.safetensors" --checkpoint "$run/diffuse-sh"
 "${measure[@]}" geometry "$test_photos" --preset paper --mean-checkpoint "$run/mean-face.safetensors" -o "$run/tables/4"
 
 # The figures, of the first photos.
-mapfile -d '' -t shown < <(find "$photos" \( -name '*.png' -o -name '*.jpg' \) -print0 | sort -z | head -z -n "${SHOWN:-4}")
+mapfile -d '' -t shown < <(find "$photos" -not -path '*/.*' \( -name '*.png' -o -name '*.jpg' \) -print0 | sort -z | head -z -n "${SHOWN:-4}")
 python "$here/figures.py" "$run/figures" "$run/paper.safetensors" "${shown[@]}"
 
 [ -n "${DEPARTURES:-}" ] || exit 0

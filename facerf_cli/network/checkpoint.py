@@ -75,7 +75,7 @@ def save_networks(path: Path, networks: Mapping[str, nn.Module], metadata: dict[
     """Write networks by name, with their form and settings and further metadata."""
     tensors = {f"{name}.{key}": t for name, net in networks.items() for key, t in net.state_dict().items()}
     described = {name: _described(network) for name, network in networks.items()}
-    save_checkpoint(path, tensors, {"networks": described, **metadata})
+    save_checkpoint(path, tensors, {"networks": described, **metadata}, half=False)
 
 
 def load_networks(
@@ -102,9 +102,13 @@ def load_networks(
     return networks, metadata
 
 
-def save_checkpoint(path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any]) -> None:
-    """Write tensors (floats in half precision) and metadata; the file appears whole or not at all."""
-    stored = {k: (t.half() if t.is_floating_point() else t).contiguous().cpu() for k, t in tensors.items()}
+def save_checkpoint(
+    path: Path, tensors: dict[str, Tensor], metadata: dict[str, Any], half: bool = True
+) -> None:
+    """Write tensors (with `half` floats in half precision) and metadata, whole or not at all."""
+    stored = {
+        k: (t.half() if half and t.is_floating_point() else t).contiguous().cpu() for k, t in tensors.items()
+    }
     with atomic_path(path) as temporary:
         temporary.write_bytes(save(stored, {"format": FORMAT, "facerf": json.dumps(metadata)}))
 

@@ -143,7 +143,7 @@ class JointSettings:
     texture_side: int = 512
     photos_share: float = 0.2  # of the batches, if photos are given
     weights: PaperWeights = _PAPER
-    validation_pairs: int = 12  # of each kind: same pose as the source, other pose
+    validation_pairs: int = 48  # of each kind: same pose as the source, other pose
     seed: int = 0
 
 
@@ -345,6 +345,7 @@ class JointObjective(Objective):
             errors += of_kind
         metrics["si_mse"] = float(torch.cat(errors).mean())
         metrics["landmarks_iod"] = float(torch.cat(distances).mean())
+        metrics["pairs"] = len(torch.cat(errors))
         return Validation(metrics, np.concatenate(rows))
 
     def _held_out_pairs(self) -> dict[str, list[CropPairs]]:

@@ -231,7 +231,7 @@ class _TrainedStage:
         photos = None
         if options.photos:
             items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
-            paths, cache = [item.input_path for item in items], options.output / "photos"
+            paths, cache = [item.input_path for item in items], _cache_of(options.photos, options.output)
             photos = open_photos(paths, cache, self.networks, side, options.jobs)
         settings = JointSettings(side, side, weights=options.training.loss, seed=options.settings.seed)
         kind = self._kind(JointObjective)
@@ -436,6 +436,12 @@ class _TrainedStage:
             "heads": f"{found} synthetic heads drawn from {drawn.credit}",
             "licence": f"MIT; the heads' shapes: {drawn.licence}",
         }
+
+
+def _cache_of(photos: Path, output: Path) -> Path:
+    """Folder of faces found in photos: next to them, for all runs, or the run's if that is not writable."""
+    folder = photos if photos.is_dir() else photos.parent
+    return folder / ".facerf-faces" if os.access(folder, os.W_OK) else output / "photos"
 
 
 def _require_crops(dataset: Dataset, side: int) -> None:

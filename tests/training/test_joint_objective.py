@@ -272,7 +272,9 @@ def test_validation_tells_poses_apart(objective: JointObjective) -> None:
         "si_mse_other_pose",
         "si_mse_other_pose_std",
         "landmarks_iod",
+        "pairs",
     }
+    assert first.metrics["pairs"] == 4
     both = (first.metrics["si_mse_same_pose"] + first.metrics["si_mse_other_pose"]) / 2
     assert first.metrics["si_mse"] == pytest.approx(both) and first.metrics["si_mse"] > 0
     assert first.sheet is not None and first.sheet.shape == (4 * CROP_PX, 4 * CROP_PX, 3)
