@@ -177,6 +177,12 @@ def test_of_the_maps_of_the_portrait(models: Models, person: facerf.Person, ligh
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
+def test_a_light_times_a_tensor_has_gradients() -> None:
+    factor = torch.tensor(2.0, requires_grad=True)
+    (facerf.Light.single(0, 0, (1, 2, 3)) * factor).weights.sum().backward()
+    assert factor.grad == 6
+
+
 def test_tensors_in_tensors_out(models: Models) -> None:
     photo = torch.from_numpy(astronaut.photo())
     one = facerf.fit(models, photo, reflectance="field", texture_side=64)

@@ -228,6 +228,18 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
         facerf.fit(models, str(PHOTO))  # type: ignore[call-overload]
     with pytest.raises(InputError, match="twice as wide as high"):
         person.relight(np.ones((30, 40, 3), np.float32))
+    with pytest.raises(ValueError, match=r"room is 'none', not a share from 0 to 1"):
+        person.relight(KEY, room="none")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"pose is .nan"):
+        person.relight(KEY, pose=(math.nan, 0, 0))
+    with pytest.raises(ValueError, match=r"not a list of some of normal, position, depth, uv, face$"):
+        person.relight(KEY, layers=["albedo"])
+    with pytest.raises(ValueError, match="texture_side is 7, not 16 to"):
+        facerf.fit(models, photo, texture_side=7)
+    with pytest.raises(ValueError, match=r"pixels have shape .4, 4., not"):
+        facerf.write_image("x.png", np.ones((4, 4)))
+    with pytest.raises(InputError, match=r"no such file; give one that Person.save wrote"):
+        facerf.Person.load(models, "nowhere.npz")
     with pytest.raises(TypeError, match=r"light has shape .3., not a facerf.Light or a map"):
         person.relight(np.array([60.0, 30.0, 1.0]))
     with pytest.raises(TypeError, match="light is tuple, not a facerf"):

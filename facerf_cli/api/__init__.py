@@ -23,7 +23,7 @@ from facerf_cli.files import images
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import FaceBox, face_at
 from facerf_cli.portrait.parse import uncovered_by
-from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
 from facerf_cli.relighting.models import load_models as load
 
 __all__ = ["Light", "Person", "PhotoCamera", "fit", "load_models", "read_image", "rig", "write_image"]
@@ -37,6 +37,8 @@ def read_image(path: str | Path, colourspace: str | None = None) -> np.ndarray:
 def write_image(path: str | Path, pixels: Array, exposure: float | Literal["auto"] = 0.0) -> None:
     """Write [H, W, 3] or [H, W, 4] as EXR, or at an exposure in EV as 8-bit PNG or JPEG, by the suffix."""
     values = pixels.detach().cpu().numpy() if isinstance(pixels, Tensor) else pixels
+    if values.ndim != 3 or values.shape[2] not in (3, 4):
+        raise ValueError(f"pixels have shape {list(values.shape)}, not [H, W, 3] or [H, W, 4]")
     path, colour = Path(path), np.ascontiguousarray(values[..., :3], np.float32)
     alpha = values[..., 3] if values.shape[-1] == 4 else None
     if path.suffix.lower() == ".exr":
@@ -98,6 +100,8 @@ def fit(
     one_of(RelightKind, "reflectance", reflectance)
     if geometry is not None:
         one_of(Geometry, "geometry", geometry)
+    if texture_side is not None and not 16 <= texture_side <= LARGEST_TEXTURE:
+        raise ValueError(f"texture_side is {texture_side}, not 16 to {LARGEST_TEXTURE}")
     if network_alone and reflectance not in ("field", "portrait"):
         raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     if landmarks_px is not None and geometry == "network":

@@ -74,9 +74,8 @@ class Light:
 
     def __mul__(self, factor: float | Rgb | Array) -> "Light":
         """The same lights, so many times as bright: by a number, or by one for each colour."""
-        return Light(
-            self.directions, self.weights * (np.array(factor) if isinstance(factor, tuple) else factor)
-        )
+        weights = as_tensor(self.weights).to(factor.device) if isinstance(factor, Tensor) else self.weights
+        return Light(self.directions, weights * (np.array(factor) if isinstance(factor, tuple) else factor))
 
     __rmul__ = __mul__
 
@@ -96,6 +95,8 @@ def as_light(given: Any, room: float = 0.0) -> Light:
 
     Raises TypeError for what is neither.
     """
+    if not (isinstance(room, (int, float)) and 0 <= room <= 1):
+        raise ValueError(f"room is {room!r}, not a share from 0 to 1")
     if isinstance(given, Light):
         return given + Light.around() * (room * given.weights.sum(0)) if room else given
     if isinstance(given, np.ndarray | Tensor) and given.ndim == 3:

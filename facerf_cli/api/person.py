@@ -24,6 +24,7 @@ from facerf_cli.face.morphable import floats, read_npz
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.texts import require_regular
 from facerf_cli.image.strips import covering, filled, whole
 from facerf_cli.light.envmap import backdrop, check_envmap
 from facerf_cli.light.sphere import rig_directions
@@ -62,6 +63,11 @@ class Person(pipeline.FittedPerson):
     kind: RelightKind = "portrait"
     network_alone: bool = False
     tensors: bool = False
+
+    def __repr__(self) -> str:
+        """A line for a notebook."""
+        camera = self._photo_camera
+        return f"<facerf.Person in {camera.width_px} x {camera.height_px} pixels, {self.kind}>"
 
     def relight(
         self,
@@ -233,6 +239,7 @@ class Person(pipeline.FittedPerson):
 
         Raises InputError for any other file, and for a fit of another face model.
         """
+        require_regular(Path(path), "give one that Person.save wrote")
         try:
             arrays = read_npz(Path(path))
             fit, side = fit_from_arrays(arrays), min(arrays["visible"].shape[-1], LARGEST_TEXTURE)
@@ -294,9 +301,9 @@ class Person(pipeline.FittedPerson):
     def _with_layers(
         composition: Composition, relit: Relit, layers: Sequence[str], bands: dict[str, Any]
     ) -> dict[str, Any]:
-        if isinstance(layers, str) or not set(layers) <= {*FACE_LAYERS, *PERSON_LAYERS}:
-            known = ", ".join(dict.fromkeys((*FACE_LAYERS, *PERSON_LAYERS)))
-            raise ValueError(f"layers is {layers!r}, not a list of some of {known}")
+        known = dict.fromkeys([*FACE_LAYERS, *(PERSON_LAYERS if composition.person else ())])
+        if isinstance(layers, str) or not set(layers) <= set(known):
+            raise ValueError(f"layers is {layers!r}, not a list of some of {', '.join(known)}")
         wanted = composition.layers(layers, relit) if layers else {}
         return filled({**bands, **wanted}, *composition.size_px)
 
@@ -385,10 +392,10 @@ def one_of(choices: Any, name: str, value: str) -> None:
 
 def _rotation(pose: Pose) -> Tensor:
     """The head_to_camera rotation [3, 3] of a pose in degrees, to which gradients flow."""
-    if len(pose) != 3:
+    angles = torch.stack([torch.as_tensor(angle, dtype=torch.float64) for angle in pose])
+    if angles.shape != (3,) or not angles.isfinite().all():
         raise ValueError(f"pose is {pose}, not yaw, pitch and roll in degrees")
-    yaw, pitch, roll = pose
-    return pose_to_rotation(yaw, pitch, roll)
+    return pose_to_rotation(*angles)
 
 
 def _by_pixel(texture: Tensor) -> Tensor:
