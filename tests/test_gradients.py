@@ -179,8 +179,10 @@ def test_of_the_maps_of_the_portrait(models: Models, person: facerf.Person, ligh
 
 def test_a_light_times_a_tensor_has_gradients() -> None:
     factor = torch.tensor(2.0, requires_grad=True)
-    (facerf.Light.single(0, 0, (1, 2, 3)) * factor).weights.sum().backward()
+    light = facerf.Light.single(0, 0, (1, 2, 3)) * factor
+    light.weights.sum().backward()
     assert factor.grad == 6
+    assert light.to_envmap(16).shape == (16, 32, 3)
 
 
 def test_tensors_in_tensors_out(models: Models) -> None:
@@ -193,6 +195,7 @@ def test_tensors_in_tensors_out(models: Models) -> None:
     assert set(layers) == {"image", "person.A", "depth"} and not layers["image"].requires_grad
     rig = torch.from_numpy(facerf.rig(4))
     arrays = facerf.fit(models, astronaut.photo(), reflectance="field", texture_side=64)
+    assert isinstance(arrays.backdrop(torch.rand(8, 16, 3, requires_grad=True)), Tensor)
     assert isinstance(arrays.relight(key), np.ndarray) and isinstance(arrays.uv_olat(rig), Tensor)
     np.testing.assert_array_equal(one.relight(key).numpy(), arrays.relight(key))
 

@@ -61,7 +61,8 @@ class Light:
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
         """A lat-long map [height, 2 height, 3] with these lights."""
-        return rig_to_latlong(self.on_cpu(), height).numpy()
+        light = self.on_cpu()
+        return rig_to_latlong(RigLight(light.directions.detach(), light.weights.detach()), height).numpy()
 
     def __add__(self, other: "Light") -> "Light":
         if not isinstance(other, Light):

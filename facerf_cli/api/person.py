@@ -137,15 +137,16 @@ class Person(pipeline.FittedPerson):
             found = pipeline.estimate_light(self.models, self.head, kind, rig_directions(lights)).light
         return Light(found.directions.numpy(), found.weights.numpy())
 
-    def backdrop(self, envmap: Array, rotate_deg: float = 0.0, blur: float = 0.0) -> np.ndarray:
+    def backdrop(self, envmap: Array, rotate_deg: float = 0.0, blur: float = 0.0) -> Array:
         """The map [H, 2 H, 3] that the photo's camera sees behind the person, [H, W, 3], for `background`.
 
         `rotate_deg` is added to every azimuth; `blur` is that of a lens, as a share of the longer side.
         """
-        linear, camera = linear_pixels("map", envmap), self._photo_camera
+        linear, camera = linear_pixels("map", envmap).detach(), self._photo_camera
         check_envmap(linear)
         size = camera.height_px, camera.width_px
-        return whole(backdrop(linear, size, partial(rays_of_rows, camera), rotate_deg, blur), *size)
+        seen = backdrop(linear, size, partial(rays_of_rows, camera), rotate_deg, blur)
+        return self._out(whole(seen, *size), envmap)
 
     @cached_property
     def light(self) -> Light:
@@ -392,7 +393,7 @@ def one_of(choices: Any, name: str, value: str) -> None:
 
 def _rotation(pose: Pose) -> Tensor:
     """The head_to_camera rotation [3, 3] of a pose in degrees, to which gradients flow."""
-    angles = torch.stack([torch.as_tensor(angle, dtype=torch.float64) for angle in pose])
+    angles = torch.stack([torch.as_tensor(angle, dtype=torch.float64).cpu() for angle in pose])
     if angles.shape != (3,) or not angles.isfinite().all():
         raise ValueError(f"pose is {pose}, not yaw, pitch and roll in degrees")
     return pose_to_rotation(*angles)
