@@ -36,7 +36,7 @@ from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
-from facerf_cli.portrait.parse import uncovered
+from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import look_at_person, wider_square
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
@@ -97,18 +97,24 @@ def find_for(
     return [face.box for face in faces] if geometry == "network" else faces
 
 
-def head_of(models: Models, photo: np.ndarray, face: FaceBox, sides: Sides | None = None) -> Head:
+def head_of(
+    models: Models,
+    photo: np.ndarray,
+    face: FaceBox,
+    sides: Sides | None = None,
+    matte: np.ndarray | None = None,
+) -> Head:
     """The head of a face found in a photo: fitted to its landmarks, or regressed where it has none.
 
-    What covers the skin in the photo (hair, glasses, a hand) is not taken as skin.
+    What covers the skin in the photo (hair, glasses, a hand, what is off a given matte) is not taken as skin.
     """
     if isinstance(face, Face):
         head = fit_photo(models, photo, face.landmarks_px, sides)
     else:
         head = regress_photo(models, photo, face.box_px, sides)
-    if face.view is None:
-        return head
-    return head.without(models.face, uncovered(face.view, head.fit.crop))
+    if face.view is not None:
+        head = head.without(models.face, uncovered(face.view, head.fit.crop))
+    return head if matte is None else head.without(models.face, uncovered_by(matte, head.fit.crop))
 
 
 @torch.no_grad()

@@ -22,7 +22,6 @@ from facerf_cli.face.fit import Geometry
 from facerf_cli.files import images
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import FaceBox, face_at
-from facerf_cli.portrait.parse import uncovered_by
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
 from facerf_cli.relighting.models import load_models as load
 
@@ -114,12 +113,11 @@ def fit(
             face: FaceBox = pipeline.find_for(models.networks.people, chosen, pixels, name)[0]
         else:
             face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
-        head = pipeline.head_of(models, pixels, face, models.sides(texture_side))
         if matte is not None:
             matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
             if matte.shape != pixels.shape[:2]:
                 raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
-            head = head.without(models.face, uncovered_by(matte, head.fit.crop))
+        head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)
         return read_person(models, pixels, head, reflectance, network_alone, matte, isinstance(photo, Tensor))
 
     if not isinstance(photo, Sequence):

@@ -29,7 +29,6 @@ from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_of, face_facts, touched_sides
 from facerf_cli.portrait.find import Face, FaceBox, face_at
-from facerf_cli.portrait.parse import uncovered_by
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
@@ -270,9 +269,7 @@ def _fitted(
 ) -> FittedFace:
     with naming(face.name):
         models = load_models_once(options)
-        head = head_of(models, image.pixels, face.found, models.sides(options.texture_side))
-        if matte is not None:
-            head = head.without(models.face, uncovered_by(matte, head.fit.crop))
+        head = head_of(models, image.pixels, face.found, models.sides(options.texture_side), matte)
     if head.fit.quality == "poor":
         log.warning(
             "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "
