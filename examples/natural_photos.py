@@ -1,10 +1,10 @@
 #!/usr/bin/env python
 """Write photographs in natural light of the people of a prepared dataset: they stand for FFHQ in training.
 
-    python examples/natural_photos.py DATASET OUT
+    python examples/natural_photos.py DATASET OUT [EACH]
 
-Each source of `facerf relight-dataset` is laid over its own environment map, as a lens sees it out of focus,
-and written as an 8-bit JPEG. `facerf train --preset paper --photos OUT` detects the faces as in any photos.
+Each source of `facerf relight-dataset` (the first EACH of a person, none of the split test) is laid over its
+own environment map, as a lens sees it out of focus, and written as an 8-bit JPEG. `facerf train --preset paper --photos OUT` detects the faces as in any photos.
 """
 
 import math
@@ -47,10 +47,12 @@ def background(pair: Pair, side: int) -> np.ndarray:
     return blurred
 
 
-def main(folder: Path, out: Path) -> None:
-    """Write a photo of each pair."""
+def main(folder: Path, out: Path, each: int) -> None:
+    """Write a photo of each pair that is not of the split test, of up to `each` a person."""
     dataset = read_dataset(folder)
     for pair in read_pairs(dataset):
+        if pair.split == "test" or pair.index >= each:
+            continue
         person = read_image(image_path(dataset, *pair.key)).pixels
         stack = read_olat_header(dataset.stack_path(pair.subject, pair.source_camera))
         shown = stack.source.max(-1) > COVERED
@@ -61,4 +63,4 @@ def main(folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]) if len(sys.argv) > 3 else sys.maxsize)

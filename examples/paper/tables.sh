@@ -17,14 +17,14 @@ mkdir -p "$run"
 form=(--preset paper) features=(--max-time "${FEATURES_TIME:-6h}") appearance_features=(--vgg-weights imagenet)
 case ${SCALE:-paper} in
 paper)
-    split=${SPLIT:-300/10/40} crop=512 each=1000 length=(--max-time "${TIME:-200h}") ;;
+    split=${SPLIT:-300/10/40} crop=512 each=1000 length=(--max-time "${TIME:-200h}") diffuse=(--texture-size 128) ;;
 small)
     split=${SPLIT:-30/2/4} crop=192 each=240 length=(--max-time "${TIME:-2h}" --validate-every 250)
-    features=(--max-time 6m) form=(--preset paper --texture-size 128 --workers 0)
+    features=(--max-time 6m) form=(--preset paper --texture-size 128 --workers 0) diffuse=(--texture-size 128 --workers 0)
     stage=(--subjects 36 --size 192 --seed 14 --face-model "${HEADS:-builtin}") ;;
 tiny)
     split=${SPLIT:-2/1/1} crop=96 each=4 length=(--steps 2) features=(--steps 2)
-    form=(--preset tiny --texture-size 32 --workers 0)
+    form=(--preset tiny --texture-size 32 --workers 0) diffuse=("${form[@]}")
     stage=(--subjects 4 --size 128 --seed 14 --lights 12 --cameras 2) ;;
 esac
 
@@ -34,7 +34,7 @@ capture=${CAPTURE:-$run/capture} maps=${MAPS:-procedural:120} test_maps=${TEST_M
 [ -f "$run/dataset/dataset.json" ] || facerf prepare-dataset "$capture" --split "$split" --crop "$crop" -o "$run/dataset"
 facerf relight-dataset "$run/dataset" --envmaps "$maps" --envmaps-test "$test_maps" --per-subject "$each"
 photos=${PHOTOS:-$run/photos} test_photos=${TEST_PHOTOS:-$run/dataset}
-[ -d "$photos" ] || python "$here/../natural_photos.py" "$run/dataset" "$photos"
+[ -d "$photos" ] || python "$here/../natural_photos.py" "$run/dataset" "$photos" 25
 
 # S_f, and where ImageNet's VGG-16 is not wanted a V_f of our own.
 data=(--dataset "$run/dataset" "${form[@]}")
@@ -52,7 +52,7 @@ joint() {  # NAME OPTIONS...: the paper's training, or an ablation of it
 joint paper
 joint without-normals --without-normals
 joint mean-face --mean-face
-$train -o "$run/diffuse-sh" --stage diffuse-sh "${data[@]}" --resume "${length[@]}"
+$train -o "$run/diffuse-sh" --stage diffuse-sh --dataset "$run/dataset" "${diffuse[@]}" --resume "${length[@]}"
 
 # The tables. Each run leaves the list of its pairs, pairs.json, for --pairs of anybody else's run.
 measure=(facerf --checkpoint "$run/paper.safetensors" evaluate)

@@ -227,6 +227,27 @@ def test_a_wrong_table_of_a_configuration_is_refused(
     assert not (tmp_path / "run").exists()
 
 
+def test_loss_weights_of_a_configuration_reach_the_loss(tmp_path: Path) -> None:
+    dataset = write_joint_dataset(tmp_path / "data")
+    (tmp_path / "c.toml").write_text("[train.loss]\nphotometric = 0\n")
+    line = [
+        "train",
+        "-o",
+        str(tmp_path / "run"),
+        "--preset",
+        "tiny",
+        "--stage",
+        "joint",
+        "--geometry",
+        "landmarks",
+    ]
+    line += ["--dataset", str(dataset.folder), "--texture-size", "32", "--steps", "1", "--workers", "0"]
+    assert main([*line, "--config", str(tmp_path / "c.toml")]) == 0
+    (row,) = map(json.loads, (tmp_path / "run/log.jsonl").read_text().splitlines())
+    assert row["terms"] == {"photometric": 0.0}
+    assert "photometric = 0" in (tmp_path / "run/config.toml").read_text()
+
+
 def test_a_configuration_changes_losses_and_optimizer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

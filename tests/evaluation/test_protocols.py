@@ -33,7 +33,7 @@ from facerf_cli.evaluation.protocols import (
     transfer,
     turn_class,
 )
-from facerf_cli.evaluation.selection import couples_of, evenly
+from facerf_cli.evaluation.selection import choose_olats, couples_of, evenly
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.morphable import load_face_model
@@ -314,6 +314,21 @@ def test_a_preset_takes_the_first_of_each_before_the_second_of_any() -> None:
     groups = {"a": [1, 2, 3, 4], "b": [5], "c": [6, 7]}
     assert evenly(groups, 4) == {"a": [1, 2], "b": [5], "c": [6]}
     assert evenly(groups, 99) == groups and evenly(groups, 1) == {"a": [1]}
+
+
+def test_the_papers_pairs_are_of_its_maps_and_as_many_as_there_are(caplog: pytest.LogCaptureFixture) -> None:
+    cameras = ("C0", "C1", "C2")
+    many = {
+        name: [replace(pair(i, "C0", cameras[i % 3], 0, f"m{i % 200}"), subject=name) for i in range(12_000)]
+        for name in ("a", "b")
+    }
+    chosen = [one for groups in choose_olats(many, 1, preset=True).values() for (one,) in groups]
+    same = sum(one.source_camera == one.target_camera for one in chosen)
+    assert (same, len(chosen) - same) == (3900, 8100) and not caplog.messages
+    assert {one.envmap for one in chosen} == {f"m{n}" for n in range(160)}
+    few = {name: members[:30] for name, members in many.items()}
+    assert sum(map(len, choose_olats(few, 1, preset=True).values())) == 60
+    assert any("60" not in line and "20 pairs of the same pose" in line for line in caplog.messages)
 
 
 def test_classes_of_angles() -> None:
