@@ -214,12 +214,21 @@ def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
 
 
 @pytest.mark.usefixtures("doubles")
-def test_a_frozen_list_gives_the_same_figures_on_a_dataset_without_its_pairs(
+def test_a_frozen_list_gives_the_same_figures_on_a_dataset_of_other_pairs(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, again, bare = (tmp_path / name for name in ("first", "again", "bare"))
     assert run("reconstruction", folder, "-o", first, "--preset", "paper", "--joint-fit") == 0
     shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("relit"))
+    own = [
+        "--envmaps",
+        "procedural:3",
+        "--per-subject",
+        "6",
+        "--seed",
+        "9",
+    ]  # other pairs of the same numbers
+    assert main(["relight-dataset", str(bare), *own]) == 0
     assert run("reconstruction", bare, "-o", again, "--pairs", first / "pairs.json", "--joint-fit") == 0
     assert images(first) == images(again) and len(images(first)) == 12
     assert (first / "pairs.json").read_text() == (again / "pairs.json").read_text()
