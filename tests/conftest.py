@@ -36,7 +36,8 @@ cli/test_train.py cli/test_film.py cli/test_prepare_dataset.py cli/test_relight.
 cli/test_output_options.py viewer/test_viewer_agreement.py cli/test_evaluate_protocols.py
 test_ray_workers.py portrait/test_find.py cli/test_prepare_checks.py test_stopping.py
 cli/test_predict_olat.py test_python_api.py test_gradients.py test_notebook.py cli/test_synth_stage.py
-cli/test_estimate_light.py training/test_loop.py tools/test_builtin_face.py cli/test_evaluate_yale_b.py cli/test_relight_dataset.py
+cli/test_estimate_light.py training/test_loop.py tools/test_builtin_face.py cli/test_evaluate_yale_b.py
+cli/test_relight_dataset.py
 cli/test_shards_sum_up.py test_foreign_modules.py test_distribution.py test_near_lights.py
 synth/test_path_tracer.py synth/head/test_hair.py test_portrait_field.py
 """
