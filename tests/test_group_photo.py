@@ -19,6 +19,7 @@ from facerf_cli.run import memory
 from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import PhotoFace
+from facerf_cli.work.plan import batches, beside_people
 
 SIZE = (4, 6)
 
@@ -110,3 +111,12 @@ def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by
     memory.set_limit(100 << 20)
     with pytest.raises(InputError, match=r"a\.png: 3 people in one image: needs .* --composite face"):
         photos.fit_each(item, image, options, together=True)
+
+
+def test_people_leave_less_memory_for_lights_at_once() -> None:
+    memory.set_limit(1 << 30)
+    alone = len(batches(100, 4 << 20))
+    with beside_people(8, (400, 600)):
+        assert len(batches(100, 4 << 20)) > 2 * alone
+    with beside_people(1, (400, 600)):
+        assert len(batches(100, 4 << 20)) == alone

@@ -28,7 +28,8 @@ _STACK_PX = 130
 _SEGMENTS_PX = _PHOTO_PX + KEPT_OF_SEGMENTS_PX
 _IMAGE_PX = 12
 _FACE_PX, _BESIDE_FACE_PX = 32, 16  # of a face drawn in its photo, and of the photo with its matte around it
-_COMPOSED_BYTES, _COMPOSED_PX = 64 << 20, 4  # of a person that waits to be composed: transport, matte
+# Of a person of a group: transport, and maps of the light that is shown; matte and grain.
+_COMPOSED_BYTES, _COMPOSED_PX = 96 << 20, 12
 _STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _WEB_PX = 9  # of an image for web viewers: half floats, then bytes
 _RELIT_HELD = 4  # relit textures are held this many times while lights are added to them
@@ -58,7 +59,7 @@ def prediction_bytes() -> int:
 
 def batches(count: int, bytes_each: int) -> list[slice]:
     """As many of some sums of lights at a time as fit the memory."""
-    at_once = max(1, memory.limit_bytes() // (_RELIT_HELD * bytes_each))
+    at_once = max(1, memory.left_bytes() // (_RELIT_HELD * bytes_each))
     return [slice(first, first + at_once) for first in range(0, count, at_once)]
 
 
@@ -73,8 +74,17 @@ def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) 
 
 def require_people(count: int, size_px: tuple[int, ...]) -> None:
     """Raise InputError where so many people of a photo [H, W], composed into one image, do not fit."""
-    needed = count * (_COMPOSED_BYTES + _COMPOSED_PX * math.prod(size_px)) if count > 1 else 0
-    memory.require(f"{count} people in one image", needed, "--composite face or --face INDEX")
+    what = f"{count} people in one image"
+    memory.require(what, _people_bytes(count, size_px), "--composite face or --face INDEX")
+
+
+def beside_people(count: int, size_px: tuple[int, ...]) -> AbstractContextManager[None]:
+    """Count so many people of a photo [H, W], composed into one image, with what is made meanwhile."""
+    return memory.holding(_people_bytes(count, size_px))
+
+
+def _people_bytes(count: int, size_px: tuple[int, ...]) -> int:
+    return count * (_COMPOSED_BYTES + _COMPOSED_PX * math.prod(size_px)) if count > 1 else 0
 
 
 def require_web_images(lights: int, size_px: tuple[int, int]) -> None:
@@ -102,7 +112,7 @@ def canvas(path: Path, held_bytes: int) -> Iterator[Empty]:
     floats are half floats.
     """
     with ExitStack() as stack:
-        left, folders = memory.limit_bytes() - held_bytes, list[Path]()
+        left, folders = memory.left_bytes() - held_bytes, list[Path]()
 
         def empty(name: str, shape: tuple[int, ...]) -> np.ndarray:
             nonlocal left

@@ -59,6 +59,7 @@ from facerf_cli.work.plan import (
     KEPT_PX,
     Empty,
     batches,
+    beside_people,
     beside_person,
     beside_stack,
     image_canvas,
@@ -168,7 +169,8 @@ def relight_item(item: Item, work: Relight) -> Outcome:
     shared_ev = _shared_exposures(item, work)
     written: dict[Path, dict[str, float]] = {}
     for tag, scene in scenes:
-        written |= _write_setups(item, tag, scene, work, metadata, shared_ev)
+        with beside_people(len(scene.faces), scene.composer.size_px):
+            written |= _write_setups(item, tag, scene, work, metadata, shared_ev)
     outputs = [path.with_suffix(suffix) for path in written for suffix in work.output.suffixes]
     names = dict.fromkeys(name for facts in written.values() for name in facts)
     facts = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
