@@ -1,8 +1,10 @@
 """What of the photo's detail a relit image keeps."""
 
 import numpy as np
+import pytest
 
 from facerf_cli.image.strips import whole
+from facerf_cli.relighting import grain as module
 from facerf_cli.relighting.grain import Grain
 
 SIDE, MAP_PX = 96, 4.0
@@ -47,3 +49,9 @@ def test_images_add_up_and_strips_show_no_borders() -> None:
     np.testing.assert_allclose(both(rows), one(rows) + two(rows), rtol=1e-5)
     parts = np.concatenate([both(slice(0, 37)), both(slice(37, SIDE))])
     np.testing.assert_allclose(parts, both(rows), rtol=1e-5)
+
+
+def test_a_photo_that_is_read_in_strips_shows_no_borders(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once = given(SMOOTH, PORES, PORES**2)
+    monkeypatch.setattr(module, "_STRIP_PX", 32 * SIDE)
+    np.testing.assert_allclose(given(SMOOTH, PORES, PORES**2), at_once, rtol=1e-6)

@@ -14,13 +14,15 @@ strands show the photo's own light, and where the photo is nearly black. R' is l
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from facerf_cli.image.strips import Band, whole
+from facerf_cli.image.strips import STRIP_PX, Band, strips
 
 _BLUR = 0.5  # reach of G, in pixels of the maps
 _DARK = (0.02, 0.08)  # A at which w is 0, and 1, in units of the person's mean
 _FAINT = 0.1  # strength of detail, root mean square of its logarithm, at which f is 1 / e
 _LARGEST = 8.0  # of A / G(A)
-_TINY = 1e-6
+_TINY, _MOST = 1e-6, 6e4  # of A in units of its mean
+_EVERY = 8  # row of which the mean is taken
+_STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
 
 
 class Grain:
@@ -30,26 +32,47 @@ class Grain:
     """
 
     def __init__(self, flat: Band, share: np.ndarray, map_px: float) -> None:
-        self._inside = (share > 0).astype(np.float32)
+        self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
-        values = whole(flat, *share.shape)
-        low = self._blurred(values, slice(None))
-        mean = float((values[..., 0] * self._inside).sum() / max(float(self._inside.sum()), 1.0))
-        seen = (low[..., 0] / max(mean, _TINY) - _DARK[0]) / (_DARK[1] - _DARK[0])
+        self._margin = 2 * self._reach
+        mean, values = self._mean(flat), np.empty((*share.shape, 2), np.float16)
+        for rows in strips(share.shape):
+            values[rows] = (flat(rows) / mean).clip(max=_MOST)
+        self._weight, self._detail = (np.empty(share.shape, np.float16) for _ in range(2))
+        for rows in strips(share.shape, _STRIP_PX):
+            wide, own = self._around(rows, 2 * self._margin)
+            weight, detail = self._read(values[wide].astype(np.float32), share[wide], wide)
+            self._weight[rows], self._detail[rows] = weight[own], detail[own]
+
+    def _mean(self, flat: Band) -> float:
+        """Mean of A inside the person, of some rows."""
+        total, count = _TINY, 1
+        for row in range(0, len(self._inside), _EVERY):
+            inside = self._inside[row]
+            total += float(flat(slice(row, row + 1))[0, inside, 0].sum())
+            count += int(inside.sum())
+        return max(total / count, _TINY)
+
+    def _read(self, values: np.ndarray, share: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Weight w and detail D [h, W] of some rows of A and B [h, W, 2], in units of the mean of A."""
+        low = self._blurred(values, rows)
+        seen = (low[..., 0] - _DARK[0]) / (_DARK[1] - _DARK[0])
         logs = np.log((values / low.clip(min=_TINY)).clip(1 / _LARGEST, _LARGEST))
         guided, coarse = logs[..., 0], logs[..., 1]
-        faint = np.exp(-self._blurred(coarse[..., None] ** 2, slice(None))[..., 0] / _FAINT**2)
-        self._weight = (share * seen.clip(0, 1)).astype(np.float16)
-        self._detail = np.exp(guided + faint * (coarse - guided)).astype(np.float16)
+        faint = np.exp(-self._blurred(coarse[..., None] ** 2, rows)[..., 0] / _FAINT**2)
+        return (share * seen.clip(0, 1)), np.exp(guided + faint * (coarse - guided))
+
+    def _around(self, rows: slice, margin: int) -> tuple[slice, slice]:
+        """Rows with those around them, and where they are among these."""
+        start, stop, _ = rows.indices(len(self._inside))
+        wide = slice(max(0, start - margin), min(len(self._inside), stop + margin))
+        return wide, slice(start - wide.start, stop - wide.start)
 
     def given(self, relit: Band) -> Band:
         """A relit image [H, W, 3], by rows, with the detail."""
-        margin = 2 * self._reach
 
         def of(rows: slice) -> np.ndarray:
-            start, stop, _ = rows.indices(len(self._inside))
-            wide = slice(max(0, start - margin), min(len(self._inside), stop + margin))
-            own = slice(start - wide.start, stop - wide.start)
+            wide, own = self._around(rows, self._margin)
             pixels = relit(wide)
             low, pixels = self._blurred(pixels, wide)[own], pixels[own]
             return np.asarray(
@@ -60,7 +83,7 @@ class Grain:
 
     def _blurred(self, values: np.ndarray, rows: slice) -> np.ndarray:
         """Some rows of an image [h, W, C], blurred inside the person, by two boxes."""
-        inside = self._inside[rows][..., None]
+        inside = self._inside[rows][..., None].astype(np.float32)
         size = (2 * self._reach + 1, 2 * self._reach + 1, 1)
 
         def blurred(image: np.ndarray) -> np.ndarray:

@@ -19,7 +19,8 @@ from facerf_cli.run import memory
 Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # an array for a layer, by its name and shape
 
 # Bytes of a pixel beside the photo that is read.
-KEPT_PX = 12  # an 8-bit copy, the matte, the view of a face; of a stack's photo an image for several formats
+# An 8-bit copy, the matte, the view of a face, the grain; of a stack's photo an image for several formats.
+KEPT_PX = 17
 KEPT_OF_SEGMENTS_PX = 26  # an 8-bit copy, the matte, the colours, a class
 # Bytes of a pixel that is held.
 _PHOTO_PX = 12
@@ -29,7 +30,7 @@ _SEGMENTS_PX = _PHOTO_PX + KEPT_OF_SEGMENTS_PX
 _IMAGE_PX = 12
 _FACE_PX, _BESIDE_FACE_PX = 32, 16  # of a face drawn in its photo, and of the photo with its matte around it
 # Of a person of a group: transport, and maps of the light that is shown; matte and grain.
-_COMPOSED_BYTES, _COMPOSED_PX = 96 << 20, 12
+_COMPOSED_BYTES, _COMPOSED_PX = 80 << 20, 12
 _STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _WEB_PX = 9  # of an image for web viewers: half floats, then bytes
 _RELIT_HELD = 4  # relit textures are held this many times while lights are added to them
