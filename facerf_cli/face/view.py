@@ -84,7 +84,7 @@ class FaceView:
             frame = np.zeros((rows.stop - rows.start, self.width_px, *channels), np.float32)
             inside = self.rows_inside(rows)
             if inside.start < inside.stop:
-                frame[self.rows_of(inside, rows), self.window[1]] = of(inside).numpy()
+                frame[self.rows_of(inside, rows), self.window[1]] = of(inside).detach().numpy()
             return frame
 
         return in_photo
