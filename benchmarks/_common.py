@@ -20,7 +20,9 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("FACERF_SHARED", ROOT.parent / "shared"))  # test data, not in the repository
 ASTRONAUT = ROOT / "examples" / "astronaut.jpg"
 PHOTOS, YALE_B, MAPS = (SHARED / "data" / name for name in ("photos", "extended_yale_b", "hdri"))
-SHIFTS = SHARED / "bench" / "yale_b" / "shifts.csv"
+WHOLE_YALE_B = SHARED / "data" / "yale_b_full"  # uncropped frames of some people
+BENCHMARK_DATA = ROOT / "benchmarks" / "data"  # outlines and shifts, measured for facerf
+SHIFTS = BENCHMARK_DATA / "yale_b_shifts.csv"
 ICT_FACEKIT = SHARED / "data" / "ict_facekit" / "ICT-FaceKit-master.tar.xz"
 sys.path.append(str(ROOT))  # benchmarks import from tools/
 _SUFFIXES = (".jpg", ".jpeg", ".png")

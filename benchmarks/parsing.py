@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import skimage.data
 import torch
-from _common import PHOTOS, SHARED, YALE_B, arguments
+from _common import BENCHMARK_DATA, PHOTOS, SHARED, YALE_B, arguments
 from PIL import Image, ImageDraw
 from scipy.ndimage import gaussian_gradient_magnitude
 from skimage.transform import resize
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=3, help="of the flashes of a subject")
     parser.add_argument("--photos", type=Path, default=PHOTOS)
     parser.add_argument("--portraits", type=Path, default=SHARED / "data" / "yale_b_full")
-    parser.add_argument("--regions", type=Path, default=SHARED / "bench" / "portrait" / "regions.json")
+    parser.add_argument("--regions", type=Path, default=BENCHMARK_DATA / "portrait_regions.json")
     parser.add_argument("--bank", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -5,6 +5,7 @@ Workers read the crops of a few lights; the device unwraps them. Nothing is unwr
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from facerf_cli.raster.camera import crop_camera
 from facerf_cli.raster.texture import UnwrapSettings, unwrap
 from facerf_cli.synth.bank.texture_samples import cast_and_greyed, draw_target_lights
 
+_FACES_KEPT = 512  # a worker, of .7 MB at 512 pixels
 _DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not divide by 0
 
 
@@ -79,19 +81,36 @@ class LightStacks:
         cameras = self.dataset.cameras[subject]
         camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
         path = self.dataset.stack_path(subject, camera)
-        header, fit = read_stack(path)
-        directions = torch.from_numpy(header.directions).float()
-        chosen = draw_target_lights(directions, min(lights, len(directions)), generator).tolist()
-        images = torch.cat([read_olats(path, slice(light, light + 1)) for light in chosen]).float()
-        seen = torch.from_numpy(header.seen)
-        exposure = MEAN_RADIANCE / max(float(header.source[header.seen > 0.5].mean()), _DARKEST)
+        face = _face_of(path, self.model)
+        chosen = draw_target_lights(face.directions, min(lights, len(face.directions)), generator).tolist()
+        images = cast_and_greyed(read_olats(path, chosen).float() * face.exposure, generator)
+        directions = face.directions[chosen] @ face.rotation  # R^T w, of row vectors
         return LightCrops(
-            cast_and_greyed(images * exposure, generator)[None].half(),
-            seen[None, None],
-            fit.vertices_camera(self.model)[None],
-            (directions[chosen] @ torch.from_numpy(header.rotation).float())[None],  # R^T w, of row vectors
-            head,
+            images[None].half(), face.seen[None, None].float(), face.vertices[None], directions[None], head
         )
+
+
+@dataclass(frozen=True, eq=False)
+class _Face:
+    """What a stack tells of its face: lights [L, 3], rotation [3, 3], seen [S, S], mesh [V, 3], exposure."""
+
+    directions: Tensor
+    rotation: Tensor
+    seen: Tensor
+    vertices: Tensor
+    exposure: float
+
+
+@lru_cache(maxsize=_FACES_KEPT)
+def _face_of(path: Path, model: MorphableModel) -> _Face:
+    header, fit = read_stack(path)
+    return _Face(
+        torch.from_numpy(header.directions).float(),
+        torch.from_numpy(header.rotation).float(),
+        torch.from_numpy(header.seen).half(),
+        fit.vertices_camera(model),
+        MEAN_RADIANCE / max(float(header.source[header.seen > 0.5].mean()), _DARKEST),
+    )
 
 
 def open_light_stacks(folder: Path, face_model: str) -> LightStacks:

@@ -8,7 +8,7 @@ stack, the head's rotation and the fit, so that a stack can be relit without its
 """
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -174,13 +174,14 @@ def read_olat_header(path: Path) -> StackHeader:
         return _read_header(stack)
 
 
-def read_olats(path: Path, lights: slice = slice(None), rows: slice = slice(None)) -> Tensor:
+def read_olats(path: Path, lights: slice | Sequence[int] = slice(None), rows: slice = slice(None)) -> Tensor:
     """Read some lights' OLATs [l, 3, h, W] float16, or some of their rows, from a stack of any size."""
     with _opened(path) as stack:
         height = stack.shape[0]
         share = len(range(height)[rows]) / max(1, height)
-        _ask_for(stack, len(range(stack.document.lights)[lights]), share)
-        return _read_lights(stack, lights, rows)
+        numbers = range(stack.document.lights)[lights] if isinstance(lights, slice) else lights
+        _ask_for(stack, len(numbers), share)
+        return _read_lights(stack, numbers, rows)
 
 
 def stream_olats(path: Path) -> Iterator[Tensor]:
@@ -198,7 +199,7 @@ def stream_olats(path: Path) -> Iterator[Tensor]:
         last = min(first + _OPEN, lights)
         with _opened(path) as stack:
             for start in range(first, last, at_once):
-                yield _read_lights(stack, slice(start, min(start + at_once, last))).float()
+                yield _read_lights(stack, range(start, min(start + at_once, last))).float()
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
@@ -277,8 +278,8 @@ def _read_header(stack: _Stack) -> StackHeader:
     )
 
 
-def _read_lights(stack: _Stack, lights: slice, rows: slice = slice(None)) -> Tensor:
-    numbers, (height, width) = range(stack.document.lights)[lights], stack.shape
+def _read_lights(stack: _Stack, numbers: Sequence[int], rows: slice = slice(None)) -> Tensor:
+    height, width = stack.shape
     olats = np.empty((len(numbers), len(range(height)[rows]), width, 3), np.float16)
     for place, number in enumerate(numbers):
         olats[place] = _pixels(stack, number, ("R", "G", "B"), rows)

@@ -34,9 +34,13 @@ DATA = {
     "feature_colours": "--run",
     "held_out_heads": "--bank",
     "portrait_designs": "--bank",
-    "portrait_oracles": "--bench",
+    "emily_normals": "--emily",
+    "portrait": "--data",
+    "portrait_oracles": "--data",
     "skin_tones": "--bank",
+    "training_data": "--dataset",
     "training_speed": "--bank",
+    "whole_heads": "--data",
 }
 
 
@@ -45,7 +49,7 @@ def test_a_script_without_its_data_says_so_and_succeeds(
     script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     module = importlib.import_module(script)
-    for name in {"YALE_B", "ICT_FACEKIT", "SHARED"} & vars(module).keys():
+    for name in {"YALE_B", "WHOLE_YALE_B", "ICT_FACEKIT", "SHARED"} & vars(module).keys():
         monkeypatch.setattr(module, name, tmp_path / "absent")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", [f"{script}.py"])
