@@ -92,7 +92,7 @@ class LightStacks:
 
 @dataclass(frozen=True, eq=False)
 class _Face:
-    """What a stack tells of its face: lights [L, 3], rotation [3, 3], seen [S, S], mesh [V, 3], exposure."""
+    """The face of a stack: lights [L, 3], rotation [3, 3], seen [S, S], mesh [V, 3], exposure."""
 
     directions: Tensor
     rotation: Tensor
