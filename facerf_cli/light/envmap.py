@@ -206,6 +206,19 @@ def _irradiance(envmap: Tensor, rotate_deg: float) -> Tensor:
     return (normals @ sources.T).clamp(min=0) @ power
 
 
+def rig_triangles(lights: np.ndarray) -> np.ndarray:
+    """Triangles [F, 3] of neighbours among a rig's lights [L, 3]; none where it surrounds nothing.
+
+    Of a rig that is open to a side, the triangles that close it are left out.
+    """
+    try:
+        hull = ConvexHull(lights.astype(float))
+    except (QhullError, ValueError):  # fewer than four lights, or all in a plane
+        return np.zeros((0, 3), np.int64)
+    triangles: np.ndarray = hull.simplices[hull.equations[:, 3] < -_FLAT].astype(np.int64)
+    return triangles
+
+
 def lights_around(directions: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
     """Three of the lights [L, 3] around each of directions [P, 3]: indices and shares [P, 3], which sum to 1.
 
@@ -216,17 +229,11 @@ def lights_around(directions: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
     nearest = (directions.double() @ lights.double().T).argmax(1)
     index = nearest[:, None].expand(-1, 3).clone()
     share = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).repeat(len(directions), 1)
-    try:
-        hull = ConvexHull(lights.double().numpy())
-    except (QhullError, ValueError):  # fewer than four lights, or all in a plane
+    corners = torch.from_numpy(rig_triangles(lights.numpy()))
+    if not len(corners):
         return index, share
-    planes = torch.from_numpy(hull.equations)  # [F, 4]: n . x + d = 0, n outward
-    cap = planes[:, 3] < -_FLAT  # not the sides that an open rig shows its middle
-    if not cap.any():
-        return index, share
-    corners, planes = torch.from_numpy(hull.simplices).long()[cap], planes[cap]  # [F, 3]
     around = torch.linalg.pinv(lights.double()[corners].mT)  # [F, 3, 3]: from a direction to its shares
-    reciprocal = planes[:, :3] / -planes[:, 3:]  # of the distance along a ray
+    reciprocal = around.sum(1)  # of the distance along a ray
     for first in range(0, len(directions), _DIRECTIONS_AT_ONCE):
         rows = slice(first, first + _DIRECTIONS_AT_ONCE)
         toward = directions[rows].double()

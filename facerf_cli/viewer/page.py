@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from scipy.spatial import ConvexHull, QhullError
 
 from facerf_cli.files.documents import json_text
 from facerf_cli.files.sheets import filled_page
@@ -22,6 +21,7 @@ from facerf_cli.image.colour import (
     linear_to_srgb,
 )
 from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK
+from facerf_cli.light.envmap import rig_triangles
 from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
 _HERE = Path(__file__).parent
@@ -101,11 +101,8 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
 
     The matrix of a triangle turns a direction into shares of its lights, up to their sum.
     """
-    try:
-        corners = np.asarray(ConvexHull(directions.astype(float)).simplices)
-    except (QhullError, ValueError):
-        corners = np.zeros((0, 3), int)
-    to_shares = np.linalg.inv(directions[corners].astype(float).mT)
+    corners = rig_triangles(directions)
+    to_shares = np.linalg.pinv(directions[corners].astype(float).mT)
     return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
 
 

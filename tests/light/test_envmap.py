@@ -14,6 +14,7 @@ from facerf_cli.light.envmap import (
     check_envmap,
     envmap_weights,
     lights_around,
+    rig_triangles,
     rotated_weights,
     texel_integrals,
 )
@@ -225,6 +226,8 @@ def test_lights_around_in_a_rig_that_is_open_to_the_back() -> None:
     torch.testing.assert_close(mean, towards.double(), atol=1e-6, rtol=0)
     index, share = lights_around(torch.tensor([[0.0, 0, -1]]), front)
     assert share[0].tolist() == [1, 0, 0]
+    corners = front.numpy()[rig_triangles(front.numpy())]
+    assert len(corners) and corners.mean(1)[:, 2].min() > 0.3  # none closes the back
 
 
 @pytest.mark.parametrize("lights", [[[0.0, 0, 1]], [[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.6, 0.53]]])
