@@ -4,8 +4,8 @@
     python examples/natural_photos.py DATASET OUT [EACH]
 
 Each source of `facerf relight-dataset` (the first EACH of a person, none of the split test) is laid over its
-own environment map, as a lens sees it out of focus, and written as an 8-bit JPEG. `facerf train --preset paper
---photos OUT` detects the faces as in any photos.
+own environment map, as a lens sees it out of focus, and written as an 8-bit JPEG. `facerf train
+--preset paper --photos OUT` detects the faces as in any photos.
 """
 
 import math
