@@ -32,6 +32,7 @@ SHARED = Path(os.environ.get("FACERF_SHARED", Path(__file__).parents[2] / "share
 
 # Files that take 10 s or more, the longest first: where they come first, both processes end together.
 LONG = """
+test_paper_script.py test_docs_commands.py
 cli/test_train.py cli/test_film.py cli/test_prepare_dataset.py cli/test_relight.py
 cli/test_output_options.py viewer/test_viewer_agreement.py cli/test_evaluate_protocols.py
 test_ray_workers.py portrait/test_find.py cli/test_prepare_checks.py test_stopping.py

@@ -17,7 +17,9 @@ def test_from_a_capture_to_the_papers_tables_and_figures(tmp_path: Path) -> None
     write_capture(tmp_path / "capture", subjects=4, lights=12)
     run = tmp_path / "run"
     given = {"SCALE": "tiny", "CAPTURE": tmp_path / "capture", "SHOWN": "1"}
-    maps = {"MAPS": "procedural:2", "TEST_MAPS": "procedural:2"}
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test/astronaut.jpg").symlink_to(SCRIPT.parents[1] / "astronaut.jpg")
+    maps = {"TEST_PHOTOS": tmp_path / "test", "MAPS": "procedural:2", "TEST_MAPS": "procedural:2"}
     run_shell(tmp_path / "bin", SCRIPT, run, **given, **maps)
     for table, methods in {
         "1": ["field", "lambert", "composite"],

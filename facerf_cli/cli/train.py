@@ -5,7 +5,7 @@ from typing import Any
 
 import typer
 
-from facerf_cli.cli.options import is_default
+from facerf_cli.cli.options import is_default, was_given
 from facerf_cli.errors import UsageError
 from facerf_cli.option import flag
 from facerf_cli.training.settings import KINDS, TrainSettings
@@ -61,8 +61,6 @@ def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> N
     _refuse_conflicts(context, options)
     of_file = (context.find_root().default_map or {}).get("train", {})
     tables = {name: table for name, table in of_file.items() if name in KINDS}
-    if "loss" in tables and options.stage != "joint":
-        raise UsageError(f"--config: [train.loss] does not apply to the stage {options.stage}; leave it out")
     training = pace.of_run(options, tables)
     from facerf_cli.work.train import run_training
 
@@ -92,11 +90,11 @@ def _typed(context: typer.Context, options: TrainOptions, training: TrainSetting
 
 def _refuse_conflicts(context: typer.Context, options: TrainOptions) -> None:
     """Raise UsageError for options that do not apply to the stage or contradict each other."""
-    stage, given = options.stage, {name for name in context.params if not is_default(context, name)}
+    stage, given = options.stage, {name for name in context.params if was_given(context, name)}
     for name, stages in _STAGES.items():
         if name in given and stage not in stages:
             raise UsageError(f"{flag(name)}: does not apply to the stage {stage}; leave it out")
-    if stage in _CROP_STAGES and "dataset" not in given:
+    if stage in _CROP_STAGES and options.dataset is None:
         raise UsageError(f"--stage {stage}: needs a prepared dataset; give --dataset")
     if {"vgg_weights", "appearance_features"} <= given:
         raise UsageError("--appearance-features: takes the place of --vgg-weights; give one of them")
@@ -110,7 +108,7 @@ def _refuse_conflicts(context: typer.Context, options: TrainOptions) -> None:
             raise UsageError(
                 f"{flag(name)}: is for the Geometry Network, which --geometry landmarks leaves out"
             )
-    if "texture_size" in given and "dataset" not in given:
+    if "texture_size" in given and options.dataset is None:
         raise UsageError("--texture-size: applies to a dataset; give --dataset, too")
     if {"mean_face", "dataset"} <= given and stage == "reflectance":
         raise UsageError("--mean-face: the dataset is fitted already; give --stage joint, or synthetic heads")

@@ -57,8 +57,6 @@ def write_config(folder: Path, options: Mapping[str, Any], training: TrainSettin
     """Write DIR/config.toml: the options of the command line by name, and all other settings in force."""
     tables = {"global": {"seed": seed}, "train": options}
     for name in KINDS:
-        if name == "loss" and options["stage"] != "joint":
-            continue
         group = getattr(training, name)
         kind = {"name": type(group).__name__} if len(KINDS[name]) > 1 else {}
         tables[f"train.{name}"] = kind | asdict(group)

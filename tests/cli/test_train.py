@@ -208,7 +208,7 @@ def test_curves_are_a_table_of_all_steps(run: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[train.loss]\nphotometric = 9", "[train.loss] does not apply to the stage reflectance"),
+        ("[train.loss]\nphotometric = -9", "[train.loss] photometric is -9; give a number from 0 on"),
         ("[train]\nstage = 'joint'", "--stage joint: needs a prepared dataset"),
         ("[train.optimizer]\nname = 'SGD'", "name is 'SGD'; give one of AdamW, Adadelta"),
         ("[train.optimizer]\nrho = 0.5", "[train.optimizer] rho: no such setting; give one of learning_rate"),
