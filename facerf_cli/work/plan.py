@@ -20,7 +20,7 @@ Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # an array for a layer, by
 
 # Bytes of a pixel beside the photo that is read.
 # An 8-bit copy, the matte, the view of a face, the grain; of a stack's photo an image for several formats.
-KEPT_PX = 17
+KEPT_PX = 22
 KEPT_OF_SEGMENTS_PX = 26  # an 8-bit copy, the matte, the colours, a class
 # Bytes of a pixel that is held.
 _PHOTO_PX = 12
