@@ -154,16 +154,19 @@ def test_of_the_weights_of_the_reflectance_network(
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
-def test_values_without_gradients_stay_so(person: facerf.Person, light: facerf.Light) -> None:
-    """Layers, and the texture in the photo."""
+def test_values_without_gradients_stay_so(person: facerf.Person, light: facerf.Light, tmp_path: Path) -> None:
+    """Layers, files, and the texture in the photo."""
     weights = torch.as_tensor(light.weights).clone().requires_grad_()
     texture = torch.from_numpy(person.texture).requires_grad_()
     pose = POSE.clone().requires_grad_()
     lit = facerf.Light(light.directions, weights)
     turned = person.relight(lit, pose=pose, layers=["normal", "depth"])
     assert turned["image"].requires_grad and not turned["normal"].requires_grad
-    person.with_texture(texture).relight(lit, layers=["albedo"])["image"].sum().backward()
+    textured = person.with_texture(texture)
+    textured.relight(lit, layers=["albedo"])["image"].sum().backward()
     assert weights.grad is not None and texture.grad is None
+    textured.save(tmp_path / "person.npz")
+    assert textured.mesh.visual.material.image.size == (64, 64)
 
 
 def test_of_the_maps_of_the_portrait(models: Models, person: facerf.Person, light: facerf.Light) -> None:

@@ -196,7 +196,7 @@ class Person(pipeline.FittedPerson):
     def mesh(self) -> trimesh.Trimesh:
         """The fitted face with its texture, head frame, m: `.vertices` [V, 3], `.faces`, `.export(path)`."""
         fit, (u, v) = self.head.fit, grid_uv().numpy().T
-        texture = Image.fromarray(to_display(_by_pixel(self.head.face.texture).numpy()))
+        texture = Image.fromarray(to_display(_by_pixel(self.head.face.texture).detach().numpy()))
         vertices = self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy()
         visual = TextureVisuals(np.stack([u, 1 - v], -1), image=texture)
         return trimesh.Trimesh(vertices, grid_triangles().numpy(), visual=visual, process=False)
@@ -228,7 +228,8 @@ class Person(pipeline.FittedPerson):
     def save(self, path: str | Path) -> None:
         """Write photo, fit and texture as .npz; `Person.load` reads the rest from the photo."""
         arrays: dict[str, Any] = {"photo": self.photo, "cropped": self.head.cropped, "kind": self.kind}
-        arrays |= {name: getattr(self.head.face, name).numpy() for name in FaceTexture.__dataclass_fields__}
+        maps = {name: getattr(self.head.face, name) for name in FaceTexture.__dataclass_fields__}
+        arrays |= {name: tensor.detach().numpy() for name, tensor in maps.items()}
         arrays |= {"network_alone": self.network_alone, **fit_to_arrays(self.head.fit)}
         arrays |= {} if self.given_matte is None else {"matte": self.given_matte}
         with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
