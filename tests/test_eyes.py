@@ -11,13 +11,15 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
+from tests import astronaut
 
 SIDE, IRIS = 40, np.array([[20.0, 18.0, 10.0]])
 DARK = np.full((SIDE, SIDE, 3), 0.05, np.float32)
 
 
 def image_of(azimuth_deg: float, elevation_deg: float) -> torch.Tensor:
-    return mirrored_in_cornea(azel_to_direction(azimuth_deg, elevation_deg)[None], torch.ones(1, 1, 3))[0]
+    light = azel_to_direction(azimuth_deg, elevation_deg)[None]
+    return mirrored_in_cornea(light, torch.ones(1, 1, 3), torch.ones(1, 1))[0, 0]
 
 
 @pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (50, 0), (0, 40), (-40, -20)])
@@ -33,12 +35,12 @@ def test_a_light_is_seen_where_the_cornea_faces_half_way_to_it(azimuth: float, e
 
 def test_a_light_behind_the_head_is_not_seen() -> None:
     assert image_of(180, 0).max() == 0 and image_of(0, 0).max() > 0.5
-    assert mirrored_in_cornea(torch.zeros(0, 3), torch.zeros(1, 0, 3)).abs().max() == 0
+    assert mirrored_in_cornea(torch.zeros(0, 3), torch.zeros(1, 0, 3), torch.zeros(1, 0)).abs().max() == 0
 
 
 def test_light_from_all_around_is_seen_as_a_smooth_veil() -> None:
     around = rig_directions(24)
-    seen = mirrored_in_cornea(around, torch.full((1, 24, 3), 4 / 24))[0, 0]
+    seen = mirrored_in_cornea(around, torch.full((1, 24, 3), 4 / 24), torch.ones(1, 24))[0, 0, 0]
     at = 2 * (torch.arange(len(seen)) + 0.5) / len(seen) - 1
     iris = seen[(at[None].square() + at[:, None].square()) < 0.9]
     assert float(iris.mean()) == pytest.approx(0.025, rel=0.3)  # of a radiance of 1
@@ -50,8 +52,9 @@ def test_a_light_is_seen_alike_whatever_else_shines() -> None:
         [azel_to_direction(20.0, 10.0)[None], rig_directions(24), azel_to_direction(24.0, 10.0)[None]]
     )
     weights = torch.rand(1, len(lamps), 3, generator=torch.Generator().manual_seed(0))
-    each = [mirrored_in_cornea(lamps[[n]], weights[:, [n]]) for n in range(len(lamps))]
-    torch.testing.assert_close(mirrored_in_cornea(lamps, weights), sum(each))
+    arrives = torch.rand(2, len(lamps), generator=torch.Generator().manual_seed(1))
+    each = [mirrored_in_cornea(lamps[[n]], weights[:, [n]], arrives[:, [n]]) for n in range(len(lamps))]
+    torch.testing.assert_close(mirrored_in_cornea(lamps, weights, arrives), sum(each))
 
 
 def eyes(photo: np.ndarray) -> Eyes:
@@ -62,12 +65,12 @@ def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
     photo = DARK.copy()
     photo[14:17, 15:18] = 3.0
     relit, mirrored = 2 * photo, image_of(40, 0)
-    found = whole(eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored), SIDE, SIDE)
+    found = whole(eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored[None]), SIDE, SIDE)
     assert found[14:17, 15:18].max() < 0.2  # 6 before
     assert found[18, 22:28].max() > 0.5 and found[18, 12:18].max() < 0.2
     assert np.array_equal(found[:5], relit[:5]) and np.array_equal(found[:, :8], relit[:, :8])
     rows = slice(17, 21)
-    part = eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored)(rows)
+    part = eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored[None])(rows)
     assert np.array_equal(part, found[rows])
 
 
@@ -81,3 +84,10 @@ def test_light_that_arrives_from_near_and_far() -> None:
     mean = torch.einsum("mnc,nd->mcd", weights, directions)[0, 0]
     torch.testing.assert_close(mean, torch.tensor([1.0, 2.0, 0.0]), atol=1e-4, rtol=1e-3)
     assert math.isclose(float(weights[0, :, 0].sum()), 3.0, rel_tol=1e-3)
+
+
+def test_the_nose_keeps_a_light_from_the_eye_behind_it() -> None:
+    lights = torch.stack([azel_to_direction(azimuth, 0.0) for azimuth in (-95.0, 0.0, 95.0)])
+    left, right = astronaut.field().person.reaching_irises(lights)  # as the picture shows them
+    assert left[1] > 0.9 and right[1] > 0.9
+    assert right[0] < 0.1 and left[2] < 0.1  # each from the other's side

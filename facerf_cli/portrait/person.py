@@ -63,6 +63,16 @@ class SeenPerson:
         """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
         return self.shadows.toward(places_m)
 
+    def reaching_irises(self, directions: Tensor) -> Tensor:
+        """Share [N, L] of lights [L, 3] that reaches each of N irises."""
+        found = torch.zeros(len(self.irises_px), len(directions))
+        places = self.square.to_crop(self.irises_px[:, :2]).clip(0, self.square.size_px - 1).astype(int)
+        for share, (column, row) in zip(found, places, strict=True):
+            fields = (self.maps.normals, self.maps.positions_m, self.maps.covered)
+            maps = ProxyMaps(*(field[..., row, column, None, None] for field in fields))
+            share[:] = Shadows(self.proxy, maps).along(directions)[:, 0, 0]
+        return found
+
     @property
     def sides(self) -> float:
         """Side of the square in faces, the larger sides of the bounds of landmarks."""
@@ -83,7 +93,7 @@ class SeenPerson:
     def shadows(self) -> Shadows:
         """The lights that reach each pixel, at half the square's side."""
         half = replace(self.square, size_px=self.square.size_px // 2)
-        return Shadows(self.proxy, square_camera(self.fit, half))
+        return Shadows(self.proxy, proxy_maps(self.proxy, square_camera(self.fit, half)))
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""

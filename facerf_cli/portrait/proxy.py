@@ -8,8 +8,9 @@ that explains the photo best is a first guess of the photo's light, from which t
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,6 +72,11 @@ class Proxy:
     normals: Tensor
     triangles: Tensor
 
+    @cached_property
+    def scene(self) -> Any:
+        """The mesh for tracing of rays."""
+        return build_scene(self.vertices.numpy(), self.triangles.numpy())
+
     @staticmethod
     def of(vertices: Tensor, triangles: Tensor) -> "Proxy":
         """Compute the normals."""
@@ -127,19 +133,18 @@ def proxy_maps(proxy: Proxy, camera: Camera) -> ProxyMaps:
 
 
 class Shadows:
-    """Lights that reach each pixel of a camera, where a proxy shades itself.
+    """Lights that reach each pixel of a proxy's maps, where it shades itself.
 
     A surface that faces away is not reached. What all lights share is computed once: the pixels that are
     covered [s, s], the rays' origins [N, 3], and numbers [rays, 2, N, 1] in 0..1, which place their ends on
     the disc of a light.
     """
 
-    def __init__(self, proxy: Proxy, camera: Camera) -> None:
-        maps = proxy_maps(proxy, camera)
+    def __init__(self, proxy: Proxy, maps: ProxyMaps) -> None:
         self.covered, self._inside = maps.covered, maps.covered.numpy() > 0
         normals, points = (field.numpy()[:, self._inside].T for field in (maps.normals, maps.positions_m))
         self.origins = (points + _OFF_M * normals).astype(np.float32)
-        self._scene = build_scene(proxy.vertices.numpy(), proxy.triangles.numpy())
+        self._scene = proxy.scene
         # by pixel of the square, so that those of neighbouring frames of a shot are alike
         numbers = np.random.default_rng(_SEED).random((_RAYS, 2, *self._inside.shape)).astype(np.float32)
         self.numbers = numbers[:, :, self._inside][..., None]

@@ -89,7 +89,7 @@ class Relit:
     """A head under one light: its texture [3, T, T], and the light around it.
 
     `surround` is [3, s, s] of a `Surround`, [views, 9, S, S] of a `WholePerson`; None of a face alone.
-    `mirrored` is what the eyes of a whole person mirror [3, s, s].
+    `mirrored` is what the eyes of a whole person mirror [N, 3, s, s].
     """
 
     texture: Tensor
@@ -186,7 +186,8 @@ class Composition:
                 texture = near_texture(reflectance.field, points, self.vertices_m, side)
                 textures = textures + rgb[..., None, None] * texture
             stacked = torch.stack([view.stacked for view in lit], 1)
-            mirrored = mirrored_in_cornea(*lights.arriving(self.vertices_m.mean(0)))
+            toward, arriving = lights.arriving(self.vertices_m.mean(0))
+            mirrored = mirrored_in_cornea(toward, arriving, reflectance.person.reaching_irises(toward))
             yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored)
             return
         changes = self.surround.changes if isinstance(self.surround, Surround) else None

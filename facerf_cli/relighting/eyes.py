@@ -26,10 +26,11 @@ _LEAST_PX = 2.0  # radius of an iris in which something can be seen
 _CATCHLIGHT = 1.5  # radiance from which on a pixel is a catchlight, over the median of the iris
 
 
-def mirrored_in_cornea(directions: Tensor, weights: Tensor) -> Tensor:
-    """Radiance [M, 3, s, s] that an iris mirrors under M sums, rgb weights [M, L, 3], of lights [L, 3].
+def mirrored_in_cornea(directions: Tensor, weights: Tensor, arrives: Tensor) -> Tensor:
+    """Radiance [M, N, 3, s, s] that N irises mirror under M sums, rgb weights [M, L, 3], of lights [L, 3].
 
-    The square lies around the iris, as the camera sees it; the eye looks at the camera.
+    `arrives` [N, L] is the share of each light that reaches each iris, past nose and brows. The square lies
+    around the iris, as the camera sees it; the eye looks at the camera.
     """
     at = 2 * (torch.arange(_SIDE) + PIXEL_CENTRE) / _SIDE - 1
     down, right = torch.meshgrid(at, at, indexing="ij")
@@ -41,13 +42,15 @@ def mirrored_in_cornea(directions: Tensor, weights: Tensor) -> Tensor:
     inside = (right.square() + down.square()) < 1
     discs = inside * smoothstep((torch.einsum("lc,cij->lij", directions, seen) - outer) / (inner - outer))
     # a disc that gives a white surface radiance 1 has itself the radiance 1 / sin^2
-    return torch.einsum("mlc,lij->mcij", weights, discs * (_REFLECTED / radii.sin().square()))
+    shown = discs * (_REFLECTED / radii.sin().square())
+    return torch.einsum("mlc,nl,lij->mncij", weights, arrives, shown)
 
 
 @dataclass(frozen=True, eq=False)
 class _Iris:
     """A window of the photo: share of the iris [h, w], what stays without catchlights [h, w], its grid."""
 
+    number: int  # among the person's irises
     rows: slice
     columns: slice
     share: np.ndarray
@@ -69,7 +72,7 @@ class Eyes:
         size_px: tuple[int, ...],
     ) -> None:
         self._irises = []
-        for x_px, y_px, radius_px in irises_px.tolist():
+        for number, (x_px, y_px, radius_px) in enumerate(irises_px.tolist()):
             rows, columns = (
                 slice(max(0, math.floor(middle - radius_px)), min(length, math.ceil(middle + radius_px)))
                 for middle, length in zip((y_px, x_px), size_px, strict=True)
@@ -87,11 +90,11 @@ class Eyes:
                 most = _CATCHLIGHT * np.median(light[share > 0.5])
                 kept = np.minimum(1, most / np.maximum(light, 1e-9)).astype(np.float32)
                 grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
-                self._irises.append(_Iris(rows, columns, share.astype(np.float32), kept, grid))
+                self._irises.append(_Iris(number, rows, columns, share.astype(np.float32), kept, grid))
 
     def lit(self, relit: Band, mirrored: Tensor) -> Band:
-        """A relit image [H, W, 3], by rows, with the mirror image [3, s, s] in its eyes."""
-        images = [self._placed(iris, mirrored) for iris in self._irises]
+        """A relit image [H, W, 3], by rows, with the mirror images [N, 3, s, s] in its eyes."""
+        images = [self._placed(iris, mirrored[iris.number]) for iris in self._irises]
 
         def of(rows: slice) -> np.ndarray:
             pixels = relit(rows)

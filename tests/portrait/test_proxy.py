@@ -1,5 +1,6 @@
 """The proxy follows its fit and its hair, and casts the shadows of a head."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -86,7 +87,7 @@ def test_heads_cast_shadows() -> None:
     camera = square_camera(fit(), SQUARE)
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
     maps = proxy_maps(proxy(), camera)
-    visible = Shadows(proxy(), camera).along(lights)
+    visible = Shadows(proxy(), proxy_maps(proxy(), camera)).along(lights)
     assert visible.shape == (3, SIDE, SIDE) and visible.min() >= 0 and visible.max() <= 1
     face = (maps.covered > 0) & (torch.arange(SIDE)[:, None] > 36) & (torch.arange(SIDE)[:, None] < 60)
     left = face & (torch.arange(SIDE) < 44) & (torch.arange(SIDE) > 34)
@@ -101,29 +102,32 @@ def test_shadows_of_points_are_cast_toward_their_places() -> None:
     """A point far away is a far light; what stands behind a point casts no shadow."""
     camera = square_camera(fit(), SQUARE)
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 75.0))])
-    far = Shadows(proxy(), camera).toward(3000 * lights)
-    torch.testing.assert_close(far, Shadows(proxy(), camera).along(lights), atol=0.5, rtol=0)
-    assert (far - Shadows(proxy(), camera).along(lights)).abs().mean() < 2e-3  # rays that graze
+    far = Shadows(proxy(), proxy_maps(proxy(), camera)).toward(3000 * lights)
+    torch.testing.assert_close(
+        far, Shadows(proxy(), proxy_maps(proxy(), camera)).along(lights), atol=0.5, rtol=0
+    )
+    assert (
+        far - Shadows(proxy(), proxy_maps(proxy(), camera)).along(lights)
+    ).abs().mean() < 2e-3  # rays that graze
     points = torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -1.6]])
-    before, behind = Shadows(proxy(), camera).toward(points)
+    before, behind = Shadows(proxy(), proxy_maps(proxy(), camera)).toward(points)
     face = slice(40, 56), slice(42, 54)
     assert before[face].mean() > 0.9 and behind[face].mean() < 0.01
     neck, above = proxy_maps(proxy(), camera).positions_m[:, 72, 48], azel_to_direction(0.0, 60.0)
     places = torch.stack([neck + length_m * above for length_m in (0.02, 0.5)])
-    below_chin, over_head = Shadows(proxy(), camera).toward(places)[:, 72, 48]
+    below_chin, over_head = Shadows(proxy(), proxy_maps(proxy(), camera)).toward(places)[:, 72, 48]
     assert below_chin > 0.9 and over_head < 0.1  # the chin is behind the first
 
 
-def test_all_lights_share_one_scene_and_one_view(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_lights_share_one_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
     monkeypatch.setattr(module, "build_scene", lambda *given: calls.append("scene") or build_scene(*given))
-    monkeypatch.setattr(module, "proxy_maps", lambda *given: calls.append("view") or proxy_maps(*given))
-    shadows = Shadows(proxy(), square_camera(fit(), SQUARE))
+    mesh = replace(proxy())
+    shadows = Shadows(mesh, proxy_maps(mesh, square_camera(fit(), SQUARE)))
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
     at_once = shadows.along(lights)
-    assert calls == ["view", "scene"]
     torch.testing.assert_close(at_once, torch.cat([shadows.along(light[None]) for light in lights]))
-    assert len(calls) == 2
+    assert calls == ["scene"]
 
 
 def test_rays_of_a_pixel_are_those_of_the_frame_before() -> None:
@@ -131,7 +135,7 @@ def test_rays_of_a_pixel_are_those_of_the_frame_before() -> None:
     camera = square_camera(fit(), SQUARE)
     numbers = []
     for hair_px in (20.0, 34.0):
-        shadows = Shadows(proxy(hair_px=hair_px), camera)
+        shadows = Shadows(proxy(hair_px=hair_px), proxy_maps(proxy(hair_px=hair_px), camera))
         placed = np.full((*shadows.numbers.shape[:2], SIDE, SIDE), np.nan)
         placed[:, :, shadows.covered.numpy() > 0] = shadows.numbers[..., 0]
         numbers.append(placed)
