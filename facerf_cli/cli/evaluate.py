@@ -170,7 +170,7 @@ def yale_b(
     runs on the sources that --pictures keeps; its PNGs are read as given, too, and its colours are averaged.
     The database is for research and never trained on.
     """
-    if is_default(context, "reflectance") and not options.against:
+    if is_default(context, "reflectance"):
         options = replace(options, reflectance=("portrait",))
     settings = FaceSettings("yale-b", options, photo, network_alone=field.network_alone)
     _check(context, settings, photos=False)

@@ -135,13 +135,30 @@ def _parse_kinds(names: Sequence[str]) -> tuple[RelightKind, ...]:
 
 
 @dataclass(frozen=True)
+class NamedCheckpoint:
+    """A checkpoint, or a run's folder, under the name of its method."""
+
+    name: str
+    path: Path
+
+    @staticmethod
+    def parse(text: str) -> "NamedCheckpoint":
+        """Parse FILE or NAME=FILE; the best and the last of a run have the name of its folder."""
+        name, equals, file = text.rpartition("=")
+        path = Path(file)
+        of_run = path.is_dir() or path.stem in ("best", "last")
+        own = folder_name(path if path.is_dir() else path.parent) if of_run else path.stem
+        return NamedCheckpoint(name if equals else own, path)
+
+
+@dataclass(frozen=True)
 class EvaluateOptions(BatchOptions):
     """Settings of what is measured, by which methods, and where it goes, for other processes too.
 
     Attributes:
         reflectance: Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait;
             repeatable, and the others are compared with the first.
-        against: Measure another checkpoint of the field, named by its stem. Repeatable.
+        against: Measure another checkpoint of the field, under its name or that of its run. Repeatable.
         compare: Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name.
             Repeatable.
         pictures: Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.
@@ -157,8 +174,13 @@ class EvaluateOptions(BatchOptions):
         parse=_parse_kinds,
         panel=METHODS,
     )
-    against: tuple[Path, ...] = option(
-        (), metavar="FILE", shown_default="none", typed=list[Path] | None, parse=tuple, panel=METHODS
+    against: tuple[NamedCheckpoint, ...] = option(
+        (),
+        metavar="FILE|NAME=FILE",
+        shown_default="none",
+        typed=list[str] | None,
+        parse=lambda given: tuple(map(NamedCheckpoint.parse, given)),
+        panel=METHODS,
     )
     compare: tuple[Path, ...] = option(
         (), metavar="DIR", shown_default="none", typed=list[Path] | None, parse=tuple, panel=METHODS
@@ -171,7 +193,7 @@ class EvaluateOptions(BatchOptions):
     @property
     def methods(self) -> tuple[str, ...]:
         """The names of all methods: reflectance models, checkpoints, and folders of predictions."""
-        return (*self.reflectance, *(path.stem for path in self.against), *map(folder_name, self.compare))
+        return (*self.reflectance, *(one.name for one in self.against), *map(folder_name, self.compare))
 
     @property
     def has_field(self) -> bool:
@@ -182,10 +204,10 @@ class EvaluateOptions(BatchOptions):
         """Raise UsageError for an option that would fail every item."""
         twice = sorted({name for name in self.methods if self.methods.count(name) > 1})
         if twice:
-            raise UsageError(f"two methods have the name {twice[0]!r}; rename the file or folder of one")
-        for path in self.against:
-            if not path.is_file():
-                raise UsageError(f"--against {path}: no such file; give one that exists")
+            raise UsageError(f"two methods have the name {twice[0]!r}; rename one, or give NAME=FILE")
+        for one in self.against:
+            if not one.path.exists():
+                raise UsageError(f"--against {one.path}: no such file; give one that exists")
         for folder in self.compare:
             if not folder.is_dir():
                 raise UsageError(f"--compare {folder}: no such folder; give one that exists")

@@ -57,8 +57,9 @@ def collect_pairs(
     """Match the images of folders, sorted by name; a folder of predictions is a method with its name.
 
     `masks` mirrors the truths; `facts` is a CSV file (`read_facts`). If it names no person, that is the
-    truth's topmost folder, or in a flat tree each image is a person. Raises UsageError for folders that
-    cannot be used, InputError for names that do not match: it names the first few and counts all.
+    truth's topmost folder; in a flat tree nobody knows, for an image is no person. Raises UsageError for
+    folders that cannot be used, InputError for names that do not match: it names the first few and counts
+    all.
     """
     others = [*predictions, *([] if masks is None else [masks])]
     _check_folders(predictions, [truths, *others])
@@ -78,7 +79,8 @@ def collect_pairs(
     pairs = []
     for name in sorted(found):
         known = described.get(name, Facts())
-        case = Case(name, known.person or name.split("/")[0], known.values)
+        folder, slash, _ = name.partition("/")
+        case = Case(name, known.person or (folder if slash else ""), known.values)
         files = {method: images[name] for method, images in by_method.items()}
         pairs.append(ImagePair(case, found[name], files, mask_files.get(name)))
     return pairs

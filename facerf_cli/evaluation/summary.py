@@ -283,7 +283,7 @@ def _table_rows(summary: Summary, group: Group, metric: str) -> Iterator[list[st
     digits = metric_named(metric).digits
     title = group.title
     for method, cell in group.cells.get(metric, {}).items():
-        yield [title, method, str(cell.interval.images), *cell_words(cell, digits)]
+        yield [title, method, str(cell.interval.images), *cell_words(cell, digits, with_intervals=True)]
         title = ""
     for figure in published_for(summary, group, metric):
         yield [f"published, {figure.source}", figure.method, "", *figure.words(digits), *[""] * 4]
@@ -296,8 +296,8 @@ def cell_words(cell: Cell, digits: int, with_intervals: bool = False) -> list[st
     """
     interval, paired = cell.interval, cell.paired
     middle = [f"{value:.{digits}f}" for value in (interval.mean, interval.sd, interval.median)]
-    known = not math.isnan(interval.low)  # NaN with one person
-    between = f"{interval.low:.{digits}f} to {interval.high:.{digits}f}" if known else "one person"
+    known = not math.isnan(interval.low)  # NaN with one person, or where nobody is named
+    between = f"{interval.low:.{digits}f} to {interval.high:.{digits}f}" if known else "one person?"
     if paired is None:
         return [*middle, between, "", ""]
     apart = f"{paired.difference.mean:+.{digits}f}"

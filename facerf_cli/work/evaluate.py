@@ -239,8 +239,8 @@ class Evaluation:
         if self.uses:
             for own in serving_files(self.settings.checkpoints, self.uses).values():
                 facts[f"checkpoint {own.stem}"] = f"SHA-256 {file_sha256(own)}"
-        for path in self.options.against:
-            facts[f"checkpoint against {path.stem}"] = f"SHA-256 {file_sha256(checkpoint_file(path))}"
+        for one in self.options.against:
+            facts[f"checkpoint against {one.name}"] = f"SHA-256 {file_sha256(checkpoint_file(one.path))}"
         spaces = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}
         facts["values compared"] = spaces[self.options.measures.space]
         if self.photo:

@@ -1,5 +1,6 @@
 """The items of each protocol of `facerf evaluate`: people of a dataset, photos, and folders of images."""
 
+import logging
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -50,6 +51,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.pipeline import Estimator
 from facerf_cli.relighting.models import load_models
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.evaluate import CompareItem, Evaluation
 from facerf_cli.work.evaluation_settings import FaceSettings
 from facerf_cli.work.light_of_photo import feature_network
@@ -57,6 +59,7 @@ from facerf_cli.work.photo_options import LightOptions, PhotoOptions, SolveOptio
 from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, read_photo
 
 _PARTS = 64  # most items of `pairs`
+log = logging.getLogger(LOGGER_NAME)
 _RED = "one photo cannot separate red light from red skin"
 
 
@@ -72,8 +75,8 @@ def methods_of(settings: FaceSettings) -> tuple[Method, ...]:
     estimator = Estimator(solve.non_negative, features)
     alone = settings.network_alone
     others = [
-        (path.stem, load_models((checkpoint_file(path),), photo.face_model, models.device, photo.form))
-        for path in options.against
+        (one.name, load_models((checkpoint_file(one.path),), photo.face_model, models.device, photo.form))
+        for one in options.against
     ]
     return (
         *(Method(kind, kind, models, alone, estimator) for kind in options.reflectance),
@@ -299,6 +302,8 @@ def run_pairs(compared: PairsOptions, options: EvaluateOptions, settings: Settin
     """Measure folders of predictions against a folder of truths; the exit code."""
     truth = compared.truth
     pairs = collect_pairs(compared.predictions, truth, compared.masks, compared.facts)
+    if not all(pair.case.person for pair in pairs):
+        log.info("who is in which image is not known: no intervals; give --facts, a CSV with name,person")
     facts = (fact for pair in pairs for fact in pair.case.facts.items())
     by = dict.fromkeys(name for name, value in facts if isinstance(value, str))
     measures = options.measures

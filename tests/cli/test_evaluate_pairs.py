@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.options import EvaluateOptions, NamedCheckpoint
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.main import main
 from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
@@ -122,4 +122,12 @@ def test_reflectance_models_are_named_and_files_are_there() -> None:
     assert EvaluateOptions(Path("out"), reflectance=("prt", "field")).has_field
     assert not EvaluateOptions(Path("out"), reflectance=("prt",)).has_field
     with pytest.raises(UsageError, match="no such file"):
-        EvaluateOptions(Path("out"), against=(Path("none.safetensors"),)).check()
+        EvaluateOptions(Path("out"), against=(NamedCheckpoint.parse("none.safetensors"),)).check()
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [("other.safetensors", "other"), ("runs/b/best.safetensors", "b"), ("a=runs/b/last.safetensors", "a")],
+)
+def test_a_checkpoint_has_its_name_or_that_of_its_run(given: str, name: str) -> None:
+    assert NamedCheckpoint.parse(given).name == name

@@ -1,5 +1,6 @@
 """Folders are matched by name, whole: nothing is left out, and nothing of another size compared."""
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,16 @@ def test_images_of_all_formats_meet_their_truths(truths: Path, ours: Path) -> No
     assert errors[:2] == [0, 0] and errors[2] > 0.01  # a PNG is encoded
     decoded = compare_pair(pairs[2]).predictions["ours"]
     np.testing.assert_allclose(decoded, srgb_to_linear(image(NAMES[2]) * 256 / 255), atol=1e-5)
+
+
+def test_an_image_without_a_folder_is_no_person(tmp_path: Path) -> None:
+    for folder, name in product(("truth", "ours"), ("one", "two")):
+        save(tmp_path / folder / f"{name}.npy", image(name))
+    pairs = collect_pairs([tmp_path / "ours"], tmp_path / "truth")
+    assert [pair.case.person for pair in pairs] == ["", ""]
+    (tmp_path / "facts.csv").write_text("name,person\none,anna\ntwo,bert\n")
+    named = collect_pairs([tmp_path / "ours"], tmp_path / "truth", facts=tmp_path / "facts.csv")
+    assert [pair.case.person for pair in named] == ["anna", "bert"]
 
 
 def test_several_methods_stand_side_by_side(truths: Path, ours: Path) -> None:
