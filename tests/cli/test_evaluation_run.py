@@ -10,7 +10,7 @@ import pytest
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.options import EvaluateOptions, Measures
+from facerf_cli.evaluation.options import EvaluateOptions, Measures, NamedCheckpoint
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, configure_logging
@@ -184,7 +184,7 @@ def test_what_was_kept_and_is_gone_is_made_anew(tmp_path: Path, lost: str) -> No
 
 
 def test_two_methods_of_one_name(tmp_path: Path) -> None:
-    options = EvaluateOptions(tmp_path, against=(tmp_path / "field.safetensors",))
+    options = EvaluateOptions(tmp_path, against=(NamedCheckpoint.parse("field.safetensors"),))
     with pytest.raises(UsageError, match="two methods have the name 'field'"):
         options.check()
     with pytest.raises(UsageError, match="nothing to evaluate"):

@@ -64,7 +64,7 @@ def comparison(person: str, number: int) -> Comparison:
     }
     extra = {"good": {"light_error_deg": 3.0 + number}, "bad <i>": {"light_error_deg": 9.0 + number}}
     case = Case(f"{person}/{number:02d}", person, facts)
-    return Comparison(case, truth, mask, guesses, truth[::-1, ::2], None, extra)
+    return Comparison(case, truth, mask, guesses, truth[::-1, ::2], extra=extra)
 
 
 def items(output: Path, people: tuple[str, ...] = PEOPLE) -> list[Item]:
@@ -94,4 +94,4 @@ def evaluation(
 ) -> Evaluation:
     given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
     toy = toy or Toy()
-    return Evaluation(layout, toy, (toy,), given, Settings(), photo)
+    return Evaluation(layout, toy, (toy,), given, Settings(), photo=photo)
