@@ -1,10 +1,10 @@
-# make demo | test | lint | bench | man | completions | dist. The first call makes the virtual environment.
+# make demo | test | test-slow | lint | bench | man | completions | dist. The first call makes the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 STAMP := $(VENV)/.installed
 FACERF := $(VENV)/bin/facerf
 
-.PHONY: demo test lint bench man completions dist setup clean
+.PHONY: demo test test-slow lint bench man completions dist setup clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml constraints.txt
@@ -22,8 +22,13 @@ lint: $(STAMP)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
+PYTEST := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+
 test: lint
-	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow"
+
+test-slow: $(STAMP)
+	$(PYTEST) -m slow
 
 # A benchmark that lacks its data says so in one line and succeeds.
 bench: $(STAMP)

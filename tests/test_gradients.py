@@ -215,6 +215,7 @@ def test_tensors_in_tensors_out(models: Models) -> None:
     np.testing.assert_array_equal(one.relight(key).numpy(), arrays.relight(key))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:No complete tensor found")
 def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")

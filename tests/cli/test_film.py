@@ -178,6 +178,7 @@ def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
     assert row["frames"] == [0, 1, 2] and row["residual"] < 0.3
 
 
+@pytest.mark.slow
 def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The second take is dark and mirrored; the film is stopped in it, and goes on."""
     takes = [frame_of(0)] * 2 + [(frame_of(0)[:, ::-1] * 0.5).astype(np.uint8)] * 2

@@ -51,6 +51,7 @@ def test_formats_of_the_command_line() -> None:
             parse_formats(wrong)
 
 
+@pytest.mark.slow
 def test_every_format_holds_the_same_image(
     given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

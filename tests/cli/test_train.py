@@ -406,6 +406,7 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(
     require_served(tmp_path, "parsing", shipped)
 
 
+@pytest.mark.slow
 def test_the_portrait_network_trains_on_a_bank_of_transport(
     transport_folder: Path, tmp_path: Path, shipped: tuple[list[str], np.ndarray]
 ) -> None:

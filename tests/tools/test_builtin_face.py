@@ -40,6 +40,7 @@ def landmark(model: MorphableModel, vertices: torch.Tensor, index: int) -> torch
     return model.landmarks(vertices[None])[0, index]
 
 
+@pytest.mark.slow
 def test_the_asset_is_what_the_recipe_builds(model):
     built = build()
     assert model.expression_names == built.expression_names

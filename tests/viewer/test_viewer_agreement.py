@@ -29,6 +29,7 @@ from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.view_photos import head_place, of_photo, page_maps
 from tests.viewer.browser import Drawn, chromium, drawn, driven
 
+pytestmark = pytest.mark.slow
 ASTRONAUT = Path(__file__).parents[2] / "examples" / "astronaut.jpg"
 MEAN, PERCENTILE_99 = (
     2.0,
