@@ -35,7 +35,7 @@ from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import load_fit
 from facerf_cli.files.documents import Document, Points68, read_document, write_document
 from facerf_cli.files.images import read_image, write_display
-from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.files.olat_stack import StackHeader, read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, concatenate, resize
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Networks
@@ -231,12 +231,17 @@ def open_pairs(dataset: Dataset, split: str, side_px: int) -> PairReader:
             "after a prepare-dataset whose --split puts subjects there"
         )
     stack = _stack_info(dataset.stack_path(pairs[0].subject, pairs[0].source_camera))
-    if stack.side_px < side_px:
-        raise InputError(
-            f"{dataset.folder}: its crops have {stack.side_px} px, the networks need {side_px}; run "
-            f"prepare-dataset with --crop {side_px}, or train with --texture-size {stack.side_px}"
-        )
+    require_crops(dataset, stack.side_px, side_px)
     return PairReader(dataset, pairs, side_px)
+
+
+def require_crops(dataset: Dataset, found_px: int, side_px: int) -> None:
+    """Raise InputError where a dataset's crops are smaller than the networks need."""
+    if found_px < side_px:
+        raise InputError(
+            f"{dataset.folder}: its crops have {found_px} px, the networks need {side_px}; run "
+            f"prepare-dataset with --crop {side_px}, or train with --texture-size {found_px}"
+        )
 
 
 def spread_pairs(reader: PairReader, count: int, wanted: Callable[[Pair], bool]) -> list[Pair]:
@@ -279,16 +284,21 @@ class _StackInfo:
 @lru_cache(maxsize=_STACKS_CACHED)
 def _stack_info(path: Path) -> _StackInfo:
     header, fit = read_stack(path)
-    face = header.seen > 0.5
-    if not face.any():
-        raise InputError(f"{path}: does not show the face; {PREPARE_AGAIN}")
     return _StackInfo(
         directions=torch.from_numpy(header.directions).float(),
         landmarks_px=fit.landmarks_px,
         side_px=fit.crop.size_px,
-        lit_mean=max(float(header.source[face].mean()), _DARKEST),
-        face_bits=np.packbits(face),
+        lit_mean=lit_mean_of(path, header),
+        face_bits=np.packbits(header.seen > 0.5),
     )
+
+
+def lit_mean_of(path: Path, header: StackHeader) -> float:
+    """Mean radiance of the face under a constant map of radiance 1; InputError where none is shown."""
+    face = header.seen > 0.5
+    if not face.any():
+        raise InputError(f"{path}: does not show the face; {PREPARE_AGAIN}")
+    return max(float(header.source[face].mean()), _DARKEST)
 
 
 CACHED_SIDE_PX = 512  # the side of the paper's crops

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from facerf_cli.dataset.crops import lit_mean_of
 from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset, read_stack
 from facerf_cli.dataset.textures import LEAST_INSIDE, heads_of, model_of
 from facerf_cli.face.morphable import MorphableModel
@@ -23,7 +24,6 @@ from facerf_cli.raster.texture import UnwrapSettings, unwrap
 from facerf_cli.synth.bank.texture_samples import cast_and_greyed, draw_target_lights
 
 _FACES_KEPT = 512  # a worker, of .7 MB at 512 pixels
-_DARKEST = 1e-4  # least mean radiance, so that exposing a black image does not divide by 0
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def _face_of(path: Path, model: MorphableModel) -> _Face:
         torch.from_numpy(header.rotation).float(),
         torch.from_numpy(header.seen).half(),
         fit.vertices_camera(model),
-        MEAN_RADIANCE / max(float(header.source[header.seen > 0.5].mean()), _DARKEST),
+        MEAN_RADIANCE / lit_mean_of(path, header),
     )
 
 

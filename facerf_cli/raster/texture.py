@@ -29,9 +29,7 @@ class UnwrapSettings:
     seen_cosine: float = 0.35  # fully visible at and above this, smooth in between
     depth_side_px: int = 512  # least length of the depth map's longer side
     samples: int = 4  # at most samples x samples in a texel; a larger image is scaled down first
-    measured: bool = (
-        True  # the texels' sizes in the image choose its scale and the samples; else all are taken
-    )
+    measured: bool = True  # the texels' sizes choose the image's scale and the samples; else all are taken
 
 
 def vertex_normals(vertices: Tensor, triangles: Tensor) -> Tensor:

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.batch.settings import Settings, torch_device
-from facerf_cli.dataset.crops import mean_translation_m, open_photos
-from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.crops import mean_translation_m, open_photos, require_crops
+from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.dataset.textures import open_dataset_textures
@@ -222,7 +222,7 @@ class _TrainedStage:
         appearance, light, _ = _all_or_none(
             partial(self._frozen_appearance, side),
             partial(self._frozen_light_features, side),
-            partial(_require_crops, dataset, side),
+            partial(require_crops, dataset, dataset.crop_px, side),
         )
         reflectance, geometry = self._reflectance(side), None  # heads are fitted to landmarks
         model = load_face_model(options.fit_with)  # of the Geometry Network, whatever fitted the dataset
@@ -442,15 +442,6 @@ def _cache_of(photos: Path, output: Path) -> Path:
     """Folder of faces found in photos: next to them, for all runs, or the run's if that is not writable."""
     folder = photos if photos.is_dir() else photos.parent
     return folder / ".facerf-faces" if os.access(folder, os.W_OK) else output / "photos"
-
-
-def _require_crops(dataset: Dataset, side: int) -> None:
-    """Raise InputError where all crops are smaller than the networks need."""
-    if dataset.crop_px < side:
-        raise InputError(
-            f"{dataset.folder}: its crops have {dataset.crop_px} px, the networks need {side}; run "
-            f"prepare-dataset with --crop {side}, or train with --texture-size {dataset.crop_px}"
-        )
 
 
 def _all_or_none(*loads: Callable[[], Any]) -> list[Any]:

@@ -115,8 +115,7 @@ def simulate_camera(
     """
     faces = len(source)
     uniform = Uniform(generator, (faces, 1, 1, 1))
-    balance = torch.exp(uniform(-0.12, 0.12, faces, 3, 1, 1))
-    grey = (uniform(0, 1) < 0.25).float()
+    balance, grey = _colours_of_camera(uniform, faces)
     source, target, albedo = (
         _greyed(x, grey) for x in (source * balance, target * balance[:, None], albedo * balance)
     )
@@ -132,9 +131,13 @@ def simulate_camera(
 
 def cast_and_greyed(images: Tensor, generator: torch.Generator) -> Tensor:
     """Images [..., 3, H, W] with the colours of one simulated camera, or of one without colours."""
-    uniform = Uniform(generator, (1, 1, 1, 1))
-    balance = torch.exp(uniform(-0.12, 0.12, 1, 3, 1, 1))[0]
-    return _greyed(images * balance, (uniform(0, 1) < 0.25).float())
+    balance, grey = _colours_of_camera(Uniform(generator, (1, 1, 1, 1)), 1)
+    return _greyed(images * balance[0], grey)
+
+
+def _colours_of_camera(uniform: Uniform, faces: int) -> tuple[Tensor, Tensor]:
+    """Balance [B, 3, 1, 1] of the cameras of B faces, and 1 where one sees no colours [B, 1, 1, 1]."""
+    return torch.exp(uniform(-0.12, 0.12, faces, 3, 1, 1)), (uniform(0, 1) < 0.25).float()
 
 
 def _greyed(field: Tensor, grey: Tensor) -> Tensor:
