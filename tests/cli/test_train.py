@@ -336,7 +336,7 @@ def test_own_networks_and_losses_of_an_installed_package(
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert type(networks["reflectance"]).__name__ == "Darker"
     assert metadata["training"][-1]["objective"] == "Doubled"
-    monkeypatch.setattr(checkpoint, "_CLASSES", FORMS)
+    monkeypatch.setattr(checkpoint, "_CLASSES", dict(FORMS))
     relight = ["relight", str(PHOTO), "--light", "40,20", "-o", str(tmp_path / "out")]
     relight += ["--checkpoint", str(tmp_path / "run/last.safetensors"), "--reflectance", "field"]
     capsys.readouterr()
