@@ -28,7 +28,7 @@ from torch import Tensor
 
 from facerf_cli.batch.made_from import Recipe, key_of, text_of_state
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, read_stack
-from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, read_pairs
+from facerf_cli.dataset.pairs import DRAW_AGAIN, Pair, image_path, load_pairs, read_pairs
 from facerf_cli.dataset.weights import relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
@@ -167,10 +167,7 @@ class PairReader:
         source = self._read_source(pair) if source is None else source
         target = read_olats(path, slice(pair.target_light, pair.target_light + 1))[0].float()
         if source.shape[-1] != source_stack.side_px or target.shape[-1] != target_stack.side_px:
-            raise InputError(
-                f"{path}: the source has another size than the stack; "
-                "run relight-dataset with --overwrite always"
-            )
+            raise InputError(f"{path}: the source has another size than the stack; {DRAW_AGAIN}")
         exposed = source * (MEAN_RADIANCE / source_stack.colour_on_face(source).mean())
         moved, moved_target = moves
         return CropPairs(

@@ -40,6 +40,8 @@ from facerf_cli.files.texts import parse_json, text_of
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"
+DRAW_AGAIN = f"move the folder {RELIT} elsewhere and run relight-dataset"
+GIVE_BEFORE = f"give prepare-dataset the --split and --seed of before, or {DRAW_AGAIN}"
 _TEST, _TEST_SAME_SHARE = "test", 0.5  # of the test's pairs, for both rows of the paper's Table 1
 log = logging.getLogger(LOGGER_NAME)
 
@@ -135,8 +137,7 @@ def read_pairs(dataset: Dataset) -> list[Pair]:
                 raise ValueError("not sorted, or repeated")
         except (ValueError, KeyError, InputError):
             raise InputError(
-                f"{path}: line {number} is not a pair of this dataset; "
-                "run relight-dataset with --overwrite always"
+                f"{path}: line {number} is not a pair of this dataset and its split; {GIVE_BEFORE}"
             ) from None
         pairs.append(pair)
     return pairs
@@ -184,7 +185,7 @@ def _require_agreement(dataset: Dataset, old: list[Pair], new: list[Pair]) -> No
     if any(known[pair.key] != pair for pair in both) or not explained.issuperset(_images(dataset)):
         raise UsageError(
             f"{dataset.folder / RELIT}: holds images of another seed, other envmaps, another dataset or a "
-            "larger --per-subject; give those options again, or --overwrite always"
+            f"larger --per-subject; give those options again, or {DRAW_AGAIN}"
         )
 
 
@@ -260,8 +261,7 @@ def _load_weights(dataset: Dataset, pairs: list[Pair]) -> np.ndarray:
         weights, computed = compute_pair_weights(dataset, pairs)
         if computed != pairs:
             raise InputError(
-                f"{pairs_path(dataset)}: the envmaps have changed since the pairs were made; run "
-                "relight-dataset with --overwrite always"
+                f"{pairs_path(dataset)}: the envmaps have changed since the pairs were made; {DRAW_AGAIN}"
             )
         _write_weights(dataset, weights, pairs_path(dataset).read_bytes())
     try:
@@ -315,10 +315,7 @@ def pair_weights(dataset: Dataset, pair: Pair) -> Tensor:
     if isinstance(result, str):
         raise InputError(result)
     if result.exposure_ev != pair.exposure_ev:
-        raise InputError(
-            f"{pair.envmap}: the envmap has changed since the pair was made; run relight-dataset with "
-            "--overwrite always"
-        )
+        raise InputError(f"{pair.envmap}: the envmap has changed since the pair was made; {DRAW_AGAIN}")
     return torch.from_numpy(result.weights[0, : len(lights)])
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from facerf_cli.batch.made_from import is_made_from, text_of_state
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, provenance_of, read_dataset, read_stack
-from facerf_cli.dataset.pairs import Pair, image_path, load_pairs
+from facerf_cli.dataset.pairs import DRAW_AGAIN, Pair, image_path, load_pairs
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel, load_face_model
@@ -182,7 +182,7 @@ def _read_source(dataset: Dataset, pair: Pair, fit: FaceFit) -> Tensor:
     path = image_path(dataset, *pair.key)
     pixels = read_image(path).pixels
     if pixels.shape[:2] != (fit.crop.size_px, fit.crop.size_px):
-        raise InputError(f"{path}: another size than its stack; run relight-dataset with --overwrite always")
+        raise InputError(f"{path}: another size than its stack; {DRAW_AGAIN}")
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 

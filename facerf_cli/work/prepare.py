@@ -41,6 +41,7 @@ from facerf_cli.dataset.dataset import (
     read_dataset,
 )
 from facerf_cli.dataset.pairs import (
+    GIVE_BEFORE,
     PAIRS_NAME,
     RELIT,
     draw_pairs,
@@ -311,12 +312,8 @@ def _write_dataset(
     split_of = {subject: name for name, members in dataset["splits"].items() for subject in members}
     pairs = json_rows(folder / RELIT / PAIRS_NAME)
     if moved := {row.get("subject") for row in pairs if split_of.get(row.get("subject")) != row.get("split")}:
-        log.warning(
-            "%s: the pairs of %d subjects are of another split; draw and relight all again by "
-            "relight-dataset --overwrite always, or give the --split and --seed of before",
-            folder / RELIT,
-            len(moved),
-        )
+        words = "%s: the pairs of %d subjects are of another split; %s"
+        log.warning(words, folder / RELIT, len(moved), GIVE_BEFORE)
 
 
 def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, settings: Settings) -> int:

@@ -330,7 +330,12 @@ def test_a_new_split_says_that_old_pairs_are_of_another(
     assert prepare(given[0], out) == 0
     assert "another split" not in capsys.readouterr().err
     assert prepare(given[0], out, "--split", "0/0/2") == 0
-    assert "pairs of 2 subjects are of another split" in capsys.readouterr().err
+    said, relit = capsys.readouterr().err, out / "relit"
+    assert "pairs of 2 subjects are of another split" in said and "--overwrite" not in said
+    line = ["relight-dataset", str(out), "--envmaps", "procedural:2", "--per-subject", "1", "--lazy"]
+    assert main(line) == 1 and "move the folder relit elsewhere" in capsys.readouterr().err
+    relit.rename(tmp_path / "kept")  # the advice
+    assert main(line) == 0 and (relit / "pairs.jsonl").is_file()
 
 
 def test_a_camera_behind_the_head_is_left_out(given: Given, tmp_path: Path, capsys: Said) -> None:

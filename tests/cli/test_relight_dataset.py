@@ -155,7 +155,7 @@ def test_what_cannot_be_used_is_one_line(
     assert "--envmaps nowhere: no such folder" in says(2, line(dataset, maps="nowhere"))
     assert main(line(dataset, images=1)) == 0
     capsys.readouterr()
-    assert "--overwrite" in says(2, line(dataset, "--seed", "9", images=1))
+    assert "move the folder relit" in says(2, line(dataset, "--seed", "9", images=1))
     stack = dataset / "olat" / "0001" / "C1.exr"
     stack.unlink()
     assert f"{stack}: missing from the dataset" in says(1, line(dataset))

@@ -231,7 +231,7 @@ def test_other_recipes_need_overwrite_and_take_the_old_images_with_them(fresh: D
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     before = weights_path(fresh)
-    with pytest.raises(UsageError, match=r"another seed, other envmaps, .* --overwrite"):
+    with pytest.raises(UsageError, match=r"another seed, other envmaps, .* or move the folder relit"):
         write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
     assert image_path(fresh, "0000", 1).exists()
     write_pairs(fresh, draw_pairs(fresh, MAPS, 4, 0), overwrite=False)  # more of the same
@@ -326,7 +326,7 @@ def test_images_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -
     path = image_path(fresh, "0000", 0)
     path.parent.mkdir(parents=True)
     path.write_text("of an unknown light")
-    with pytest.raises(UsageError, match="--overwrite"):
+    with pytest.raises(UsageError, match="move the folder relit"):
         write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
     write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
     assert not path.exists()
