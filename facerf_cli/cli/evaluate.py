@@ -17,6 +17,7 @@ from facerf_cli.evaluation.options import (
     TransferOptions,
     YaleOptions,
     folder_name,
+    has_own_field_alone,
 )
 from facerf_cli.option import Only, Without
 from facerf_cli.work.evaluation_settings import FaceSettings
@@ -166,11 +167,12 @@ def yale_b(
     Sources are an image under one flash and four soft lights summed from the subject's own images; targets
     are single flashes and four environments. Lights are given, not estimated. Images are read as linear, as
     measured, relit as by `facerf relight`, and compared inside one ellipse, open eyes included. Cases are
-    SUBJECT/SOURCE/LIGHT; the rows of other methods were published for the same images. A method for --compare
+    SUBJECT/SOURCE/LIGHT. An own Reflectance Network is measured alone; with --reflectance portrait its row
+    names both networks. The rows of other methods were published for the same images. A method for --compare
     runs on the sources that --pictures keeps; its PNGs are read as given, too, and its colours are averaged.
     The database is for research and never trained on.
     """
-    if is_default(context, "reflectance"):
+    if is_default(context, "reflectance") and not has_own_field_alone(photo.settings.checkpoints):
         options = replace(options, reflectance=("portrait",))
     settings = FaceSettings("yale-b", options, photo, network_alone=field.network_alone)
     _check(context, settings, photos=False)

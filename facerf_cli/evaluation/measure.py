@@ -1,6 +1,7 @@
 """The images of a case and the figures of each method on them: the metrics that every protocol shares."""
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -55,6 +56,7 @@ class Comparison:
     grey_as_given: bool = False
 
 
+NEAR_BLACK = 0.02  # root mean square: the Si-MSE of a darker truth is below .0004 for any image
 SOURCE = "source, not relit"  # the row of the source's Face dis
 _PACKAGE, _FILE = "lpips", "weights/v0.1/vgg.pth"  # Zhang et al., LPIPS v0.1, BSD 2-Clause
 _ADVICE = "give --lpips lpips/weights/v0.1/vgg.pth of the package lpips"
@@ -148,8 +150,9 @@ class Row:
 def measure(comparison: Comparison, measures: Measures, faces: bool = True) -> list[Row]:
     """Measure each method's prediction, and with `faces` Face dis, of the source too if its face is known.
 
-    Face dis and LPIPS compare images as `shown` returns them, in any space. Raises InputError where a
-    prediction has another size than the truth or values that are not finite, or where the mask is empty.
+    Each Si-MSE is NaN where the truth `is_near_black`. Face dis and LPIPS compare images as `shown` returns
+    them, in any space. Raises InputError where a prediction has another size than the truth or values that
+    are not finite, or where the mask is empty.
     """
     _check(comparison)
     case, landmarks_px = comparison.case, comparison.landmarks_px if faces else None
@@ -183,15 +186,21 @@ def _encoded(image: np.ndarray, exposed_as: np.ndarray, mask: np.ndarray) -> np.
     return linear_to_srgb(exposed) * mask[..., None].astype(np.float32)
 
 
+def is_near_black(truth: np.ndarray, mask: np.ndarray) -> bool:
+    """True for a truth [H, W, 3] that is too dark within its mask [H, W] for Si-MSE to tell methods apart."""
+    return float(np.average(np.square(truth, dtype=np.float64).mean(-1), weights=mask)) < NEAR_BLACK**2
+
+
 def _pixel_values(prediction: np.ndarray, comparison: Comparison, space: Space) -> dict[str, float]:
     images = prediction, comparison.truth
     p, t = map(linear_to_srgb, images) if space == "display" else images
     mask = comparison.mask
     squared, alike = mse(p, t, mask), ssim(p, t, mask)
+    dark = is_near_black(comparison.truth, mask)
     return {
-        "si_mse": si_mse(p, t, mask),
-        "si_mse_clipped": si_mse_clipped(p, t, mask),
-        "si_mse_channels": si_mse_channels(p, t, mask),
+        "si_mse": math.nan if dark else si_mse(p, t, mask),
+        "si_mse_clipped": math.nan if dark else si_mse_clipped(p, t, mask),
+        "si_mse_channels": math.nan if dark else si_mse_channels(p, t, mask),
         "mse": squared,
         "psnr": psnr_of(squared),
         "ssim": alike,

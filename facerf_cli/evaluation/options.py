@@ -9,6 +9,7 @@ from typing import Literal, get_args
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.errors import UsageError
+from facerf_cli.network.files import SHIPPED, serving_files
 from facerf_cli.option import DATA, MEASURES, METHODS, option
 
 Space = Literal["linear", "display"]
@@ -18,6 +19,30 @@ _KINDS = get_args(RelightKind)
 def folder_name(folder: Path) -> str:
     """The name of a folder of predictions, and of its method; '.' is resolved, a link is not."""
     return Path(os.path.abspath(folder)).name
+
+
+def checkpoint_name(path: Path) -> str:
+    """The name of a checkpoint's method: the file's, or for the best and the last of a run its folder's."""
+    of_run = path.is_dir() or path.stem in ("best", "last")
+    return folder_name(path if path.is_dir() else path.parent) if of_run else path.stem
+
+
+def portrait_name(checkpoints: Sequence[Path]) -> str:
+    """The name of the portrait field's method.
+
+    It is `portrait`; or FIELD+PORTRAIT, the names of both networks' files, if one ships and one is the
+    user's.
+    """
+    files = serving_files(checkpoints)
+    own = [files[name] != SHIPPED[name] for name in ("reflectance", "portrait")]
+    both = checkpoint_name(files["reflectance"]), checkpoint_name(files["portrait"])
+    return "portrait" if own[0] == own[1] else "+".join(both)
+
+
+def has_own_field_alone(checkpoints: Sequence[Path]) -> bool:
+    """True if the user's files serve the Reflectance Network, and the Portrait Network is the shipped one."""
+    files = serving_files(checkpoints)
+    return files["reflectance"] != SHIPPED["reflectance"] and files["portrait"] == SHIPPED["portrait"]
 
 
 @dataclass(frozen=True)
@@ -143,12 +168,10 @@ class NamedCheckpoint:
 
     @staticmethod
     def parse(text: str) -> "NamedCheckpoint":
-        """Parse FILE or NAME=FILE; the best and the last of a run have the name of its folder."""
+        """Parse FILE or NAME=FILE."""
         name, equals, file = text.rpartition("=")
         path = Path(file)
-        of_run = path.is_dir() or path.stem in ("best", "last")
-        own = folder_name(path if path.is_dir() else path.parent) if of_run else path.stem
-        return NamedCheckpoint(name if equals else own, path)
+        return NamedCheckpoint(name if equals else checkpoint_name(path), path)
 
 
 @dataclass(frozen=True)
@@ -169,7 +192,7 @@ class EvaluateOptions(BatchOptions):
     reflectance: tuple[RelightKind, ...] = option(
         ("field",),
         metavar="KIND",
-        shown_default="field; of yale-b portrait",
+        shown_default="field; of yale-b portrait, or field for an own field's --checkpoint",
         typed=list[str] | None,
         parse=_parse_kinds,
         panel=METHODS,

@@ -203,7 +203,8 @@ def images_csv(rows: Sequence[Row]) -> str:
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["case", "person", "method", *facts, *values])
     for row in rows:
-        figures = [f"{row.values[name]:.9g}" if name in row.values else "" for name in values]
+        known = {name for name, value in row.values.items() if math.isfinite(value)}
+        figures = [f"{row.values[name]:.9g}" if name in known else "" for name in values]
         writer.writerow([row.case, row.person, row.method, *(row.facts.get(n, "") for n in facts), *figures])
     return stream.getvalue()
 
@@ -296,10 +297,11 @@ def _figure(values: Mapping[str, float], metric: str) -> str:
 
 @dataclass(frozen=True)
 class About:
-    """The run: its command line, facerf's version, and facts such as the checkpoints' digests."""
+    """The run: its command line, facerf's version, and facts; file and SHA-256 of each network, by title."""
 
     command: str
     version: str
+    networks: Mapping[str, Mapping[str, str]]
     facts: Mapping[str, str]
 
 

@@ -5,7 +5,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from facerf_cli.evaluation.measure import METRICS, Metric, Row
+from facerf_cli.evaluation.measure import METRICS, NEAR_BLACK, Metric, Row
 from facerf_cli.image.metrics import Interval, mean_interval
 from facerf_cli.run.logs import counted
 
@@ -62,6 +62,7 @@ def published(*protocols: str) -> tuple[PublishedFigure, ...]:
 
 
 ALL = "all images"
+_DIGITS = 12  # of a digest
 _PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 
 
@@ -176,6 +177,12 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for value in sorted(by_value, key=natural):
             groups.append(Group(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
+    if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
+        note = (
+            f"Of {counted(len(dark), 'image')} the truth is near black (root mean square below "
+            f"{NEAR_BLACK}): left out of Si-MSE."
+        )
+        layout = replace(layout, notes=(*layout.notes, note))
     return Summary(layout, methods, metrics, tuple(groups), len(cases), len(persons))
 
 
@@ -236,8 +243,11 @@ def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -
     return Paired(interval, sum(won) / len(won))
 
 
-def print_tables(summary: Summary) -> None:
-    """Print a table for each of the layout's metrics to standard output; plain text if it is piped."""
+def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) -> None:
+    """Print a table for each of the layout's metrics to standard output; plain text if it is piped.
+
+    `networks` has the file and SHA-256 of each network, by title.
+    """
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
     layout = summary.layout
@@ -252,6 +262,9 @@ def print_tables(summary: Summary) -> None:
         console.print(Text("Published figures. " + ". ".join(measured_on) + "."))
     for note in layout.notes:
         console.print(Text(note))
+    if networks:
+        named = [f"{title} {one['file']} {one['sha256'][:_DIGITS]}" for title, one in networks.items()]
+        console.print(Text(f"Networks, with the first digits of SHA-256: {'; '.join(named)}."))
 
 
 def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) -> Table:

@@ -40,8 +40,8 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
 from facerf_cli.files.image_metadata import embed_xmp
 from facerf_cli.files.images import write_exr
-from facerf_cli.files.texts import file_sha256
-from facerf_cli.network.files import checkpoint_file, serving_files
+from facerf_cli.network.files import serving_files
+from facerf_cli.relighting.models import described_file
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import face_model
@@ -49,7 +49,7 @@ from facerf_cli.work.photos import face_model
 CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
 KEPT, STRIPS = "pictures", "strips"
 _STRIP_QUALITY = 88
-_MEASURING = 6  # raised where the same recipe gives other figures
+_MEASURING = 7  # raised where the same recipe gives other figures
 log = logging.getLogger(LOGGER_NAME)
 
 CompareItem = Callable[[Item], Iterable[Comparison]]
@@ -69,7 +69,7 @@ class Evaluation:
     recipe: tuple[Any, ...]  # dataclasses whose fields shape the figures, besides the options
     options: EvaluateOptions
     settings: Settings
-    uses: frozenset[str] = frozenset()  # names of the networks that make the images
+    networks: tuple[tuple[str, Path], ...] = ()  # title and file of each that takes part
     photo: PhotoOptions | None = None  # has the face model of the images; they and the summary name it
 
     @property
@@ -219,7 +219,8 @@ class Evaluation:
         chosen = choose(summary, rows, [strip for of_item in figures for strip in of_item.strips])
         folder, about = self.options.output, self._about()
         jpegs = {case.strip.case: (folder / case.strip.file).read_bytes() for case in chosen.all()}
-        content = {"facerf": about.version, "command": about.command, **about.facts, **summary.as_dict()}
+        run = {"facerf": about.version, "command": about.command, "networks": about.networks}
+        content = {**run, **about.facts, **summary.as_dict()}
         texts = {
             IMAGES: images_csv(rows),
             PAGE: page(summary, about, chosen, jpegs),
@@ -228,24 +229,19 @@ class Evaluation:
         for name, text in texts.items():
             with atomic_path(folder / name) as temporary:
                 temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
-        print_tables(summary)
+        print_tables(summary, about.networks)
         log.info(
             "%s shows the images, worst cases first; %s has a row for each", folder / PAGE, folder / IMAGES
         )
 
     def _about(self) -> About:
         """The run's command and networks, without the time: equal runs give equal files."""
-        facts: dict[str, str] = {}
-        if self.uses:
-            for own in serving_files(self.settings.checkpoints, self.uses).values():
-                facts[f"checkpoint {own.stem}"] = f"SHA-256 {file_sha256(own)}"
-        for one in self.options.against:
-            facts[f"checkpoint against {one.name}"] = f"SHA-256 {file_sha256(checkpoint_file(one.path))}"
+        networks = {title: described_file(path) for title, path in self.networks}
         spaces = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}
-        facts["values compared"] = spaces[self.options.measures.space]
+        facts = {"values compared": spaces[self.options.measures.space]}
         if self.photo:
             facts["face model"] = face_model(self.photo).credit
-        return About(shlex.join(["facerf", *sys.argv[1:]]), __version__, facts)
+        return About(shlex.join(["facerf", *sys.argv[1:]]), __version__, networks, facts)
 
 
 def _with_others(own: Comparison, folders: Sequence[Path], wrong: list[str]) -> Comparison:

@@ -20,6 +20,7 @@ from facerf_cli.evaluation.options import (
     PairsOptions,
     YaleOptions,
     folder_name,
+    portrait_name,
 )
 from facerf_cli.evaluation.pairs import ImagePair, collect_pairs, compare_pair
 from facerf_cli.evaluation.people import (
@@ -31,7 +32,15 @@ from facerf_cli.evaluation.people import (
     SourceFace,
     compare_people,
 )
-from facerf_cli.evaluation.protocols import LAYOUTS, compare_olats, fitted_and_mean, reconstruct, transfer
+from facerf_cli.evaluation.protocols import (
+    COMPOSITE,
+    LAMBERT,
+    LAYOUTS,
+    compare_olats,
+    fitted_and_mean,
+    reconstruct,
+    transfer,
+)
 from facerf_cli.evaluation.selection import (
     PAIRS_LIST,
     Couple,
@@ -48,7 +57,8 @@ from facerf_cli.evaluation.selection import (
 from facerf_cli.evaluation.summary import Layout, published
 from facerf_cli.evaluation.yale_b import compare_subject, layout
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.network.files import checkpoint_file
+from facerf_cli.network.files import checkpoint_file, serving_files, title_of
+from facerf_cli.network.stored_graph import ASSET
 from facerf_cli.pipeline import Estimator
 from facerf_cli.relighting.models import load_models
 from facerf_cli.run.logs import LOGGER_NAME
@@ -60,6 +70,7 @@ from facerf_cli.work.photos import fit_faces, load_models_once, prepare_photos, 
 
 _PARTS = 64  # most items of `pairs`
 log = logging.getLogger(LOGGER_NAME)
+_MEDIAPIPE = {"networks of MediaPipe": ASSET}
 _RED = "one photo cannot separate red light from red skin"
 
 
@@ -74,12 +85,13 @@ def methods_of(settings: FaceSettings) -> tuple[Method, ...]:
         features = feature_network(LightOptions(photo=photo, vgg_weights=vgg_weights))[0]
     estimator = Estimator(solve.non_negative, features)
     alone = settings.network_alone
+    names = {"portrait": portrait_name(photo.settings.checkpoints)}
     others = [
         (one.name, load_models((checkpoint_file(one.path),), photo.face_model, models.device, photo.form))
         for one in options.against
     ]
     return (
-        *(Method(kind, kind, models, alone, estimator) for kind in options.reflectance),
+        *(Method(names.get(kind, kind), kind, models, alone, estimator) for kind in options.reflectance),
         *(Method(name, "field", other, alone, estimator) for name, other in others),
     )
 
@@ -123,6 +135,21 @@ def _networks_used(settings: FaceSettings) -> frozenset[str]:
     return networks_of(settings.options.reflectance) | ({"light_features"} if refined else set())
 
 
+def _networks_named(settings: FaceSettings) -> dict[str, Path]:
+    """The file of each network that takes part, by title; those that one method alone uses name it."""
+    options, uses = settings.options, _networks_used(settings)
+    files = serving_files(settings.photo.settings.checkpoints)
+    named = {title_of(name): path for name, path in files.items() if name in uses}
+    others = {one.name: one.path for one in options.against}
+    if settings.mean_checkpoint is not None:
+        others["the mean face"] = settings.mean_checkpoint
+    for method, path in others.items():
+        by = serving_files((checkpoint_file(path),))
+        own = {name for name in networks_of(("field",)) if by[name] != named.get(title_of(name))}
+        named |= {f"{title_of(name)} of {method}": by[name] for name in sorted(own)}
+    return named | _MEDIAPIPE
+
+
 def _prepare(settings: FaceSettings) -> None:
     """Load what all items need; raises UsageError or InputError for what would fail each."""
     prepare_photos(settings.photo, _networks_used(settings), with_networks=not settings.options.dry_run)
@@ -141,10 +168,10 @@ def _run(
 ) -> int:
     """Measure items; the exit code. `recipe` has more options that shape the figures."""
     photo = settings.photo
-    uses = _networks_used(settings)
     if settings.options.measures.face_distance:
         tables = replace(tables, metrics=tuple(dict.fromkeys((*tables.metrics, "face_distance"))))
-    run = Evaluation(tables, compare, (settings, *recipe), settings.options, photo.settings, uses, photo)
+    networks = tuple(_networks_named(settings).items())
+    run = Evaluation(tables, compare, (settings, *recipe), settings.options, photo.settings, networks, photo)
     return run.run(items, partial(_prepare, settings))
 
 
@@ -236,6 +263,8 @@ def _notes(settings: FaceSettings, chosen: int | None) -> tuple[str, ...]:
             f"Split {settings.data.split}. The field is {_field_is(alone, 'its source image')}.",
             *of_set,
             "si_mse_clipped clips the truth at white, as a camera does; otherwise a glint outweighs a face.",
+            f"{LAMBERT} is the source's own texture under the cosine of the light, the least to beat; "
+            f"{COMPOSITE} is the first method's image of `facerf relight`, with the photo's detail.",
             "tone_drift_deg is of the skin under lights within 25 degrees of the camera's axis.",
         )
     if settings.protocol == "reconstruction":
@@ -316,7 +345,11 @@ def run_pairs(compared: PairsOptions, options: EvaluateOptions, settings: Settin
     }
     items = [Item(truth, options.output / name, name) for name in parts]
     compare = partial(_compare_part, settings if measures.face_distance else None, parts)
-    return Evaluation(tables, compare, (compared, settings), options, settings).run(items)
+    finders: dict[str, Path] = {}
+    if measures.face_distance:
+        finders = {title_of("parsing"): serving_files(settings.checkpoints)["parsing"], **_MEDIAPIPE}
+    networks = tuple(finders.items())
+    return Evaluation(tables, compare, (compared, settings), options, settings, networks).run(items)
 
 
 def _compare_part(

@@ -12,9 +12,13 @@ from facerf_cli.capture.yale_b import Flash
 from facerf_cli.evaluation import people, yale_b
 from facerf_cli.evaluation.measure import SOURCE
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
+from facerf_cli.network.files import BEST, SHIPPED
 from facerf_cli.work import evaluate_items
+from facerf_cli.work.evaluation_settings import FaceSettings
 from tests.capture.yale_fixture import write_pgm, write_yale_b
+from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
 
 Said = pytest.CaptureFixture[str]
@@ -62,6 +66,50 @@ def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> Non
     figures = json.loads((out / "summary.json").read_text())["groups"][0]["metrics"]["face_distance"]
     assert figures[SOURCE]["pictures"] == figures["field"]["pictures"] == 10
     assert "Face dis" in capsys.readouterr().out
+
+
+def test_an_own_field_is_measured_alone_or_its_row_names_both(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the tables name every network that took part, with its digest."""
+    run, out, asked = tmp_path / "mine", tmp_path / "out", []
+    run.mkdir()
+    save_toy_checkpoint(run / "best.safetensors")
+    models: Any = FaceModelOnly(load_face_model("builtin"))
+    named = evaluate_items.methods_of
+
+    def toys(settings: FaceSettings) -> tuple[Lambert, ...]:
+        asked.append([method.name for method in named(settings)])
+        return tuple(Lambert(name, models) for name in asked[-1])
+
+    monkeypatch.setattr(evaluate_items, "methods_of", toys)
+    monkeypatch.setattr(yale_b, "SOFT_SOURCES", ())
+    monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ())
+    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    evaluate = ["evaluate", "yale-b", str(folder), "-o", str(out), "--subjects", "yaleB07"]
+    lines: list[tuple[list[str], list[str], dict[str, Path]]] = [
+        ([], ["portrait"], {"Reflectance Network": SHIPPED["reflectance"]}),
+        (["--checkpoint", str(run)], ["field"], {"Reflectance Network": run / BEST}),
+        (
+            ["--checkpoint", str(run), "--reflectance", "portrait"],
+            ["mine+portrait"],
+            {"Reflectance Network": run / BEST, "Portrait Network": SHIPPED["portrait"]},
+        ),
+        (
+            ["--against", str(run)],
+            ["portrait", "mine"],
+            {"Reflectance Network": SHIPPED["reflectance"], "Reflectance Network of mine": run / BEST},
+        ),
+    ]
+    for options, names, files in lines:
+        assert main([*evaluate, *options]) == 0
+        summary = json.loads((out / "summary.json").read_text())
+        networks = {title: one["sha256"] for title, one in summary["networks"].items()}
+        assert asked[-1] == summary["methods"] == names
+        assert networks.items() >= {title: file_sha256(path) for title, path in files.items()}.items()
+        assert ("Portrait Network" in networks) == ("portrait" in "".join(names))
+        assert {"Parsing Network", "Geometry Network", "networks of MediaPipe"} <= networks.keys()
+        assert networks["Reflectance Network"] in (out / "report.html").read_text()
 
 
 @pytest.mark.usefixtures("toys")

@@ -141,9 +141,14 @@ def test_what_cannot_be_compared_is_refused_in_words(comparison: Comparison, tro
         measure(replace(comparison, truth=truth, predictions={"far": far}, mask=mask), Measures())
 
 
-def test_a_black_prediction_is_measured_and_a_black_truth_too(comparison: Comparison) -> None:
+def test_a_black_prediction_is_measured_and_a_truth_near_black_has_no_si_mse(comparison: Comparison) -> None:
     truth = comparison.truth
     (black,) = measure(replace(comparison, predictions={"black": 0 * truth}), Measures())
     assert all(np.isfinite(list(black.values.values())))
-    (dark,) = measure(replace(comparison, truth=0 * truth, predictions={"near": truth}), Measures())
-    assert all(np.isfinite(list(dark.values.values()))) and dark.values["si_mse"] == 0
+    level = np.sqrt(np.average((truth**2).mean(-1), weights=comparison.mask))
+    for space in ("linear", "display"):
+        for brightness, measured in ((0.0, False), (0.0199, False), (0.0201, True)):
+            dim = replace(comparison, truth=truth * np.float32(brightness / level))
+            for row in measure(dim, Measures(space=space)):
+                unknown = {name for name, value in row.values.items() if np.isnan(value)}
+                assert unknown == (set() if measured else {"si_mse", "si_mse_clipped", "si_mse_channels"})

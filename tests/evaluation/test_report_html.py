@@ -84,7 +84,12 @@ def strips(found: list[Row]) -> list[Strip]:
 
 def write(summary: Summary, chosen: Chosen, command: str = "facerf evaluate") -> str:
     jpegs = {case.strip.case: f"jpeg of {case.strip.case}".encode() for case in chosen.all()}
-    return page(summary, About(command, "1.2.3", {"checkpoint x": "abc"}), chosen, jpegs)
+    return page(
+        summary,
+        About(command, "1.2.3", {"Network <x>": {"file": "x", "sha256": "abc"}}, {"face model": "builtin"}),
+        chosen,
+        jpegs,
+    )
 
 
 @pytest.fixture(scope="module")

@@ -49,6 +49,17 @@ def test_means_and_pairs_by_hand() -> None:
     assert 0.15 - 1e-9 <= ours.interval.low <= ours.interval.high <= 0.35 + 1e-9
 
 
+def test_images_near_black_are_counted_and_do_not_improve_the_mean() -> None:
+    dark = [
+        Row("case0", "a", method, {"pose": POSES[0]}, {"si_mse": math.nan, "psnr": 1}) for method in ERRORS
+    ]
+    summary = summarise(LAYOUT, [*dark, *(row for row in rows() if row.case != "case0")])
+    cell = summary.groups[0].cells["si_mse"]["ours"]
+    assert (cell.interval.mean, cell.left_out) == (pytest.approx(0.3), 1)
+    assert "Of 1 image the truth is near black" in summary.layout.notes[-1]
+    assert summarise(LAYOUT, rows()).layout == LAYOUT
+
+
 def test_text_breaks_the_tables_down_and_numbers_do_not() -> None:
     summary = summarise(Layout("toy", "Toy", ("si_mse",), ("pose", "not there")), rows())
     assert [(group.fact, group.value) for group in summary.groups] == [
