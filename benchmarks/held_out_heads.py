@@ -35,8 +35,8 @@ from facerf_cli.synth.appearance import skin
 from facerf_cli.synth.appearance.people import People, draw_people
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.loop import seeded
 from facerf_cli.training.losses import clipped_si_mse, si_mse
+from facerf_cli.training.objective import seeded
 
 ANGLES_DEG = (0, 30, 60, 90, 180)  # between the light and the camera
 _NEAR_AXIS = float(np.cos(np.radians(25)))  # of the lights under which tone drift is measured

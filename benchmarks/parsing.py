@@ -41,7 +41,7 @@ from facerf_cli.portrait.segment import segment
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.synth.bank.portraits import heaps_of, views_of_map
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 
 SEED = 7
 SEGMENT_PX = 384  # side of the photos in which the whole of `segment` is measured

@@ -32,7 +32,7 @@ from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 from facerf_cli.synth.bank.transport import load_view
 from facerf_cli.synth.portraits import images_under
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 
 SEED = 16
 LAMPS, NATURAL = 3, 2

@@ -29,7 +29,7 @@ from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.bank.transport import StoredView, load_view
 from facerf_cli.synth.portraits import albedo_of, images_under, materials_of
 from facerf_cli.synth.shading import Material
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 
 SEED, SKINS, LOOK_PX = 17, 6, 128
 LAMP_AZEL_DEG = (60.0, 20.0)

@@ -22,7 +22,7 @@ from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.network.features import VggFeatures
 from facerf_cli.training.joint import JointObjective, JointSettings
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 
 LIGHTS, FACES = 8, 4  # of a step of light-features
 

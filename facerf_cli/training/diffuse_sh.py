@@ -17,8 +17,8 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Validation, metrics_by_pose
 from facerf_cli.training.losses import clipped_si_mse, root_loss
+from facerf_cli.training.objective import Validation, metrics_by_pose
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 

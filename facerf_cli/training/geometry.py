@@ -19,7 +19,7 @@ from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, Geome
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
 from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
 _SHEET_ROWS, _SHEET_COLUMNS, _SHEET_PX = 4, 8, 192

@@ -37,7 +37,6 @@ from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize,
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
-from facerf_cli.training.loop import Objective, Validation, broadcast_from_first, process_rank, seeded
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -50,6 +49,8 @@ from facerf_cli.training.losses import (
     regularisation,
     slid_contour,
 )
+from facerf_cli.training.objective import Objective, Validation, seeded
+from facerf_cli.training.processes import broadcast_from_first, process_rank
 from facerf_cli.training.sheets import tiled
 
 FIXED_LANDMARKS = tuple(i for i in range(len(CONTOUR), 68) if i not in INNER_MOUTH_CORNERS)

@@ -21,7 +21,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 

@@ -1,14 +1,12 @@
 """The training loop: draw a batch, compute losses, step, log, validate, save, resume.
 
 An `Objective` gives the stage's batches, losses and validation; the loop is the same for all stages. Several
-processes train by `torchrun --nproc-per-node N -m facerf_cli train ...`.
+processes train by `torchrun` (`training/processes.py`).
 """
 
 import copy
-import datetime
 import logging
 import math
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -17,9 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader, Dataset
@@ -28,8 +24,17 @@ from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.network.checkpoint import load_networks, save_networks
-from facerf_cli.network.inputs import Batch, SourceColours, concatenate, mixed_precision
+from facerf_cli.network.inputs import Batch
 from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.training.objective import INPUTS, Objective, seeded
+from facerf_cli.training.processes import (
+    broadcast_from_first,
+    distributed,
+    mean_over_processes,
+    process_count,
+    process_device,
+    process_rank,
+)
 from facerf_cli.training.run_folder import (
     RunLog,
     State,
@@ -42,188 +47,6 @@ from facerf_cli.training.run_folder import (
     update_average,
 )
 from facerf_cli.training.settings import TrainSettings
-
-# Entries of a checkpoint's metadata that say what its networks expect at test time (`models.py`).
-INPUTS = ("source_colours", "geometry", "texture_side", "crop_px")
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Quality of the networks on held-out people."""
-
-    metrics: dict[str, float]
-    sheet: np.ndarray | None  # contact sheet [H, W, 3], scene-linear
-
-
-class Objective(nn.Module):
-    """A training stage: its batches, its loss terms and its validation.
-
-    Subclasses set `held_out` and `settings` where they use `held_out_samples`; they implement `draw_one`,
-    `forward` and `validate`.
-    """
-
-    chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
-    source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
-    skips_networks: bool = False  # True if a batch may leave some weights without a gradient
-    bf16: bool = False  # set by the loop, for `mixed_precision`
-    held_out: Any  # numbers of the people that are not trained on
-    settings: Any  # with `held_out_draws`, of each of them
-    validation_seed: int = 12345
-
-    def __init__(self, networks: dict[str, nn.Module], provenance: dict[str, Any]) -> None:
-        """Make a stage that trains, averages and saves networks, by the names of `network/checkpoint.py`.
-
-        provenance: of the data, for the checkpoint; 'licence' is that of the whole.
-        """
-        super().__init__()
-        self.networks = nn.ModuleDict(networks)
-        self.provenance = provenance
-        self.inputs: dict[str, Any] = {}  # entries of `INPUTS`
-        self._held_out_samples: list[Any] = []
-
-    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
-        """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.
-
-        `generator_of(i, step)` is that of another step, for samples that share what costs much to read. A
-        choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
-        CPU and without the networks.
-        """
-        return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
-
-    def draw_one(self, generator: torch.Generator) -> Any:
-        """Draw one sample of a random person, B = 1."""
-        raise NotImplementedError
-
-    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
-        """Draw one sample of a held-out person, B = 1."""
-        raise NotImplementedError
-
-    def held_out_samples(self) -> list[Any]:
-        """Samples of the held-out people, B = 1, drawn once."""
-        if not self._held_out_samples:
-            self._held_out_samples = [
-                self.draw_held_out(int(person), seeded(self.validation_seed, int(person), index))
-                for index in range(self.settings.held_out_draws)
-                for person in self.held_out
-            ]
-        return self._held_out_samples
-
-    def measure(self) -> None:
-        """Measure what the losses need by the networks, once all processes have them on their device."""
-
-    def forward(self, batch: Any) -> dict[str, Tensor]:
-        """Compute the weighted terms of the loss, each a mean over samples; the loop minimises their sum."""
-        raise NotImplementedError
-
-    def validate(self) -> Validation:
-        """Measure the networks on held-out people, on the same samples every time."""
-        raise NotImplementedError
-
-    def mixed_precision(self) -> torch.autocast:
-        """Context for the networks in `forward`; geometry and losses need single precision."""
-        return mixed_precision(self.device, self.bf16)
-
-    @property
-    def network(self) -> Any:
-        """The network of a stage that trains one."""
-        (network,) = self.networks.values()
-        return network
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the networks."""
-        return next(self.networks.parameters()).device
-
-
-def seeded(*numbers: int) -> torch.Generator:
-    """Make a CPU generator from non-negative numbers; their order and count matter, too."""
-    state = int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1, np.uint64)[0])
-    return torch.Generator().manual_seed(state >> 1)
-
-
-def metrics_by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
-    """Mean Si-MSE of errors [N]: of all, and by whether the target has the source's pose [N]."""
-    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
-    return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}
-
-
-_TIMEOUT = datetime.timedelta(hours=24)  # others wait while the first process bakes heads or validates
-
-
-@contextmanager
-def joined_processes() -> Iterator[None]:
-    """Join torchrun's group of processes, if the environment describes one, and leave it at the end."""
-    if int(os.environ.get("WORLD_SIZE", "1")) < 2 or dist.is_initialized():
-        yield
-        return
-    # Imported once the group exists, it would keep the group (as defaults of its functions), whose threads
-    # then outlive the interpreter and abort the process.
-    import torch.distributed.nn
-
-    backend = "cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo"
-    dist.init_process_group(backend, timeout=_TIMEOUT)
-    try:
-        yield
-        _meet()  # a process that leaves while others still talk to it can be aborted
-    finally:
-        dist.destroy_process_group()
-
-
-def process_count() -> int:
-    """Number of training processes."""
-    return dist.get_world_size() if dist.is_initialized() else 1
-
-
-def process_rank() -> int:
-    """Index of this process; only process 0 writes files."""
-    return dist.get_rank() if dist.is_initialized() else 0
-
-
-def process_device(device: torch.device) -> torch.device:
-    """GPU of this process where a machine has several; otherwise `device`."""
-    if device.type != "cuda" or process_count() == 1:
-        return device
-    own = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
-    torch.cuda.set_device(own)
-    return own
-
-
-@contextmanager
-def first_process_first() -> Iterator[None]:
-    """Run a block in process 0, then in all others at once, so that they find the files that it made."""
-    if process_rank() > 0:
-        _meet()
-    yield
-    if process_rank() == 0:
-        _meet()
-
-
-def _meet() -> None:
-    """Wait for all processes, on the CPU, where a barrier would take a GPU."""
-    mean_over_processes(torch.zeros(1))
-
-
-def distributed(objective: nn.Module, skips_networks: bool) -> nn.Module:
-    """Wrap the objective so that gradients are averaged over all processes; not needed for one process."""
-    if process_count() == 1:
-        return objective
-    return DistributedDataParallel(objective, find_unused_parameters=skips_networks)
-
-
-def broadcast_from_first(values: Tensor) -> Tensor:
-    """The values of process 0."""
-    if process_count() > 1:
-        dist.broadcast(values, 0)
-    return values
-
-
-def mean_over_processes(values: Tensor) -> Tensor:
-    """Mean of values over all processes."""
-    if process_count() > 1:
-        dist.all_reduce(values)
-        values = values / process_count()
-    return values
-
 
 CPU = torch.device("cpu")
 _ENDLESS = 1 << 31  # steps that the sampler lists; the loop ends the run
@@ -252,7 +75,7 @@ def train(
 
     On a CPU a run that ends by its steps is the same to the last digit however often it is stopped and
     resumed, for draws and dropout depend on (seed, step, index) alone. Rows go to `folder/log.jsonl` and
-    `report`. Under torchrun (`training/loop.py`) every process calls this; process 0 alone writes.
+    `report`. Under torchrun (`training/processes.py`) every process calls this; process 0 alone writes.
     """
     if process_rank() == 0 and not resume:
         refuse_another_run(folder)

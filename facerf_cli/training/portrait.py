@@ -17,7 +17,7 @@ from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.bank.transport import SMALL, PortraitSample, PortraitSource
-from facerf_cli.training.loop import Objective, Validation
+from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import tiled
 
 _ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black

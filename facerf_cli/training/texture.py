@@ -15,8 +15,8 @@ from facerf_cli.network.checkpoint import new_network
 from facerf_cli.network.features import LightNetwork, feature_distance
 from facerf_cli.network.inputs import Batch, SourceColours, from_root, mean_colours, without_cast
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
-from facerf_cli.training.loop import Objective, Validation, metrics_by_pose, seeded
 from facerf_cli.training.losses import clipped_si_mse, root_loss
+from facerf_cli.training.objective import Objective, Validation, metrics_by_pose, seeded
 from facerf_cli.training.sheets import tiled
 
 _COLOUR_SEED, _COLOURS_MEASURED = 31415, 192

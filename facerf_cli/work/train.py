@@ -20,20 +20,18 @@ from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.dataset.textures import open_dataset_textures
-from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
+from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import alone_in
 from facerf_cli.light.sphere import RIG_LIGHTS
-from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.checkpoint import load_networks, load_vgg, new_network, use_form
+from facerf_cli.network.checkpoint import load_networks, use_form
 from facerf_cli.network.files import serving_files
-from facerf_cli.network.geometry import GeometryNetworkSettings
 from facerf_cli.network.installed import installed
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
-from facerf_cli.synth.bank.heads import HeadBakeSettings, add_views, bake_heads, load_bank
+from facerf_cli.synth.bank.heads import add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.parsing import StoredPortraits
 from facerf_cli.synth.bank.portraits import (
     BACKGROUND_HEAPS,
@@ -58,57 +56,21 @@ from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.joint import JointObjective, JointSettings
 from facerf_cli.training.light_features import AppearanceObjective, LightFeaturesObjective
-from facerf_cli.training.loop import (
-    Objective,
-    Start,
-    first_process_first,
-    joined_processes,
-    process_rank,
-    train,
-)
-from facerf_cli.training.losses import load_features
+from facerf_cli.training.loop import Start, train
+from facerf_cli.training.objective import Objective
 from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettings
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
+from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
-from facerf_cli.training.settings import Preset, TrainSettings
+from facerf_cli.training.settings import TrainSettings
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
+from facerf_cli.work.train_networks import TINY_LIGHTS, StageNetworks
 from facerf_cli.work.train_options import TrainOptions
 
 _WORKERS_ON_GPU = 4
 _SMOOTH = 0.95  # of the moving average of the losses
 _PACE_S = 600.0  # of the last steps, whose pace gives the time left
-# Sizes of networks with the preset `tiny`, and the lights of the rig that it bakes heads under.
-_TINY_LIGHTS = 20
-_TINY_CODER: dict[str, Any] = {"side": 32, "encoder_widths": (8, 12, 16), "decoder_widths": (8, 12, 16)}
-_TINY_UNET: dict[str, Any] = {"widths": (8, 8, 12, 16), "blocks": (0, 1, 1, 1)}
-_TINY_NETWORKS: dict[str, dict[str, Any]] = {
-    "reflectance default": _TINY_CODER | {"template_channels": 2, "rig_lights": _TINY_LIGHTS},
-    "reflectance paper": {"side": 32, "widths": (8, 12, 16), "features": 8},
-    "diffuse_sh default": _TINY_CODER | {"light_channels": 4, "light_grid": 4, "light_hidden": 16},
-    "parsing default": _TINY_UNET | {"side": 64},
-    "portrait default": _TINY_UNET,
-}
 log = logging.getLogger(LOGGER_NAME)
-
-
-@dataclass(frozen=True)
-class _PresetSizes:
-    """Amounts of data and sizes of networks of a preset."""
-
-    heads: int = 240
-    views: int = 8
-    images: int = 24  # of each head, for the Geometry Network
-    texture_side: int = 128  # of a dataset's textures
-    joint_side: int = 256  # of the stage joint's crops and textures
-    held_out_heads: int = 12
-    light_width: float = 0.25  # of S_f and V_f; 1 is VGG-16's
-
-
-_SIZES: dict[Preset, _PresetSizes] = {
-    "default": _PresetSizes(),
-    "paper": _PresetSizes(texture_side=512, joint_side=512, light_width=1.0),
-    "tiny": _PresetSizes(heads=16, views=2, images=2, joint_side=64, held_out_heads=4, light_width=0.05),
-}
 
 
 def run_training(options: TrainOptions) -> None:
@@ -126,7 +88,7 @@ def run_training(options: TrainOptions) -> None:
         with first_process_first():
             if first and not options.resume:
                 refuse_another_run(options.output)  # before hours of baking
-            stage = _TrainedStage(options, trained, networks)
+            stage = _TrainedStage(options, StageNetworks(options, trained), networks)
             objective: Objective = getattr(stage, options.stage.replace("-", "_"))()
         if first and not (options.resume and (options.output / CONFIG).exists()):
             write_config(options.output, options.typed, training, options.settings.seed)
@@ -173,61 +135,61 @@ class _TrainedStage:
     """Makes the objective of each stage; bakes, unwraps or detects its data where that is missing."""
 
     options: TrainOptions
-    trained: dict[str, Any]  # networks of --start-from
+    make: StageNetworks
     networks: Networks
 
     def reflectance(self) -> Objective:
         """The Reflectance Network on textures."""
-        side = self._texture_side
-        light, network = self._frozen_light_features(side), self._reflectance(side)
-        settings = TextureObjectiveSettings(held_out_heads=self._sizes.held_out_heads)
+        side = self.make.texture_side
+        light, network = self.make.frozen_light_features(side), self.make.reflectance(side)
+        settings = TextureObjectiveSettings(held_out_heads=self.make.sizes.held_out_heads)
         return self._kind(TextureObjective)(self._samples(), network, light, settings)
 
     def light_features(self) -> Objective:
         """S_f on textures."""
-        side = self._texture_side
-        network, options = self._features("light_features", side), self.options
-        settings = HeadsSettings(held_out_heads=self._sizes.held_out_heads)
+        side = self.make.texture_side
+        network, options = self.make.features("light_features", side), self.options
+        settings = HeadsSettings(held_out_heads=self.make.sizes.held_out_heads)
         stacks = open_light_stacks(options.dataset, options.fit_with) if options.dataset else None
         return self._kind(LightFeaturesObjective)(stacks or self._samples(), network, settings)
 
     def appearance_features(self) -> Objective:
         """V_f on a dataset's crops."""
         assert self.options.dataset
-        dataset, side = read_dataset(self.options.dataset), self._joint_side
-        network = self._features("appearance_features", side, people=len(dataset.subjects))
+        dataset, side = read_dataset(self.options.dataset), self.make.joint_side
+        network = self.make.features("appearance_features", side, people=len(dataset.subjects))
         return self._kind(AppearanceObjective)(dataset, load_face_model(dataset.face_model), network)
 
     def diffuse_sh(self) -> Objective:
         """The network of the baseline diffuse-sh, on textures."""
-        settings = SumSettings(held_out_heads=self._sizes.held_out_heads)
-        return self._kind(DiffuseObjective)(self._samples(), self._network("diffuse_sh"), settings)
+        settings = SumSettings(held_out_heads=self.make.sizes.held_out_heads)
+        return self._kind(DiffuseObjective)(self._samples(), self.make.network("diffuse_sh"), settings)
 
     def geometry(self) -> Objective:
         """The Geometry Network on rendered heads."""
-        options, sizes, folder = self.options, self._sizes, self._bank
+        options, sizes, folder = self.options, self.make.sizes, self._bank
         provenance = self._bake()
         images = folder / "pictures"
         add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
         faces = RenderedFaces(images, provenance)
-        network = self._geometry(faces.mean_translation_m(), load_face_model())
+        network = self.make.geometry(faces.mean_translation_m(), load_face_model())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
         return self._kind(GeometryObjective)(faces, network, settings)
 
     def joint(self) -> Objective:
         """Both networks through the rasterizer."""
-        options, side = self.options, self._joint_side
+        options, side = self.options, self.make.joint_side
         assert options.dataset
         dataset = read_dataset(options.dataset)
         appearance, light, _ = _all_or_none(
-            partial(self._frozen_appearance, side),
-            partial(self._frozen_light_features, side),
+            partial(self.make.frozen_appearance, side),
+            partial(self.make.frozen_light_features, side),
             partial(require_crops, dataset, dataset.crop_px, side),
         )
-        reflectance, geometry = self._reflectance(side), None  # heads are fitted to landmarks
+        reflectance, geometry = self.make.reflectance(side), None  # heads are fitted to landmarks
         model = load_face_model(options.fit_with)  # of the Geometry Network, whatever fitted the dataset
         if options.geometry == "network":
-            geometry = self._geometry(mean_translation_m(dataset), model)
+            geometry = self.make.geometry(mean_translation_m(dataset), model)
         photos = None
         if options.photos:
             items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
@@ -244,20 +206,20 @@ class _TrainedStage:
         settings = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
-        objective = ParsingObjectiveSettings(held_out_people=self._sizes.held_out_heads)
-        return self._kind(ParsingObjective)(stored, self._network("parsing"), objective)
+        objective = ParsingObjectiveSettings(held_out_people=self.make.sizes.held_out_heads)
+        return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective)
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""
         options, targets = self.options, 2 if self.options.preset == "tiny" else 4
         source: PortraitSource
-        network = self._network("portrait")
+        network = self.make.network("portrait")
         if options.dataset:
             backgrounds = self._backgrounds(options.output)
             source = open_dataset_portraits(options.dataset, backgrounds, self.networks, options.jobs)
         else:
             source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
-        settings = PortraitObjectiveSettings(held_out_people=self._sizes.held_out_heads, targets=targets)
+        settings = PortraitObjectiveSettings(held_out_people=self.make.sizes.held_out_heads, targets=targets)
         return self._kind(PortraitObjective)(source, network, settings)
 
     def _stored_transport(self) -> StoredTransport:
@@ -273,7 +235,7 @@ class _TrainedStage:
 
     def _whole_people(self) -> tuple[range, list[str], dict[str, Any]]:
         """Numbers of synthetic people, the face models that they take turns in, and their provenance."""
-        sizes, models = self._sizes, self.options.heads_from.split(",")
+        sizes, models = self.make.sizes, self.options.heads_from.split(",")
         if sizes.heads < sizes.held_out_heads + 1:
             raise UsageError(f"--heads {sizes.heads}: {sizes.held_out_heads} people are held out; give more")
         drawn = [load_face_model(model) for model in models]
@@ -290,32 +252,8 @@ class _TrainedStage:
         return load_backgrounds(folder / "backgrounds.safetensors", maps, shapes, self.options.settings.seed)
 
     @property
-    def _sizes(self) -> _PresetSizes:
-        """Sizes of the preset, with --heads and --views if given."""
-        options, preset = self.options, _SIZES[self.options.preset]
-        return replace(preset, heads=options.heads or preset.heads, views=options.views or preset.views)
-
-    @property
-    def _texture_side(self) -> int:
-        """Side of the textures of the stages that read textures: of a dataset, or of baked heads."""
-        if self.options.dataset:
-            return self.options.texture_size or self._sizes.texture_side
-        return self._bake_settings.side
-
-    @property
-    def _joint_side(self) -> int:
-        """Side of the crops and textures of the stages that read crops."""
-        return self.options.texture_size or self._sizes.joint_side
-
-    @property
     def _bank(self) -> Path:
         return self.options.bank or self.options.output / "bank"
-
-    @property
-    def _bake_settings(self) -> HeadBakeSettings:
-        if self.options.preset == "tiny":
-            return HeadBakeSettings(32, _TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
-        return HeadBakeSettings()
 
     def _kind(self, objective: type[Objective]) -> Any:
         """The class of the stage's objective, or the subclass of --objective."""
@@ -328,87 +266,12 @@ class _TrainedStage:
             raise UsageError(f"--objective {name}: is no subclass of {needed}, the stage's own")
         return kind
 
-    def _frozen_appearance(self, side: int) -> Any:
-        """V_f; None without one."""
-        options = self.options
-        if options.appearance_features:
-            return load_features(options.appearance_features, "appearance_features", side)
-        if options.vgg_weights is None:
-            if options.preset != "paper":
-                return None
-            raise UsageError(
-                "the paper's loss needs V_f; give --vgg-weights imagenet (553 MB), a file of it, or "
-                "--appearance-features FILE, a checkpoint of `facerf train --stage appearance-features "
-                f"--texture-size {side}`"
-            )
-        return load_vgg(options.vgg_weights)
-
-    def _frozen_light_features(self, side: int) -> Any:
-        """S_f for images of a side; None without one."""
-        path, options = self.options.light_features, self.options
-        if path is None and options.preset == "paper" and options.stage == "joint":
-            raise UsageError(
-                "the paper's loss needs S_f; give --light-features FILE, a checkpoint of `facerf train "
-                f"--stage light-features --texture-size {side}`"
-            )
-        return load_features(path, "light_features", side) if path else None
-
-    def _network(self, name: str, form: str = "default", **settings: Any) -> Any:
-        """The network of --start-from, or an untrained one of the preset's sizes."""
-        tiny = _TINY_NETWORKS.get(f"{name} {form}") if self.options.preset == "tiny" else None
-        return self.trained.get(name) or new_network(name, form, settings | (tiny or {}))
-
-    def _features(self, name: str, side: int, **settings: Any) -> Any:
-        """S_f or V_f; InputError for one of --start-from that was trained on images of another side."""
-        network = self._network(name, "vgg", width=self._sizes.light_width, side=side, **settings)
-        if network.settings.side != side:
-            trained = network.settings.side
-            raise InputError(
-                f"{self.options.start_from}: trained on images of {trained} px, here they have {side}; "
-                f"give --texture-size {trained}"
-            )
-        return network
-
-    def _reflectance(self, side: int) -> Any:
-        """The Reflectance Network of the options' form; the paper's works at the textures' side."""
-        form, without_normals = self.options.form, self.options.without_normals
-        settings: dict[str, Any] = {"side": side} if form == "paper" else {}
-        if without_normals:
-            settings["normals"] = False
-        try:
-            return self._network("reflectance", form, **settings)
-        except TypeError:
-            if not without_normals:
-                raise
-            raise UsageError(
-                f"--without-normals: the form {form} has no setting normals; leave it out"
-            ) from None
-
-    def _geometry(self, mean_translation_m: tuple[float, float, float], model: MorphableModel) -> Any:
-        """The Geometry Network; with --mean-face of the pose alone (paper, 'Ablative Study').
-
-        Raises InputError for one of --start-from whose coefficients are another model's.
-        """
-        form, most = "paper" if self.options.preset == "paper" else "default", GeometryNetworkSettings()
-        shapes = {
-            "identity": min(most.identity, len(model.identity)),
-            "expression": min(most.expression, len(model.expression)),
-        }
-        if self.options.mean_face:
-            shapes = dict.fromkeys(shapes, 0)
-        settings = {"mean_translation_m": mean_translation_m, "face_model": model.name, **shapes}
-        network = self._network("geometry", form, **settings)
-        if network.settings.face_model != model.name:
-            trained = f"its Geometry Network was trained with the face model {network.settings.face_model}"
-            raise InputError(f"{self.options.start_from}: {trained}, not {model.name}; give --fit-with")
-        return network
-
     def _samples(self) -> SampleSource:
         """Open a dataset's textures, or the bank of synthetic heads, whose missing views are fitted first."""
         options, folder = self.options, self._bank
         if options.dataset:
-            rig_lights = _TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS
-            side = self._texture_side
+            rig_lights = TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS
+            side = self.make.texture_side
             return open_dataset_textures(options.dataset, options.fit_with, side, options.jobs, rig_lights)
         provenance, fitted_with = self._bake(), options.fit_with
         if options.mean_face:  # a fit of a model without shapes is a pose alone
@@ -416,7 +279,7 @@ class _TrainedStage:
             fitted_with = str(folder / f"{still.name}.npz")
             save_face_model(Path(fitted_with), still)
         fitted = load_face_model(fitted_with)
-        views, count = folder / f"views-{fitted.name}", self._sizes.views
+        views, count = folder / f"views-{fitted.name}", self.make.sizes.views
         add_views(folder / "heads", views, fitted_with, count, options.jobs, options.settings.seed)
         fit = {"fitted_with": fitted.credit, "skin": "procedural (facerf)"}
         return load_bank(folder / "heads", views, provenance | fit)
@@ -424,13 +287,13 @@ class _TrainedStage:
     def _bake(self) -> dict[str, Any]:
         """Bake the heads that are missing; return their provenance."""
         options, folder = self.options, self._bank / "heads"
-        heads, held_out = self._sizes.heads, self._sizes.held_out_heads
+        heads, held_out = self.make.sizes.heads, self.make.sizes.held_out_heads
         if heads < held_out + 2:
             raise UsageError(f"--heads {heads}: the mean face and {held_out} heads are held out; give more")
         drawn = load_face_model(options.heads_from)
         load_face_model(options.fit_with)  # raises for an invalid model before anything is baked
         seed = options.settings.seed
-        bake_heads(folder, options.heads_from, heads, options.jobs, seed, self._bake_settings)
+        bake_heads(folder, options.heads_from, heads, options.jobs, seed, self.make.bake_settings)
         found = len(list(folder.glob("*.safetensors")))
         return {
             "heads": f"{found} synthetic heads drawn from {drawn.credit}",

@@ -11,7 +11,7 @@ from facerf_cli.training.diffuse_sh import (
     predicted_images,
     sum_lights,
 )
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 
 NETWORK = DiffuseSettings(32, (8, 12, 16), (8, 12, 16), 4, 4, 16)
 SETTINGS = SumSettings(lights=4, sums=2, held_out_heads=2, held_out_draws=2)

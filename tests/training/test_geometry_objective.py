@@ -13,7 +13,7 @@ from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, Geome
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 
 FEW = GeometryObjectiveSettings(held_out_heads=1, held_out_draws=4)
 

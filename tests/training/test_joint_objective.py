@@ -21,8 +21,8 @@ from facerf_cli.training.joint import (
     render_textures,
     unwrap_images,
 )
-from facerf_cli.training.loop import seeded
 from facerf_cli.training.losses import PaperWeights
+from facerf_cli.training.objective import seeded
 from tests import fake_device
 from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 

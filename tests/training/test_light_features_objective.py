@@ -12,7 +12,7 @@ from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
 from facerf_cli.training.light_features import LightFeaturesObjective
-from facerf_cli.training.loop import seeded
+from facerf_cli.training.objective import seeded
 from facerf_cli.training.texture import HeadsSettings
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.toy_faces import ToyFaces

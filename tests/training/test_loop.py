@@ -17,7 +17,8 @@ import torch.multiprocessing as mp
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks, save_networks
-from facerf_cli.training.loop import Start, drawn_batches, joined_processes, train
+from facerf_cli.training.loop import Start, drawn_batches, train
+from facerf_cli.training.processes import joined_processes
 from facerf_cli.training.settings import PRESETS, Adadelta, TrainSettings
 from tests.toy_faces import toy_objective
 

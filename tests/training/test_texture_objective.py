@@ -10,13 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from facerf_cli.network.features import LightNetwork, LightSettings
-from facerf_cli.network.inputs import colour_cast
+from facerf_cli.network.inputs import colour_cast, concatenate
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import Sample
-from facerf_cli.training.loop import concatenate, seeded, train
+from facerf_cli.training.loop import train
 from facerf_cli.training.losses import root_loss
+from facerf_cli.training.objective import seeded
 from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 from tests.toy_faces import SIDE, ToyFaces, toy_objective

@@ -1,0 +1,114 @@
+"""A training stage: its batches, its loss terms and its validation. `training/loop.py` takes its steps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.network.inputs import Batch, SourceColours, concatenate, mixed_precision
+
+# Entries of a checkpoint's metadata that say what its networks expect at test time (`models.py`).
+INPUTS = ("source_colours", "geometry", "texture_side", "crop_px")
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Quality of the networks on held-out people."""
+
+    metrics: dict[str, float]
+    sheet: np.ndarray | None  # contact sheet [H, W, 3], scene-linear
+
+
+class Objective(nn.Module):
+    """A training stage: its batches, its loss terms and its validation.
+
+    Subclasses set `held_out` and `settings` where they use `held_out_samples`; they implement `draw_one`,
+    `forward` and `validate`.
+    """
+
+    chooses_by: str  # metric of `validate` (lower is better) that selects best.safetensors
+    source_colours: SourceColours | None = None  # of a trained Reflectance Network's sources
+    skips_networks: bool = False  # True if a batch may leave some weights without a gradient
+    bf16: bool = False  # set by the loop, for `mixed_precision`
+    held_out: Any  # numbers of the people that are not trained on
+    settings: Any  # with `held_out_draws`, of each of them
+    validation_seed: int = 12345
+
+    def __init__(self, networks: dict[str, nn.Module], provenance: dict[str, Any]) -> None:
+        """Make a stage that trains, averages and saves networks, by the names of `network/checkpoint.py`.
+
+        provenance: of the data, for the checkpoint; 'licence' is that of the whole.
+        """
+        super().__init__()
+        self.networks = nn.ModuleDict(networks)
+        self.provenance = provenance
+        self.inputs: dict[str, Any] = {}  # entries of `INPUTS`
+        self._held_out_samples: list[Any] = []
+
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
+        """Draw `count` samples, sample i from `generator_of(i)` alone, independent of the others.
+
+        `generator_of(i, step)` is that of another step, for samples that share what costs much to read. A
+        choice for the whole batch is drawn from `seeded(seed, step)`. Runs in data-loading workers, on the
+        CPU and without the networks.
+        """
+        return concatenate([self.draw_one(generator_of(i)) for i in range(count)])
+
+    def draw_one(self, generator: torch.Generator) -> Any:
+        """Draw one sample of a random person, B = 1."""
+        raise NotImplementedError
+
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
+        """Draw one sample of a held-out person, B = 1."""
+        raise NotImplementedError
+
+    def held_out_samples(self) -> list[Any]:
+        """Samples of the held-out people, B = 1, drawn once."""
+        if not self._held_out_samples:
+            self._held_out_samples = [
+                self.draw_held_out(int(person), seeded(self.validation_seed, int(person), index))
+                for index in range(self.settings.held_out_draws)
+                for person in self.held_out
+            ]
+        return self._held_out_samples
+
+    def measure(self) -> None:
+        """Measure what the losses need by the networks, once all processes have them on their device."""
+
+    def forward(self, batch: Any) -> dict[str, Tensor]:
+        """Compute the weighted terms of the loss, each a mean over samples; the loop minimises their sum."""
+        raise NotImplementedError
+
+    def validate(self) -> Validation:
+        """Measure the networks on held-out people, on the same samples every time."""
+        raise NotImplementedError
+
+    def mixed_precision(self) -> torch.autocast:
+        """Context for the networks in `forward`; geometry and losses need single precision."""
+        return mixed_precision(self.device, self.bf16)
+
+    @property
+    def network(self) -> Any:
+        """The network of a stage that trains one."""
+        (network,) = self.networks.values()
+        return network
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the networks."""
+        return next(self.networks.parameters()).device
+
+
+def seeded(*numbers: int) -> torch.Generator:
+    """Make a CPU generator from non-negative numbers; their order and count matter, too."""
+    state = int(np.random.SeedSequence((len(numbers), *numbers)).generate_state(1, np.uint64)[0])
+    return torch.Generator().manual_seed(state >> 1)
+
+
+def metrics_by_pose(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
+    """Mean Si-MSE of errors [N]: of all, and by whether the target has the source's pose [N]."""
+    parts = {"": torch.ones_like(same_pose), "_same_pose": same_pose, "_other_pose": ~same_pose}
+    return {f"si_mse{name}": float(errors[part].mean()) for name, part in parts.items() if part.any()}
