@@ -57,6 +57,8 @@ def _described(network: Any) -> dict[str, Any]:
     """Form and settings of a network; a class that the user has installed does not know its name."""
     forms = (form for (_, form), known in _CLASSES.items() if known is type(network))
     own = next(filter(is_installed_name, forms), None)
+    if type(network) not in _CLASSES.values():
+        raise UsageError(f"{type(network).__name__}: no class of facerf's own; call use_form with its name")
     return {**network.as_metadata(), **({"form": own} if own else {})}
 
 

@@ -1,0 +1,96 @@
+"""The code of docs/training.md runs, and a dataset from arrays is what prepare-dataset writes."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facerf_cli.dataset.dataset import read_dataset, read_stack
+from facerf_cli.dataset.from_arrays import write_dataset
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.network.checkpoint import save_networks
+from facerf_cli.network.files import read_metadata
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from tests import astronaut
+
+ROOT = Path(__file__).parents[2]
+FRONT = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The names that the page's code leaves, run from top to bottom."""
+    folder = tmp_path_factory.mktemp("page")
+    (folder / "examples").symlink_to(ROOT / "examples")
+    names: dict[str, Any] = {"folder": folder}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs/training.md").read_text(), re.S):
+            exec(compile(block, "docs/training.md", "exec"), names)
+    return names
+
+
+def test_the_page_trains_by_a_loss_of_its_own(page: dict[str, Any]) -> None:
+    rows = (page["folder"] / "run/log.jsonl").read_text().splitlines()
+    assert len(rows) == 20 and all('"smooth"' in row for row in rows)
+    assert read_metadata(page["folder"] / "run/best.safetensors")["training"]
+    assert page["mine"].models.checkpoint_name() == "best"
+    assert page["image"].shape == page["photo"].shape and np.isfinite(page["image"]).all()
+
+
+def test_a_dataset_holds_the_arrays_in_the_crop_of_the_face(page: dict[str, Any]) -> None:
+    dataset, rig = read_dataset(page["folder"] / "dataset"), page["rig"]
+    assert dataset.subjects == ("anna", "bo", "cy")
+    assert all(len(members) == 1 for members in dataset.splits.values())
+    path = dataset.stack_path("anna", "camera")
+    header, fit = read_stack(path)
+    # Lights turn with the fitted head, so they are those that were given, in the crop's camera.
+    np.testing.assert_allclose(header.directions @ header.directions.T, rig @ rig.T, atol=1e-6)
+    assert np.degrees(np.arccos((header.directions * rig).sum(1).clip(-1, 1))).max() < 5
+    expected = fit.crop.apply(page["olats"][3]).clip(min=0)
+    stored = read_olats(path, slice(3, 4))[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(stored, expected, atol=1e-3, rtol=1e-3)
+    own = page["mine"].landmarks
+    crop_px = fit.crop.to_crop(own) - fit.landmarks_px.numpy()
+    assert np.abs(crop_px).mean() < 0.03 * fit.crop.size_px
+
+
+@pytest.mark.parametrize(
+    ("people", "directions", "said"),
+    [
+        ({}, FRONT, "no name"),
+        ({"a/b": np.zeros((2, 8, 8, 3))}, FRONT, "'a/b' is no name"),
+        ({"a": np.zeros((2, 8, 8))}, FRONT, r"give \[2, height, width, 3\]"),
+        ({"a": np.zeros((3, 8, 8, 3))}, FRONT, r"shape \[3, 8, 8, 3\]"),
+        ({"a": np.zeros((2, 8, 8, 3))}, FRONT[0], r"give \[lights, 3\]"),
+        ({"a": np.zeros((2, 8, 8, 3))}, 2 * FRONT, "give unit vectors"),
+    ],
+)
+def test_arrays_that_do_not_fit(people: Any, directions: np.ndarray, said: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=said):
+        write_dataset(tmp_path / "out", astronaut.models(), people, directions)
+
+
+def test_people_of_two_sizes_and_no_face(page: dict[str, Any], tmp_path: Path) -> None:
+    models = astronaut.models()
+    one = {"a": np.zeros((2, 64, 48, 3), np.float32)}
+    with pytest.raises(InputError, match="a: no camera shows a face"):
+        write_dataset(tmp_path / "out", models, one, FRONT)
+    two = {"a": page["olats"], "b": page["olats"][:, 1:]}
+    with pytest.raises(InputError, match=r"b: images of shape \[511, 512, 3\], not \[512, 512, 3\]"):
+        write_dataset(tmp_path / "two", models, two, page["rig"], split="1/0/0")
+    with pytest.raises(UsageError, match="holds a dataset already"):
+        write_dataset(page["folder"] / "dataset", models, one, FRONT)
+    assert not (tmp_path / "two" / "dataset.json").exists()
+
+
+def test_a_network_without_a_name_is_not_saved_as_another(tmp_path: Path) -> None:
+    class Unnamed(DefaultReflectanceNetwork):
+        pass
+
+    small = DefaultReflectanceSettings(32, (4, 8, 8), (4, 8, 8), rig_lights=8)
+    with pytest.raises(UsageError, match="Unnamed: no class of facerf's own; call use_form"):
+        save_networks(tmp_path / "x.safetensors", {"reflectance": Unnamed(small)}, {})
