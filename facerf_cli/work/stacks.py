@@ -18,6 +18,7 @@ from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
 from facerf_cli.files.images import LinearImage, write_display
+from facerf_cli.files.olat_npz import write_olat_npz
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
@@ -60,10 +61,10 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             header, olats = _of_person(item, image, face, directions, work, tiles)
         else:
             header, olats = _of_face(item, face, directions, work, tiles)
-        if work.format == "exr":
-            write_olat_stack(stack, header, olats)
-        else:
+        if work.format == "relight":
             _write_relight_web(stack.parent, header, olats)
+        else:
+            {"exr": write_olat_stack, "npz": write_olat_npz}[work.format](stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
             write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)

@@ -162,7 +162,8 @@ class PredictOlat(PhotoWork):
             textures, which other poses can be rendered from.
         size_px: Scale larger photos down to this longer side, with --frame photo.
         precision: Compute the network in this precision; bf16 where the device has instructions for it.
-        format: Write OpenEXR; or a folder for the web viewers Relight and OpenLIME, front lights only.
+        format: Write OpenEXR; NumPy's arrays (_olat.npz); or a folder for the web viewers Relight and
+            OpenLIME, front lights only.
         page: Write the web page of `facerf view`, _page.html, too.
     """
 
@@ -174,20 +175,20 @@ class PredictOlat(PhotoWork):
     size_px: int = option(1024, metavar="PX", least=64, most=16384, panel=IMAGE)
     network_alone: bool = network_alone_option()
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
-    format: Literal["exr", "relight"] = option("exr", panel=IMAGE)
+    format: Literal["exr", "npz", "relight"] = option("exr", panel=IMAGE)
     page: bool = option(False, panel=IMAGE)
     verb = "predict-olat"
 
     @property
     def endings(self) -> tuple[str, ...]:
         """Ends of the stack, its contact sheet and, if wanted, its page."""
-        stack = "_olat.exr" if self.format == "exr" else "_relight/info.json"
+        stack = "_relight/info.json" if self.format == "relight" else f"_olat.{self.format}"
         return (stack, "_olat.png", *(["_page.html"] if self.page else []))
 
     @property
     def alone_as(self) -> tuple[str, ...]:
         """The stack."""
-        return self.endings[:1] if self.format == "exr" else ()
+        return () if self.format == "relight" else self.endings[:1]
 
     @property
     def networks(self) -> frozenset[str]:

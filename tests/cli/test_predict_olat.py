@@ -90,6 +90,21 @@ def test_the_person_in_the_photos_frame_goes_back_on_the_photo(given: Path, tmp_
     assert read_image(tmp_path / "alone/astronaut_olat_light_70_0.exr").alpha is not None
 
 
+def test_arrays_are_those_of_the_stack(given: Path, tmp_path: Path) -> None:
+    stack = stack_of(given, tmp_path, "--lights", SIDES)
+    assert predict(given, tmp_path / "me.npz", "--lights", SIDES, "--format", "npz") == 0
+    with np.load(tmp_path / "me.npz", allow_pickle=False) as file:
+        arrays = dict(file)
+    np.testing.assert_array_equal(arrays["olats"].transpose(0, 3, 1, 2), stack.olats.numpy())
+    for name in ("directions", "rotation", "source", "seen", "normals"):
+        np.testing.assert_allclose(arrays[name], getattr(stack.header, name), atol=1e-3, rtol=1e-3)
+    np.testing.assert_array_equal(arrays["fit_landmarks_px"], stack.header.fit["landmarks_px"])
+    assert arrays["kind"] == "texture" and arrays["facerf:synthetic"] == 1
+    page = (Path(__file__).parents[2] / "docs/formats.md").read_text()
+    named = {name for name in arrays if not name.startswith(("fit_", "facerf:"))}
+    assert all(f"`{name}`" in page for name in named)
+
+
 def test_the_format_of_web_viewers_has_the_lights_from_in_front(given: Path, tmp_path: Path) -> None:
     line = ["--lights", "40", "--frame", "photo", "--size", "128", "--format", "relight"]
     assert predict(given, tmp_path, *line) == 0
