@@ -29,9 +29,9 @@ def relight_dataset(
     half-float EXRs, DATASET/relit/SUBJECT/00000.exr and on, exposed so that the envmap's mean radiance is
     near 1 (exposure_ev).
 
-    A source of 256 x 256 pixels takes 100 to 200 kB and about 25 ms of one core: 35 to 70 GB and 2.5 hours at
-    the paper's scale (350 subjects). --lazy writes 250 bytes of recipe and 2 kB of weights for each instead,
-    and training multiplies a stack's textures (15 MB at 128 texels) for every source that it draws.
+    --dry-run says what the pairs take, by making some: at the paper's scale (350 subjects, 8 cameras, 512
+    pixels) about 310 GB and 6 hours of a core. --lazy writes .7 GB of recipes and weights instead, and
+    training sums stacks.
     """
     from facerf_cli.dataset.pairs import RELIT
     from facerf_cli.work.prepare import relight_subjects

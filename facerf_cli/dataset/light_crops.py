@@ -14,7 +14,8 @@ from torch import Tensor
 
 from facerf_cli.dataset.crops import lit_mean_of
 from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset, read_stack
-from facerf_cli.dataset.textures import LEAST_INSIDE, heads_of, model_of
+from facerf_cli.dataset.textures import heads_of, model_of
+from facerf_cli.dataset.unwrapped import LEAST_INSIDE
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_triangles, on_device
 from facerf_cli.files.olat_stack import read_olats

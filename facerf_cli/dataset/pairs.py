@@ -34,6 +34,7 @@ from facerf_cli.dataset.weights import (
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import checked, digest
+from facerf_cli.files.image_metadata import Attributes
 from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.texts import parse_json, text_of
@@ -334,10 +335,14 @@ def relight_subject(
         images = relit_images(path, torch.from_numpy(np.array(weights[rows])), memory_bytes)
         attributes = attributes_of_sum(read_olat_header(path).metadata)
         for row, image in zip(rows, images, strict=True):
-            pixels = image.permute(1, 2, 0).float().numpy()
-            recipe = {f"facerf:{name}": value for name, value in asdict(pairs[row]).items()}
-            write_exr(image_path(dataset, *pairs[row].key), pixels, metadata=attributes | recipe)
+            write_source(image_path(dataset, *pairs[row].key), pairs[row], image, attributes)
     return len(todo)
+
+
+def write_source(path: Path, pair: Pair, image: Tensor, attributes: Attributes) -> None:
+    """Write the source [3, H, W] of a pair, with the pair and attributes as metadata."""
+    recipe = {f"facerf:{name}": value for name, value in asdict(pair).items()}
+    write_exr(path, image.permute(1, 2, 0).float().numpy(), metadata={**attributes, **recipe})
 
 
 def render_source(dataset: Dataset, row: Pair | Mapping[str, Any]) -> Tensor:

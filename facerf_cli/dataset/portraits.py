@@ -23,7 +23,7 @@ from torch import Tensor
 
 from facerf_cli.batch.made_from import is_made_from
 from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
-from facerf_cli.dataset.textures import stamp
+from facerf_cli.dataset.unwrapped import stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.atomic import atomic_path

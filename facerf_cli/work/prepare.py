@@ -30,6 +30,7 @@ from facerf_cli.capture.findings import (
 )
 from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
 from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
+from facerf_cli.dataset.cost import cost_of_sources, in_words, recipe_bytes
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
     LARGEST_CROP_PX,
@@ -44,6 +45,7 @@ from facerf_cli.dataset.pairs import (
     GIVE_BEFORE,
     PAIRS_NAME,
     RELIT,
+    Pair,
     draw_pairs,
     image_path,
     load_pairs,
@@ -323,7 +325,9 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     pairs = draw_pairs(dataset, maps, wanted.per_subject, settings.seed, test_maps)
     if not pairs:
         raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
-    if not batch.dry_run:
+    if batch.dry_run:
+        _say_cost(dataset, pairs, wanted.lazy, overwrite)
+    else:
         write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
         if test_maps != maps:
             log.info("maps: %d, and %d others for the split test alone", len(maps), len(test_maps))
@@ -334,6 +338,14 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     items = [Item(folder / "olat" / name, batch.output / name, name) for name in subjects]
     return run_items("relight-dataset", items, work, work.outputs_of, batch, settings)
+
+
+def _say_cost(dataset: Dataset, pairs: list[Pair], lazy: bool, overwrite: bool) -> None:
+    """Log what the pairs and the sources that are missing will take."""
+    log.info("%d recipes with their weights: %s", len(pairs), in_words(recipe_bytes(dataset, pairs)))
+    if not lazy:
+        todo = [pair for pair in pairs if overwrite or not image_path(dataset, *pair.key).exists()]
+        log.info("%d sources of %d px: %s", len(todo), dataset.crop_px, cost_of_sources(dataset, todo))
 
 
 def _maps_of_splits(

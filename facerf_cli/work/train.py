@@ -64,6 +64,7 @@ from facerf_cli.training.processes import first_process_first, joined_processes,
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import TrainSettings
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
+from facerf_cli.work.train_cost import say_cost
 from facerf_cli.work.train_networks import TINY_LIGHTS, StageNetworks
 from facerf_cli.work.train_options import TrainOptions
 
@@ -78,6 +79,10 @@ def run_training(options: TrainOptions) -> None:
     with joined_processes(), ExitStack() as stack:
         device, first = _device(options.settings), process_rank() == 0
         use_form(options.form)
+        if options.dry_run:
+            if first:
+                say_cost(options, StageNetworks(options, _load_start(options)[0]))
+            return
         if first:
             stack.enter_context(alone_in(options.output, ".facerf-lock"))
         workers = options.workers

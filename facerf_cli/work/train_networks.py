@@ -3,8 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.checkpoint import load_vgg, new_network
 from facerf_cli.network.geometry import GeometryNetworkSettings
@@ -77,6 +78,25 @@ class StageNetworks:
         if self.options.preset == "tiny":
             return HeadBakeSettings(32, TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
         return HeadBakeSettings()
+
+    def of_stage(self) -> dict[str, Any]:
+        """The networks that the stage trains, before their data is known: the right sizes, not starts."""
+        options, stage = self.options, self.options.stage
+        name = stage.replace("-", "_")
+        if stage == "light-features":
+            return {name: self.features(name, self.texture_side)}
+        if stage == "appearance-features":
+            assert options.dataset
+            people = len(read_dataset(options.dataset).subjects)
+            return {name: self.features(name, self.joint_side, people=people)}
+        found: dict[str, Any] = {}
+        if stage in ("reflectance", "joint"):
+            side = self.joint_side if stage == "joint" else self.texture_side
+            found["reflectance"] = self.reflectance(side)
+        if stage == "geometry" or (stage == "joint" and options.geometry == "network"):
+            model = load_face_model(options.fit_with) if stage == "joint" else load_face_model()
+            found["geometry"] = self.geometry((0.0, 0.0, -1.0), model)
+        return found or {name: self.network(name)}
 
     def frozen_appearance(self, side: int) -> Any:
         """V_f; None without one."""

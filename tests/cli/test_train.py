@@ -96,6 +96,29 @@ def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("stage", "trained", "said"),
+    [
+        ("reflectance", "reflectance", "textures-32: about 0."),
+        ("joint", "reflectance, geometry", ""),
+        ("light-features", "light_features", ""),
+        ("appearance-features", "appearance_features", ""),
+        ("portrait", "portrait", "not computed"),
+    ],
+)
+def test_a_dry_run_says_what_a_run_writes_and_writes_nothing(
+    stage: str, trained: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_small_dataset(tmp_path / "data", counts=(1, 1, 1), lights=12, crop_px=48)
+    before = sorted(tmp_path.rglob("*"))
+    line = ["train", "-o", str(tmp_path / "run"), "--dataset", str(tmp_path / "data"), "--dry-run"]
+    size = [] if stage == "portrait" else ["--texture-size", "32"]
+    assert main([*line, "--stage", stage, "--preset", "tiny", *size]) == 0
+    err = capsys.readouterr().err
+    assert f"best.safetensors ({trained}): " in err and "state.pt: " in err and said in err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
     ("options", "words"),
     [
         (

@@ -16,7 +16,8 @@ from facerf_cli.dataset.pairs import (
     relight_subject,
     write_pairs,
 )
-from facerf_cli.dataset.textures import DatasetTextures, UnwrappedView, open_dataset_textures, texture_path
+from facerf_cli.dataset.textures import DatasetTextures, open_dataset_textures
+from facerf_cli.dataset.unwrapped import UnwrappedView, texture_path
 from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import grid_triangles

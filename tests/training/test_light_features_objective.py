@@ -5,7 +5,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.dataset.light_crops import open_light_stacks
-from facerf_cli.dataset.textures import UnwrappedView, open_dataset_textures
+from facerf_cli.dataset.textures import open_dataset_textures
+from facerf_cli.dataset.unwrapped import UnwrappedView
 from facerf_cli.network.features import LightNetwork, LightSettings
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
