@@ -29,7 +29,16 @@ from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_targe
 
 
 def heads_of(dataset: Dataset, held_out: int) -> tuple[Tensor, Tensor]:
-    """Places in `subjects` of the split train, and of at most `held_out` of the split validation."""
+    """Places in `subjects` of the split train, and of at most `held_out` of the split validation.
+
+    The only person of a dataset is validated on, too, and a line says so.
+    """
+    if len(dataset.subjects) == 1 and dataset.splits["train"]:
+        log.warning(
+            "%s: has one person, so nobody is held out: the validation is of who is trained on",
+            dataset.folder,
+        )
+        return torch.tensor([0]), torch.tensor([0])
     places = {subject: place for place, subject in enumerate(dataset.subjects)}
     for split in ("train", "validation"):
         if not dataset.splits[split]:

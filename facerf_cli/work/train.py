@@ -161,7 +161,8 @@ class _TrainedStage:
     def appearance_features(self) -> Objective:
         """V_f on a dataset's crops."""
         assert self.options.dataset
-        dataset, side = read_dataset(self.options.dataset), self.make.joint_side
+        dataset = read_dataset(self.options.dataset)
+        side = self.make.joint_side(dataset.crop_px)
         network = self.make.features("appearance_features", side, people=len(dataset.subjects))
         return self._kind(AppearanceObjective)(dataset, load_face_model(dataset.face_model), network)
 
@@ -183,9 +184,10 @@ class _TrainedStage:
 
     def joint(self) -> Objective:
         """Both networks through the rasterizer."""
-        options, side = self.options, self.make.joint_side
+        options = self.options
         assert options.dataset
         dataset = read_dataset(options.dataset)
+        side = self.make.joint_side(dataset.crop_px)
         appearance, light, _ = _all_or_none(
             partial(self.make.frozen_appearance, side),
             partial(self.make.frozen_light_features, side),

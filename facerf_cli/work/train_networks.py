@@ -67,10 +67,12 @@ class StageNetworks:
             return self.options.texture_size or self.sizes.texture_side
         return self.bake_settings.side
 
-    @property
-    def joint_side(self) -> int:
-        """Side of the crops and textures of the stages that read crops."""
-        return self.options.texture_size or self.sizes.joint_side
+    def joint_side(self, crop_px: int) -> int:
+        """Side of the crops and textures of the stages that read crops; `tiny` takes any dataset's."""
+        preset = self.sizes.joint_side
+        return self.options.texture_size or (
+            min(preset, crop_px) if self.options.preset == "tiny" else preset
+        )
 
     @property
     def bake_settings(self) -> HeadBakeSettings:

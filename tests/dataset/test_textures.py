@@ -16,7 +16,7 @@ from facerf_cli.dataset.pairs import (
     relight_subject,
     write_pairs,
 )
-from facerf_cli.dataset.textures import DatasetTextures, open_dataset_textures
+from facerf_cli.dataset.textures import DatasetTextures, heads_of, open_dataset_textures
 from facerf_cli.dataset.unwrapped import UnwrappedView, texture_path
 from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import InputError
@@ -184,10 +184,16 @@ def test_training_on_a_dataset_lowers_the_loss_and_names_it(lazy: DatasetTexture
     assert metadata["metrics"]["si_mse"] > 0 and lazy.dataset.folder.name in metadata["licence"]
 
 
+def test_the_only_person_is_validated_on(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    one = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=4, crop_px=32)
+    assert [heads.tolist() for heads in heads_of(one, 12)] == [[0], [0]]
+    assert "nobody is held out" in caplog.text
+
+
 def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such face model"):
         open_dataset_textures(dataset.folder, "nobody.npz", SIDE, 1)
-    none = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=4, crop_px=32)
+    none = write_small_dataset(tmp_path, counts=(2, 0, 0), cameras=1, lights=4, crop_px=32)
     with pytest.raises(InputError, match="no subject in the split validation; run prepare-dataset"):
         open_dataset_textures(none.folder, "builtin", SIDE, 1)
     text = (tmp_path / "dataset.json").read_text().replace('"face_model": "builtin"', '"face_model": "other"')
