@@ -6,6 +6,7 @@ the stack's textures, which is the same, for unwrapping is linear. Without pairs
 for synthetic heads.
 """
 
+import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,11 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import inpaint, normal_map
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
 from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
+
+log = logging.getLogger(LOGGER_NAME)
 
 
 def heads_of(dataset: Dataset, held_out: int) -> tuple[Tensor, Tensor]:

@@ -161,8 +161,7 @@ class _TrainedStage:
     def appearance_features(self) -> Objective:
         """V_f on a dataset's crops."""
         assert self.options.dataset
-        dataset = read_dataset(self.options.dataset)
-        side = self.make.joint_side(dataset.crop_px)
+        dataset, side = read_dataset(self.options.dataset), self.make.joint_side
         network = self.make.features("appearance_features", side, people=len(dataset.subjects))
         return self._kind(AppearanceObjective)(dataset, load_face_model(dataset.face_model), network)
 
@@ -184,10 +183,9 @@ class _TrainedStage:
 
     def joint(self) -> Objective:
         """Both networks through the rasterizer."""
-        options = self.options
+        options, side = self.options, self.make.joint_side
         assert options.dataset
         dataset = read_dataset(options.dataset)
-        side = self.make.joint_side(dataset.crop_px)
         appearance, light, _ = _all_or_none(
             partial(self.make.frozen_appearance, side),
             partial(self.make.frozen_light_features, side),

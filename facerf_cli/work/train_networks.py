@@ -67,12 +67,13 @@ class StageNetworks:
             return self.options.texture_size or self.sizes.texture_side
         return self.bake_settings.side
 
-    def joint_side(self, crop_px: int) -> int:
+    @property
+    def joint_side(self) -> int:
         """Side of the crops and textures of the stages that read crops; `tiny` takes any dataset's."""
-        preset = self.sizes.joint_side
-        return self.options.texture_size or (
-            min(preset, crop_px) if self.options.preset == "tiny" else preset
-        )
+        options, side = self.options, self.sizes.joint_side
+        if options.preset == "tiny" and options.dataset:
+            side = min(side, read_dataset(options.dataset).crop_px)
+        return options.texture_size or side
 
     @property
     def bake_settings(self) -> HeadBakeSettings:
