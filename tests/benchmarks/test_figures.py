@@ -1,6 +1,7 @@
 """The scripts of benchmarks/ import and say what they lack; the arithmetic behind their figures."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -13,6 +14,18 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from _common import ROOT, best_s, required
 from held_out_heads import RelitTexture, drift_of, groups, print_tables
 
+PAGES = "\n".join(page.read_text() for page in (*(ROOT / "docs").glob("*.md"), ROOT / "MODEL_CARD.md"))
+
+
+def options_in_docs(script: str) -> set[str]:
+    """The options that the documents give a script."""
+    spans = re.findall(rf"\b{script}\.py([^`;|&]*)`", PAGES)
+    return {option for span in spans for option in re.findall(r"--[a-z][\w-]*", span)}
+
+
+def test_no_figure_rests_on_a_script_that_is_gone() -> None:
+    assert not re.search(r"scripts? that (was|were) not kept", PAGES)
+
 
 @pytest.mark.parametrize("script", sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z]*.py")))
 def test_every_script_imports_and_has_help(
@@ -22,7 +35,9 @@ def test_every_script_imports_and_has_help(
     monkeypatch.setattr(sys, "argv", [f"{script}.py", "--help"])
     with pytest.raises(SystemExit) as end:
         module.main()
-    assert end.value.code == 0 and module.__doc__.splitlines()[0] in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert end.value.code == 0 and module.__doc__.splitlines()[0] in said
+    assert options_in_docs(script) <= set(re.findall(r"--[a-z][\w-]*", said.split("options:")[1]))
 
 
 DATA = {
