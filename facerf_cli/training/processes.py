@@ -10,12 +10,17 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from facerf_cli.errors import FacerfError
+
 _TIMEOUT = datetime.timedelta(hours=24)  # others wait while the first process bakes heads or validates
 
 
 @contextmanager
 def joined_processes() -> Iterator[None]:
-    """Join torchrun's group of processes, if the environment describes one, and leave it at the end."""
+    """Join torchrun's group of processes, if the environment describes one, and leave it at the end.
+
+    Raises FacerfError where another process is lost.
+    """
     if int(os.environ.get("WORLD_SIZE", "1")) < 2 or dist.is_initialized():
         yield
         return
@@ -28,6 +33,11 @@ def joined_processes() -> Iterator[None]:
     try:
         yield
         _meet()  # a process that leaves while others still talk to it can be aborted
+    except RuntimeError as error:
+        if not isinstance(error, dist.DistError) and "gloo" not in str(error):
+            raise
+        said = "another process of this run ended; its own message says why"
+        raise FacerfError(f"{said}; give the same line again with --resume") from error
     finally:
         dist.destroy_process_group()
 
