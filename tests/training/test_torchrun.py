@@ -16,9 +16,7 @@ from tests.training.joint_dataset import write_joint_dataset
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-ENVIRONMENT["TORCH_DISABLE_SHARE_RDZV_TCP_STORE"] = (
-    "1"  # docs/clusters.md
-)
+ENVIRONMENT["TORCH_DISABLE_SHARE_RDZV_TCP_STORE"] = "1"  # docs/clusters.md
 STEPS = 12
 
 
