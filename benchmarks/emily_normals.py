@@ -44,7 +44,7 @@ def measured(folder: Path, view: int) -> tuple[float, float, float]:
     field = fit(models, photo, find_for(models.networks.people, "landmarks", photo, path.name)[0]).reflectance
     assert isinstance(field, PortraitField)
     dark = torch.zeros(len(field.views), 9, *field.person.image.shape[1:])
-    whole = WholePerson(photo, field).layer("normal", dark)["normal"]
+    whole = WholePerson(photo, field).layer("normal", dark, photo)["normal"]
     (found, seen), (truth, known) = unit(whole(slice(0, len(photo)))), unit(file["normal"].astype(np.float32))
     shown = known & seen & (truth[..., 2] > 0.1) & (np.asarray(Image.open(path).convert("L")) > _BLACK)
     away_deg = np.degrees(np.arccos((found * truth).sum(-1).clip(-1, 1)))

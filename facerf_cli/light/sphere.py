@@ -7,6 +7,7 @@ u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres 
 
 import math
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -83,11 +84,15 @@ def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
     """
     if n < 1:
         raise ValueError(f"a rig needs at least one light, not {n}")
+    return torch.from_numpy(_relaxed(n)).float()
+
+
+@cache
+def _relaxed(n: int) -> np.ndarray:
     points = golden_spiral(n)
-    if n > 1:
-        for step in range(_RELAX_STEPS):
-            points = _repel(points, 0.2 * (1 - step / _RELAX_STEPS))
-    return torch.from_numpy(points).float()
+    for step in range(_RELAX_STEPS if n > 1 else 0):
+        points = _repel(points, 0.2 * (1 - step / _RELAX_STEPS))
+    return points
 
 
 def golden_spiral(points: int) -> np.ndarray:

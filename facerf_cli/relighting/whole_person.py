@@ -26,7 +26,7 @@ class WholePerson:
         segmentation = field.person.segmentation
         self.matte = segmentation.matte
         self.bare_face = uncovered_rows(segmentation.classes, (photo.shape[0], photo.shape[1]))
-        self._segmentation, self._photo = segmentation, photo
+        self._segmentation, self._size_px = segmentation, photo.shape[:2]
         self._irises_px = field.person.irises_px
         self._views = [Enlarged(view, photo) for view in field.views]
 
@@ -51,14 +51,14 @@ class WholePerson:
         hair = self._segmentation.layer("hair")
         grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px)
         opening = partial(self._segmentation.layer, "eyes")
-        return grain, Eyes(photo.__getitem__, self._irises_px, opening, self._photo.shape[:2])
+        return grain, Eyes(photo.__getitem__, self._irises_px, opening, self._size_px)
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [views, 9, S, S]."""
         return self._views[0].exposure_ev(lit[0], rule)
 
-    def layer(self, name: str, lit: Tensor) -> dict[str, Layer]:
-        """A layer of an image under the light of maps, by the name or names that it has in a file.
+    def layer(self, name: str, lit: Tensor, photo: np.ndarray | PersonColours) -> dict[str, Layer]:
+        """A layer of the photo's pixels [H, W, 3] under the light of maps, by the names that it has in a file.
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
         shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
@@ -66,9 +66,8 @@ class WholePerson:
         """
         if name == "classes":
             return {**self._segmentation.layers()}
-        joined = self._joined(
-            self._photo, [view.layer(name, one) for view, one in zip(self._views, lit, strict=True)]
-        )
+        views = [view.layer(name, one) for view, one in zip(self._views, lit, strict=True)]
+        joined = self._joined(photo, views)
 
         def of(rows: slice) -> np.ndarray:
             wide = joined(rows) * (self.matte[rows] > 0)[..., None]

@@ -133,6 +133,22 @@ def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
     assert relight(given, tmp_path / "bad", "--light", "40,10", "--aov", "beauty") == 2
 
 
+def test_the_albedo_at_the_mattes_edge_is_the_persons(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path, "--light", "40,10") == 0
+    (matte,) = layers_of(tmp_path / "astronaut_light_40_10.exr", "person.A")
+    photo = read_image(PHOTO).pixels
+    green = np.float32([0, 0.4, 0])
+    write_display(tmp_path / "green.png", green + matte[..., None] * (photo - green))
+    line = ["--light", "40,10", "--aov", "albedo"]
+    assert relight(given, tmp_path / "out", *line, photo=tmp_path / "green.png") == 0
+    *albedo, matte = layers_of(
+        tmp_path / "out/green_light_40_10.exr", "albedo.R", "albedo.G", "albedo.B", "person.A"
+    )
+    edge = (matte > 0.1) & (matte < 0.5)
+    colour = np.array([channel[edge].mean() for channel in albedo])
+    assert edge.sum() > 100 and colour[1] < 0.65 * colour.sum()  # of the mixture: 0.77
+
+
 def test_lights_with_names_are_layers_that_add_up(given: Path, tmp_path: Path) -> None:
     lights = ["--light", "key=40,20", "--light", "rim=160,10,0.2,0.4,0.9", "--light", "5,6"]
     assert relight(given, tmp_path, *lights, "--background", "0,0,0") == 0
