@@ -58,7 +58,7 @@ class WholePerson:
         return self._views[0].exposure_ev(lit[0], rule)
 
     def layer(self, name: str, lit: Tensor, photo: np.ndarray | PersonColours) -> dict[str, Layer]:
-        """A layer of the photo's pixels [H, W, 3] under the light of maps, by the names that it has in a file.
+        """A layer of the photo's pixels [H, W, 3] under maps of light, by the names that it has in a file.
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
         shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
