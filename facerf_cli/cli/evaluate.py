@@ -11,6 +11,7 @@ from facerf_cli.cli.options import HELP_NAMES, is_default, refuse_given, setting
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.options import (
     EvaluateOptions,
+    FactsOptions,
     GeometryOptions,
     PairsOptions,
     SplitOptions,
@@ -79,6 +80,7 @@ def reconstruction(
     inputs: PhotosOrDatasetArgument,
     *,
     data: SplitOptions,
+    people: FactsOptions,
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     solve: SolveOptions,
     options: Annotated[EvaluateOptions, Without("name")],
@@ -90,7 +92,8 @@ def reconstruction(
     makes: that would be exact by construction. Of a DATASET the sources of its pairs are measured; its true
     light is known, so light_error_deg is the angle between the brightest single lights.
     """
-    _run(context, FaceSettings("reconstruction", options, photo, data, solve=solve), inputs)
+    settings = FaceSettings("reconstruction", options, photo, data, solve=solve, facts=people.facts)
+    _run(context, settings, inputs)
 
 
 def transfer(
@@ -133,6 +136,7 @@ def geometry(
     *,
     mean: GeometryOptions,
     data: Annotated[SplitOptions, Only("split", "every", "pairs")],
+    people: FactsOptions,
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
@@ -142,7 +146,9 @@ def geometry(
     crop, and compared where both show the face. The paper trained networks with the mean face: give them as
     --mean-checkpoint. --against does not apply.
     """
-    settings = FaceSettings("geometry", options, photo, data, mean_checkpoint=mean.mean_checkpoint)
+    settings = FaceSettings(
+        "geometry", options, photo, data, mean_checkpoint=mean.mean_checkpoint, facts=people.facts
+    )
     _run(context, settings, inputs)
 
 
@@ -247,7 +253,9 @@ def _check(context: typer.Context, settings: FaceSettings, photos: bool) -> None
         )
     else:
         refuse_given(
-            context, ("face", "landmarks", "colourspace", "layer"), "is for photos; leave it out here"
+            context,
+            ("face", "landmarks", "colourspace", "layer", "facts"),
+            "is for photos; leave it out here",
         )
     if not settings.options.has_field:
         why = "is for the field; give --reflectance field too, or leave it out"

@@ -104,6 +104,19 @@ class PairsOptions:
 
 
 @dataclass(frozen=True)
+class FactsOptions:
+    """The people of photos.
+
+    Attributes:
+        facts: Read a row for each photo: name, person, and columns for the list of images.
+    """
+
+    facts: Path | None = option(
+        None, metavar="CSV", shown_default="a person is a photo's topmost folder", panel=DATA
+    )
+
+
+@dataclass(frozen=True)
 class GeometryOptions:
     """The mean face of Table 4.
 

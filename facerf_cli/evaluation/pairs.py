@@ -78,12 +78,16 @@ def collect_pairs(
         )
     pairs = []
     for name in sorted(found):
-        known = described.get(name, Facts())
-        folder, slash, _ = name.partition("/")
-        case = Case(name, known.person or (folder if slash else ""), known.values)
         files = {method: images[name] for method, images in by_method.items()}
-        pairs.append(ImagePair(case, found[name], files, mask_files.get(name)))
+        pairs.append(ImagePair(case_of(name, described), found[name], files, mask_files.get(name)))
     return pairs
+
+
+def case_of(name: str, described: Mapping[str, Facts]) -> Case:
+    """The case of an image; its person is the described one, else its topmost folder, else '': not known."""
+    known = described.get(name, Facts())
+    folder, slash, _ = name.partition("/")
+    return Case(name, known.person or (folder if slash else ""), known.values)
 
 
 def compare_pair(pair: ImagePair, finder: PeopleNetworks | None = None) -> Comparison:

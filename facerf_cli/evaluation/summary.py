@@ -141,6 +141,12 @@ class Summary:
     images: int
     persons: int
 
+    @property
+    def size(self) -> str:
+        """Its images and people in words; of unknown people the images alone."""
+        images = counted(self.images, "image")
+        return f"{images} of {counted(self.persons, 'person')}" if self.persons else images
+
     def as_dict(self) -> dict[str, Any]:
         """Return all tables for JSON."""
         return {
@@ -177,6 +183,7 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for value in sorted(by_value, key=natural):
             groups.append(Group(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
+    persons = set() if "" in persons else persons
     if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
         note = (
             f"Of {counted(len(dark), 'image')} the truth is near black (root mean square below "
@@ -222,11 +229,17 @@ def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) 
 def _cell(metric: str, ours: Mapping[str, Row], firsts: Mapping[str, Row]) -> Cell | None:
     """The figures of one method's rows by case; None if no value is finite."""
     finite = {case: row.values[metric] for case, row in ours.items() if math.isfinite(row.values[metric])}
-    interval = mean_interval((ours[case].person, value) for case, value in finite.items())
+    interval = _interval([(ours[case].person, value) for case, value in finite.items()])
     if interval is None:
         return None
     paired = None if ours is firsts else _paired(metric, finite, firsts)
     return Cell(tuple(sorted(finite.values())), interval, len(ours) - len(finite), paired)
+
+
+def _interval(values: Sequence[tuple[str, float]]) -> Interval | None:
+    """The mean of (person, value) pairs and its interval, NaN where somebody is not known."""
+    known = all(person for person, _ in values)
+    return mean_interval(values if known else [("", value) for _, value in values])
 
 
 def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -> Paired | None:
@@ -236,7 +249,7 @@ def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -
         for case, value in ours.items()
         if case in firsts and math.isfinite(firsts[case].values[metric])
     }
-    interval = mean_interval(differences.values())
+    interval = _interval(list(differences.values()))
     if interval is None:
         return None
     won = [0.5 if apart == 0 else float(better * apart > 0) for _, apart in differences.values()]
@@ -251,8 +264,7 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
     layout = summary.layout
-    images, persons = counted(summary.images, "image"), counted(summary.persons, "person")
-    console.print(Text(f"{layout.title}: {images} of {persons}", style="bold"))
+    console.print(Text(f"{layout.title}: {summary.size}", style="bold"))
     first, *others = [metric for metric in layout.metrics if metric in summary.metrics]
     console.print(_table(summary, first, summary.groups, plain=not terminal))
     for metric in others:

@@ -49,7 +49,7 @@ from facerf_cli.work.photos import face_model
 CASES, SUMMARY, IMAGES, PAGE = "cases", "summary.json", "images.csv", "report.html"
 KEPT, STRIPS = "pictures", "strips"
 _STRIP_QUALITY = 88
-_MEASURING = 7  # raised where the same recipe gives other figures
+_MEASURING = 8  # raised where the same recipe gives other figures
 log = logging.getLogger(LOGGER_NAME)
 
 CompareItem = Callable[[Item], Iterable[Comparison]]
@@ -230,6 +230,8 @@ class Evaluation:
             with atomic_path(folder / name) as temporary:
                 temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
         print_tables(summary, about.networks)
+        if not all(row.person for row in rows):
+            log.info("who is in which image is not known: no intervals; give --facts, a CSV with name,person")
         log.info(
             "%s shows the images, worst cases first; %s has a row for each", folder / PAGE, folder / IMAGES
         )

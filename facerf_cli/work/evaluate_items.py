@@ -13,8 +13,8 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.capture.yale_b import YaleB, read_shifts, read_yale_b
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
-from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.measure import Comparison
 from facerf_cli.evaluation.options import (
     EvaluateOptions,
     PairsOptions,
@@ -22,7 +22,7 @@ from facerf_cli.evaluation.options import (
     folder_name,
     portrait_name,
 )
-from facerf_cli.evaluation.pairs import ImagePair, collect_pairs, compare_pair
+from facerf_cli.evaluation.pairs import Facts, ImagePair, case_of, collect_pairs, compare_pair, read_facts
 from facerf_cli.evaluation.people import (
     Compare,
     DatasetPerson,
@@ -207,6 +207,11 @@ def run_on_photos(settings: FaceSettings, inputs: Sequence[str]) -> int:
     """Measure photos; the exit code."""
     items = collect_items(inputs, settings.options.output, PHOTO_SUFFIXES)
     chosen = choose_photos(items, bool(settings.options.preset))
+    names = {item.name for item in items}
+    if settings.photo.face != "all" and (unknown := sorted(_described(settings.facts).keys() - names)):
+        raise InputError(
+            f"{settings.facts}: {unknown[0]} is no photo of this run; give names such as {min(names)}"
+        )
     return _run(settings, _tables(settings, None), chosen, partial(_compare_photo, settings))
 
 
@@ -234,14 +239,21 @@ def _compare_couple(
 
 
 def faces_of(item: Item, settings: FaceSettings) -> Iterator[SourceFace]:
-    """Yield the chosen faces of a photo; each counts as a person."""
+    """Yield the chosen faces of a photo."""
     photo, models = settings.photo, methods_of(settings)[0].models
     image, reading = read_photo(item, photo), reading_of(settings)
     for face in fit_faces(item, image, photo):
         name = f"{item.name}{face.tag}"
         portrait = Portrait(str(item.input_path), image, face.found, reading)
         portrait.by(models)
-        yield SourceFace(Case(name, name, {"quality": face.fit.quality}), portrait)
+        case = case_of(name, _described(settings.facts))
+        yield SourceFace(replace(case, facts={"quality": face.fit.quality, **case.facts}), portrait)
+
+
+@cache
+def _described(facts: Path | None) -> Mapping[str, Facts]:
+    """The rows of --facts by name, once a process."""
+    return {} if facts is None else read_facts(facts)
 
 
 def _tables(settings: FaceSettings, chosen: int | None) -> Layout:
@@ -271,7 +283,7 @@ def _notes(settings: FaceSettings, chosen: int | None) -> tuple[str, ...]:
         return (
             "The field is the network's own: corrected by the photo it would be exact by construction.",
             light,
-            *(of_set or ("Each photo counts as a person.",)),
+            *of_set,
         )
     if settings.protocol == "transfer":
         mouths = "Where expressions differ, mouths differ, which no reflectance describes."
@@ -331,8 +343,6 @@ def run_pairs(compared: PairsOptions, options: EvaluateOptions, settings: Settin
     """Measure folders of predictions against a folder of truths; the exit code."""
     truth = compared.truth
     pairs = collect_pairs(compared.predictions, truth, compared.masks, compared.facts)
-    if not all(pair.case.person for pair in pairs):
-        log.info("who is in which image is not known: no intervals; give --facts, a CSV with name,person")
     facts = (fact for pair in pairs for fact in pair.case.facts.items())
     by = dict.fromkeys(name for name, value in facts if isinstance(value, str))
     measures = options.measures

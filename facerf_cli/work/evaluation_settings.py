@@ -23,6 +23,7 @@ class FaceSettings:
     network_alone: bool = True
     solve: SolveOptions = _AS_RELIGHT
     mean_checkpoint: Path | None = None
+    facts: Path | None = None
     files: tuple[Path, ...] = ()  # that shape the figures beside the items
 
     def check(self) -> None:

@@ -107,6 +107,9 @@ def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
     assert "--photos" in refused(capsys, "transfer", PHOTO, *out)
     assert "two of each person" in refused(capsys, "transfer", "--photos", PHOTO, *out)
     assert "--mean-checkpoint" in refused(capsys, "geometry", PHOTO, *out, "--against", PHOTO)
+    (tmp_path / "who.csv").write_text("name,person\nastronot,Eileen\n")
+    assert run("reconstruction", PHOTO, *out, "--facts", tmp_path / "who.csv") == 1
+    assert "astronot is no photo of this run; give names such as astronaut" in capsys.readouterr().err
     assert not (tmp_path / "out" / "summary.json").exists()
 
 
@@ -120,6 +123,7 @@ def test_options_that_would_do_nothing_are_refused(
     assert "--every" in refused(capsys, "geometry", PHOTO, *out, "--every", "2")
     assert "--joint-fit" in refused(capsys, "transfer", "--photos", PHOTO, PHOTO, *out, "--joint-fit")
     assert "is for photos" in refused(capsys, "reconstruction", folder, *out, "--face", "all")
+    assert "is for photos" in refused(capsys, "geometry", folder, *out, "--facts", PHOTO)
     assert "--landmarks" in refused(capsys, "transfer", folder, *out, "--landmarks", tmp_path)
     alone = "--reflectance", "prt"
     assert "is for the field" in refused(capsys, "olat", folder, *out, *alone, "--network-alone")

@@ -10,7 +10,7 @@ from PIL import Image
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import measure
 from facerf_cli.evaluation.options import Measures
-from facerf_cli.evaluation.pairs import collect_pairs, compare_pair, read_predictions
+from facerf_cli.evaluation.pairs import Facts, case_of, collect_pairs, compare_pair, read_predictions
 from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.image.colour import srgb_to_linear
 
@@ -47,6 +47,12 @@ def ours(tmp_path: Path) -> Path:
         pixels = image(name)
         save(tmp_path / f"ours/{name}{suffix}", pixels * 256 if suffix == ".png" else pixels)
     return tmp_path / "ours"
+
+
+def test_an_image_is_no_person() -> None:
+    described = {"b": Facts("bo", {"age": 3.0})}
+    assert [case_of(name, described).person for name in ("a", "b", "anna/1/2")] == ["", "bo", "anna"]
+    assert case_of("b", described).facts == {"age": 3.0}
 
 
 def test_images_of_all_formats_meet_their_truths(truths: Path, ours: Path) -> None:

@@ -1,6 +1,7 @@
 """Tables from rows: means, people, facts, and what is better than the first method."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -47,6 +48,15 @@ def test_means_and_pairs_by_hand() -> None:
     assert summary.groups[0].cells["psnr"]["theirs"].paired.won == pytest.approx(1.5 / 4)
     # Two people: the interval of the mean spans their own means at most.
     assert 0.15 - 1e-9 <= ours.interval.low <= ours.interval.high <= 0.35 + 1e-9
+
+
+def test_without_people_there_are_no_intervals() -> None:
+    unknown = [replace(row, person="" if row.case == "case0" else row.person) for row in rows()]
+    summary = summarise(LAYOUT, unknown)
+    for cell in summary.groups[0].cells["si_mse"].values():
+        assert math.isnan(cell.interval.low) and cell.interval.mean > 0
+        assert cell.paired is None or math.isnan(cell.paired.difference.high)
+    assert (summary.size, summarise(LAYOUT, rows()).size) == ("4 images", "4 images of 2 people")
 
 
 def test_images_near_black_are_counted_and_do_not_improve_the_mean() -> None:
