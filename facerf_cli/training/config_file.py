@@ -41,7 +41,11 @@ def _changed(before: Any, name: str, table: Any) -> Any:
 
 
 def _like(default: Any, value: Any, where: str) -> Any:
-    """A value as numbers of the default's kind and count, from 0 on."""
+    """A value as true or false, or numbers of the default's kind and count, from 0 on."""
+    if isinstance(default, bool):
+        if not isinstance(value, bool):
+            raise UsageError(f"{where} is {value}; give true or false")
+        return value
     several = isinstance(default, tuple)
     numbers = list(value) if several and isinstance(value, list) else [value]
     kind = int if isinstance(default, int) else (int, float)

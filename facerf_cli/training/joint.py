@@ -31,7 +31,7 @@ from facerf_cli.face.topology import (
     silhouette_ids,
 )
 from facerf_cli.network.checkpoint import VGG16_LICENCE
-from facerf_cli.network.features import FEATURE_LAYERS, VggFeatures, layer_powers
+from facerf_cli.network.features import FEATURE_LAYERS, TrainedFeatures, VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize, without_cast
 from facerf_cli.raster.camera import Camera, crop_camera, project
@@ -42,6 +42,7 @@ from facerf_cli.training.losses import (
     MaskedPair,
     PaperWeights,
     appearance_loss,
+    channels_apart,
     clipped_si_mse,
     landmark_loss,
     light_loss,
@@ -193,7 +194,7 @@ class JointObjective(Objective):
                 if network is not None
             }
         )
-        self.feature_powers: dict[str, Tensor] = {}
+        self.features: dict[str, Features] = {}
         self.camera = crop_camera(settings.crop_px)
         self._model = self._fitted = model  # on the device of training, and on the CPU
         self._train = open_pairs(dataset, "train", settings.crop_px)
@@ -296,10 +297,10 @@ class JointObjective(Objective):
         with self.mixed_precision():
             if "appearance" in self.feature_networks:
                 image = MaskedPair(relit.image, batch.target, relit.mask)
-                appearance = appearance_loss(self._features("appearance"), image, texture)
+                appearance = appearance_loss(self.features["appearance"], image, texture)
                 terms["appearance_features"] = weights.features * appearance
             if "light" in self.feature_networks:
-                terms["light_features"] = weights.features * light_loss(self._features("light"), texture)
+                terms["light_features"] = weights.features * light_loss(self.features["light"], texture)
         return terms
 
     def measure(self) -> None:
@@ -309,27 +310,27 @@ class JointObjective(Objective):
         """
         networks: Any = self.feature_networks.items()
         for name, network in networks:
+            apart = self.settings.weights.channels_apart and isinstance(network, TrainedFeatures)
             powers = torch.zeros(len(FEATURE_LAYERS), device=self.device)
             if process_rank() == 0:
                 pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
                 targets = (self._train.read(pair).target.to(self.device) for pair in pairs)
-                powers = torch.stack([layer_powers(network, target) for target in targets]).mean(0)
-            self.feature_powers[name] = broadcast_from_first(powers)
-
-    def _features(self, name: str) -> Features:
-        network: Any = self.feature_networks[name]
-        return Features(network, self.feature_powers[name])
+                seen = (channels_apart(target, target) if apart else target for target in targets)
+                powers = torch.stack([layer_powers(network, image) for image in seen]).mean(0)
+            self.features[name] = Features(network, broadcast_from_first(powers), apart)
 
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure the images' Si-MSE, clipped at white, for the same and another pose; and landmarks.
 
         `landmarks_iod` is the mean error of the 66 landmarks over the distance of the outer eye corners.
+        `tint_red` and `tint_blue` are red and blue over green of all faces, over those of the truth: 1 and 1
+        where skin has its colour.
         """
         if self._validation is None:
             self._validation = self._held_out_pairs()
         metrics: dict[str, float] = {}
-        errors, distances, rows = [], [], []
+        errors, distances, colours, rows = [], [], [], []
         for kind, pairs in self._validation.items():
             of_kind = []
             for index, pair in enumerate(pairs):
@@ -339,6 +340,8 @@ class JointObjective(Objective):
                 relit = self._relit(batch, heads)
                 of_kind.append(clipped_si_mse(relit.image[:, None], batch.target[:, None], relit.mask))
                 distances.append(_landmark_error(heads, batch, self.camera))
+                images = torch.stack([relit.image, batch.target])  # [2, B, 3, S, S]
+                colours.append((images * relit.mask).sum((1, 3, 4)))
                 if index % max(1, 2 * len(pairs) // _SHEET_ROWS) == 0:
                     rows.append(_sheet_row(batch, relit, self.camera))
             metrics[f"si_mse_{kind}"] = float(torch.cat(of_kind).mean())
@@ -346,6 +349,9 @@ class JointObjective(Objective):
             errors += of_kind
         metrics["si_mse"] = float(torch.cat(errors).mean())
         metrics["landmarks_iod"] = float(torch.cat(distances).mean())
+        prediction, truth = torch.stack(colours).sum(0).clamp_min(1e-6)
+        red, green, blue = (prediction / truth).tolist()
+        metrics |= {"tint_red": red / green, "tint_blue": blue / green}
         metrics["pairs"] = len(torch.cat(errors))
         return Validation(metrics, np.concatenate(rows))
 

@@ -7,6 +7,8 @@ its weights:
 - landmarks are in units of half the crop's side, as for image coordinates from -1 to 1;
 - radiance is scene-linear, exposed as in `dataset/crops.py`; feature networks see it as sRGB
   (`network/features.py`);
+- S_f and a V_f that facerf trained see each colour channel by itself, over the target's mean of it
+  (`channels_apart`): their filters prefer colours by accident, and would tint what is uncertain;
 - textures are compared where the target's camera sees the face; the target's texture gets no gradient.
 """
 
@@ -28,6 +30,7 @@ _SLOPE_WEIGHT = 0.6  # of differences between neighbouring texels
 _RADIANCE_WEIGHT = 16.0  # of squared errors of radiance, as in Si-MSE, against L1 on roots
 _WHITE = 1.0  # radiance at which a camera clips, at the exposure of samples
 _PAPER = PaperWeights()
+_DIM, _LEAST_SHARE = 1e-3, 0.1  # radiance below which a colour is noise; of a channel in a mean colour of 1
 _BRIGHTEST_ROOT = 1.25  # above it a photograph clips
 
 
@@ -102,12 +105,24 @@ def photometric_loss(prediction: Tensor, target: Tensor, mask: Tensor) -> Tensor
     return difference.sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp_min(1.0)
 
 
+def channels_apart(images: Tensor, target: Tensor) -> Tensor:
+    """Make grey images [3 B, 3, H, W] of the channels of images [B, 3, H, W], over the target's mean colour.
+
+    The target's colour has the mean 1 over its channels, so that brightness is kept. All channels then have
+    the same brightness, and no feature can prefer one to another.
+    """
+    mean = target.mean((2, 3), keepdim=True) + _DIM
+    colour = (mean / mean.mean(1, keepdim=True)).clamp_min(_LEAST_SHARE)
+    return (images / colour).flatten(0, 1)[:, None].expand(-1, 3, -1, -1)
+
+
 @dataclass(frozen=True)
 class Features:
-    """V_f or S_f, and the mean squares of its layers [layers] on training images (`layer_powers`)."""
+    """V_f or S_f, its layers' mean squares [layers] on training images, and if it sees channels apart."""
 
     network: FeatureNetwork
     powers: Tensor
+    apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -120,8 +135,11 @@ class MaskedPair:
 
     def distance(self, features: Features) -> Tensor:
         """Distance [B] of the features of both, masked, relative to the features' powers."""
-        images = (self.prediction * self.mask, self.target * self.mask)
-        return feature_distance(features.network, *images, features.powers)
+        prediction, target = self.prediction * self.mask, self.target * self.mask
+        if features.apart:
+            prediction, target = channels_apart(prediction, target), channels_apart(target, target)
+        distance = feature_distance(features.network, prediction, target, features.powers)
+        return distance.view(len(self.target), -1).mean(1)
 
 
 def appearance_loss(features: Features, image: MaskedPair, texture: MaskedPair) -> Tensor:

@@ -69,7 +69,11 @@ class Constant:
 
 @dataclass(frozen=True)
 class PaperWeights:
-    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r."""
+    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r.
+
+    With `channels_apart` S_f and a V_f of facerf compare the colour channels by themselves; ImageNet's V_f
+    always sees colours, as the paper's does.
+    """
 
     landmarks: float = 25.0
     regularisation: float = 1.0
@@ -77,6 +81,7 @@ class PaperWeights:
     features: float = 1.0
     alpha: float = 0.4
     beta: float = 0.002
+    channels_apart: bool = True
 
 
 # The groups of settings that a configuration file may change, and their kinds by name.

@@ -239,6 +239,7 @@ def test_curves_are_a_table_of_all_steps(run: Path) -> None:
         ("[train.optimizer]\nbetas = [0.9]", "betas is [0.9]; give 2 numbers"),
         ("[train.schedule]\nwarmup_steps = 1.5", "warmup_steps is 1.5; give a whole number"),
         ("[train]\nschedule = 3", "[train.schedule] is no table"),
+        ("[train.loss]\nchannels_apart = 1", "channels_apart is 1; give true or false"),
     ],
 )
 def test_a_wrong_table_of_a_configuration_is_refused(
@@ -278,11 +279,12 @@ def test_a_configuration_changes_losses_and_optimizer(
     monkeypatch.setattr(train_work, "run_training", seen.append)
     (tmp_path / "c.toml").write_text(
         "[train]\nstage = 'joint'\ndataset = 'd'\nema-decay = 0\n[train.loss]\nfeatures = 0.1\n"
+        "channels_apart = false\n"
         "[train.optimizer]\nname = 'Adadelta'\neps = 1e-6\n[train.schedule]\nname = 'Constant'\n"
     )
     assert main(["--config", str(tmp_path / "c.toml"), "train", "-o", str(tmp_path / "run")]) == 0
     training = seen[0].training
-    assert training.loss == PaperWeights(features=0.1) and training.ema_decay is None
+    assert training.loss == PaperWeights(features=0.1, channels_apart=False) and training.ema_decay is None
     assert training.optimizer == Adadelta(eps=1e-6) and training.schedule == Constant()
 
 

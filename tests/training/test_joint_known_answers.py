@@ -180,7 +180,7 @@ def _raw_distance(asked: Asked, name: str, a: Tensor, b: Tensor) -> Tensor:
     pairs = spread_pairs(asked.objective._train, 8, lambda pair: True)
     targets = torch.cat([asked.objective._train.read(pair).target for pair in pairs])
     powers = [layer.square().mean() for layer in Raw().layers(targets)]
-    _close(asked.objective.feature_powers[name], torch.stack(powers))
+    _close(asked.objective.features[name].powers, torch.stack(powers))
     layers = zip(Raw().layers(a), Raw().layers(b), powers, strict=True)
     return sum((x - y).square().mean() / power for x, y, power in layers)
 

@@ -1,6 +1,7 @@
 """The joint stage on a dataset of four people under twenty lights, with both forms of both networks."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -105,8 +106,10 @@ def test_a_step_stays_on_the_device(dataset: Dataset, photos: bool) -> None:
     objective = objective_of(dataset)
     batch = batch_of(objective, photos).each(fake_device.OnDevice)
     fake_device.moved(objective)
-    powers = objective.feature_powers.items()
-    objective.feature_powers = {name: fake_device.OnDevice(values) for name, values in powers}
+    objective.features = {
+        name: replace(features, powers=fake_device.OnDevice(features.powers))
+        for name, features in objective.features.items()
+    }
     with fake_device.counted() as counts:
         for _ in range(2):
             counts.copies.clear()  # of constants, which are sent once
@@ -169,6 +172,14 @@ def test_samples_do_not_know_their_neighbours_and_terms_are_means(objective: Joi
             for name, term in joint.items():
                 mean = (apart[0][name] + apart[1][name]) / 2
                 assert torch.allclose(term, mean, rtol=1e-3, atol=1e-6), name
+
+
+def test_networks_trained_here_see_channels_apart(dataset: Dataset, objective: JointObjective) -> None:
+    together = objective_of(dataset, weights=PaperWeights(channels_apart=False))
+    for made, light in ((objective, True), (together, False)):
+        assert [made.features[name].apart for name in ("appearance", "light")] == [False, light]
+    powers = [made.features["light"].powers for made in (objective, together)]
+    assert not torch.allclose(*powers)  # measured on what the network sees
 
 
 @torch.no_grad()
@@ -272,6 +283,8 @@ def test_validation_tells_poses_apart(objective: JointObjective) -> None:
         "si_mse_other_pose",
         "si_mse_other_pose_std",
         "landmarks_iod",
+        "tint_red",
+        "tint_blue",
         "pairs",
     }
     assert first.metrics["pairs"] == 4
@@ -279,6 +292,17 @@ def test_validation_tells_poses_apart(objective: JointObjective) -> None:
     assert first.metrics["si_mse"] == pytest.approx(both) and first.metrics["si_mse"] > 0
     assert first.sheet is not None and first.sheet.shape == (4 * CROP_PX, 4 * CROP_PX, 3)
     assert objective.chooses_by in first.metrics
+
+
+def test_validation_sees_a_tint(objective: JointObjective, monkeypatch: pytest.MonkeyPatch) -> None:
+    network: Any = objective.networks["reflectance"]
+    decode, tint = network.decode, torch.tensor([1.5, 1.0, 0.5])[:, None, None]
+    before = objective.validate().metrics
+    monkeypatch.setattr(network, "decode", lambda *given: tint * decode(*given))
+    after = objective.validate().metrics
+    ratios = [after[name] / before[name] for name in ("tint_red", "tint_blue")]
+    assert ratios == pytest.approx([1.5, 0.5])
+    assert after["si_mse"] != before["si_mse"]
 
 
 def test_a_checkpoint_says_what_its_losses_learnt_from(objective: JointObjective) -> None:

@@ -130,3 +130,23 @@ def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) ->
         grad = seen.prediction.grad
         assert grad is not None and grad.abs().sum() > 0
         assert (grad[(seen.mask == 0).expand_as(grad)] == 0).all()
+
+
+def test_channels_apart_no_colour_is_preferred(net: VggFeatures) -> None:
+    """An error costs as much in one channel as in another, on skin of any colour, and pulls that channel."""
+    grey, mask = torch.rand(2, 1, 24, 24), torch.ones(2, 1, 24, 24)
+    skin = torch.tensor([1.5, 0.9, 0.6])[:, None, None] * (grey + 0.2)
+    costs, pulls = [], []
+    for channel in range(3):
+        factor = torch.ones(3, 1, 1)
+        factor[channel] = 0.7
+        wrong = (skin * factor).requires_grad_()
+        cost = light_loss(Features(net, POWERS, apart=True), MaskedPair(wrong, skin, mask))
+        (slope,) = torch.autograd.grad(cost.sum(), wrong)
+        costs.append(cost.detach())
+        pulls.append(-slope.sum((0, 2, 3)))
+    torch.testing.assert_close(costs[0], costs[1], rtol=1e-2, atol=0)
+    torch.testing.assert_close(costs[0], costs[2], rtol=1e-2, atol=0)
+    assert costs[0].min() > 0
+    for channel, pull in enumerate(pulls):
+        assert pull[channel] > 0 and pull.abs().sum() == pytest.approx(float(pull[channel]), rel=1e-3)
