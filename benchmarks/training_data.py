@@ -1,4 +1,4 @@
-"""Seconds a sample that the data of the paper's stages take on one core, and what a start measures.
+"""Processor time in seconds of the data of the paper's stages, a sample, and of what a start measures.
 
     python benchmarks/training_data.py --dataset DATASET [--side 512] [--steps 128]
 
@@ -65,11 +65,11 @@ def generator_of(step: int) -> Callable[..., torch.Generator]:
 
 
 def per_step(act: Callable[[int], object], steps: int) -> float:
-    """Mean seconds of an act."""
-    begun = time.perf_counter()
+    """Mean processor time of an act in seconds."""
+    begun = time.process_time()
     for step in range(steps):
         act(step)
-    return round((time.perf_counter() - begun) / steps, 3)
+    return round((time.process_time() - begun) / steps, 3)
 
 
 if __name__ == "__main__":

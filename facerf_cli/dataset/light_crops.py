@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,9 +23,10 @@ from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.raster.texture import UnwrapSettings, unwrap
-from facerf_cli.synth.bank.texture_samples import cast_and_greyed, draw_target_lights
+from facerf_cli.synth.bank.texture_samples import camera_matrix, draw_target_lights
 
 _FACES_KEPT = 512  # a worker, of .7 MB at 512 pixels
+_AROUND_PX = 16  # rows read beyond the face, for texels that cross its border
 
 
 @dataclass(frozen=True)
@@ -41,12 +43,14 @@ class LightTextures(Batch):
 
 @dataclass(frozen=True)
 class LightCrops(Batch):
-    """B faces under L single lights as cameras saw them: images [B, L, 3, S, S] float16, exposed.
+    """B faces under L single lights as stacks hold them: images [B, L, 3, S, S] float16, 0 far from the face.
 
-    `seen` [B, 1, S, S] in 0..1 shows the face, `vertices` [B, V, 3] is its fitted mesh in the crop's camera.
+    `colours` [B, 3, 3] are the matrices of a camera's colours and exposure. `seen` [B, 1, S, S] in 0..1 shows
+    the face, `vertices` [B, V, 3] is its fitted mesh in the crop's camera.
     """
 
     images: Tensor
+    colours: Tensor
     seen: Tensor
     vertices: Tensor
     lights_head: Tensor
@@ -60,8 +64,8 @@ class LightCrops(Batch):
         settings = UnwrapSettings(samples=math.ceil(camera.width_px / side), measured=False)
         found, _ = unwrap(planes, self.vertices, triangles, camera, side, settings)
         textures = found[:, :-1] * (found[:, -1:] > LEAST_INSIDE)
-        textures = textures.view(faces, lights, 3, side, side)
-        return LightTextures(textures, self.lights_head, self.heads)
+        textures = self.colours[:, None] @ textures.view(faces, lights, 3, -1)
+        return LightTextures(textures.view(faces, lights, 3, side, side), self.lights_head, self.heads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,20 +88,21 @@ class LightStacks:
         path = self.dataset.stack_path(subject, camera)
         face = _face_of(path, self.model)
         chosen = draw_target_lights(face.directions, min(lights, len(face.directions)), generator).tolist()
-        images = cast_and_greyed(read_olats(path, chosen).float() * face.exposure, generator)
         directions = face.directions[chosen] @ face.rotation  # R^T w, of row vectors
-        return LightCrops(
-            images[None].half(), face.seen[None, None].float(), face.vertices[None], directions[None], head
-        )
+        seen, colours = face.seen[None, None].float(), face.exposure * camera_matrix(generator)
+        images = torch.zeros(1, len(chosen), 3, *face.seen.shape, dtype=torch.float16)
+        images[0, ..., face.rows, :] = read_olats(path, chosen, face.rows)
+        return LightCrops(images, colours[None], seen, face.vertices[None], directions[None], head)
 
 
 @dataclass(frozen=True, eq=False)
 class _Face:
-    """The face of a stack: lights [L, 3], rotation [3, 3], seen [S, S], mesh [V, 3], exposure."""
+    """The face of a stack: lights [L, 3], rotation [3, 3], seen [S, S] in `rows`, mesh [V, 3], exposure."""
 
     directions: Tensor
     rotation: Tensor
     seen: Tensor
+    rows: slice
     vertices: Tensor
     exposure: float
 
@@ -105,12 +110,15 @@ class _Face:
 @lru_cache(maxsize=_FACES_KEPT)
 def _face_of(path: Path, model: MorphableModel) -> _Face:
     header, fit = read_stack(path)
+    exposure = MEAN_RADIANCE / lit_mean_of(path, header)  # raises where no row shows the face
+    rows = np.flatnonzero(header.seen.any(1))
     return _Face(
         torch.from_numpy(header.directions).float(),
         torch.from_numpy(header.rotation).float(),
         torch.from_numpy(header.seen).half(),
+        slice(max(int(rows[0]) - _AROUND_PX, 0), int(rows[-1]) + 1 + _AROUND_PX),
         fit.vertices_camera(model),
-        MEAN_RADIANCE / lit_mean_of(path, header),
+        exposure,
     )
 
 

@@ -129,10 +129,10 @@ def simulate_camera(
     return source / _mean(source, visible) * MEAN_RADIANCE, target
 
 
-def cast_and_greyed(images: Tensor, generator: torch.Generator) -> Tensor:
-    """Images [..., 3, H, W] with the colours of one simulated camera, or of one without colours."""
+def camera_matrix(generator: torch.Generator) -> Tensor:
+    """Draw the matrix [3, 3] from true colours to those of a simulated camera, or of one without colours."""
     balance, grey = _colours_of_camera(Uniform(generator, (1, 1, 1, 1)), 1)
-    return _greyed(images * balance[0], grey)
+    return _greyed(balance * torch.eye(3)[..., None, None], grey)[..., 0, 0].T
 
 
 def _colours_of_camera(uniform: Uniform, faces: int) -> tuple[Tensor, Tensor]:
