@@ -11,7 +11,7 @@ from facerf_cli.network.features import LightNetwork, LightSettings
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.bank.heads import Bank
-from facerf_cli.synth.bank.texture_samples import Sample
+from facerf_cli.synth.bank.texture_samples import Sample, camera_matrix
 from facerf_cli.training.light_features import LightFeaturesObjective
 from facerf_cli.training.objective import seeded
 from facerf_cli.training.texture import HeadsSettings
@@ -78,20 +78,30 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
     batch = stacks.draw(head, 5, torch.Generator().manual_seed(2))  # a camera that sees colours
     faces = batch.unwrapped(32)
     cached = open_dataset_textures(dataset.folder, "builtin", 32, 1, 20)
-    errors = []
+    errors, colours = [], batch.colours[0].diagonal()
     for one in camera:
         with cached._open(dataset.subjects[0], one) as file:
             view, olats = UnwrappedView.read(file), file.get_tensor("olats").float()
         directions = view.directions @ view.rotation
         light = (faces.lights_head[0] @ directions.T).argmax(1)
         found, wanted = faces.textures[0], olats[light] * (view.visible > 0)
-        scale = found.mean((0, 2, 3)) / wanted.mean((0, 2, 3))  # exposure and colours of the camera
-        errors.append(float((found - wanted * scale[:, None, None]).abs().mean() / found.mean()))
+        errors.append(float((found - wanted * colours[:, None, None]).abs().mean() / found.mean()))
     assert min(errors) < 1e-3 < 0.3 < max(errors)  # another camera's view of the face
     stage = LightFeaturesObjective(stacks, LightNetwork(LightSettings(1 / 16, 4, 8, 32)), SETTINGS)  # type: ignore[arg-type]
     drawn = stage.draw(2, lambda i: seeded(5, i), 0)
     assert stage(drawn)["light"].item() > 0 and "angle_deg" in stage.validate().metrics
     assert not any(dataset.folder.glob("textures-32/*/relit*"))
+
+
+def test_a_camera_casts_colours_or_sees_none() -> None:
+    matrices = torch.stack([camera_matrix(seeded(draw)) for draw in range(400)])
+    grey = matrices[:, 0, 1] > 0
+    cast, mixed = matrices[~grey], matrices[grey]
+    assert 0.2 < grey.float().mean() < 0.3
+    assert torch.equal(cast, cast.diagonal(dim1=1, dim2=2).diag_embed())
+    assert torch.equal(mixed, mixed[:, :1].expand_as(mixed)), "a row for all channels"
+    balance = matrices.sum(1).log()
+    assert balance.abs().max() < 0.121 and balance.std() > 0.05
 
 
 def test_the_heads_turn_is_found_from_its_normals() -> None:
