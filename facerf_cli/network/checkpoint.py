@@ -53,6 +53,17 @@ def use_form(form: str | None) -> None:
         _CLASSES["reflectance", form] = installed(form, "--form")
 
 
+def form_of(name: str, form: str) -> str:
+    """The form of facerf's that a class of the user's extends, with its settings; else the form itself."""
+    own = _CLASSES.get((name, form))
+    if own is None or not is_installed_name(form):
+        return form
+    for (network, known), kind in _CLASSES.items():
+        if network == name and not is_installed_name(known) and issubclass(own, kind):
+            return known if issubclass(own.kind_of_settings, kind.kind_of_settings) else form
+    return form
+
+
 def _described(network: Any) -> dict[str, Any]:
     """Form and settings of a network; a class that the user has installed does not know its name."""
     forms = (form for (_, form), known in _CLASSES.items() if known is type(network))

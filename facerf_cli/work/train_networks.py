@@ -7,7 +7,7 @@ from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.checkpoint import load_vgg, new_network
+from facerf_cli.network.checkpoint import form_of, load_vgg, new_network
 from facerf_cli.network.geometry import GeometryNetworkSettings
 from facerf_cli.synth.bank.heads import HeadBakeSettings
 from facerf_cli.training.losses import load_features
@@ -128,7 +128,7 @@ class StageNetworks:
 
     def network(self, name: str, form: str = "default", **settings: Any) -> Any:
         """The network of --start-from, or an untrained one of the preset's sizes."""
-        tiny = _TINY_NETWORKS.get(f"{name} {form}") if self.options.preset == "tiny" else None
+        tiny = _TINY_NETWORKS.get(f"{name} {form_of(name, form)}") if self.options.preset == "tiny" else None
         return self.trained.get(name) or new_network(name, form, settings | (tiny or {}))
 
     def features(self, name: str, side: int, **settings: Any) -> Any:
@@ -145,7 +145,7 @@ class StageNetworks:
     def reflectance(self, side: int) -> Any:
         """The Reflectance Network of the options' form; the paper's works at the textures' side."""
         form, without_normals = self.options.form, self.options.without_normals
-        settings: dict[str, Any] = {"side": side} if form == "paper" else {}
+        settings: dict[str, Any] = {"side": side} if form_of("reflectance", form) == "paper" else {}
         if without_normals:
             settings["normals"] = False
         try:

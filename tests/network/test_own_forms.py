@@ -8,7 +8,7 @@ import pytest
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network import checkpoint
-from facerf_cli.network.checkpoint import load_networks, new_network, save_networks, use_form
+from facerf_cli.network.checkpoint import form_of, load_networks, new_network, save_networks, use_form
 from facerf_cli.network.installed import installed
 
 OWN = """
@@ -70,6 +70,13 @@ def test_an_own_network_is_saved_and_needs_its_name(package: Path, tmp_path: Pat
         InputError, match=f"own.safetensors: its network is {NAME}, code of your own; give --form"
     ):
         load_networks(path, LAYOUT_VERSION)
+
+
+def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
+    use_form(NAME)
+    assert form_of("reflectance", NAME) == "default"
+    for network, form in (("reflectance", "paper"), ("geometry", "paper"), ("reflectance", "my_lab:Other")):
+        assert form_of(network, form) == form
 
 
 def test_nothing_comes_from_the_working_directory(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
