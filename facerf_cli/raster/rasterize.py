@@ -1,10 +1,11 @@
 """A z-buffer in plain torch: the visible triangle of each pixel, its barycentric weights and its depth.
 
-All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with the
-covered area and not with the bounding boxes. Meshes of a batch share these steps, so that a device waits for
-the host as often for many as for one. A pixel belongs to a triangle if its centre lies inside. A run includes
-its left end and excludes its right, a triangle includes its upper end and excludes its lower, and both
-triangles of a shared edge compute the same crossing, so each pixel on an edge is covered exactly once.
+All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with
+the covered area and not with the bounding boxes. Meshes of a batch share these steps. A device waits for
+the host once for all of them, to know the rows: runs and pixels are bounded there, not counted as on the
+CPU. A pixel belongs to a triangle if its centre lies inside. A run includes its left end and excludes its
+right, a triangle includes its upper end and excludes its lower, and both triangles of a shared edge compute
+the same crossing, so each pixel on an edge is covered exactly once.
 Visibility has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle
 have one. All arithmetic is elementwise, so the result does not depend on how triangles are split into parts.
 """
@@ -31,7 +32,7 @@ class Fragments:
     triangle: Tensor  # [..., H, W] int64, -1 for none
     barycentric: Tensor  # [..., H, W, 3] perspective-correct, differentiable in the vertices; 0 for none
     depth_m: Tensor  # [..., H, W] distance along the viewing axis (-z), differentiable; inf for none
-    pixel: Tensor  # [P] places of the covered pixels in the flat images
+    pixel: Tensor  # [P] places in the flat images: of the covered pixels, or of all on a device
 
     @property
     def covered(self) -> Tensor:
@@ -41,7 +42,7 @@ class Fragments:
 
 @dataclass(frozen=True, eq=False)
 class _Screen:
-    """Triangles [N] inside the image, projected in float64; float32 is too coarse for slivers."""
+    """Triangles [N], projected in float64; float32 is too coarse for slivers."""
 
     triangle: Tensor  # [N] index in the mesh, or in all meshes one after another
     first_px: Tensor  # [N] place of the first pixel of the triangle's image in the flat images
@@ -66,7 +67,7 @@ def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fra
     vertices, corners = vertices_camera.flatten(0, -2), _of_each_mesh(triangles, vertices_camera)
     with torch.no_grad():
         triangle = _visible_triangles(vertices.detach(), corners, camera, math.prod(size[:-2]))
-    pixel = torch.nonzero(triangle >= 0).squeeze(-1)
+    pixel = _places(triangle >= 0)
     weights, depth = _hit(vertices, corners, triangle[pixel], pixel, camera)
     nothing, far = vertices.new_zeros(len(triangle), 3), vertices.new_full((len(triangle),), torch.inf)
     return Fragments(
@@ -75,6 +76,18 @@ def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fra
         far.index_copy(0, pixel, depth.to(vertices.dtype)).view(size),
         pixel,
     )
+
+
+def _places(chosen: Tensor) -> Tensor:
+    """Places where a mask [N] is true; all on a device, which would wait to know how many there are."""
+    if _counts(chosen):
+        return torch.nonzero(chosen).squeeze(-1)
+    return torch.arange(len(chosen), device=chosen.device)
+
+
+def _counts(tensor: Tensor) -> bool:
+    """Tell if the sizes of a tensor's device are known to the host at once."""
+    return tensor.device.type == "cpu"
 
 
 def _of_each_mesh(triangles: Tensor, vertices: Tensor) -> Tensor:
@@ -106,18 +119,20 @@ def _visible_triangles(vertices_camera: Tensor, triangles: Tensor, camera: Camer
     """Return the index of the nearest triangle at each pixel [M * H * W] int64 of M meshes, -1 for none."""
     screen = _on_screen(vertices_camera, triangles, camera, meshes)
     pixels = meshes * camera.height_px * camera.width_px
-    nearest = torch.full((pixels,), _FAR_KEY, dtype=torch.int64, device=vertices_camera.device)
-    for part in _chunks(screen):
-        owner, pixel = _cover(part, camera.width_px)
+    # The last place is for what is no pixel.
+    nearest = torch.full((pixels + 1,), _FAR_KEY, dtype=torch.int64, device=vertices_camera.device)
+    for part, rows, box_px in _chunks(screen):
+        owner, pixel = _cover(part, camera.width_px, rows, box_px, pixels)
         depth_bits = _fragment_depth(part, owner, pixel, camera).view(torch.int32)
         # Bits of positive floats sort like the floats, so an integer minimum finds both depth and triangle.
         key = (depth_bits.long() << 32) | part.triangle[owner]
         nearest.scatter_reduce_(0, pixel, key, "amin")
+    nearest = nearest[:-1]
     return torch.where(nearest == _FAR_KEY, -1, nearest & 0xFFFFFFFF)
 
 
 def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshes: int) -> _Screen:
-    """Project the meshes and drop triangles that cover no pixel."""
+    """Project the meshes; triangles that cover no pixel are dropped or, on a device, get no rows."""
     vertices = vertices_camera.double()
     px = project(vertices, camera)
     in_front = (vertices[:, 2] < -NEAR_M) & px.isfinite().all(-1)
@@ -126,9 +141,9 @@ def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshe
     a, b, c = corners_px.unbind(1)
     area2_px = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     seen = in_front[triangles].all(-1) & (high > low).all(-1) & (area2_px.abs() > _SLIVER_PX2)
-    keep = torch.nonzero(seen).squeeze(-1)
+    keep = _places(seen)
     first, last = low[keep].long(), high[keep].long()
-    size = last - first
+    size = torch.where(seen[keep, None], last - first, 0)
     inverse_depth = -1 / vertices[:, 2][triangles[keep]]
     first_px = keep * meshes // max(len(triangles), 1) * (camera.width_px * camera.height_px)
     return _Screen(keep, first_px, corners_px[keep], inverse_depth, first[:, 1], size[:, 1], size.prod(-1))
@@ -145,32 +160,48 @@ def _first_centre(position_px: Tensor) -> Tensor:
     return (position_px - PIXEL_CENTRE).ceil()
 
 
-def _chunks(screen: _Screen) -> Iterator[_Screen]:
-    """Split the triangles, in order, into parts of limited bounding-box area."""
-    end_px = screen.box_px.cumsum(0)
-    chunks = int(end_px[-1]) // _CHUNK_PX if len(end_px) else -1
-    if chunks == 0:
-        yield screen
+def _chunks(screen: _Screen) -> Iterator[tuple[_Screen, int, int]]:
+    """Split the triangles, in order, into parts of limited bounding-box area; each with its `_totals`."""
+    rows, box_px = _totals(screen)
+    if box_px <= _CHUNK_PX:
+        yield screen, rows, box_px
         return
-    for number in range(chunks + 1):
-        yield screen.part(torch.nonzero(end_px // _CHUNK_PX == number).squeeze(-1))
+    number = screen.box_px.cumsum(0) // _CHUNK_PX
+    for chunk in range(box_px // _CHUNK_PX + 1):
+        part = screen.part(torch.nonzero(number == chunk).squeeze(-1))
+        yield part, *_totals(part)
 
 
-def _cover(screen: _Screen, width_px: int) -> tuple[Tensor, Tensor]:
-    """Return all pairs of a triangle and a pixel centre inside it: index into `screen` [P], pixel [P]."""
-    owner, row = _expand(screen.first_row, screen.rows)
+def _totals(screen: _Screen) -> tuple[int, int]:
+    """Rows and bounding-box pixels of all triangles; here a device waits."""
+    rows, box_px = torch.stack([screen.rows.sum(), screen.box_px.sum()]).cpu().tolist()
+    return rows, box_px
+
+
+def _cover(screen: _Screen, width_px: int, rows: int, box_px: int, nowhere: int) -> tuple[Tensor, Tensor]:
+    """Return all pairs of a triangle and a pixel centre inside it: index into `screen` [P], pixel [P].
+
+    On a device P is the area of the boxes, and pairs beyond the last have the pixel `nowhere`.
+    """
+    owner, row = _expand(screen.first_row, screen.rows, rows)
     left, right = _row_crossings(screen.corners_px, owner, row.double() + PIXEL_CENTRE)
     first = _first_centre(left).clamp(0, width_px).long()
     last = _first_centre(right).clamp(0, width_px).long()
-    run, column = _expand(first, last - first)
-    return owner[run], screen.first_px[owner[run]] + row[run] * width_px + column
+    counted = _counts(owner)
+    run, column = _expand(first, last - first, int((last - first).sum()) if counted else box_px)
+    owner, pixel = owner[run], (screen.first_px[owner] + row * width_px)[run] + column
+    return owner, pixel if counted else torch.where(column < last[run], pixel, nowhere)
 
 
-def _expand(first: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-    """Expand runs of integers: the run's index [sum(count)] and first + 0, 1, ... count - 1."""
-    run = torch.repeat_interleave(count)
+def _expand(first: Tensor, count: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Expand runs of integers to `size` places: the run's index, and first + 0, 1, ... count - 1.
+
+    Places beyond the last run go on with it.
+    """
     begin = count.cumsum(0) - count
-    return run, torch.arange(len(run), device=run.device) + (first - begin)[run]
+    count = torch.cat([count[:-1], size - begin[-1:]])
+    run = torch.repeat_interleave(count, output_size=size)
+    return run, torch.arange(size, device=run.device) + (first - begin)[run]
 
 
 def _row_crossings(corners_px: Tensor, owner: Tensor, y_px: Tensor) -> tuple[Tensor, Tensor]:
@@ -214,18 +245,21 @@ def _hit(
 ) -> tuple[Tensor, Tensor]:
     """Return barycentric weights [P, 3] and depth [P], float64, of triangles `seen` [P] at pixels [P].
 
-    For corners a, b, c and weights w: w_a a + w_b b + w_c c = depth * ray. By Cramer's rule
-    w_a = depth * ray . (b x c) / (a . (b x c)), and cyclically. Float64, because of cancellation.
+    Without a triangle (-1) they are 0 and infinite. For corners a, b, c and weights w:
+    w_a a + w_b b + w_c c = depth * ray. By Cramer's rule w_a = depth * ray . (b x c) / (a . (b x c)), and
+    cyclically. Float64, because of cancellation.
     """
     corners = vertices_camera.double().nan_to_num()[triangles].permute(1, 2, 0).contiguous()  # [3, xyz, F]
     a, b, c = corners
     cofactors = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)])  # [3, xyz, F]
     column_row = torch.stack(_column_row(pixel, camera), -1)
     ray = pixel_rays(column_row.double() + PIXEL_CENTRE, camera).T.contiguous()
+    hit, seen = seen >= 0, seen.clamp_min(0)  # of the first triangle where there is none: numbers, no NaN
     parts = [_dot(cofactor.index_select(1, seen), ray) for cofactor in cofactors]
-    total = parts[0] + parts[1] + parts[2]
+    total = torch.where(hit, parts[0] + parts[1] + parts[2], 1)
     volume = _dot(a, cofactors[0])
-    return torch.stack([part / total for part in parts], -1), volume[seen] / total
+    weights = torch.stack([torch.where(hit, part / total, 0) for part in parts], -1)
+    return weights, torch.where(hit, volume[seen] / total, torch.inf)
 
 
 def _column_row(pixel: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

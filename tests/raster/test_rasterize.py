@@ -4,6 +4,7 @@ from torch import Tensor
 
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
+from tests.fake_device import OnDevice, counted
 from tests.oracles.rasterize import rasterize_slowly
 
 WIDE = Camera(focal_px=40.0, width_px=37, height_px=22, cx_px=17.3, cy_px=11.9)  # neither square nor centred
@@ -54,6 +55,28 @@ def test_values_and_gradients_are_the_oracles(seed: int) -> None:
     torch.testing.assert_close(weights, weights0, rtol=0, atol=1e-9)
     torch.testing.assert_close(depth, depth0, rtol=1e-9, atol=0)
     torch.testing.assert_close(gradient, gradient0, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("chunk_px", [None, 500])
+def test_a_device_waits_once_for_the_same_bits(chunk_px: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sizes that the CPU counts are bounded there; in parts, it waits for each."""
+    if chunk_px:
+        monkeypatch.setattr("facerf_cli.raster.rasterize._CHUNK_PX", chunk_px)
+    vertices, triangles = triangle_soup(40, seed=0)
+    results, behind = [], vertices * torch.tensor([1.0, 1.0, -1.0])
+    for place in (lambda tensor: tensor, OnDevice):
+        leaf = place(torch.stack([vertices, behind, vertices.flip(0)])).requires_grad_()
+        uv, ids = place(torch.linspace(0, 1, 240).view(120, 2).double()), place(triangles)
+        with counted() as counts:
+            out = rasterize(leaf, ids, WIDE)
+            shown = interpolate(uv, ids, out)
+            depth = torch.where(out.covered, out.depth_m, 0)
+            (shown.square().sum() + out.barycentric.square().sum() + depth.sum()).backward()
+        results.append([out.triangle, out.barycentric, out.depth_m, shown, leaf.grad])
+    assert counts.waits.total() == 1 or chunk_px
+    assert 0.2 < out.covered.values[0].float().mean() < 1 and not out.covered.values[1].any()
+    for here, there in zip(*results, strict=True):
+        assert torch.equal(here, there.values)
 
 
 def test_float32_differs_from_the_oracle_only_by_rounding() -> None:

@@ -102,7 +102,7 @@ def gradients(objective: JointObjective, term: Tensor) -> dict[str, float]:
 
 @pytest.mark.parametrize("photos", [False, True])
 def test_a_step_stays_on_the_device(dataset: Dataset, photos: bool) -> None:
-    """It mixes no devices, copies nothing but its batch, and waits a few times for each rasterization."""
+    """It mixes no devices, copies nothing but its batch, and waits once for each rasterization."""
     objective = objective_of(dataset)
     batch = batch_of(objective, photos).each(fake_device.OnDevice)
     fake_device.moved(objective)
@@ -117,7 +117,7 @@ def test_a_step_stays_on_the_device(dataset: Dataset, photos: bool) -> None:
             torch.stack(list(objective(batch).values())).sum().backward()
     assert not counts.copies
     assert {line.split(":")[0] for line in counts.waits} <= {"raster/rasterize.py"}
-    assert counts.waits.total() == (0 if photos else 10)
+    assert counts.waits.total() == (0 if photos else 2)
 
 
 @pytest.fixture(scope="module")
