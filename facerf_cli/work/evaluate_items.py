@@ -90,6 +90,8 @@ def methods_of(settings: FaceSettings) -> tuple[Method, ...]:
         (one.name, load_models((checkpoint_file(one.path),), photo.face_model, models.device, photo.form))
         for one in options.against
     ]
+    for _, other in others:
+        other.networks.load(("reflectance",))  # fails before anything is measured
     return (
         *(Method(names.get(kind, kind), kind, models, alone, estimator) for kind in options.reflectance),
         *(Method(name, "field", other, alone, estimator) for name, other in others),

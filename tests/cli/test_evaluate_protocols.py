@@ -24,6 +24,7 @@ from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
 from facerf_cli.files.images import write_exr
 from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_checkpoint
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.relighting.models import Models
@@ -95,6 +96,13 @@ def test_a_checkpoint_that_is_none_is_said_once(
         capsys.readouterr()
         assert run(*map(str, words), PHOTO, "-o", tmp_path / "out") == 1
         assert len([x for x in capsys.readouterr().err.splitlines() if "astronaut.jpg" in x]) == 1
+    layout = {"layout_version": 99, "networks": {"reflectance": {"form": "default"}}}
+    save_checkpoint(tmp_path / "other.safetensors", {}, layout)
+    assert (
+        run("reconstruction", PHOTO, "-o", tmp_path / "x", "--against", tmp_path / "other.safetensors") == 1
+    )
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "other.safetensors: trained for another UV layout" in line
 
 
 def test_what_a_dataset_cannot_give_is_said_with_what_to_do(
