@@ -16,6 +16,7 @@ from facerf_cli.dataset.unwrapped import images_at_once, missing_parts, unwrappe
 from facerf_cli.dataset.weights import TILE_IMAGES, relit_images
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.run import memory
 from facerf_cli.run.logs import attributes_of_sum, json_line
 from facerf_cli.run.workers import one_thread
 
@@ -51,7 +52,7 @@ def cost_of_sources(dataset: Dataset, pairs: Sequence[Pair]) -> Cost:
     some = [pair for pair in pairs if (pair.subject, pair.source_camera) == stack][:_MEASURED]
     weights, _ = compute_pair_weights(dataset, some)
     path, begun_s = dataset.stack_path(*stack), time.process_time()
-    images = list(relit_images(path, torch.from_numpy(weights)))
+    images = list(relit_images(path, torch.from_numpy(weights), memory.limit_bytes()))
     summed_s = time.process_time()
     attributes = attributes_of_sum(read_olat_header(path).metadata)
     with TemporaryDirectory() as folder:
