@@ -157,7 +157,7 @@ def reflectance_of(
     if kind == "portrait" and photo is None:
         raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
     own = None if network_alone else own_light(models, head.face, steady.light if steady else None)
-    field = Field(models, head.face, own.quotient if own else None, memory_bytes)
+    field = Field(models, head.face, own.quotient if own else None, memory_bytes, even_shade=own is not None)
     if photo is None or kind == "field":
         return field
     if steady and steady.portrait:
@@ -274,7 +274,8 @@ def predict_olat(
     """
     quotient = None if network_alone else own_light(models, head.face).quotient
     turn = None if rotation is None else head.fit.turn_to(rotation)
-    return Field(models, head.face, quotient, memory_bytes, bf16).olats(lights, turn)
+    even_shade = quotient is not None
+    return Field(models, head.face, quotient, memory_bytes, bf16, even_shade).olats(lights, turn)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from facerf_cli.network.inputs import is_grey, mixed_precision, without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.shade import without_colour_of_shade
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
@@ -27,13 +28,17 @@ SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo'
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """The field of a face, by the network alone or corrected by a photo's quotient; a `Reflectance`."""
+    """The field of a face, by the network alone or corrected by a photo's quotient; a `Reflectance`.
+
+    With `even_shade` the network sees the face `without_colour_of_shade`, as the quotient's field does.
+    """
 
     models: Models
     face: FaceTexture
     quotient: Quotient | None = None
     memory_bytes: int = MEMORY_BYTES
     bf16: bool = False
+    even_shade: bool = False
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
@@ -49,7 +54,11 @@ class Field:
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals = normals[None].to(device)
         visible = face.visible[None, None]
-        texture = without_cast(face.texture[None], visible, self.models.source_colours)
+        shown = face.texture
+        if self.even_shade:
+            skin = face.visible * region_mask("skin", shown.shape[-1])
+            shown = shown * without_colour_of_shade(shown, skin)
+        texture = without_cast(shown[None], visible, self.models.source_colours)
         source, grey = (texture, face.normals[None], visible), is_grey(face.texture)
         with mixed_precision(device, self.bf16):
             encoded = network.encode(*(tensor.to(device) for tensor in source))

@@ -62,7 +62,7 @@ class _Frame:
 
     @staticmethod
     def of(models: Models, face: FaceTexture) -> "_Frame":
-        field = Field(models, shrunk(face))
+        field = Field(models, shrunk(face), even_shade=True)
         return _Frame(field, torch.cat(list(field.olats(_rig()))))
 
     def under(self, directions: Tensor) -> Tensor:

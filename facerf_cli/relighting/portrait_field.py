@@ -31,6 +31,7 @@ from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.own_light import OwnLight
+from facerf_cli.relighting.shade import without_colour_of_shade
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
@@ -232,11 +233,14 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """
     rig = rig_directions(_SUMMARY_LIGHTS)
     inputs = person.inputs(rig, person.visibility(rig))
+    even = without_colour_of_shade(inputs.image[0], inputs.classes[0, _SKIN])
+    inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device
     on_device = inputs.to(device)
     both = network(on_device).averaged(network(on_device.mirrored()).mirrored())
     maps = PortraitMaps(*(part.cpu() for part in both))
     maps = _with_own_colours(maps, inputs)
+    maps = maps._replace(gain=maps.gain * even)  # of the photo, which has the colour
     return maps.without_colours() if is_grey(inputs.image[0]) else maps
 
 

@@ -1,0 +1,35 @@
+"""The colour of skin in the shade.
+
+Where the key of a photo does not reach, skin is seen in other light: blue sky, a purple wall. Networks take
+some of that colour for the skin's own, and under a new key it shows as a stain. So they see a photo whose
+shaded skin has the colour of its lit skin. Brightness and detail stay; the correction of each field knows the
+photo as it is, and gives it back in its own light.
+"""
+
+import torch
+from torch import Tensor
+
+from facerf_cli.raster.texture import blurred
+
+_REACH = 0.03  # blur of colours, in sides: what is narrower, as freckles are, is the skin's own
+_SHADE = (0.3, 0.8)  # brightness over that of lit skin, below which all is shade, and from which on none
+_MOST = 2.5  # change of a channel
+_TINY = 1e-6
+
+
+def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
+    """Factors [3, S, S] for a scene-linear image [3, S, S], where shaded skin gets the colour of lit skin.
+
+    `skin` [S, S] is the share of skin; without any the factors are 1.
+    """
+    image, skin = image.detach(), skin.detach()
+    side = image.shape[-1]
+    *low, share = blurred(torch.cat([image * skin, skin[None]]), _REACH * side)
+    colour = torch.stack(low) / share.clamp_min(_TINY)
+    weight = skin * colour.mean(0)  # so that the lit skin counts most
+    lit = (colour * weight).sum((1, 2)) / weight.sum().clamp_min(_TINY)
+    level = colour.mean(0) / lit.mean().clamp_min(_TINY)
+    shaded = ((_SHADE[1] - level) / (_SHADE[1] - _SHADE[0])).clamp(0, 1) * skin
+    typical = (lit / lit.mean().clamp_min(_TINY))[:, None, None]
+    change = typical * colour.mean(0) / colour.clamp_min(_TINY)
+    return change.clamp(1 / _MOST, _MOST) ** blurred(shaded[None], 0.3 * _REACH * side)
