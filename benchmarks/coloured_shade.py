@@ -4,8 +4,8 @@
     python benchmarks/coloured_shade.py CAPTURE
 
 A source is a white key from one side and a dim coloured fill from the other; the truth is the capture under
-the fill's light alone, in white. The error is the mean of |change of log red / green| and |of log blue / green|
-over the face's lit skin. `seen as it is` is the twin: networks that see the photo's own colours.
+the fill's light alone, in white. The error is the mean change, by size, of log red / green and of log blue /
+green over the lit skin of the face. `seen as it is` is the twin: networks that see the colours of the photo.
 """
 
 import itertools
