@@ -22,6 +22,7 @@ from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
 NEAR_M = 0.01  # a triangle is dropped if a corner is nearer than this, or behind the camera
 _SLIVER_PX2 = 1e-9  # a projected triangle with less than half this area is degenerate and is dropped
 _CHUNK_PX = 1 << 24  # bounding-box pixels that are processed at a time; bounds the memory
+_SPARE = 1024  # places for what is no pixel; at one place a device would add them one after another
 _FAR_KEY = torch.iinfo(torch.int64).max  # of a pixel without a triangle
 
 
@@ -119,15 +120,14 @@ def _visible_triangles(vertices_camera: Tensor, triangles: Tensor, camera: Camer
     """Return the index of the nearest triangle at each pixel [M * H * W] int64 of M meshes, -1 for none."""
     screen = _on_screen(vertices_camera, triangles, camera, meshes)
     pixels = meshes * camera.height_px * camera.width_px
-    # The last place is for what is no pixel.
-    nearest = torch.full((pixels + 1,), _FAR_KEY, dtype=torch.int64, device=vertices_camera.device)
+    nearest = torch.full((pixels + _SPARE,), _FAR_KEY, dtype=torch.int64, device=vertices_camera.device)
     for part, rows, box_px in _chunks(screen):
         owner, pixel = _cover(part, camera.width_px, rows, box_px, pixels)
         depth_bits = _fragment_depth(part, owner, pixel, camera).view(torch.int32)
         # Bits of positive floats sort like the floats, so an integer minimum finds both depth and triangle.
         key = (depth_bits.long() << 32) | part.triangle[owner]
         nearest.scatter_reduce_(0, pixel, key, "amin")
-    nearest = nearest[:-1]
+    nearest = nearest[:pixels]
     return torch.where(nearest == _FAR_KEY, -1, nearest & 0xFFFFFFFF)
 
 
@@ -181,7 +181,7 @@ def _totals(screen: _Screen) -> tuple[int, int]:
 def _cover(screen: _Screen, width_px: int, rows: int, box_px: int, nowhere: int) -> tuple[Tensor, Tensor]:
     """Return all pairs of a triangle and a pixel centre inside it: index into `screen` [P], pixel [P].
 
-    On a device P is the area of the boxes, and pairs beyond the last have the pixel `nowhere`.
+    On a device P is the area of the boxes, and pairs beyond the last have pixels from `nowhere` on.
     """
     owner, row = _expand(screen.first_row, screen.rows, rows)
     left, right = _row_crossings(screen.corners_px, owner, row.double() + PIXEL_CENTRE)
@@ -190,7 +190,7 @@ def _cover(screen: _Screen, width_px: int, rows: int, box_px: int, nowhere: int)
     counted = _counts(owner)
     run, column = _expand(first, last - first, int((last - first).sum()) if counted else box_px)
     owner, pixel = owner[run], (screen.first_px[owner] + row * width_px)[run] + column
-    return owner, pixel if counted else torch.where(column < last[run], pixel, nowhere)
+    return owner, pixel if counted else torch.where(column < last[run], pixel, nowhere + column % _SPARE)
 
 
 def _expand(first: Tensor, count: Tensor, size: int) -> tuple[Tensor, Tensor]:
