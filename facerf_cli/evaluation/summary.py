@@ -263,12 +263,13 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
     """
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
+    plain = not terminal or console.width <= _PIPED_WIDTH  # rules take columns that a narrow terminal lacks
     layout = summary.layout
     console.print(Text(f"{layout.title}: {summary.size}", style="bold"))
     first, *others = [metric for metric in layout.metrics if metric in summary.metrics]
-    console.print(_table(summary, first, summary.groups, plain=not terminal))
+    console.print(_table(summary, first, summary.groups, plain=plain))
     for metric in others:
-        console.print(_table(summary, metric, summary.groups[:1], plain=not terminal))
+        console.print(_table(summary, metric, summary.groups[:1], plain=plain))
     measured_on = dict.fromkeys(f"{figure.source}: {figure.data}" for figure in layout.published)
     if measured_on:
         console.print(Text("Published figures. " + ". ".join(measured_on) + "."))
@@ -290,10 +291,10 @@ def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) 
         padding=(0, 1, 0, 0),
         expand=False,
     )
-    table.add_column("images", overflow="fold", min_width=20, max_width=26)
+    table.add_column("images", overflow="fold", min_width=10, max_width=26)
     table.add_column("method", overflow="fold", max_width=20)
     for name in ("n", "mean", "sd", "median", "95 % interval", "vs first", "won"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right", no_wrap=name not in ("95 % interval", "vs first"))
     for group in groups:
         for row in _table_rows(summary, group, metric):
             table.add_row(*(Text(entry) for entry in row))
@@ -308,24 +309,34 @@ def _table_rows(summary: Summary, group: Group, metric: str) -> Iterator[list[st
     digits = metric_named(metric).digits
     title = group.title
     for method, cell in group.cells.get(metric, {}).items():
-        yield [title, method, str(cell.interval.images), *cell_words(cell, digits, with_intervals=True)]
+        yield [title, method, str(cell.interval.images), *cell_words(cell, digits)]
         title = ""
     for figure in published_for(summary, group, metric):
         yield [f"published, {figure.source}", figure.method, "", *figure.words(digits), *[""] * 4]
 
 
-def cell_words(cell: Cell, digits: int, with_intervals: bool = False) -> list[str]:
+def cell_words(cell: Cell, digits: int) -> list[str]:
     """Mean, sd, median and interval of a cell, its difference to the first method, and the share won.
 
-    `with_intervals` adds the interval of the difference. The last two are empty for the first method.
+    The difference is followed by its interval. Both have as many digits after the point as show two of their
+    uncertainty, and at most `digits`. The last two are empty for the first method.
     """
     interval, paired = cell.interval, cell.paired
-    middle = [f"{value:.{digits}f}" for value in (interval.mean, interval.sd, interval.median)]
+    most = _decimals(interval, digits)
+    words = [f"{value:.{most}f}" for value in (interval.mean, interval.sd, interval.median)]
     known = not math.isnan(interval.low)  # NaN with one person, or where nobody is named
-    between = f"{interval.low:.{digits}f} to {interval.high:.{digits}f}" if known else "one person?"
+    words.append(f"{interval.low:.{most}f} to {interval.high:.{most}f}" if known else "one person?")
     if paired is None:
-        return [*middle, between, "", ""]
-    apart = f"{paired.difference.mean:+.{digits}f}"
-    if known and with_intervals:
-        apart += f" ({paired.difference.low:+.{digits}f} to {paired.difference.high:+.{digits}f})"
-    return [*middle, between, apart, f"{100 * paired.won:.0f} %"]
+        return [*words, "", ""]
+    apart = paired.difference
+    most = _decimals(apart, digits)
+    difference = f"{apart.mean:+.{most}f}"
+    if known:
+        difference += f" ({apart.low:+.{most}f} to {apart.high:+.{most}f})"
+    return [*words, difference, f"{100 * paired.won:.0f} %"]
+
+
+def _decimals(interval: Interval, most: int) -> int:
+    """Digits after the point that show two significant ones of the interval's half width; at most `most`."""
+    half = (interval.high - interval.low) / 2
+    return min(most, max(0, 1 - math.floor(math.log10(half)))) if half > 0 else most

@@ -8,12 +8,17 @@ import pytest
 
 from facerf_cli.evaluation.measure import METRICS, Row
 from facerf_cli.evaluation.summary import (
+    Cell,
     Layout,
+    Paired,
+    cell_words,
     natural,
+    print_tables,
     published,
     published_for,
     summarise,
 )
+from facerf_cli.image.metrics import Interval
 
 LAYOUT = Layout("toy", "Toy", ("si_mse", "psnr"), ("pose",), published("olat"))
 ERRORS = {"ours": (0.1, 0.2, 0.4, 0.3), "theirs": (0.2, 0.1, 0.8, 0.3)}
@@ -48,6 +53,24 @@ def test_means_and_pairs_by_hand() -> None:
     assert summary.groups[0].cells["psnr"]["theirs"].paired.won == pytest.approx(1.5 / 4)
     # Two people: the interval of the mean spans their own means at most.
     assert 0.15 - 1e-9 <= ours.interval.low <= ours.interval.high <= 0.35 + 1e-9
+
+
+def test_figures_have_two_digits_of_their_uncertainty() -> None:
+    first = Interval(0.006523, 0.006123, 0.00553, 0.00781, 0.00312, 800, 21)
+    apart = Interval(0.000812, 0.0008, 0.00071, 0.00093, 0.0003, 800, 21)
+    cell = Cell((), first, 0, Paired(apart, 0.257))
+    figures = ["0.0065", "0.0031", "0.0061", "0.0055 to 0.0078", "+0.00081 (+0.00071 to +0.00093)", "26 %"]
+    assert cell_words(cell, 5) == figures
+    unknown = replace(first, low=math.nan, high=math.nan)
+    assert cell_words(replace(cell, interval=unknown, paired=None), 5)[0] == "0.00652"
+
+
+def test_a_table_of_long_names_loses_no_column(capsys: pytest.CaptureFixture[str]) -> None:
+    long = [replace(row, method=f"{row.method}_of_people_with_a_long_name") for row in rows()]
+    print_tables(summarise(Layout("toy", "Toy", ("si_mse",), ("pose",)), long), {})
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 100 and out.count(" won") == 1
+    assert out.count(" %") == 1 + 3  # of the interval's column, and the second method's in all groups
 
 
 def test_without_people_there_are_no_intervals() -> None:
