@@ -110,11 +110,6 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     return float((weight * similar).sum() / weight.sum())
 
 
-def dssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return the structural dissimilarity (1 - `ssim`) / 2, 0 if equal (Loza et al. 2006)."""
-    return (1 - ssim(prediction, truth, mask)) / 2
-
-
 def light_error_deg(direction: np.ndarray, truth: np.ndarray) -> float:
     """Return the angle in degrees between two directions toward the light [3], of any length except 0."""
     lengths = np.linalg.norm(direction), np.linalg.norm(truth)
