@@ -1,4 +1,4 @@
-"""Colours in the feature losses of a run of examples/paper/tables.sh: cost of changes, pushes, best images.
+"""Colours in the feature losses of a run of examples/paper/tables.sh: cost of changes, pushes, trainings.
 
     python benchmarks/feature_colours.py --run RUN [--side 128]
 
@@ -8,14 +8,16 @@ V_f (L_I) and S_f (L_L), which see colours together or their channels apart (`tr
 where the target is black. Then, for the blurred targets, the descent direction of each term, summed over the
 pixels of each colour: a term that prefers no colour pushes all three alike.
 
-Last, what a network predicts that knows the face and not the light: the one image that costs least on average
-over all targets of a person and camera. Printed is its tint: red and blue over green, over the targets' own.
-S_f of several seeds are untrained; their filters are random.
+Last, small trainings that differ in one thing: a narrow U-Net with heads fitted to landmarks, from the same
+weights on the same pairs. Printed is the tint of faces of the validation split: red and blue over green, over
+those of the truth. `swapped`: V_f and S_f are the same networks, with the colour channels at their entry in
+another order.
 
 Peer, in the same run: L_p.
 """
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -24,19 +26,35 @@ from _common import arguments, print_header, print_row, required
 from torch import Tensor
 
 from facerf_cli.dataset.crops import open_pairs, spread_pairs
-from facerf_cli.dataset.dataset import read_dataset
-from facerf_cli.network.features import FeatureNetwork, LightNetwork, LightSettings, layer_powers
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.network.features import FeatureNetwork, layer_powers
+from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
+from facerf_cli.training.joint import JointObjective, JointSettings
+from facerf_cli.training.loop import seeded
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
     PaperWeights,
     channels_apart,
+    colour_shares,
     load_features,
     photometric_loss,
 )
 
 TRAINED, MEASURED = 24, 8
-LIGHTS, STEPS, BATCH, SEEDS = 40, 100, 8, 4  # of the best image, and untrained S_f
+STEPS, WIDTHS = 160, (32, 64, *[128] * 6)  # of the small trainings
+RGB, GBR, BRG = (0, 1, 2), (1, 2, 0), (2, 0, 1)  # by whose filters red, green and blue enter
+TRAININGS = {  # lambda_f, channels apart, order of the filters
+    "L_p alone": (0.0, False, RGB),
+    "together": (1.0, False, RGB),
+    "together, swapped": (1.0, False, GBR),
+    "together, swapped otherwise": (1.0, False, BRG),
+    "together, lambda_f .1": (0.1, False, RGB),
+    "together, lambda_f .1, swapped": (0.1, False, GBR),
+    "apart": (1.0, True, RGB),
+    "apart, lambda_f .1": (0.1, True, RGB),
+}
 COVERED = 0.01  # mean radiance above which a pixel is compared
 CHANGES: dict[str, Callable[[Tensor], Tensor]] = {
     "green x 0.7 (magenta)": lambda x: x * torch.tensor([1, 0.7, 1]).view(1, 3, 1, 1),
@@ -85,20 +103,40 @@ def main() -> None:
         (slope,) = torch.autograd.grad(term(image, target), image)
         print_row(name, *(f"{value:.2f}" for value in -slope.sum((0, 2, 3))))
     print()
-    person = next(iter(spread_pairs(validation, 1, lambda _: True)))
-    alike = [
-        p for p in validation.pairs if (p.subject, p.target_camera) == (person.subject, person.target_camera)
+    print_header("training", "tint, red", "tint, blue", "Si-MSE", "5 L_p", "L_I", "L_L")
+    for name, variant in TRAININGS.items():
+        print_row(name, *small_training(run, dataset, given.side, *variant))
+
+
+def small_training(
+    run: Path, dataset: Dataset, side: int, features: float, apart: bool, order: tuple[int, ...]
+) -> list[str]:
+    """Train `STEPS` pairs by the paper's optimiser; the tint, Si-MSE and mean terms of the last half."""
+    torch.manual_seed(0)
+    reflectance = PaperReflectanceNetwork(PaperReflectanceSettings(side=side, widths=WIDTHS))
+    networks = [
+        load_features(run / "appearance/best.safetensors", "appearance_features"),
+        load_features(run / "light/best.safetensors", "light_features"),
     ]
-    lit = torch.cat([validation.read(pair).target for pair in alike[:LIGHTS]])
-    print_header("least cost over the lights of a face", "tint, red", "tint, blue")
-    print_row("5 L_p", *tint_of_best([photometric], lit))
-    for seed in range(SEEDS):
-        torch.manual_seed(seed)
-        untrained = LightNetwork(LightSettings(side=given.side)).eval().requires_grad_(False)
-        for apart in (False, True):
-            term = feature_term(untrained, seen, apart)
-            name = f"5 L_p + untrained L_L, seed {seed} {'apart' if apart else 'together'}"
-            print_row(name, *tint_of_best([photometric, term], lit))
+    for network in networks:
+        weight = network.trunk.features[0].weight
+        weight.copy_(weight[:, list(order)])
+    weights = PaperWeights(features=features, channels_apart=apart)
+    settings = JointSettings(side, side, weights=weights, validation_pairs=12)
+    objective = JointObjective(dataset, load_face_model(), reflectance, None, *networks, settings=settings)
+    objective.measure()
+    optimiser = torch.optim.Adadelta(reflectance.parameters(), lr=0.05, rho=0.95, eps=1e-8)
+    means: dict[str, float] = {}
+    for step in range(STEPS):
+        terms = objective(objective.draw(1, partial(seeded, 0, step), step))
+        optimiser.zero_grad()
+        torch.stack(list(terms.values())).sum().backward()
+        optimiser.step()
+        for name, term in terms.items():
+            means[name] = means.get(name, 0.0) + (step >= STEPS / 2) * float(term.detach()) / (STEPS / 2)
+    found = objective.validate().metrics
+    tint = [f"{found[name]:.2f}" for name in ("tint_red", "tint_blue")]
+    return [*tint, f"{found['si_mse']:.4f}", *(f"{value:.2f}" for value in means.values())]
 
 
 def covered(target: Tensor) -> Tensor:
@@ -113,29 +151,11 @@ def photometric(image: Tensor, target: Tensor) -> Tensor:
 
 def feature_term(network: FeatureNetwork, training: Tensor, apart: bool) -> Term:
     """The weighted distance by a network whose powers are measured on training targets."""
-    powers = layer_powers(network, channels_apart(training, training) if apart else training)
+    powers = layer_powers(network, channels_apart(training, colour_shares(training)) if apart else training)
     features = Features(network, powers, apart)
     return lambda image, target: (
         PaperWeights().features * MaskedPair(image, target, covered(target)).distance(features).mean()
     )
-
-
-def tint_of_best(terms: list[Term], targets: Tensor) -> list[str]:
-    """Red and blue over green of the one image that costs least, over those of the targets."""
-    torch.manual_seed(0)
-    root = (0.25 + 0.01 * torch.randn(1, *targets.shape[1:])).requires_grad_()  # of radiance; grey
-    optimiser = torch.optim.Adam([root], 0.02)
-    for step in range(STEPS):
-        optimiser.param_groups[0]["lr"] = 0.02 * (1 - step / STEPS)
-        some = targets[torch.randint(len(targets), (BATCH,))]
-        cost = torch.stack([term((root**2).expand_as(some), some) for term in terms]).sum()
-        optimiser.zero_grad()
-        cost.backward()
-        optimiser.step()
-    face = covered(targets.mean(0, keepdim=True))
-    colours = [(image * face).sum((0, 2, 3)) for image in (root.detach() ** 2, targets)]
-    red, green, blue = (colours[0] / colours[1]).tolist()
-    return [f"{red / green:.2f}", f"{blue / green:.2f}"]
 
 
 if __name__ == "__main__":

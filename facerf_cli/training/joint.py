@@ -44,6 +44,7 @@ from facerf_cli.training.losses import (
     appearance_loss,
     channels_apart,
     clipped_si_mse,
+    colour_shares,
     landmark_loss,
     light_loss,
     photometric_loss,
@@ -315,7 +316,9 @@ class JointObjective(Objective):
             if process_rank() == 0:
                 pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
                 targets = (self._train.read(pair).target.to(self.device) for pair in pairs)
-                seen = (channels_apart(target, target) if apart else target for target in targets)
+                seen = (
+                    channels_apart(target, colour_shares(target)) if apart else target for target in targets
+                )
                 powers = torch.stack([layer_powers(network, image) for image in seen]).mean(0)
             self.features[name] = Features(network, broadcast_from_first(powers), apart)
 

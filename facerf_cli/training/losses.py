@@ -7,7 +7,7 @@ its weights:
 - landmarks are in units of half the crop's side, as for image coordinates from -1 to 1;
 - radiance is scene-linear, exposed as in `dataset/crops.py`; feature networks see it as sRGB
   (`network/features.py`);
-- S_f and a V_f that facerf trained see each colour channel by itself, over the target's mean of it
+- S_f and a V_f that facerf trained see each colour channel by itself, over the target's share of it
   (`channels_apart`): their filters prefer colours by accident, and would tint what is uncertain;
 - textures are compared where the target's camera sees the face; the target's texture gets no gradient.
 """
@@ -105,15 +105,18 @@ def photometric_loss(prediction: Tensor, target: Tensor, mask: Tensor) -> Tensor
     return difference.sum((1, 2, 3)) / mask.sum((1, 2, 3)).clamp_min(1.0)
 
 
-def channels_apart(images: Tensor, target: Tensor) -> Tensor:
-    """Make grey images [3 B, 3, H, W] of the channels of images [B, 3, H, W], over the target's mean colour.
-
-    The target's colour has the mean 1 over its channels, so that brightness is kept. All channels then have
-    the same brightness, and no feature can prefer one to another.
-    """
+def colour_shares(target: Tensor) -> Tensor:
+    """Mean colour [B, 3, 1, 1] of images [B, 3, H, W], over its mean of the channels."""
     mean = target.mean((2, 3), keepdim=True) + _DIM
-    colour = (mean / mean.mean(1, keepdim=True)).clamp_min(_LEAST_SHARE)
-    return (images / colour).flatten(0, 1)[:, None].expand(-1, 3, -1, -1)
+    return (mean / mean.mean(1, keepdim=True)).clamp_min(_LEAST_SHARE)
+
+
+def channels_apart(images: Tensor, shares: Tensor) -> Tensor:
+    """Make grey images [3 B, 3, H, W] of the channels of images [B, 3, H, W], over the `colour_shares`.
+
+    Those of the target give all channels the same brightness, so that no feature can prefer one to another.
+    """
+    return (images / shares).flatten(0, 1)[:, None].expand(-1, 3, -1, -1)
 
 
 @dataclass(frozen=True)
@@ -136,10 +139,13 @@ class MaskedPair:
     def distance(self, features: Features) -> Tensor:
         """Distance [B] of the features of both, masked, relative to the features' powers."""
         prediction, target = self.prediction * self.mask, self.target * self.mask
+        shares = colour_shares(target)
         if features.apart:
-            prediction, target = channels_apart(prediction, target), channels_apart(target, target)
+            prediction, target = (channels_apart(image, shares) for image in (prediction, target))
         distance = feature_distance(features.network, prediction, target, features.powers)
-        return distance.view(len(self.target), -1).mean(1)
+        if not features.apart:
+            return distance
+        return (distance.view(-1, 3) * shares.flatten(1)).mean(1)  # so that channels are pulled alike
 
 
 def appearance_loss(features: Features, image: MaskedPair, texture: MaskedPair) -> Tensor:
