@@ -163,6 +163,22 @@ def test_the_network_gets_what_the_paper_says(models: Models, head: Head) -> Non
     torch.testing.assert_close(network.normals[0], turned)
 
 
+def test_a_field_that_is_corrected_sees_no_coloured_shade(models: Models, head: Head) -> None:
+    face, seen = head.face, []
+    half = face.texture.shape[-1] // 2
+    texture = face.texture.clone()
+    texture[..., :half] *= torch.tensor([0.2, 0.1, 0.4]).view(3, 1, 1)
+    shaded = replace(head, face=replace(face, texture=texture))
+    for alone in (True, False):
+        network = WritesDown()
+        own = models.with_networks(reflectance=network)
+        list(predict_olat(own, shaded, azel_to_direction(0.0, 0.0)[None], network_alone=alone))
+        well = face.visible[:, :half] > 0.9
+        colour = network.encoded[0][0, :, :, :half][:, well].mean(1)
+        seen.append(float(colour[2] / colour[1]))
+    assert seen[1] < 0.6 * seen[0]
+
+
 def test_without_colours_of_training_no_cast_is_removed(models: Models, head: Head) -> None:
     network = WritesDown()
     blue = replace(head.face, texture=head.face.texture * torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1))

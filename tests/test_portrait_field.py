@@ -104,6 +104,26 @@ def test_the_bias_has_the_photos_colours(field: PortraitField) -> None:
     torch.testing.assert_close(found, shown, atol=0.05, rtol=0)
 
 
+def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: PortraitField) -> None:
+    """The albedo is the photo, with the shade's colour, times the gain, plus the bias."""
+    rig, person = rig_directions(48), field.person
+    inputs = person.inputs(rig, person.visibility(rig))
+    side = inputs.image.shape[-1]
+    cast_in_shade = torch.ones(3, 1, side)
+    cast_in_shade[..., : side // 2] = torch.tensor([0.2, 0.1, 0.4])[:, None, None]
+    image = inputs.image * cast_in_shade
+    maps = maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, image=image))))
+    torch.testing.assert_close(image * maps.gain + maps.bias, maps.albedo)
+    skin = inputs.classes[0, class_index("skin")] > 0.95
+    left, right = (maps.albedo[0, :, :, half][:, skin[:, half]].mean(1) for half in halves_of(side))
+    colour = (left / left.mean()) / (right / right.mean())
+    assert colour.min() > 0.6  # of the photo: 0.43
+
+
+def halves_of(side: int) -> tuple[slice, slice]:
+    return slice(0, side // 2), slice(side // 2, side)
+
+
 def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
     rig = rig_directions(48)
     given = field.person.inputs(rig, field.person.visibility(rig))
