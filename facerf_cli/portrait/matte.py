@@ -73,8 +73,8 @@ class PersonColours:
         person = own = background = mixture
         for reach in _COLOUR_REACH:
             span = max(3, 2 * round(reach * max(size)) + 1)
-            own = _weighted_mean(person, share, span)
-            background = _weighted_mean(background, 1 - share, span)
+            own = weighted_mean(person, share, span)
+            background = weighted_mean(background, 1 - share, span)
             person = _unmixed(mixture, share, own, background)
         self._means = np.concatenate([own, background], -1)
         self.small = person * (share > 0)[..., None]  # [h, w, 3], of at most `_COLOURS_PX`
@@ -131,7 +131,7 @@ def _unmixed(mixture: np.ndarray, matte: np.ndarray, own: np.ndarray, other: np.
     return np.asarray((own + share * rest).clip(min=0))
 
 
-def _weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:
+def weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.ndarray:
     """Means [H, W, 3] over squares of `size` pixels, under weights [H, W]."""
     total = uniform_filter(colours * weight[..., None], (size, size, 1), mode="nearest")
     return np.asarray(total / (uniform_filter(weight, size, mode="nearest")[..., None] + _TINY))

@@ -19,11 +19,13 @@ from scipy.ndimage import (
     watershed_ift,
 )
 
+from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.closed_form import solve_matte
 from facerf_cli.portrait.matte import lifted, shrunk
 from facerf_cli.portrait.parse import Square
+from facerf_cli.portrait.plain_background import solved_before_plain_background
 
 _SOLVED_PX, _SOLVED_HEAD_PX = 768, 320  # longest side, and height of the head, at which the outline is solved
 _NETWORK_PX = 256
@@ -104,6 +106,7 @@ def matte_of(share: np.ndarray, image_srgb: np.ndarray, landmarks_px: np.ndarray
     scaled = head.scaled(max(size) / longest_px)
     expected, unknown = outline(np.asarray(enlarged(share[None], size)[0]).clip(0, 1), scaled)
     alpha = solve_matte(image, expected, unknown)
+    alpha = solved_before_plain_background(alpha, srgb_to_linear(image))
     return alpha if size == (height, width) else lifted(alpha, image, image_srgb)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.portrait.matte import _COLOUR_REACH, _unmixed, _weighted_mean
+from facerf_cli.portrait.matte import _COLOUR_REACH, _unmixed, weighted_mean
 
 
 def slow_person_colours(photo: np.ndarray, matte: np.ndarray, most_px: int) -> np.ndarray:
@@ -17,8 +17,8 @@ def slow_person_colours(photo: np.ndarray, matte: np.ndarray, most_px: int) -> n
     person = own = background = seen
     for reach in _COLOUR_REACH:
         span = max(3, 2 * round(reach * max(size)) + 1)
-        own = _weighted_mean(person, share, span)
-        background = _weighted_mean(background, 1 - share, span)
+        own = weighted_mean(person, share, span)
+        background = weighted_mean(background, 1 - share, span)
         person = _unmixed(seen, share, own, background)
     means = torch.from_numpy(np.dstack([own, background])).permute(2, 0, 1)[None]
     wide = F.interpolate(means, matte.shape, mode="bilinear")[0].permute(1, 2, 0).numpy()
