@@ -133,6 +133,7 @@ def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
     assert relight(given, tmp_path / "bad", "--light", "40,10", "--aov", "beauty") == 2
 
 
+@pytest.mark.slow
 def test_the_albedo_at_the_mattes_edge_is_the_persons(given: Path, tmp_path: Path) -> None:
     assert relight(given, tmp_path, "--light", "40,10") == 0
     (matte,) = layers_of(tmp_path / "astronaut_light_40_10.exr", "person.A")
@@ -193,6 +194,7 @@ def test_the_photos_background_looks_as_it_did(given: Path, tmp_path: Path) -> N
     np.testing.assert_allclose(2 * read_image(name).pixels[behind], shown[behind].clip(0, 1), atol=4e-3)
 
 
+@pytest.mark.slow
 def test_backgrounds(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A colour and a file as they look, a map as bright as it is, nothing with alpha."""
     write_exr(tmp_path / "red.exr", np.full((20, 60, 3), (0.5, 0.1, 0.1), np.float32))
@@ -355,6 +357,7 @@ def test_a_dry_run_checks_what_a_run_would_load(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_near_lights_sweeps_and_rigs_from_the_command_line(
     given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

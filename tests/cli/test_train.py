@@ -345,6 +345,7 @@ def test_a_stage_carries_over_the_networks_of_others(run: Path, tmp_path: Path, 
     assert same != (stage == "reflectance")
 
 
+@pytest.mark.slow
 def test_own_networks_and_losses_of_an_installed_package(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
