@@ -41,6 +41,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("toys")
 def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> None:
     out = tmp_path / "out"

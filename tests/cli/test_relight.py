@@ -40,6 +40,7 @@ def face_sides(path: Path) -> tuple[float, float]:
     return tuple(float((image.pixels.mean(-1) * side).sum() / side.sum()) for side in (left, right))
 
 
+@pytest.mark.slow
 def test_maps_rotations_and_lamps_from_one_prediction(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -419,6 +420,7 @@ def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -
     assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image
 
 
+@pytest.mark.slow
 def test_a_group_shares_the_exposure_of_its_first_photo(given: Path, tmp_path: Path) -> None:
     """A darker frame, which by itself would be made as bright as the first."""
     photo = read_image(PHOTO).pixels

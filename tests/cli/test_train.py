@@ -87,6 +87,7 @@ def test_an_unknown_form_is_named_before_baking(tmp_path: Path, capsys: pytest.C
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
     write_small_dataset(tmp_path / "data", counts=(1, 1, 1), lights=30, crop_px=64)
     line = ["--dataset", str(tmp_path / "data"), "--texture-size", "32", "--steps", "1"]
@@ -202,6 +203,7 @@ def test_the_papers_preset_says_what_it_wants(tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "run" / "last.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_the_configuration_of_a_run_repeats_it(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -314,6 +316,7 @@ def test_a_run_by_the_command(run: Path) -> None:
     assert metadata["training"][-1]["optimizer"]["learning_rate"] == 0.002
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
