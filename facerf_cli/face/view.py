@@ -124,7 +124,7 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     uv, coverage, mask = torch.empty(*size, 2), torch.empty(size), torch.empty(size)
     region = region_mask("face", _MASK_SIDE)[None]
     for rows in strips(size):
-        fragments = rasterize(vertices_camera, triangles, _rows_of(window, rows))
+        fragments = rasterize(vertices_camera, triangles, rows_of_camera(window, rows))
         uv[rows] = interpolate(grid_uv(), triangles, fragments)
         coverage[rows] = fragments.covered.float()
         mask[rows] = sample_texture(region, uv[rows])[..., 0]
@@ -135,14 +135,14 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     attributes = torch.cat([vertex_normals(vertices_camera, triangles), vertices_camera], 1)
 
     def surface(rows: slice) -> Tensor:
-        fragments = rasterize(vertices_camera, triangles, _rows_of(window, rows))
+        fragments = rasterize(vertices_camera, triangles, rows_of_camera(window, rows))
         normal, position_m = torch.split(interpolate(attributes, triangles, fragments), 3, -1)
         return torch.cat([F.normalize(normal, dim=-1), position_m], -1)
 
     return FaceView(camera.height_px, camera.width_px, top, left, uv, coverage, mask, surface)
 
 
-def _rows_of(camera: Camera, rows: slice) -> Camera:
+def rows_of_camera(camera: Camera, rows: slice) -> Camera:
     """The camera of some rows of an image."""
     height_px, cy_px = rows.stop - rows.start, camera.cy_px - rows.start
     return Camera(camera.focal_px, camera.width_px, height_px, camera.cx_px, cy_px)

@@ -214,7 +214,7 @@ def inpaint(texture: Tensor, visible: Tensor) -> Tensor:
 
 
 def _inpaint(texture: Tensor, visible: Tensor) -> Tensor:
-    if min(visible.shape[-2:]) == 1:
+    if max(visible.shape[-2:]) == 1:
         return texture * (visible > 0)
     weight = F.avg_pool2d(visible, 2, ceil_mode=True, count_include_pad=False)
     coarse = F.avg_pool2d(texture * visible, 2, ceil_mode=True, count_include_pad=False)

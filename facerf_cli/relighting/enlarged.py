@@ -87,7 +87,6 @@ class Enlarged:
 
     def layer(self, name: str, lit: Tensor) -> Shown:
         """A layer of an image under the light of maps [9, S, S]; see `WholePerson.layer`."""
-        person = self._view.person
         if name == "albedo":
             return lambda pixels, rows, columns: _by_pixel(
                 self._albedo(pixels, self._enlarged(self._albedo_maps, rows, columns), self._display_ev)
@@ -97,8 +96,6 @@ class Enlarged:
             "specular": lit[3:6].clamp_min(0) * self._view.exposure,
             "shadow": lit[6:9],
             "normal": self._view.maps.normals[0],
-            "position": person.maps.positions_m,
-            "depth": -person.maps.positions_m[2:],
         }[name]
         filled = self._filled(maps)
         return lambda pixels, rows, columns: _by_pixel(self._enlarged(filled, rows, columns))

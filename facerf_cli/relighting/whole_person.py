@@ -4,7 +4,7 @@ Of its views the narrower lies over the wider one, and fades toward its border.
 """
 
 from collections.abc import Sequence
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from torch import Tensor
@@ -17,6 +17,9 @@ from facerf_cli.relighting.enlarged import Enlarged, Shown
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.grain import Grain
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.surface import Surface
+
+_LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
 
 
 class WholePerson:
@@ -27,7 +30,7 @@ class WholePerson:
         self.matte = segmentation.matte
         self.bare_face = uncovered_rows(segmentation.classes, (photo.shape[0], photo.shape[1]))
         self._segmentation, self._size_px = segmentation, photo.shape[:2]
-        self._irises_px = field.person.irises_px
+        self._person = field.person
         self._views = [Enlarged(view, photo) for view in field.views]
 
     @property
@@ -51,7 +54,7 @@ class WholePerson:
         hair = self._segmentation.layer("hair")
         grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px)
         opening = partial(self._segmentation.layer, "eyes")
-        return grain, Eyes(photo.__getitem__, self._irises_px, opening, self._size_px)
+        return grain, Eyes(photo.__getitem__, self._person.irises_px, opening, self._size_px)
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [views, 9, S, S]."""
@@ -66,16 +69,23 @@ class WholePerson:
         """
         if name == "classes":
             return {**self._segmentation.layers()}
-        views = [view.layer(name, one) for view, one in zip(self._views, lit, strict=True)]
-        joined = self._joined(photo, views)
+        if name in ("position", "depth"):
+            shown = getattr(self._surface, f"{name}_m")
+        else:
+            views = [view.layer(name, one) for view, one in zip(self._views, lit, strict=True)]
+            shown = self._joined(photo, views)
 
         def of(rows: slice) -> np.ndarray:
-            wide = joined(rows) * (self.matte[rows] > 0)[..., None]
+            wide = shown(rows) * (self.matte[rows] > _LEAST)[..., None]
             if name == "normal":
                 wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
             return wide
 
         return {name: of}
+
+    @cached_property
+    def _surface(self) -> Surface:
+        return Surface(self._person, self._size_px)
 
     def _joined(self, photo: np.ndarray | PersonColours, views: Sequence[Shown]) -> Band:
         """An image or layer [H, W, C], by rows, of what each view shows; the widest lies below."""
