@@ -47,7 +47,7 @@ class Surface:
         return rasterize(self._proxy.vertices, self._outside, camera).depth_m
 
     def _continued(self, classes: Tensor) -> Tensor:
-        """Depth of head and of body, continued, and the lead of the head's share [3, h, w], at the classes."""
+        """Depth of head and of body, continued, and the lead of the head in the classes [3, h, w]."""
         height, width = classes.shape[1:]
         scale = width / self._size_px[1], height / self._size_px[0]
         whole = self._camera
