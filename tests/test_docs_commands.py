@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +61,8 @@ def toy(command: str) -> list[str]:
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Path:
-    """A folder with all that the pages take for given."""
-
+def place(tmp_path: Path) -> Iterator[Path]:
+    """A folder with all that the pages take for given; a Ray that they start is left at the end."""
     save_face_model(tmp_path / "ict.npz", load_face_model())
     write_joint_dataset(tmp_path / "dataset")
     write_small_dataset(tmp_path / "data", counts=(2, 1, 1), lights=12, crop_px=48)
@@ -73,7 +73,9 @@ def place(tmp_path: Path) -> Path:
         write_exr(tmp_path / name, np.ones((8, 16, 3), np.float32))
     torch.manual_seed(0)
     save_file(VggFeatures().state_dict(), tmp_path / "vgg.safetensors")
-    return tmp_path
+    yield tmp_path
+    if "ray" in sys.modules:
+        sys.modules["ray"].shutdown()  # tests/test_ray_workers.py connects with settings of its own
 
 
 @pytest.mark.slow
