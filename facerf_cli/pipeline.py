@@ -112,6 +112,7 @@ def head_of(
         head = fit_photo(models, photo, face.landmarks_px, sides)
     else:
         head = regress_photo(models, photo, face.box_px, sides)
+    head = replace(head, others_px=face.others_px)
     if face.view is not None:
         head = head.without(models.face, uncovered(face.view, head.fit.crop))
     return head if matte is None else head.without(models.face, uncovered_by(matte, head.fit.crop))
@@ -162,10 +163,11 @@ def reflectance_of(
         return field
     if steady and steady.portrait:
         return PortraitField.of(models.face, head, field, own, steady.portrait)
-    person = look_at_person(models.networks.people, models.face, photo, head.fit, matte=matte)
+    people, others_px = models.networks.people, head.others_px
+    person = look_at_person(people, models.face, photo, head.fit, matte=matte, others_px=others_px)
     wide = wider_square(person.square, person.segmentation.matte)
-    people = [person] if wide is None else [person, person.within(wide, photo)]
-    seen = [(one, maps_of(models.networks.portrait, one)) for one in people]
+    squares = [person] if wide is None else [person, person.within(wide, photo)]
+    seen = [(one, maps_of(models.networks.portrait, one)) for one in squares]
     return PortraitField.of(models.face, head, field, own, seen)
 
 
@@ -189,8 +191,8 @@ class FittedPerson:
         if isinstance(self.reflectance, PortraitField):
             return self.reflectance.person.segmentation
         landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        people, matte = self.models.networks.people, self.given_matte
-        return segment(people, to_display(self.photo), landmarks_px, matte)
+        people, matte, others_px = self.models.networks.people, self.given_matte, self.head.others_px
+        return segment(people, to_display(self.photo), landmarks_px, matte, others_px)
 
     @property
     def share(self) -> np.ndarray:

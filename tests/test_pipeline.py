@@ -23,7 +23,7 @@ from facerf_cli.pipeline import (
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.composition import Composition, Target
-from facerf_cli.relighting.field import photo_evidence, weighted_sum
+from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
 from facerf_cli.relighting.models import Models
 from facerf_cli.run import memory
 from facerf_cli.work.plan import require_face
@@ -118,6 +118,18 @@ def test_the_light_of_the_photo_explains_it(models: Models, head: Head) -> None:
     estimate = estimate_light(models, head, rig=rig_directions(60))
     assert estimate.light.weights.shape == (60, 3) and (estimate.light.weights >= 0).all()
     assert estimate.evidence.residual(estimate.explained) < 0.25
+
+
+def test_a_face_is_encoded_once_and_sees_lights_as_in_one_batch(
+    models: Models, head: Head, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, network, faces = Field(models, head.face), models.networks.reflectance, []
+    encode = network.encode
+    monkeypatch.setattr(network, "encode", lambda *source: faces.append(source) or encode(*source))
+    rig = rig_directions(5)
+    apart = torch.cat([next(field.olats(light[None])) for light in rig])
+    assert len(faces) == 1
+    torch.testing.assert_close(apart, torch.cat(list(Field(models, head.face).olats(rig))))
 
 
 def test_a_mask_that_hides_nothing_changes_nothing(models: Models, head: Head) -> None:

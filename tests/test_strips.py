@@ -11,7 +11,7 @@ import torch.nn.functional as F
 
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
-from facerf_cli.image.strips import enlarged, filled, strips, whole
+from facerf_cli.image.strips import block_means, box_means, enlarged, filled, strips, whole
 from facerf_cli.portrait.matte import PersonColours, lifted, shrunk
 from tests.oracles.person_colours import slow_person_colours
 
@@ -28,6 +28,18 @@ def test_strips_cover_all_rows_once() -> None:
     parts = list(strips((HEIGHT, WIDTH, 3)))
     assert [row for part in parts for row in range(HEIGHT)[part]] == list(range(HEIGHT))
     assert [part.start for part in parts] == [0, 64, 128]
+
+
+def test_means_of_boxes_and_blocks_are_those_of_their_pixels() -> None:
+    image = DRAW.integers(0, 256, (23, 17, 3), dtype=np.uint8)
+    found = box_means(image.astype(np.float32), 2)
+    padded = np.pad(image, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    assert found.shape == image.shape
+    assert found[0, 16] == pytest.approx(padded[:5, 16:].mean((0, 1))) and found[9, 4] == pytest.approx(
+        image[7:12, 2:7].mean((0, 1))
+    )
+    blocks = block_means(image, 4)
+    assert blocks.shape == (5, 4, 3) and blocks[3, 1] == pytest.approx(image[12:16, 4:8].mean((0, 1)))
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.jpg", "a.tif"])

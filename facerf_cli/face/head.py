@@ -10,9 +10,10 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import GIVE_LANDMARKS
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.topology import grid_triangles
+from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.image.strips import fitted, resized
-from facerf_cli.raster.texture import inpaint, normal_map, unwrap
+from facerf_cli.raster.camera import project
+from facerf_cli.raster.texture import bake_attributes, inpaint, normal_map, sample_texture, unwrap
 
 _INSIDE_PHOTO = 0.99  # share of a texel's pixels that lie inside the photo, from which on it is visible
 _SEEN_WELL = 0.9  # share of a texel that a mask must show
@@ -32,11 +33,15 @@ class FaceTexture:
 
 @dataclass(frozen=True, eq=False)
 class Head:
-    """The face of a photo: its crop [S, S, 3], scene-linear, the fitted face model, and its texture."""
+    """The face of a photo: its crop [S, S, 3], scene-linear, the fitted face model, and its texture.
+
+    `others_px` are landmarks [N, 68, 2] of the photo's other heads in its pixels; None where nobody looked.
+    """
 
     cropped: np.ndarray
     fit: FaceFit
     face: FaceTexture
+    others_px: np.ndarray | None = None
 
     @property
     def landmarks_px(self) -> np.ndarray:
@@ -52,7 +57,8 @@ class Head:
         side = self.face.texture.shape[-1]
         image = torch.from_numpy(mask.astype(np.float32))[None]
         vertices = self.fit.vertices_camera(model)
-        kept = unwrap(image, vertices, grid_triangles(), self.fit.camera, side)[0][0]
+        places = bake_attributes(project(vertices, self.fit.camera), GRID, side).movedim(0, -1)
+        kept = sample_texture(image, places / self.fit.camera.width_px)[..., 0]
         visible = self.face.visible * (kept > _SEEN_WELL)
         if torch.equal(visible, self.face.visible):
             return self
@@ -85,5 +91,7 @@ def shrunk_photo(photo: np.ndarray, head: Head, most_px: int) -> tuple[np.ndarra
     height, width = fitted(photo.shape[0], photo.shape[1], most_px)
     if (height, width) == photo.shape[:2]:
         return photo, head
-    crop = head.fit.crop.of_scaled(width / photo.shape[1])
-    return resized(photo, height, width), replace(head, fit=replace(head.fit, crop=crop))
+    scale = width / photo.shape[1]
+    fit = replace(head.fit, crop=head.fit.crop.of_scaled(scale))
+    others_px = None if head.others_px is None else head.others_px * scale
+    return resized(photo, height, width), replace(head, fit=fit, others_px=others_px)

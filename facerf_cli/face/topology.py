@@ -170,9 +170,13 @@ def region_mask(name: str, side: int) -> Tensor:
     if name == "skin":
         return (1 - torch.stack([region_mask(part, side) for part in _NOT_SKIN]).sum(0)).clamp(0, 1)
     centre = (np.arange(side) + 0.5) / side
-    uv = np.stack(np.meshgrid(centre, centre), -1)
-    distance_mm = inside_mm(name, uv)
     edge_mm = max(_EDGE_MM[name], UV_SIZE_MM.max() / side)  # never sharper than a texel
+    outline, margin = _outline_mm(name) / UV_SIZE_MM, edge_mm / UV_SIZE_MM
+    bounds = zip(outline.min(0) - margin, outline.max(0) + margin, strict=True)
+    columns, rows = (np.flatnonzero((low < centre) & (centre < high)) for low, high in bounds)
+    uv = np.stack(np.meshgrid(centre[columns], centre[rows]), -1)
+    distance_mm = np.full((side, side), -edge_mm)
+    distance_mm[np.ix_(rows, columns)] = inside_mm(name, uv)
     mask = smoothstep(torch.from_numpy(distance_mm / edge_mm + 0.5))
     mirrored = mask.flip(1)
     return (torch.maximum(mask, mirrored) if name in _PAIRED else (mask + mirrored) / 2).float()

@@ -44,12 +44,14 @@ _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels i
 class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
-    There is no view of a face that was given, or found by dlib.
+    There is no view of a face that was given, or found by dlib. Landmarks [N, 68, 2] of the photo's other
+    heads are there where these were looked for.
     """
 
     box_px: Box
     score: float
     view: SquareView | None = field(default=None, kw_only=True)
+    others_px: np.ndarray | None = field(default=None, kw_only=True)
 
     @property
     def area_px(self) -> float:
@@ -67,7 +69,7 @@ class Face(FaceBox):
     @property
     def box(self) -> FaceBox:
         """The face without its landmarks."""
-        return FaceBox(self.box_px, self.score, view=self.view)
+        return FaceBox(self.box_px, self.score, view=self.view, others_px=self.others_px)
 
 
 def face_at(landmarks_px: np.ndarray) -> Face:
@@ -134,7 +136,9 @@ def detect_faces(
         if meshes and not everyone:
             break
     faces = [face for mesh in meshes if (face := _as_face(people, image_srgb, mesh))]
-    return sorted(faces, key=lambda face: face.box_px[0])
+    faces.sort(key=lambda face: face.box_px[0])
+    landmarks_px = np.array([face.landmarks_px for face in faces])
+    return [replace(one, others_px=np.delete(landmarks_px, n, 0)) for n, one in enumerate(faces)]
 
 
 def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:

@@ -1,12 +1,13 @@
 """The matte of a person at the photo's own resolution, and the person's colours without the background's."""
 
 import math
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import uniform_filter
 from scipy.sparse import csr_array
 
-from facerf_cli.image.strips import between, enlarged, fitted, strips
+from facerf_cli.image.strips import between, box_means, enlarged, fitted, strips
 
 _REACH_PX = 2  # of the linear functions of colour by which a matte is enlarged
 _SMOOTHNESS = 1e-5  # variance of colours, sRGB in 0..1, below which the matte is smoothed
@@ -39,12 +40,7 @@ def local_lines(
 
     `reach` is in pixels; where the variance of the colours is below `smoothness`, values are smoothed.
     """
-
-    def mean(field: np.ndarray) -> np.ndarray:
-        return np.asarray(
-            uniform_filter(field, (2 * reach + 1,) * 2 + (1,) * (field.ndim - 2), mode="nearest")
-        )
-
+    mean = partial(box_means, reach=reach)
     colour, share = mean(guide), mean(values)
     products = guide[..., :, None] * guide[..., None, :]
     covariance = mean(products.reshape(*values.shape, 9)).reshape(products.shape)
@@ -78,13 +74,21 @@ class PersonColours:
             person = _unmixed(mixture, share, own, background)
         self._means = np.concatenate([own, background], -1)
         self.small = person * (share > 0)[..., None]  # [h, w, 3], of at most `_COLOURS_PX`
+        self._last = 0, photo[:0]  # first row, and colours that are kept: of one image they are read thrice
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
+        start, stop, _ = rows.indices(self.shape[0])
+        first, kept = self._last
+        if not first <= start <= stop <= first + len(kept):
+            first, kept = self._last = start, self._found(slice(start, stop))
+        return kept[start - first : stop - first]
+
+    def _found(self, rows: slice) -> np.ndarray:
         photo, matte = self._photo[rows], self._matte[rows]
         found = photo * (matte > 0)[..., None]
         mixed = np.nonzero((matte > 0) & (matte < 1))
         if len(mixed[0]):
-            y = mixed[0] + range(self.shape[0])[rows].start
+            y = mixed[0] + rows.start
             own, background = np.split(_looked_up(self._means, y, mixed[1], self.shape), 2, -1)
             mixture, share = photo[mixed], matte[mixed]
             found[mixed] = np.minimum(_unmixed(mixture, share, own, background), mixture / share[:, None])

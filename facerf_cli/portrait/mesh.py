@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
+import torch
 
 from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
@@ -151,11 +152,11 @@ def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[S
     boxes: list[_Box] = []
     for network, detector in ((people.near_faces, _NEAR), (people.far_faces, _FAR)):
         anchors = detector.anchors()
-        for square in squares:
-            image = square.cut(image_srgb, detector.side_px, outside=0.0)
-            out = network(image[None] * 2 - 1)
-            score = out["scores"][0, :, 0].sigmoid().numpy()
-            values = out["boxes"].reshape(-1, 8, 2).numpy() / detector.side_px
+        images = torch.stack([square.cut(image_srgb, detector.side_px, outside=0.0) for square in squares])
+        out = network(images * 2 - 1)
+        scores = out["scores"][..., 0].sigmoid().numpy()
+        all_values = out["boxes"].reshape(len(squares), -1, 8, 2).numpy() / detector.side_px
+        for square, score, values in zip(squares, scores, all_values, strict=True):
             likely = score > detector.least_score
             for middle, size, eyes, its_score in zip(
                 values[likely, 0] + anchors[likely],

@@ -154,17 +154,18 @@ def look_at_person(
     fit: FaceFit,
     segmentation: Segmentation | None = None,
     matte: np.ndarray | None = None,
+    others_px: np.ndarray | None = None,
 ) -> SeenPerson:
     """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
 
     All is seen in the square around the landmarks; a `segmentation` may be given, or the person's `matte`
-    [H, W].
+    [H, W], or landmarks [N, 68, 2] of the other heads.
     Raises InputError where no skin is seen, by which the person is exposed.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = portrait_square(landmarks_px)
     shown = to_display(photo)
-    segmentation = segmentation or segment(people, shown, landmarks_px, matte)
+    segmentation = segmentation or segment(people, shown, landmarks_px, matte, others_px)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or relight --reflectance field")

@@ -86,12 +86,16 @@ def segment(
     image_srgb: np.ndarray,
     landmarks_px: np.ndarray,
     matte: np.ndarray | None = None,
+    others_px: np.ndarray | None = None,
 ) -> Segmentation:
-    """Segment one person, with landmarks [68, 2], in an sRGB uint8 image [H, W, 3]; a matte may be given."""
+    """Segment one person, with landmarks [68, 2], in an sRGB uint8 image [H, W, 3]; a matte may be given.
+
+    The other heads, whose landmarks may be given [N, 68, 2], are looked for otherwise.
+    """
     small = small_image(image_srgb)
     if matte is not None:
         return within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
-    classes, shares, head = _look(people, image_srgb, landmarks_px, small)
+    classes, shares, head = _look(people, image_srgb, landmarks_px, small, others_px)
     found = segmentation_of(_within_share(classes, shares.person), image_srgb, landmarks_px)
     places = _places((small.shape[1], small.shape[2]), found.matte.shape).astype(int)
     small_matte = found.matte[places[..., 1], places[..., 0]]
@@ -107,12 +111,17 @@ def seen_classes(
 
 
 def _look(
-    people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
+    people: PeopleNetworks,
+    image_srgb: np.ndarray,
+    landmarks_px: np.ndarray,
+    small: Tensor,
+    others_px: np.ndarray | None = None,
 ) -> tuple[Tensor, PersonShares, HeadPlace]:
     """Shares of the classes as the Parsing Network sees them, those of the person, and the head's place."""
     classes = parsed(people.parsing, image_srgb, landmarks_px, small)
     scale = small.shape[2] / image_srgb.shape[1]
-    everyone = [landmarks_px, *_neighbours(people, image_srgb, landmarks_px)]
+    others = _neighbours(people, image_srgb, landmarks_px) if others_px is None else others_px
+    everyone = [landmarks_px, *others]
     heads = [HeadPlace.of(points * scale) for points in everyone]
     shares = person_among(people, small.permute(1, 2, 0).numpy(), heads, 1 - classes[0].numpy())
     return classes, shares, heads[0]

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -48,27 +50,30 @@ class Field:
         """Yield OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T].
 
         `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s (paper,
-        'Network Architecture'). The encoder runs once, the decoder once a light.
+        'Network Architecture'). The encoder runs once a field, the decoder once a light.
         """
         network, face, device = self._network, self.face, self.models.device
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
-        normals = normals[None].to(device)
-        visible = face.visible[None, None]
-        shown = face.texture
+        normals, grey = normals[None].to(device), is_grey(face.texture)
+        for chunk in torch.split(lights, self._batch(len(lights))):
+            # autocast does not enclose the yield, or it would stay on in the caller
+            with mixed_precision(device, self.bf16):
+                olats = network.decode(self._encoded, normals, chunk[None].to(device))[0]
+            olats = olats.float().cpu()
+            olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
+            yield self.quotient.corrected(olats) if self.quotient else olats
+
+    @cached_property
+    def _encoded(self) -> Any:
+        """The face as the network's encoder sees it."""
+        face, device = self.face, self.models.device
+        visible, shown = face.visible[None, None], face.texture
         if self.even_shade:
             skin = face.visible * region_mask("skin", shown.shape[-1])
             shown = shown * without_colour_of_shade(shown, skin)
         texture = without_cast(shown[None], visible, self.models.source_colours)
-        source, grey = (texture, face.normals[None], visible), is_grey(face.texture)
         with mixed_precision(device, self.bf16):
-            encoded = network.encode(*(tensor.to(device) for tensor in source))
-        for chunk in torch.split(lights, self._batch(len(lights))):
-            # autocast does not enclose the yield, or it would stay on in the caller
-            with mixed_precision(device, self.bf16):
-                olats = network.decode(encoded, normals, chunk[None].to(device))[0]
-            olats = olats.float().cpu()
-            olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
-            yield self.quotient.corrected(olats) if self.quotient else olats
+            return self._network.encode(*(x.to(device) for x in (texture, face.normals[None], visible)))
 
     @property
     def _network(self) -> ReflectanceNetwork:

@@ -12,16 +12,14 @@ strands show the photo's own light, and where the photo is nearly black. R' is l
 """
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
-from facerf_cli.image.strips import STRIP_PX, Band, strips
+from facerf_cli.image.strips import STRIP_PX, Band, box_means, strips
 
 _BLUR = 0.5  # reach of G, in pixels of the maps
 _DARK = (0.02, 0.08)  # A at which w is 0, and 1, in units of the person's mean
 _FAINT = 0.1  # strength of detail, root mean square of its logarithm, at which f is 1 / e
 _LARGEST = 8.0  # of A / G(A)
 _TINY, _MOST = 1e-6, 6e4  # of A in units of its mean
-_EVERY = 8  # row of which the mean is taken
 _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
 
 
@@ -35,23 +33,20 @@ class Grain:
         self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
         self._margin = 2 * self._reach
-        mean, values = self._mean(flat), np.empty((*share.shape, 2), np.float16)
+        values = np.empty((*share.shape, 2), np.float16)
+        unit, total, count = 0.0, 0.0, 0
         for rows in strips(share.shape):
-            values[rows] = (flat(rows) / mean).clip(max=_MOST)
+            light = flat(rows)
+            inside = light[self._inside[rows], 0]
+            total, count = total + float(inside.sum()), count + len(inside)
+            unit = unit or total / max(count, 1)  # near enough to the mean for half floats
+            values[rows] = (light / max(unit, _TINY)).clip(max=_MOST)
+        scale = np.float32(max(unit, _TINY) * max(count, 1) / max(total, _TINY))
         self._weight, self._detail = (np.empty(share.shape, np.float16) for _ in range(2))
         for rows in strips(share.shape, _STRIP_PX):
             wide, own = self._around(rows, 2 * self._margin)
-            weight, detail = self._read(values[wide].astype(np.float32), share[wide], wide)
+            weight, detail = self._read(values[wide] * scale, share[wide], wide)
             self._weight[rows], self._detail[rows] = weight[own], detail[own]
-
-    def _mean(self, flat: Band) -> float:
-        """Mean of A inside the person, of some rows."""
-        total, count = _TINY, 1
-        for row in range(0, len(self._inside), _EVERY):
-            inside = self._inside[row]
-            total += float(flat(slice(row, row + 1))[0, inside, 0].sum())
-            count += int(inside.sum())
-        return max(total / count, _TINY)
 
     def _read(self, values: np.ndarray, share: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """Weight w and detail D [h, W] of some rows of A and B [h, W, 2], in units of the mean of A."""
@@ -84,11 +79,6 @@ class Grain:
     def _blurred(self, values: np.ndarray, rows: slice) -> np.ndarray:
         """Some rows of an image [h, W, C], blurred inside the person, by two boxes."""
         inside = self._inside[rows][..., None].astype(np.float32)
-        size = (2 * self._reach + 1, 2 * self._reach + 1, 1)
-
-        def blurred(image: np.ndarray) -> np.ndarray:
-            return np.asarray(
-                uniform_filter(uniform_filter(image, size, mode="nearest"), size, mode="nearest")
-            )
-
-        return blurred(values * inside) / blurred(inside).clip(min=_TINY)
+        both = box_means(np.concatenate([values * inside, inside], -1), self._reach)
+        both = box_means(both, self._reach)
+        return both[..., :-1] / both[..., -1:].clip(min=_TINY)
