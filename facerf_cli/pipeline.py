@@ -47,7 +47,7 @@ from facerf_cli.relighting.field import (
     shrunk,
 )
 from facerf_cli.relighting.models import Models, Sides
-from facerf_cli.relighting.own_light import own_light
+from facerf_cli.relighting.own_light import light_of_frames, over_rig, own_light, share_of_lamp
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
 
 
@@ -240,6 +240,8 @@ class Estimator:
 
 
 DEFAULT_ESTIMATOR = Estimator()
+_ONE_LAMP = 0.8  # share of the lamp in a photo's light from which it may be the light
+_AS_WELL = 1.1  # times the error of the rig's lights: one lamp then explains the photo as well
 
 
 def explain(
@@ -285,7 +287,7 @@ class LightEstimate:
     """The light of a photo, the evidence for it, and the texture [3, t, t] of the face under it.
 
     If features refined the weights, `refined` holds the refinement, and `least_squares` [L, 3] are those
-    before.
+    before. `lamp_share` is the share of one lamp in the light, where that was asked.
     """
 
     light: RigLight
@@ -293,6 +295,7 @@ class LightEstimate:
     explained: Tensor
     refined: RefinedLight | None = None
     least_squares: Tensor | None = None
+    lamp_share: float | None = None
 
 
 def estimate_light(
@@ -308,6 +311,7 @@ def estimate_light(
 
     Of a shot the heads of `more` frames take part in the field's least squares.
 
+    Where one lamp and light from around explain the photo as well, they are its light (`own_light.py`).
     The models other than the field estimate their own light. Eyes are left out, as in the paper,
     unless `keep_eyes`. Raises InputError where too little of the face is visible.
     """
@@ -324,9 +328,16 @@ def estimate_light(
         for one, seen in heads
     ]
     evidence, features = frames[0], estimator.features
-    weights = joined(frames).least_squares(estimator.non_negative)
+    whole = joined(frames)
+    weights, share = whole.least_squares(estimator.non_negative), None
+    if estimator.non_negative:
+        own = light_of_frames(models, [one.face for one, _ in heads])
+        share, one_lamp = share_of_lamp(own), over_rig(own, rig)
+        left = [whole.residual(whole.relit(either)) for either in (weights, one_lamp)]
+        if share > _ONE_LAMP and left[1] < _AS_WELL * left[0]:
+            weights = one_lamp
     if features is None:
-        return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights))
+        return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights), lamp_share=share)
 
     def layers(x: Tensor) -> list[Tensor]:
         return [layer.cpu() for layer in features.layers((x / exposure).to(models.device))]
@@ -334,4 +345,4 @@ def estimate_light(
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
     refined = refine_light(evidence, weights, layers, estimator.non_negative)
     light = RigLight(rig, refined.weights)
-    return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights)
+    return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights, share)

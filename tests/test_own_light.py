@@ -4,15 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+import torch.nn.functional as F
 
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.pipeline import fit_photo
+from facerf_cli.pipeline import estimate_light, fit_photo
 from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.own_light import light_of_frames, own_light
+from facerf_cli.relighting.own_light import light_of_frames, over_rig, own_light
 from tests import astronaut
 
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
@@ -70,6 +71,33 @@ def test_light_from_all_around_has_no_lamp(models: Models, face: FaceTexture) ->
     found = own_light(models, lit(models, face, AROUND)).light.weights
     assert found[0].sum() < 0.1 * found.sum()
     assert found[1:].std() < 0.3 * found[1:].mean()
+
+
+def test_over_a_rig_the_light_keeps_its_sum_and_the_lamp_its_place() -> None:
+    lamp, rig = azel_to_direction(-38.0, 12.0), rig_directions(150)
+    around = torch.rand(32, 3, generator=torch.Generator().manual_seed(1)) / 32
+    light = RigLight(torch.cat([lamp[None], rig_directions(32)]), torch.cat([torch.ones(1, 3), around]))
+    weights = over_rig(light, rig)
+    torch.testing.assert_close(weights.sum(0), light.weights.sum(0))
+    alone = over_rig(RigLight(light.directions, light.weights * torch.eye(33)[:, :1]), rig)
+    assert (alone[:, 0] > 0).sum() == 3
+    assert degrees_between(F.normalize(alone[:, 0] @ rig, dim=0), lamp) < 2  # the triangle's sides have 18
+    assert (weights >= alone).all()
+
+
+@pytest.mark.parametrize(("fill", "one_lamp"), [(0.02, True), (0.6, False)])
+def test_one_lamp_that_explains_the_photo_is_its_light(
+    models: Models, face: FaceTexture, fill: float, one_lamp: bool
+) -> None:
+    """With much light from elsewhere the rig's lights are the estimate. No light explains the noise."""
+    lamps = azel_to_direction(torch.tensor([-38.0, 70.0]), torch.tensor([12.0, 40.0]))
+    shown = lit(models, face, RigLight(lamps, torch.tensor([[1.0], [fill]]).expand(2, 3)))
+    noise = 1 + 0.12 * torch.randn(shown.texture.shape, generator=torch.Generator().manual_seed(0))
+    head = replace(astronaut.head(), face=replace(shown, texture=shown.texture * noise))
+    found = estimate_light(models, head)
+    rig_alone = found.evidence.least_squares()
+    assert found.lamp_share is not None and (found.lamp_share > 0.8) == one_lamp
+    assert torch.equal(found.light.weights, rig_alone) != one_lamp
 
 
 def test_the_quotient_is_of_the_light_that_is_held(models: Models, face: FaceTexture) -> None:

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.head import FaceTexture
+from facerf_cli.light.envmap import lights_around
 from facerf_cli.light.estimate import estimate_lamps, lamp_error
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
@@ -24,6 +25,7 @@ from facerf_cli.relighting.models import Models
 _AROUND = 32  # lights of the rig from around
 _RINGS_DEG = (14.0, 6.0)  # of the search for the lamp, each around the best place so far
 _RING = 6  # places on a ring
+_TINY = 1e-12  # avoids divisions by 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +53,24 @@ def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -
 def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
     """Estimate one light, on small textures, from several frames of a shot together."""
     return _estimated([_Frame.of(models, face) for face in faces])
+
+
+def over_rig(light: RigLight, rig: Tensor) -> Tensor:
+    """Weights [L, 3] of a rig's lights that shine as a light of `light_of_frames` does.
+
+    The lamp is shared by the three lights around it, and the light from around keeps its sum.
+    """
+    weights = torch.zeros(len(rig), 3)
+    index, share = lights_around(light.directions[:1], rig)
+    weights.index_add_(0, index[0], share[0][:, None].float() * light.weights[:1])
+    index, share = lights_around(rig, light.directions[1:])
+    even = (share[..., None].float() * light.weights[1:][index]).sum(1)
+    return weights + even * (light.weights[1:].sum(0) / even.sum(0).clamp_min(_TINY))
+
+
+def share_of_lamp(light: RigLight) -> float:
+    """The lamp's share of all the light that `light_of_frames` found, 0 to 1."""
+    return float(light.weights[0].sum() / light.weights.sum().clamp_min(_TINY))
 
 
 @dataclass(frozen=True, eq=False)

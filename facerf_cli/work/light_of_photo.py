@@ -94,6 +94,7 @@ def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.n
 
 
 _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
+_SOFT = 0.32  # share of one lamp below which the brightest direction was 24 to 120 degrees off
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -163,6 +164,8 @@ def _estimate(
             item.input_path,
             100 * residual,
         )
+    if estimate.lamp_share is not None and estimate.lamp_share < _SOFT:
+        log.info("%s: soft light; its brightest direction is doubtful", item.input_path)
     return estimate, _facts(estimate, residual, options, name)
 
 
@@ -193,6 +196,8 @@ def _facts(
     if options.reflectance != "field":
         return facts | {"non_negative": bool((light.weights >= 0).all())}
     facts |= {"non_negative": options.non_negative, "features": features}
+    if estimate.lamp_share is not None:
+        facts["lamp_share"] = round(estimate.lamp_share, 3)
     if (refined := estimate.refined) is not None and estimate.least_squares is not None:
         facts |= {
             "feature_loss": [float(f"{loss:.4g}") for loss in (refined.loss_before, refined.loss_after)],
