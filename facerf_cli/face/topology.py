@@ -169,9 +169,9 @@ def region_mask(name: str, side: int) -> Tensor:
     """The mask [T, T] in 0..1 of the region `name`; row 0 is the forehead; symmetric in u."""
     if name == "skin":
         return (1 - torch.stack([region_mask(part, side) for part in _NOT_SKIN]).sum(0)).clamp(0, 1)
-    centre = (np.arange(side) + 0.5) / side
+    outline, centre = _outline_mm(name) / UV_SIZE_MM, (np.arange(side) + 0.5) / side
     edge_mm = max(_EDGE_MM[name], UV_SIZE_MM.max() / side)  # never sharper than a texel
-    outline, margin = _outline_mm(name) / UV_SIZE_MM, edge_mm / UV_SIZE_MM
+    margin = edge_mm / UV_SIZE_MM
     bounds = zip(outline.min(0) - margin, outline.max(0) + margin, strict=True)
     columns, rows = (np.flatnonzero((low < centre) & (centre < high)) for low, high in bounds)
     uv = np.stack(np.meshgrid(centre[columns], centre[rows]), -1)

@@ -11,6 +11,8 @@ where the detail of B is faint, as grain is, and 0 where it is strong, as edges 
 strands show the photo's own light, and where the photo is nearly black. R' is linear in R: layers add up.
 """
 
+import math
+
 import numpy as np
 
 from facerf_cli.image.strips import STRIP_PX, Band, box_means, strips
@@ -39,9 +41,12 @@ class Grain:
             light = flat(rows)
             inside = light[self._inside[rows], 0]
             total, count = total + float(inside.sum()), count + len(inside)
-            unit = unit or total / max(count, 1)  # near enough to the mean for half floats
-            values[rows] = (light / max(unit, _TINY)).clip(max=_MOST)
-        scale = np.float32(max(unit, _TINY) * max(count, 1) / max(total, _TINY))
+            if (
+                not unit and total > 0
+            ):  # near enough to the mean for half floats, which it rounds no other way
+                unit = 2.0 ** round(math.log2(total / count))
+            values[rows] = (light / (unit or 1)).clip(max=_MOST)
+        scale = np.float32((unit or 1) * max(count, 1) / max(total, _TINY))
         self._weight, self._detail = (np.empty(share.shape, np.float16) for _ in range(2))
         for rows in strips(share.shape, _STRIP_PX):
             wide, own = self._around(rows, 2 * self._margin)
