@@ -10,10 +10,12 @@ from facerf_cli.image.strips import whole
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
+from facerf_cli.portrait.mesh import SeenEyes
 from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
 from tests import astronaut
 
 SIDE, IRIS = 40, np.array([[20.0, 18.0, 10.0]])
+LIDS = np.array([[5.0, 0], [35, 0], [35, 24], [5, 24]])  # the lower one covers the end of the iris
 DARK = np.full((SIDE, SIDE, 3), 0.05, np.float32)
 
 
@@ -58,7 +60,7 @@ def test_a_light_is_seen_alike_whatever_else_shines() -> None:
 
 
 def eyes(photo: np.ndarray) -> Eyes:
-    return Eyes(photo.__getitem__, IRIS, lambda rows: np.ones((SIDE, SIDE), np.float32)[rows], (SIDE, SIDE))
+    return Eyes(photo.__getitem__, SeenEyes(IRIS, LIDS[None]), (SIDE, SIDE))
 
 
 def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
@@ -72,6 +74,16 @@ def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
     rows = slice(17, 21)
     part = eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored[None])(rows)
     assert np.array_equal(part, found[rows])
+
+
+def test_a_lid_before_the_iris_keeps_its_light() -> None:
+    """It is brighter than the iris, as a catchlight is, and mirrors nothing."""
+    photo = DARK.copy()
+    photo[24:] = 0.5
+    mirrored = torch.ones(1, 3, 64, 64)
+    found = whole(eyes(photo).lit(lambda rows: photo[rows].copy(), mirrored), SIDE, SIDE)
+    assert np.array_equal(found[24:], photo[24:])
+    assert found[23, 20].min() > 1
 
 
 def test_light_that_arrives_from_near_and_far() -> None:

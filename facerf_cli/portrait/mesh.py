@@ -17,6 +17,10 @@ from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.parse import Square, whole_photo
 
 _IRISES = [range(468, 473), range(473, 478)]  # points of each
+_LIDS = [  # points around the opening of each eye
+    [33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246],
+    [263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466],
+]
 _AROUND_68 = 1.8  # side of the square around the 68 landmarks, in their extents
 _MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
 _MESH_PX = 192
@@ -77,6 +81,18 @@ class FaceMesh:
 
 
 @dataclass(frozen=True, eq=False)
+class SeenEyes:
+    """N eyes in a photo's pixels: irises [N, 3], centres and radii, and the lids around them [N, 16, 2]."""
+
+    irises_px: np.ndarray
+    lids_px: np.ndarray
+
+    def scaled(self, scale: float) -> "SeenEyes":
+        """The eyes in the photo at another size."""
+        return SeenEyes(self.irises_px * scale, self.lids_px * scale)
+
+
+@dataclass(frozen=True, eq=False)
 class _Box:
     """A proposed face: its square, level with the eyes, and score."""
 
@@ -128,14 +144,14 @@ def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) ->
     return mesh if mesh.score > _LEAST_MESH_SCORE and extent_px > _LEAST_PX else None
 
 
-def irises_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
-    """Centres and radii [N, 3], in pixels, of the irises of a face, by its landmarks [68, 2]; or none."""
+def eyes_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> SeenEyes:
+    """Both eyes of a face, by its landmarks [68, 2]; or none."""
     mesh = mesh_near(people, image_srgb, Square.around(landmarks_px, _AROUND_68, above=0.1))
     if mesh is None:
-        return np.zeros((0, 3))
+        return SeenEyes(np.zeros((0, 3)), np.zeros((0, len(_LIDS[0]), 2)))
     irises = mesh.points_px[_IRISES, :2]  # [2, 5, 2]: the middle, and four points of the outline
     radii = np.linalg.norm(irises[:, 1:] - irises[:, :1], axis=-1).mean(1)
-    return np.concatenate([irises[:, 0], radii[:, None]], 1)
+    return SeenEyes(np.concatenate([irises[:, 0], radii[:, None]], 1), mesh.points_px[_LIDS, :2])
 
 
 def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -> float:

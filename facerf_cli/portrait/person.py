@@ -17,7 +17,7 @@ from facerf_cli.image.colour import without_fireflies
 from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.mesh import irises_of
+from facerf_cli.portrait.mesh import SeenEyes, eyes_of
 from facerf_cli.portrait.proxy import (
     Proxy,
     ProxyMaps,
@@ -48,7 +48,7 @@ class SeenPerson:
     maps: ProxyMaps
     fit: FaceFit
     segmentation: Segmentation
-    irises_px: np.ndarray  # [N, 3] centres and radii in the photo
+    eyes: SeenEyes
 
     @cached_property
     def exposure(self) -> float:
@@ -65,8 +65,9 @@ class SeenPerson:
 
     def reaching_irises(self, directions: Tensor) -> Tensor:
         """Share [N, L] of lights [L, 3] that reaches each of N irises."""
-        found = torch.zeros(len(self.irises_px), len(directions))
-        places = self.square.to_crop(self.irises_px[:, :2]).clip(0, self.square.size_px - 1).astype(int)
+        irises_px = self.eyes.irises_px
+        found = torch.zeros(len(irises_px), len(directions))
+        places = self.square.to_crop(irises_px[:, :2]).clip(0, self.square.size_px - 1).astype(int)
         for share, (column, row) in zip(found, places, strict=True):
             fields = (self.maps.normals, self.maps.positions_m, self.maps.covered)
             maps = ProxyMaps(*(field[..., row, column, None, None] for field in fields))
@@ -171,8 +172,8 @@ def look_at_person(
         raise InputError("no skin is seen around the landmarks; check them, or relight --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
     maps = proxy_maps(proxy, square_camera(fit, square))
-    irises_px = irises_of(people, shown, landmarks_px)
-    return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation, irises_px)
+    eyes = eyes_of(people, shown, landmarks_px)
+    return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation, eyes)
 
 
 def _image_in(photo: np.ndarray, square: Crop) -> Tensor:

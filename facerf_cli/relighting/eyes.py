@@ -5,17 +5,18 @@ What is far brighter than the rest of an iris in the photo is a catchlight. All 
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F
+from skimage.draw import polygon2mask
 from torch import Tensor
 
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import Band
+from facerf_cli.image.strips import Band, block_means
 from facerf_cli.light.studio_points import seen_radii
+from facerf_cli.portrait.mesh import SeenEyes
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import smoothstep
 
@@ -23,6 +24,8 @@ _IRIS_OF_CORNEA = 5.9 / 7.8  # their radii, mm
 _REFLECTED = 0.025  # by Fresnel's law, of light that arrives at a right angle
 _SIDE = 64  # of the mirror image
 _LEAST_PX = 2.0  # radius of an iris in which something can be seen
+_RIM = 0.85  # of the radius: beyond it what is bright is the white of the eye
+_FINE = 4  # parts of a pixel at the lids, along each side
 _CATCHLIGHT = 1.5  # radiance from which on a pixel is a catchlight, over the median of the iris
 
 
@@ -59,20 +62,11 @@ class _Iris:
 
 
 class Eyes:
-    """The irises [N, 3] of a person in a photo [H, W, 3]: centres and radii in its pixels.
+    """The irises of a person's eyes, as far as they show between the lids in a photo [H, W, 3]."""
 
-    `opening` gives the share [h, W] of the eyes, between the lids, in some rows.
-    """
-
-    def __init__(
-        self,
-        photo: Band,
-        irises_px: np.ndarray,
-        opening: Callable[[slice], np.ndarray],
-        size_px: tuple[int, ...],
-    ) -> None:
+    def __init__(self, photo: Band, eyes: SeenEyes, size_px: tuple[int, ...]) -> None:
         self._irises = []
-        for number, (x_px, y_px, radius_px) in enumerate(irises_px.tolist()):
+        for number, (x_px, y_px, radius_px) in enumerate(eyes.irises_px.tolist()):
             rows, columns = (
                 slice(max(0, math.floor(middle - radius_px)), min(length, math.ceil(middle + radius_px)))
                 for middle, length in zip((y_px, x_px), size_px, strict=True)
@@ -84,11 +78,13 @@ class Eyes:
                 for at, middle in ((rows, y_px), (columns, x_px))
             )
             away = (x[None].square() + y[:, None].square()).sqrt().numpy()
-            share = ((1 - away) * radius_px + 0.5).clip(0, 1) * opening(rows)[:, columns]
+            inner, disc = (((end - away) * radius_px + 0.5).clip(0, 1) for end in (_RIM, 1))
+            share = disc * _between(eyes.lids_px[number], rows, columns)
             light = luminance(photo(rows)[:, columns])
             if (share > 0.5).any():
                 most = _CATCHLIGHT * np.median(light[share > 0.5])
-                kept = np.minimum(1, most / np.maximum(light, 1e-9)).astype(np.float32)
+                darker = (1 - most / np.maximum(light, 1e-9)).clip(min=0)
+                kept = (1 - inner * darker).astype(np.float32)
                 grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
                 self._irises.append(_Iris(number, rows, columns, share.astype(np.float32), kept, grid))
 
@@ -116,3 +112,11 @@ class Eyes:
         small = F.interpolate(mirrored[None], (side, side), mode="area")
         found = F.grid_sample(small, iris.grid, padding_mode="border", align_corners=False)
         return np.asarray(found[0].permute(1, 2, 0).numpy())
+
+
+def _between(lids_px: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
+    """Share [h, w] of the opening between lids, an outline [N, 2], in a window of the photo."""
+    size = rows.stop - rows.start, columns.stop - columns.start
+    corners = (lids_px - (columns.start, rows.start)) * _FINE - PIXEL_CENTRE
+    inside = polygon2mask((size[0] * _FINE, size[1] * _FINE), corners[:, ::-1])
+    return block_means(inside[..., None], _FINE)[..., 0]

@@ -4,7 +4,7 @@ Of its views the narrower lies over the wider one, and fades toward its border.
 """
 
 from collections.abc import Sequence
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from torch import Tensor
@@ -53,8 +53,7 @@ class WholePerson:
         flat = self._joined(photo, [view.without_light(display_ev) for view in self._views])
         hair = self._segmentation.layer("hair")
         grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px)
-        opening = partial(self._segmentation.layer, "eyes")
-        return grain, Eyes(photo.__getitem__, self._person.irises_px, opening, self._size_px)
+        return grain, Eyes(photo.__getitem__, self._person.eyes, self._size_px)
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [views, 9, S, S]."""

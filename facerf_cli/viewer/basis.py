@@ -197,8 +197,8 @@ def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) ->
 
     def shrunk(view: PortraitView) -> PortraitView:
         square = view.person.square.of_scaled(scale)
-        irises_px = view.person.irises_px * scale
-        person = replace(view.person, square=square, segmentation=segmentation, irises_px=irises_px)
+        eyes = view.person.eyes.scaled(scale)
+        person = replace(view.person, square=square, segmentation=segmentation, eyes=eyes)
         return replace(view, person=person)
 
     return replace(field, views=tuple(map(shrunk, field.views)))
