@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from facerf_cli.light.sh import cosine_lobe, sh_basis
 from facerf_cli.network.portrait import PortraitInputs, PortraitNetwork
+from facerf_cli.synth.bank.portrait_samples import StoredTransport
 from facerf_cli.synth.bank.portraits import load_backgrounds
-from facerf_cli.synth.bank.transport import StoredTransport
 from facerf_cli.training.loop import Row, train
 from facerf_cli.training.portrait import PortraitObjective
 from facerf_cli.training.settings import AdamW, preset_of

@@ -29,8 +29,8 @@ from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.synth.bank.portrait_samples import load_view
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
-from facerf_cli.synth.bank.transport import load_view
 from facerf_cli.synth.portraits import images_under
 from facerf_cli.training.objective import seeded
 

@@ -25,8 +25,8 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import draw_appearance
+from facerf_cli.synth.bank.portrait_samples import StoredView, load_view
 from facerf_cli.synth.bank.texture_samples import draw_light
-from facerf_cli.synth.bank.transport import StoredView, load_view
 from facerf_cli.synth.portraits import albedo_of, images_under, materials_of
 from facerf_cli.synth.shading import Material
 from facerf_cli.training.objective import seeded

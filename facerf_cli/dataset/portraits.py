@@ -34,15 +34,14 @@ from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.workers import in_shards, one_thread
-from facerf_cli.synth.bank.texture_samples import draw_target_lights
-from facerf_cli.synth.bank.transport import (
+from facerf_cli.synth.bank.portrait_samples import (
     LitPerson,
     PortraitSample,
-    layers_of,
-    person_in,
     sample_of,
     source_light,
 )
+from facerf_cli.synth.bank.texture_samples import draw_target_lights
+from facerf_cli.synth.bank.transport import layers_of, person_in
 
 _AROUND = 48  # lights of the rig all around whose shadows are summarised, as of photos
 log = logging.getLogger(LOGGER_NAME)

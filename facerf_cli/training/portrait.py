@@ -16,7 +16,7 @@ from torch import Tensor
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.bank.transport import SMALL, PortraitSample, PortraitSource
+from facerf_cli.synth.bank.portrait_samples import SMALL, PortraitSample, PortraitSource
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import tiled
 

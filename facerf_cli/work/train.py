@@ -33,6 +33,7 @@ from facerf_cli.run.logs import LOGGER_NAME, STDERR
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.synth.bank.heads import add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.parsing import StoredPortraits
+from facerf_cli.synth.bank.portrait_samples import PortraitSource, StoredTransport
 from facerf_cli.synth.bank.portraits import (
     BACKGROUND_HEAPS,
     BACKGROUND_MAPS,
@@ -44,8 +45,6 @@ from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.synth.bank.transport import (
     SIDE_PX,
     TINY_BANK,
-    PortraitSource,
-    StoredTransport,
     TransportBankSettings,
     add_proxies,
     add_transport,

@@ -12,7 +12,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
-from facerf_cli.synth.bank.transport import PortraitSample
+from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from tests.dataset.dataset_fixture import write_small_dataset
 
 LACKS = 3

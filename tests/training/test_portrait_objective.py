@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.synth.bank.transport import PortraitSample
+from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 
 SIDE, RIG = 16, rig_directions(12)

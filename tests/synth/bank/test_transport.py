@@ -20,15 +20,17 @@ from facerf_cli.network.portrait import SKIN
 from facerf_cli.raster.camera import project
 from facerf_cli.synth import bank
 from facerf_cli.synth.bank import Files, transport
-from facerf_cli.synth.bank.transport import (
-    SCALES,
+from facerf_cli.synth.bank.portrait_samples import (
     PortraitSample,
     StoredTransport,
     StoredView,
-    TransportBankSettings,
-    add_transport,
     draw_targets,
     load_view,
+)
+from facerf_cli.synth.bank.transport import (
+    SCALES,
+    TransportBankSettings,
+    add_transport,
     seen_path,
 )
 from facerf_cli.synth.portraits import albedo_of, images_under
@@ -141,7 +143,7 @@ def test_samples_are_exposed_by_the_skin(folder: Path) -> None:
 
 def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
     """Normals, lights, shadows and their summary are mirrored alike."""
-    from facerf_cli.synth.bank.transport import mirrored
+    from facerf_cli.synth.bank.portrait_samples import mirrored
 
     sample = drawn(folder, 2)
     other = mirrored(sample)
