@@ -261,7 +261,7 @@ def test_a_dark_source_is_rendered_and_not_multiplied() -> None:
     source[:, 16:19, 22:25] = 1e-6  # a cheek's
     face, screen, shown = flat_face(source)
     photo = shown + np.float32(1e-3)  # noise of the photo over the texture
-    relit = PhotoDetail(face, screen).relit(photo, torch.full((3, 32, 32), 0.3))(slice(0, 32))
+    relit = PhotoDetail(face, screen, photo).relit(torch.full((3, 32, 32), 0.3))(slice(0, 32))
     np.testing.assert_allclose(relit, 0.3, atol=0.02)  # the quotient would be 300
 
 
@@ -269,17 +269,17 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
     noise = torch.Generator().manual_seed(2)
     face, screen, shown = flat_face(0.01 + torch.rand(3, 48, 48, generator=noise))
     photo = (shown * np.random.default_rng(0).uniform(0, 2, shown.shape)).astype(np.float32)
-    detail, rows = PhotoDetail(face, screen), slice(0, 48)
+    detail, rows = PhotoDetail(face, screen, photo), slice(0, 48)
     own_region = (region_mask("eyes", 128) + region_mask("mouth", 128) + region_mask("brows", 128)).clamp(
         max=1
     )
     skin = torch.nn.functional.interpolate(own_region[None, None], (48, 48), mode="bilinear")[0, 0] < 1e-3
     bright = skin.numpy() & (luminance(photo) > 2 * detail.floor)  # below, colours are noise
-    returned = detail.relit(photo, face.texture)(rows)
+    returned = detail.relit(face.texture)(rows)
     np.testing.assert_allclose(returned[bright], photo[bright], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(returned[skin], photo[skin], atol=detail.floor)
     one_sided = face.texture * (torch.arange(48) > 24)
-    assert detail.relit(photo, one_sided)(rows).min() >= 0
+    assert detail.relit(one_sided)(rows).min() >= 0
 
 
 def test_the_colour_of_dark_pixels_is_not_multiplied() -> None:
@@ -288,7 +288,7 @@ def test_the_colour_of_dark_pixels_is_not_multiplied() -> None:
     face, screen, shown = flat_face(source)
     photo = shown.copy()
     photo[17, 23] = 0.02, 0.013, 0.0  # a camera's black in one channel
-    relit = PhotoDetail(face, screen).relit(photo, torch.full((3, 32, 32), 0.4))(slice(0, 32))[17, 23]
+    relit = PhotoDetail(face, screen, photo).relit(torch.full((3, 32, 32), 0.4))(slice(0, 32))[17, 23]
     assert relit[2] > 0.4 * relit[0]  # the quotient would be yellow: 0
 
 
@@ -309,7 +309,7 @@ def test_eyes_keep_their_detail() -> None:
     eyes = region_mask("eyes", 128) > 0.99
     source[:, eyes] = torch.rand(int(eyes.sum()), generator=torch.Generator().manual_seed(1))
     face, screen, photo = flat_face(source)
-    relit = PhotoDetail(face, screen).relit(photo, torch.full((3, 128, 128), 0.2))(slice(0, 128))
+    relit = PhotoDetail(face, screen, photo).relit(torch.full((3, 128, 128), 0.2))(slice(0, 128))
     np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
 
 

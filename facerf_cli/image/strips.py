@@ -3,6 +3,7 @@
 import logging
 import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ _HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
 
 
+T = TypeVar("T")
 # Values [h, W, ...] of some rows of an image.
 Band = Callable[[slice], np.ndarray]
 Layer = Band | np.ndarray  # of an image [H, W, ...]: computed by rows, or whole already
@@ -66,6 +68,19 @@ def filled(
 def by_rows(layer: Layer) -> Band:
     """A layer as a function of rows."""
     return layer.__getitem__ if isinstance(layer, np.ndarray) else layer
+
+
+def remembered(band: Callable[[slice], T]) -> Callable[[slice], T]:
+    """A function of rows that keeps its last values, for images that share what no light changes."""
+    last: list[Any] = [None, None]
+
+    def of(rows: slice) -> T:
+        if last[0] != rows:
+            last[:] = rows, band(rows)
+        found: T = last[1]
+        return found
+
+    return of
 
 
 def rows_of(array: np.ndarray, rows: slice) -> np.ndarray:

@@ -35,7 +35,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
-from facerf_cli.image.strips import Band, Layer, by_rows, filled
+from facerf_cli.image.strips import Band, Layer, by_rows, filled, remembered
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
@@ -154,7 +154,7 @@ class Composition:
             self.own = PersonColours(self._photo, self.matte)
         shown = self.own.small if isinstance(self.own, PersonColours) else self._photo
         self._display_ev = display_ev(shown)
-        self._detail = PhotoDetail(head.face, self.view)
+        self._detail = PhotoDetail(head.face, self.view, self.own)
         self._finish = self.person.finish(self.own, self._display_ev, self.matte) if self.person else None
         self.surround = self.person or Surround(vertices, crop, head.face.texture, size_px[1])
 
@@ -244,7 +244,7 @@ class Composition:
             return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
         assert self.surround is not None and relit.surround is not None
         around = self.surround.over_photo(self.own, relit.surround, self._display_ev)
-        detail, view = self._detail.relit(self.own, relit.texture), self.view
+        detail, view = self._detail.relit(relit.texture), self.view
 
         def of(rows: slice) -> np.ndarray:
             person = around(rows)
@@ -331,7 +331,7 @@ class PhotoDetail:
     Eyes, brows and teeth stay the photo's: they are scaled as the skin around them.
     """
 
-    def __init__(self, face: FaceTexture, view: FaceView) -> None:
+    def __init__(self, face: FaceTexture, view: FaceView, photo: Pixels) -> None:
         self._view, self._texture = view, face.texture
         own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
         side = face.texture.shape[1:]
@@ -340,23 +340,29 @@ class PhotoDetail:
         self.mean_source = _mean(face.texture, self.trusted)
         self.floor = _DARK * float(self.mean_source.mean()) + _TINY
         self._around_source = inpaint(face.texture, self.trusted).clamp(min=self.floor)
-        self._source = torch.cat([face.texture, own[None]])
+        self._source, self._photo = torch.cat([face.texture, own[None]]), photo
+        self._seen = remembered(self._of_photo)
 
-    def relit(self, photo: Pixels, texture: Tensor) -> Band:
+    def _of_photo(self, rows: slice) -> tuple[np.ndarray, ...]:
+        """Some rows of the window: pixels, what multiplies R and k in them, and share of `_OWN_REGIONS`."""
+        floor = self.floor
+        pixels = self._photo[self._view.in_photo(rows)][:, self._view.window[1]].clip(min=0)
+        source, own = np.split(self._view.render(self._source, rows).numpy(), [3], -1)
+        finer = pixels >= source
+        steady = _steady_colours(pixels, source, _NOISY * floor)
+        darker = steady / source.clip(min=_TINY) + (pixels - steady) / (source + floor)
+        gain = np.where(finer, (pixels + floor) / (source + floor), darker)
+        bias = np.where(finer, floor * (pixels - source) / (source + floor), 0)
+        return pixels, gain, bias, own
+
+    def relit(self, texture: Tensor) -> Band:
         """The photo's pixels in rows [h, w, 3] of the window under the light of a relit texture [3, T, T]."""
         mean_change = (_mean(texture, self.trusted) / self.mean_source.clamp(min=_TINY)).numpy()
-        around = inpaint(texture, self.trusted) / self._around_source
-        textures, floor = torch.cat([texture, around, self._source]), self.floor
+        textures = torch.cat([texture, inpaint(texture, self.trusted) / self._around_source])
 
         def of(rows: slice) -> np.ndarray:
-            pixels = photo[self._view.in_photo(rows)][:, self._view.window[1]].clip(min=0)
-            rendered = self._view.render(textures, rows).numpy()
-            skin, change, source, own = np.split(rendered, [3, 6, 9], -1)
-            finer = pixels >= source
-            steady = _steady_colours(pixels, source, _NOISY * floor)
-            darker = steady / source.clip(min=_TINY) + (pixels - steady) / (source + floor)
-            gain = np.where(finer, (pixels + floor) / (source + floor), darker)
-            bias = np.where(finer, floor * (pixels - source) / (source + floor), 0)
+            pixels, gain, bias, own = self._seen(rows)
+            skin, change = np.split(self._view.render(textures, rows).numpy(), 2, -1)
             skin = skin * gain + mean_change * bias
             return np.asarray(skin + own * (change * pixels - skin))
 

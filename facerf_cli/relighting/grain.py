@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from facerf_cli.image.strips import STRIP_PX, Band, box_means, strips
+from facerf_cli.image.strips import STRIP_PX, Band, box_means, remembered, strips
 
 _BLUR = 0.5  # reach of G, in pixels of the maps
 _DARK = (0.02, 0.08)  # A at which w is 0, and 1, in units of the person's mean
@@ -35,6 +35,9 @@ class Grain:
         self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
         self._margin = 2 * self._reach
+        self._means_inside = remembered(
+            lambda rows: self._means(self._inside[rows][..., None].astype(np.float32)).clip(min=_TINY)
+        )
         values = np.empty((*share.shape, 2), np.float16)
         unit, total, count = 0.0, 0.0, 0
         for rows in strips(share.shape):
@@ -83,7 +86,8 @@ class Grain:
 
     def _blurred(self, values: np.ndarray, rows: slice) -> np.ndarray:
         """Some rows of an image [h, W, C], blurred inside the person, by two boxes."""
-        inside = self._inside[rows][..., None].astype(np.float32)
-        both = box_means(np.concatenate([values * inside, inside], -1), self._reach)
-        both = box_means(both, self._reach)
-        return both[..., :-1] / both[..., -1:].clip(min=_TINY)
+        inside = self._inside[rows][..., None]
+        return self._means(values * inside) / self._means_inside(rows)
+
+    def _means(self, values: np.ndarray) -> np.ndarray:
+        return box_means(box_means(values, self._reach), self._reach)

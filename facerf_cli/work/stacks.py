@@ -23,11 +23,12 @@ from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
-from facerf_cli.image.strips import filled, resized, whole
+from facerf_cli.image.strips import filled, resized
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.pipeline import FittedPerson, predict_olat, reflectance_of
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.composition import Target
+from facerf_cli.run.workers import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,
@@ -44,7 +45,7 @@ from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
 _FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
-_LIGHTS_AT_ONCE = 8  # of a person in the photo's frame
+_LIGHTS_AT_ONCE = 4  # of a person in the photo's frame
 
 
 def write_stacks(item: Item, work: PredictOlat) -> Written:
@@ -126,8 +127,9 @@ def _of_person(
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
             relit = composition.relit(Lights.each(some))
-            layers = np.stack([whole(composition.light_layer(one), *size) for one in relit])
-            batch = torch.from_numpy(layers).permute(0, 3, 1, 2).float()
+            layers = {str(number): composition.light_layer(one) for number, one in enumerate(relit)}
+            images = np.stack(list(filled(layers, *size).values()))
+            batch = torch.from_numpy(images).permute(0, 3, 1, 2)
             scale = _tile_px(len(directions)) / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
             tiles.append(small.permute(0, 2, 3, 1).numpy())
@@ -144,7 +146,7 @@ def _of_person(
         fit=fit_to_arrays(head.fit),
         **_about(item, directions, work),
     )
-    return header, olats()
+    return header, one_ahead(olats())
 
 
 def _of_face(
