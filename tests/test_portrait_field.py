@@ -104,6 +104,22 @@ def test_the_bias_has_the_photos_colours(field: PortraitField) -> None:
     torch.testing.assert_close(found, shown, atol=0.05, rtol=0)
 
 
+def test_a_nearly_black_neck_has_the_colour_of_the_skin(field: PortraitField) -> None:
+    """The few values that a dark neck has are saturated; with gain and bias it would glow."""
+    rig, person = rig_directions(48), field.person
+    inputs = person.inputs(rig, person.visibility(rig))
+    image, classes = inputs.image.clone(), inputs.classes.clone()
+    neck = slice(3 * image.shape[-1] // 4, None)
+    image[:, :, neck] = torch.tensor([0.004, 0.001, 0.0])[:, None, None]
+    classes[:, :, neck] = 0
+    classes[:, class_index("neck"), neck] = 1
+    inputs = replace(inputs, image=image, classes=classes)
+    maps = maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(inputs)))
+    skin = (maps.albedo[0] * classes[0, class_index("skin")]).sum((1, 2))
+    found = maps.bias[0, :, neck].mean((1, 2))
+    torch.testing.assert_close(found / found.mean(), skin / skin.mean(), atol=0.15, rtol=0)
+
+
 def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: PortraitField) -> None:
     """The albedo is the photo, with the shade's colour, times the gain, plus the bias."""
     rig, person = rig_directions(48), field.person

@@ -38,7 +38,8 @@ _LIGHTS_AT_ONCE = 16
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
 _CLOTH = ("garment", "headwear")
-_DARK = 0.1  # of the mean of a person without light: what is darker has no colour of its own
+_SKINS = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
+_DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,22 +248,24 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
 def _with_own_colours(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMaps:
     """Give the bias the colours that the photo shows, and limit it on cloth to what the photo shows there.
 
-    A bias of its own colour bleaches lips. Nearly black pixels, whose colours are noise, have that of their
-    class. Cloth in deep shadow needs more bias, and the network allows for it: dark cloth would lie in haze.
+    A bias of its own colour bleaches lips. What is nearly black in the photo, whose colours are noise, has
+    that of its class; neck, ears and hands have the skin's, or a neck in deep shadow glows orange. Cloth in
+    deep shadow needs more bias, and the network allows for it: dark cloth would lie in haze.
     """
     own = (inputs.image * maps.gain).clamp_min(0)
-    shown = own.mean(1, keepdim=True)
+    shown, light = (image.mean(1, keepdim=True) for image in (own, inputs.image))
     person = 1 - inputs.classes[:, :1]
     dark = (
         _DARK
-        * (shown * person).mean((2, 3), keepdim=True)
+        * (light * person).mean((2, 3), keepdim=True)
         / person.mean((2, 3), keepdim=True).clamp_min(1e-6)
     )
     of_classes = torch.einsum("bkij,bcij->bkc", inputs.classes, own)
+    of_classes[:, _SKINS] = of_classes[:, _SKINS].sum(1, keepdim=True)
     of_classes = of_classes / of_classes.mean(2, keepdim=True).clamp_min(1e-9)
     typical = torch.einsum("bkij,bkc->bcij", inputs.classes, of_classes)
     colour = torch.lerp(
-        typical, own / shown.clamp_min(1e-9), shown**2 / (shown**2 + dark**2).clamp_min(1e-12)
+        typical, own / shown.clamp_min(1e-9), light**2 / (light**2 + dark**2).clamp_min(1e-12)
     )
     amount = maps.bias.mean(1, keepdim=True)
     cloth = inputs.classes[:, [class_index(name) for name in _CLOTH]].sum(1, keepdim=True)
