@@ -65,9 +65,10 @@ def test_lights_add_up(person: Shown) -> None:
     np.testing.assert_allclose(doubled, key * (2, 0.5, 0), atol=1e-3 * doubled.max())
 
 
-def test_a_near_light_far_away_is_a_far_light(person: Shown) -> None:
+@pytest.mark.parametrize("azimuth_deg", [40.0, 150.0])
+def test_a_near_light_far_away_is_a_far_light(person: Shown, azimuth_deg: float) -> None:
     """3 km away; a ray that grazes the proxy may differ, so the mean is compared."""
-    direction = azel_to_direction(40.0, 20.0)
+    direction = azel_to_direction(azimuth_deg, 20.0)
     x, y, z = (3000 * direction).tolist()
     close, far = person.image(StudioLight(at_m=(x, y, z))), person.under(direction[None], torch.ones(1))
     assert np.abs(close - far).mean() < 1e-3 * far[person.matte > 0.5].mean()

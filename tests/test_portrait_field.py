@@ -177,6 +177,19 @@ def test_a_lamp_behind_leaves_the_face_dark(
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
 
 
+def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: FittedPerson) -> None:
+    """The field of a face knows no hair beside it: it would light a temple through the hair."""
+    directions = torch.cat([lamp(azimuth, 20).directions for azimuth in (30, 125, 160)])
+    composition = person.composed(Target(background="none"))
+    weights = torch.cat([torch.eye(3), torch.ones(1, 3)])[..., None].expand(-1, -1, 3)
+    relit = list(composition.relit(Lights(directions, weights)))
+    ahead, behind = relit[0].texture, relit[2].texture
+    assert behind.abs().max() < 1e-4 * ahead.max()
+    *each, together = (composition.image(one).pixels for one in relit)
+    np.testing.assert_allclose(sum(each), together, atol=1e-4 * together.max())
+    assert min(one.min() for one in each) > -1e-12  # rounding
+
+
 def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     photo: np.ndarray, person: FittedPerson, field: PortraitField
 ) -> None:
@@ -200,9 +213,12 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
     """Image and layers of a photo are the same in one strip and in strips of 32 rows."""
     names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 
+    key, behind = lamp(40, 30), lamp(160, 10)
+    lights = RigLight(torch.cat([key.directions, behind.directions]), torch.ones(2, 3))
+
     def shown() -> list[np.ndarray]:
         composition = person.composed()
-        relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
+        relit = next(composition.relit(Lights.of_rig(lights)))
         layers = filled(composition.layers(names, relit), *composition.size_px)
         return [composition.image(relit).pixels, *layers.values()]
 
@@ -239,7 +255,7 @@ def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:
 def test_without_light_all_is_black(field: PortraitField) -> None:
     lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
     for view, one in zip(field.views, lit, strict=True):
-        assert one.stacked.shape == (2, 9, *view.person.image.shape[1:]) and one.stacked.abs().max() == 0
+        assert one.stacked.shape == (2, 15, *view.person.image.shape[1:]) and one.stacked.abs().max() == 0
 
 
 def test_a_turned_head_is_the_fields(field: PortraitField) -> None:

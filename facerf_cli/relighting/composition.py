@@ -43,6 +43,7 @@ from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.whole_person import WholePerson
 
 _DARK = 0.08  # e above, a share of the source's mean
@@ -88,7 +89,7 @@ AS_IN_PHOTO = Target()
 class Relit:
     """A head under one light: its texture [3, T, T], and the light around it.
 
-    `surround` is [3, s, s] of a `Surround`, [views, 9, S, S] of a `WholePerson`; None of a face alone.
+    `surround` is [3, s, s] of a `Surround`, [views, 15, S, S] of a `WholePerson`; None of a face alone.
     `mirrored` is what the eyes of a whole person mirror [N, 3, s, s].
     """
 
@@ -181,9 +182,10 @@ class Composition:
         assert reflectance is not None
         if self.person and isinstance(reflectance, PortraitField):
             lit = reflectance.lit(directions, weights, near)
-            textures = reflectance.field.relit(directions, weights)
+            textures = reflectance.field.relit(directions, weights * (1 - from_behind(directions))[:, None])
             for points, rgb in near:
                 texture = near_texture(reflectance.field, points, self.vertices_m, side)
+                texture = texture * (1 - from_behind(-points.toward))
                 textures = textures + rgb[..., None, None] * texture
             stacked = torch.stack([view.stacked for view in lit], 1)
             toward, arriving = lights.arriving(self.vertices_m.mean(0))
@@ -247,12 +249,12 @@ class Composition:
         detail, view = self._detail.relit(relit.texture), self.view
 
         def of(rows: slice) -> np.ndarray:
-            person = around(rows)
+            person, rims = np.split(around(rows), [3], -1)  # the field of the face knows no hair around it
             inside = view.rows_inside(rows)
             if inside.start < inside.stop:
                 part = person[view.rows_of(inside, rows), view.window[1]]
                 part += self.face_share(inside)[..., None] * (detail(inside) - part)
-            return person
+            return person + rims if rims.size else person
 
         if self._finish is None or relit.mirrored is None:
             return of

@@ -18,6 +18,7 @@ from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
 from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
+from facerf_cli.relighting.rims import Rims
 
 _REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
 _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
@@ -56,21 +57,27 @@ class Enlarged:
         away = torch.maximum(x.abs()[None], y.abs()[:, None])
         return columns, ((1 - away) / _FEATHER).clamp(0, 1).numpy()
 
-    def relit(self, lit: Tensor, display_ev: float) -> Shown:
-        """Radiance [h, w, 3] under shading and highlights, the first of maps [9, S, S].
+    def relit(self, lit: Tensor, display_ev: float, rims: Rims | None) -> Shown:
+        """Radiance [h, w, 3] under shading and highlights, the first six of maps [15, S, S].
 
-        `display_ev` is the exposure at which the photo is shown to the guided filter.
+        With `rims` that of light from behind, the last six, is apart: [h, w, 6]. `display_ev` is the exposure
+        at which the photo is shown to the guided filter.
         """
-        shine = blurred(self._filled(lit[3:6]), _GLOSS_PX)
-        maps = torch.cat([self._albedo_maps, self._filled(lit[:3]), shine, self._hair])
+        maps = torch.cat([self._albedo_maps, self._hair, self._smooth(lit[:6])])
+        rear = self._smooth(lit[9:])
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
             wide = self._enlarged(maps, rows, columns)
-            shading, shine, hair = torch.split(wide[_ALBEDO_MAPS:], [3, 3, 2])
+            hair, light = torch.split(wide[_ALBEDO_MAPS:], [2, 6])
             albedo = self._albedo(pixels, wide, display_ev)
             finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
-            shine = shine * torch.lerp(torch.ones_like(finer), finer, hair[1])
-            return _by_pixel((albedo * shading + shine) * self._view.exposure)
+            strands = torch.lerp(torch.ones_like(finer), finer, hair[1])
+            lights = [light]
+            if rims is not None:
+                offsets_px, brightness = rims.at(rows, columns)
+                lights.append(self._enlarged(rear, rows, columns, offsets_px) * brightness)
+            parts = [albedo * light[:3] + light[3:] * strands for light in lights]
+            return _by_pixel(torch.cat(parts) * self._view.exposure)
 
         return of
 
@@ -86,14 +93,14 @@ class Enlarged:
         return of
 
     def layer(self, name: str, lit: Tensor) -> Shown:
-        """A layer of an image under the light of maps [9, S, S]; see `WholePerson.layer`."""
+        """A layer of an image under the light of maps [15, S, S]; see `WholePerson.layer`."""
         if name == "albedo":
             return lambda pixels, rows, columns: _by_pixel(
                 self._albedo(pixels, self._enlarged(self._albedo_maps, rows, columns), self._display_ev)
                 * self._view.exposure
             )
         maps = {
-            "specular": lit[3:6].clamp_min(0) * self._view.exposure,
+            "specular": (lit[3:6] + lit[12:]).clamp_min(0) * self._view.exposure,
             "shadow": lit[6:9],
             "normal": self._view.maps.normals[0],
         }[name]
@@ -101,9 +108,9 @@ class Enlarged:
         return lambda pixels, rows, columns: _by_pixel(self._enlarged(filled, rows, columns))
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the person under the light of maps [9, S, S]."""
+        """The exposure in EV, by a rule, of the person under the light of maps [15, S, S]."""
         view = self._view
-        (relit,) = view.relit(PortraitLight(lit[:3], lit[3:6], lit[6:]))
+        (relit,) = view.relit(PortraitLight(*torch.split(lit[None], [3, 3, 3, 6], 1)))
         skin = view.person.classes[class_index("skin")].numpy()
         image = view.person.image.permute(1, 2, 0).numpy()
         return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())
@@ -129,14 +136,26 @@ class Enlarged:
         slopes = np.concatenate([slope.transpose(2, 0, 1) for slope, _ in lines])
         return torch.from_numpy(np.concatenate([slopes, np.stack([offset for _, offset in lines])])).float()
 
+    def _smooth(self, light: Tensor) -> Tensor:
+        """Shading and highlights [6, S, S], continued over the background; highlights are blurred."""
+        shading, highlights = torch.chunk(self._filled(light), 2)
+        return torch.cat([shading, blurred(highlights, _GLOSS_PX)])
+
     def _filled(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] with the person's values continued over the background."""
         return inpaint(maps, self.own)
 
-    def _enlarged(self, maps: Tensor, rows: slice, columns: slice) -> Tensor:
-        """Maps [C, h, w] over some of the photo's pixels; beyond the square those at its border repeat."""
+    def _enlarged(
+        self, maps: Tensor, rows: slice, columns: slice, offsets_px: Tensor | None = None
+    ) -> Tensor:
+        """Maps [C, h, w] over some of the photo's pixels; beyond the square those at its border repeat.
+
+        Each pixel may be read from elsewhere, at an offset of `offsets_px` [2, h, w], x and y.
+        """
         x, y = self._places(rows, columns)
         grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
+        if offsets_px is not None:
+            grid = grid + offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
         return F.grid_sample(maps[None], grid, padding_mode="border", align_corners=False)[0]
 
     def _places(self, rows: slice, columns: slice) -> tuple[Tensor, Tensor]:

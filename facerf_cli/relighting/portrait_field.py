@@ -31,6 +31,7 @@ from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.own_light import OwnLight
+from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
@@ -47,17 +48,26 @@ class PortraitLight:
     """A person under M sums of lights, in the square: each [M, 3, S, S].
 
     Radiance is albedo times shading, plus highlights; both hold the photo's correction. `reached` is the
-    share of the light that is not in shadow.
+    share of the light that is not in shadow. Light from behind is kept apart, as it is drawn as rims:
+    `behind` [M, 6, S, S] are its shading and highlights.
     """
 
     shading: Tensor
     highlights: Tensor
     reached: Tensor
+    behind: Tensor
 
     @property
     def stacked(self) -> Tensor:
-        """All maps [M, 9, S, S], as `WholePerson` takes them."""
-        return torch.cat([self.shading, self.highlights, self.reached], 1)
+        """All maps [M, 15, S, S], as `WholePerson` takes them."""
+        return torch.cat([self.shading, self.highlights, self.reached, self.behind], 1)
+
+    @property
+    def whole(self) -> "PortraitLight":
+        """The same with light from behind as any other."""
+        shading, highlights = torch.chunk(self.behind, 2, 1)
+        nothing = torch.zeros_like(self.behind)
+        return PortraitLight(self.shading + shading, self.highlights + highlights, self.reached, nothing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +83,17 @@ class SteadyFrame:
 
 
 class _Some(NamedTuple):
-    """Some lights: maps [l, S, S] and weights [M, l, 3]; `sent` is what would arrive without shadows."""
+    """Some lights: maps [l, S, S] and weights [M, l, 3]; `sent` is what would arrive without shadows.
+
+    `behind` [l] is the share of each that comes from behind.
+    """
 
     shading: Tensor
     highlights: Tensor
     arrives: Tensor
     sent: Tensor
     weights: Tensor
+    behind: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,18 +143,20 @@ class PortraitView:
                 strict=True,
             ):
                 maps = self._shaded(lights, self.person.visibility(lights.detach()))
-                yield _Some(*maps, torch.ones(len(lights), 1, 1), some)
+                sent = torch.ones(len(lights), 1, 1)
+                yield _Some(*maps, sent, some, from_behind(lights))
 
     def _near(self, points: PointLights, weights: Tensor) -> Iterator[_Some]:
         """Batches of the points of a near light with rgb weights [M, 3]."""
         toward, irradiance = points.arriving(self.person.maps.positions_m)
+        behind = from_behind(-points.toward)
         for first in range(0, len(toward), _LIGHTS_AT_ONCE):
             batch = slice(first, first + _LIGHTS_AT_ONCE)
             sent = irradiance[batch]
             visible = self.person.visibility_of_points(points.places_m[batch])
             shade, glow, arrives = self._shaded(toward[batch], visible)
             some = weights[:, None].expand(-1, len(sent), -1)
-            yield _Some(sent * shade, sent * glow, sent * arrives, sent, some)
+            yield _Some(sent * shade, sent * glow, sent * arrives, sent, some, behind.expand(len(sent)))
 
     def lit(
         self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
@@ -153,19 +169,26 @@ class PortraitView:
         shading, highlights, reached, sent = torch.zeros(4, len(weights), *size).unbind(0)
         batches = (self._far(directions, weights), *(self._near(*light) for light in near))
         albedo = self.maps.albedo[0].mean(0)
-        for shade, glow, arrives, whole, some in itertools.chain(*batches):
+        behind = torch.zeros(len(weights), 6, *size[1:])
+        for shade, glow, arrives, whole, some, share in itertools.chain(*batches):
             shades, glows = (x.expand(3, *x.shape) for x in (shade, glow))
             if self.correction is not None:
                 factor, added = self.correction.terms(albedo * shade + glow)
                 shades, glows = shade * factor, torch.addcmul(added, glow, factor)
-            shading = shading + torch.einsum("mlc,clij->mcij", some, shades)
-            highlights = highlights + torch.einsum("mlc,clij->mcij", some, glows)
+            rear = some * share[:, None]
+            front = some - rear
+            shading = shading + torch.einsum("mlc,clij->mcij", front, shades)
+            highlights = highlights + torch.einsum("mlc,clij->mcij", front, glows)
+            if share.any():
+                both = [torch.einsum("mlc,clij->mcij", rear, part) for part in (shades, glows)]
+                behind = behind + torch.cat(both, 1)
             reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
-        return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6))
+        return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6), behind)
 
     def relit(self, lit: PortraitLight) -> Tensor:
         """Radiance [M, 3, S, S] of the person in the square, at the resolution of the maps."""
+        lit = lit.whole
         return (self.maps.albedo * lit.shading + lit.highlights) * self.exposure
 
 
@@ -208,11 +231,16 @@ class PortraitField:
         """Textures [M, 3, T, T] of the face; of a turned head the neural field's alone."""
         textures = self.field.relit(directions, weights, turn)
         return (
-            textures if turn is not None else self.blended(textures, self.views[0].lit(directions, weights))
+            textures
+            if turn is not None
+            else self.blended(textures, self.views[0].lit(directions, weights).whole)
         )
 
     def blended(self, textures: Tensor, lit: PortraitLight) -> Tensor:
-        """Textures [M, 3, T, T] of the neural field, mixed with the portrait's, lit in the first view."""
+        """Textures [M, 3, T, T] of the neural field, mixed with the portrait's, lit in the first view.
+
+        `lit.behind` is not in it.
+        """
         grid = self.texels[None]
 
         def sampled(maps: Tensor) -> Tensor:

@@ -17,13 +17,14 @@ from facerf_cli.relighting.enlarged import Enlarged, Shown
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.grain import Grain
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.rims import Rims
 from facerf_cli.relighting.surface import Surface
 
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
 
 
 class WholePerson:
-    """A photo's person under sums of lights, given by their maps [views, 9, S, S]."""
+    """A photo's person under sums of lights, given by their maps [views, 15, S, S]."""
 
     def __init__(self, photo: np.ndarray, field: PortraitField) -> None:
         segmentation = field.person.segmentation
@@ -36,15 +37,21 @@ class WholePerson:
     @property
     def nbytes(self) -> int:
         """Size of one light's maps."""
-        return sum(9 * view.own.nbytes for view in self._views)
+        return sum(15 * view.own.nbytes for view in self._views)
 
     def over_photo(self, photo: np.ndarray | PersonColours, lit: Tensor, display_ev: float) -> Band:
-        """The photo's pixels [H, W, 3], by rows, under the light of maps [views, 9, S, S].
+        """The photo's pixels, by rows, under the light of maps [views, 15, S, S].
 
-        `display_ev` is the exposure at which the photo is shown to the guided filter.
+        [H, W, 3] under light that does not come from behind; with such light [H, W, 6], its part the last
+        three. `display_ev` is the exposure at which the photo is shown to the guided filter.
         """
-        relit = [view.relit(one, display_ev) for view, one in zip(self._views, lit, strict=True)]
+        rims = self._rims if lit[:, 9:].any() else None
+        relit = [view.relit(one, display_ev, rims) for view, one in zip(self._views, lit, strict=True)]
         return self._joined(photo, relit)
+
+    @cached_property
+    def _rims(self) -> Rims:
+        return Rims(self.matte, self._person.square.side_px / self._person.sides)
 
     def finish(
         self, photo: np.ndarray | PersonColours, display_ev: float, matte: np.ndarray
@@ -56,7 +63,7 @@ class WholePerson:
         return grain, Eyes(photo.__getitem__, self._person.eyes, self._size_px)
 
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the person under the light of maps [views, 9, S, S]."""
+        """The exposure in EV, by a rule, of the person under the light of maps [views, 15, S, S]."""
         return self._views[0].exposure_ev(lit[0], rule)
 
     def layer(self, name: str, lit: Tensor, photo: np.ndarray | PersonColours) -> dict[str, Layer]:

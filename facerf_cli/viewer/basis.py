@@ -166,7 +166,8 @@ def basis_of_photo(
     def add(relit: Relit) -> None:
         assert relit.surround is not None
         images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
-        shading, highlights, _ = relit.surround[0].chunk(3)
+        front, behind = relit.surround[0, :6], relit.surround[0, 9:]
+        shading, highlights = (front + behind).chunk(2)
         part = (view.maps.albedo[0] * shading + highlights) * view.exposure
         coarse.append(part.permute(1, 2, 0).numpy().astype(np.float16))
 
