@@ -38,8 +38,8 @@ _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
+_BARE = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
 _CLOTH = ("garment", "headwear")
-_SKINS = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
 
@@ -102,13 +102,13 @@ class PortraitView:
 
     person: SeenPerson
     maps: PortraitMaps  # of one person; albedo in the units of the network's input
-    exposure: float  # radiance of the photo over that of the maps in the photo's light
+    exposure: Tensor  # [3, 1, 1] radiance of the photo over that of the maps in the photo's light
     correction: Correction | None = None
 
     @staticmethod
     def of(person: SeenPerson, maps: PortraitMaps, own: OwnLight | None) -> "PortraitView":
         """The view of a person with its maps, corrected by the photo's estimated light `own`."""
-        found = PortraitView(person, maps, person.exposure)
+        found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
         return found if own is None else found._corrected(own)
 
     def _corrected(self, own: OwnLight) -> "PortraitView":
@@ -119,7 +119,8 @@ class PortraitView:
         olats = self.maps.albedo * shade[:, None] + glow[:, None]
         skin = self.person.classes[_SKIN]
         explained = torch.einsum("lc,lcij->cij", weights, olats)
-        exposure = float((self.person.image * skin).sum() / (explained * skin).sum().clamp_min(1e-6))
+        shown, found = ((image * skin).sum((1, 2), True) for image in (self.person.image, explained))
+        exposure = shown / found.clamp_min(1e-6)  # white, as the photo's light leaves it
         correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
         return replace(self, exposure=exposure, correction=correction)
 
@@ -262,7 +263,7 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """
     rig = rig_directions(_SUMMARY_LIGHTS)
     inputs = person.inputs(rig, person.visibility(rig))
-    even = without_colour_of_shade(inputs.image[0], inputs.classes[0, _SKIN])
+    even = without_colour_of_shade(inputs.image[0], inputs.classes[0, _BARE].sum(0))
     inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device
     on_device = inputs.to(device)
@@ -289,7 +290,7 @@ def _with_own_colours(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMap
         / person.mean((2, 3), keepdim=True).clamp_min(1e-6)
     )
     of_classes = torch.einsum("bkij,bcij->bkc", inputs.classes, own)
-    of_classes[:, _SKINS] = of_classes[:, _SKINS].sum(1, keepdim=True)
+    of_classes[:, _BARE] = of_classes[:, _BARE].sum(1, keepdim=True)
     of_classes = of_classes / of_classes.mean(2, keepdim=True).clamp_min(1e-9)
     typical = torch.einsum("bkij,bkc->bcij", inputs.classes, of_classes)
     colour = torch.lerp(

@@ -13,7 +13,8 @@ from facerf_cli.raster.texture import blurred
 
 _REACH = 0.03  # blur of colours, in sides: what is narrower, as freckles are, is the skin's own
 _SHADE = (0.3, 0.8)  # brightness over that of lit skin, below which all is shade, and from which on none
-_MOST = 2.5  # change of a channel
+_MOST = 4.0  # change of a channel
+_NOISE = 0.01  # of the brightness of lit skin: what is darker has no colour of its own
 _TINY = 1e-6
 
 
@@ -23,13 +24,20 @@ def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
     `skin` [S, S] is the share of skin; without any the factors are 1.
     """
     image, skin = image.detach(), skin.detach()
-    side = image.shape[-1]
-    *low, share = blurred(torch.cat([image * skin, skin[None]]), _REACH * side)
-    colour = torch.stack(low) / share.clamp_min(_TINY)
-    weight = skin * colour.mean(0)  # so that the lit skin counts most
-    lit = (colour * weight).sum((1, 2)) / weight.sum().clamp_min(_TINY)
-    level = colour.mean(0) / lit.mean().clamp_min(_TINY)
-    shaded = ((_SHADE[1] - level) / (_SHADE[1] - _SHADE[0])).clamp(0, 1) * skin
+    near, reach = 0.3 * _REACH * image.shape[-1], _REACH * image.shape[-1]
+    brightness = image.mean(0)
+    lit = (image * skin * brightness).sum((1, 2)) / (skin * brightness).sum().clamp_min(_TINY)
+    level = _mean_near(brightness[None], skin, near)[0] / lit.mean().clamp_min(_TINY)
+    shade = ((_SHADE[1] - level) / (_SHADE[1] - _SHADE[0])).clamp(0, 1)
+    even = image / (brightness + _NOISE * lit.mean()).clamp_min(_TINY)  # each pixel counts alike
+    colour = _mean_near(even, shade * skin, reach)
     typical = (lit / lit.mean().clamp_min(_TINY))[:, None, None]
     change = typical * colour.mean(0) / colour.clamp_min(_TINY)
-    return change.clamp(1 / _MOST, _MOST) ** blurred(shaded[None], 0.3 * _REACH * side)
+    amount = _mean_near(shade[None], skin, near)[0] * (2 * skin).clamp(max=1)
+    return change.clamp(1 / _MOST, _MOST) ** amount
+
+
+def _mean_near(image: Tensor, weight: Tensor, reach: float) -> Tensor:
+    """Mean of an image [C, S, S] around each pixel under weights [S, S]."""
+    *total, share = blurred(torch.cat([image * weight, weight[None]]), reach)
+    return torch.stack(total) / share.clamp_min(_TINY)
