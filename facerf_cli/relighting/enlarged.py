@@ -77,7 +77,7 @@ class Enlarged:
                 offsets_px, brightness = rims.at(rows, columns)
                 lights.append(self._enlarged(rear, rows, columns, offsets_px) * brightness)
             parts = [albedo * light[:3] + light[3:] * strands for light in lights]
-            return _by_pixel(torch.cat(parts) * self._view.exposure)
+            return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
 
         return of
 
