@@ -4,7 +4,7 @@ import math
 from functools import partial
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 from scipy.sparse import csr_array
 
 from facerf_cli.image.strips import between, box_means, enlarged, fitted, strips
@@ -13,6 +13,9 @@ _REACH_PX = 2  # of the linear functions of colour by which a matte is enlarged
 _SMOOTHNESS = 1e-5  # variance of colours, sRGB in 0..1, below which the matte is smoothed
 _COLOURS_PX = 512  # longest side at which they are found
 _COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
+# Depths inside the outline from which a person begins to hide all, and hides all; in pixels of the classes.
+_SOLID_PX = (1.0, 3.0)
+_LOOSE_PX = 7  # side of the square around a pixel in which hair leaves its matte as it is
 _TINY = 1e-5
 
 
@@ -51,6 +54,21 @@ def local_lines(
     slope = np.linalg.solve(covariance, common[..., None])[..., 0]
     offset = share - (slope * colour).sum(-1)
     return mean(slope), mean(offset)
+
+
+def solid_inside(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
+    """A matte [H, W] that is 1 inside its outline, away from what is loose, as hair: a share [h, w].
+
+    Skin and cloth hide what is behind them. But a jaw that shines in the background's own light has a colour
+    between the person's and the background's.
+    """
+    depth_px = distance_transform_edt(shrunk(matte, (loose.shape[0], loose.shape[1])) > 0.5)
+    first, last = _SOLID_PX
+    solid = ((depth_px - first) / (last - first)).clip(0, 1) * (1 - maximum_filter(loose, _LOOSE_PX))
+    found = np.empty_like(matte)
+    for rows in strips(matte.shape):
+        found[rows] = matte[rows] + enlarged(solid[None], matte.shape, rows)[0] * (1 - matte[rows])
+    return found
 
 
 class PersonColours:

@@ -19,7 +19,7 @@ from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.portrait.confidence import matte_facts
-from facerf_cli.portrait.matte import shrunk
+from facerf_cli.portrait.matte import shrunk, solid_inside
 from facerf_cli.portrait.mesh import find_meshes, first_squares
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look
 from facerf_cli.portrait.people import HeadPlace, PersonShares, matte_of, person_among
@@ -33,6 +33,7 @@ _CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _STEEPNESS = 4.0  # the power
 _FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
+_LOOSE = [class_index(name) for name in ("hair", "beard", "glasses", "headwear")]  # mattes of these stay
 _HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
 _LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
 _SMALL_PX = 384  # longest side at which classes are joined
@@ -141,7 +142,8 @@ def _neighbours(
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     """The segmentation of an image [H, W, 3] by the classes [C, h, w] of a person with landmarks [68, 2]."""
-    return Segmentation(classes, matte_of(1 - classes[0].numpy(), image_srgb, landmarks_px))
+    matte = matte_of(1 - classes[0].numpy(), image_srgb, landmarks_px)
+    return Segmentation(classes, solid_inside(matte, classes[_LOOSE].sum(0).numpy()))
 
 
 def within_matte(classes: Tensor, matte: np.ndarray) -> Segmentation:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facerf_cli.portrait.matte import PersonColours, lifted
+from facerf_cli.portrait.matte import PersonColours, lifted, solid_inside
 
 SIDE = 96
 
@@ -34,6 +34,20 @@ def test_where_the_matte_is_sure_no_pattern_of_the_photo_shows() -> None:
     for value in (0.0, 1.0):
         sure = np.full((SIDE, SIDE), value, np.float32)
         assert (lifted(sure, pattern / np.float32(255), pattern) == value).all()
+
+
+def test_skin_hides_the_background_and_hair_may_not() -> None:
+    """A disc that looks like the background in a ring within its outline."""
+    true, ring = disc(2 * SIDE), disc(2 * SIDE, 0.2)
+    guess = np.minimum(true, 0.8 + 0.2 * ring)
+    loose = np.zeros((SIDE, SIDE), np.float32)
+    found = solid_inside(guess, loose)
+    inner = disc(2 * SIDE, 0.24) == 1
+    assert guess[inner].min() < 0.81 and found[inner].min() > 0.999
+    np.testing.assert_allclose(found[true < 0.5], guess[true < 0.5], atol=0.1)
+    np.testing.assert_array_equal(found[true == 0], 0)
+    loose[:, : SIDE // 2] = 1
+    np.testing.assert_array_equal(solid_inside(guess, loose)[:, :SIDE], guess[:, :SIDE])
 
 
 @pytest.mark.parametrize("value", [0.25, 0.5, 0.9])
