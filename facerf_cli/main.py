@@ -214,8 +214,10 @@ def run() -> None:
     end_on_signals(_PATIENCE_S)
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small systems, which threads only wait for
     _prepare_streams()
     memory.collect_seldom()
+    memory.share_freed()
     try:
         code = main(sys.argv[1:])
     except SystemExit as stop:  # of a signal; the interpreter's own end would name what libraries hold

@@ -37,7 +37,7 @@ from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered, uncovered_by
-from facerf_cli.portrait.person import look_at_person, wider_square
+from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
 from facerf_cli.relighting.field import (
@@ -47,8 +47,9 @@ from facerf_cli.relighting.field import (
     shrunk,
 )
 from facerf_cli.relighting.models import Models, Sides
-from facerf_cli.relighting.own_light import light_of_frames, over_rig, own_light, share_of_lamp
+from facerf_cli.relighting.own_light import OwnLight, light_of_frames, over_rig, own_light, share_of_lamp
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
+from facerf_cli.run.threads import both
 
 
 def fit_photo(
@@ -157,17 +158,26 @@ def reflectance_of(
         return explain(models, head, kind).reflectance
     if kind == "portrait" and photo is None:
         raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
-    own = None if network_alone else own_light(models, head.face, steady.light if steady else None)
-    field = Field(models, head.face, own.quotient if own else None, memory_bytes, even_shade=own is not None)
+
+    def of_face() -> tuple[OwnLight | None, Field]:
+        own = None if network_alone else own_light(models, head.face, steady.light if steady else None)
+        quotient = own.quotient if own else None
+        return own, Field(models, head.face, quotient, memory_bytes, even_shade=own is not None)
+
+    def of_person() -> list[SeenPerson]:
+        assert photo is not None
+        people, others_px = models.networks.people, head.others_px
+        person = look_at_person(people, models.face, photo, head.fit, matte=matte, others_px=others_px)
+        wide = wider_square(person.square, person.segmentation.matte)
+        return [person] if wide is None else [person, person.within(wide, photo)]
+
     if photo is None or kind == "field":
-        return field
+        return of_face()[1]
     if steady and steady.portrait:
+        own, field = of_face()
         return PortraitField.of(models.face, head, field, own, steady.portrait)
-    people, others_px = models.networks.people, head.others_px
-    person = look_at_person(people, models.face, photo, head.fit, matte=matte, others_px=others_px)
-    wide = wider_square(person.square, person.segmentation.matte)
-    squares = [person] if wide is None else [person, person.within(wide, photo)]
-    seen = [(one, maps_of(models.networks.portrait, one)) for one in squares]
+    (own, field), views = both(of_face, of_person)
+    seen = [(one, maps_of(models.networks.portrait, one)) for one in views]
     return PortraitField.of(models.face, head, field, own, seen)
 
 

@@ -4,14 +4,14 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging
-from facerf_cli.run.workers import Workers, in_order, in_shards, one_ahead, spread
+from facerf_cli.run.workers import Workers, in_order, in_shards, spread
 
 
 def work(item: str) -> str:
@@ -119,21 +119,3 @@ def test_an_error_ends_the_other_shards(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no"):
         in_shards(_fail_or_wait, [tmp_path / "fails", tmp_path / "waits"], 2)
     assert not (tmp_path / "waits").exists()
-
-
-def test_one_is_made_ahead_in_order_and_its_error_comes_in_its_place() -> None:
-    made: list[int] = []
-
-    def numbers() -> Iterator[int]:
-        for number in range(3):
-            made.append(number)
-            yield number
-        raise ValueError("the fourth")
-
-    ahead = one_ahead(numbers())
-    assert made == [] and next(ahead) == 0
-    while len(made) < 2:  # nobody asked for it yet
-        time.sleep(0.001)
-    assert next(ahead) == 1 and next(ahead) == 2
-    with pytest.raises(ValueError, match="the fourth"):
-        next(ahead)

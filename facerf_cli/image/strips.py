@@ -2,8 +2,9 @@
 
 import logging
 import mmap
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -11,9 +12,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.threads import in_threads
 
 log = logging.getLogger(LOGGER_NAME)
 STRIP_PX = 1 << 18  # pixels of a strip, about
+STRIPS_AT_ONCE = 4  # at most
 _HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
 
@@ -50,9 +53,12 @@ def filled(
     found = {name: layer for name, layer in layers.items() if isinstance(layer, np.ndarray)}
     bands = {name: layer for name, layer in layers.items() if not isinstance(layer, np.ndarray)}
     beyond = 0
-    for rows in strips((height_px, width_px)):
-        for name, band in bands.items():
-            values = band(rows)
+
+    def made(rows: slice) -> tuple[slice, dict[str, np.ndarray]]:
+        return rows, {name: band(rows) for name, band in bands.items()}
+
+    for rows, parts in in_threads(made, strips((height_px, width_px)), STRIPS_AT_ONCE):
+        for name, values in parts.items():
             if name not in found:
                 found[name] = empty(name, (height_px, *values.shape[1:]))
             if found[name].dtype == np.float16:
@@ -72,12 +78,12 @@ def by_rows(layer: Layer) -> Band:
 
 def remembered(band: Callable[[slice], T]) -> Callable[[slice], T]:
     """A function of rows that keeps its last values, for images that share what no light changes."""
-    last: list[Any] = [None, None]
+    last = threading.local()
 
     def of(rows: slice) -> T:
-        if last[0] != rows:
-            last[:] = rows, band(rows)
-        found: T = last[1]
+        if getattr(last, "rows", None) != rows:
+            last.rows, last.values = rows, band(rows)
+        found: T = last.values
         return found
 
     return of

@@ -1,6 +1,7 @@
 """The matte of a person at the photo's own resolution, and the person's colours without the background's."""
 
 import math
+import threading
 from functools import partial
 
 import numpy as np
@@ -92,13 +93,13 @@ class PersonColours:
             person = _unmixed(mixture, share, own, background)
         self._means = np.concatenate([own, background], -1)
         self.small = person * (share > 0)[..., None]  # [h, w, 3], of at most `_COLOURS_PX`
-        self._last = 0, photo[:0]  # first row, and colours that are kept: of one image they are read thrice
+        self._last = threading.local()  # rows and colours: of one image they are read thrice
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
         start, stop, _ = rows.indices(self.shape[0])
-        first, kept = self._last
+        first, kept = getattr(self._last, "kept", (0, self._photo[:0]))
         if not first <= start <= stop <= first + len(kept):
-            first, kept = self._last = start, self._found(slice(start, stop))
+            first, kept = self._last.kept = start, self._found(slice(start, stop))
         return kept[start - first : stop - first]
 
     def _found(self, rows: slice) -> np.ndarray:

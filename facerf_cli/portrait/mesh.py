@@ -11,10 +11,12 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.parse import Square, whole_photo
+from facerf_cli.run.threads import in_threads
 
 _IRISES = [range(468, 473), range(473, 478)]  # points of each
 _LIDS = [  # points around the opening of each eye
@@ -165,11 +167,17 @@ def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -
 
 def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[_Box]:
     """Boxes that the detectors propose in squares; one face has many."""
+    detectors = (people.near_faces, _NEAR), (people.far_faces, _FAR)
+
+    def seen(one: tuple[StoredGraph, _Detector]) -> dict[str, Tensor]:
+        network, detector = one
+        images = [square.cut(image_srgb, detector.side_px, outside=0.0) for square in squares]
+        found: dict[str, Tensor] = network(torch.stack(images) * 2 - 1)
+        return found
+
     boxes: list[_Box] = []
-    for network, detector in ((people.near_faces, _NEAR), (people.far_faces, _FAR)):
+    for (_, detector), out in zip(detectors, in_threads(seen, detectors), strict=True):
         anchors = detector.anchors()
-        images = torch.stack([square.cut(image_srgb, detector.side_px, outside=0.0) for square in squares])
-        out = network(images * 2 - 1)
         scores = out["scores"][..., 0].sigmoid().numpy()
         all_values = out["boxes"].reshape(len(squares), -1, 8, 2).numpy() / detector.side_px
         for square, score, values in zip(squares, scores, all_values, strict=True):

@@ -6,7 +6,6 @@ that explains the photo best is a first guess of the photo's light, from which t
 """
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -32,6 +31,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import blurred, inpaint, vertex_normals
+from facerf_cli.run.threads import in_threads
 
 ASSET = Path(__file__).parents[1] / "assets" / "proxy_person.safetensors"
 _HAIR_M = 0.07  # most that the scalp is pushed out by
@@ -165,14 +165,13 @@ class Shadows:
         """Visibility [L, s, s] of lights, each given by unit rays [3] or [N, 3] to it and distances [N]."""
         found = np.zeros((len(lights), *self._inside.shape), np.float32)
 
-        def trace(number: int, light: tuple[np.ndarray, np.ndarray | None]) -> None:
-            axis, reach_m = light
+        def trace(number: int) -> None:
+            axis, reach_m = lights[number]
             rays = (on_disc(axis, places) for places in self._places)
             blocked = [occluded(self._scene, self.origins, ray, reach_m) for ray in rays]
             found[number, self._inside] = 1 - np.mean(blocked, 0)
 
-        with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-            list(threads.map(trace, range(len(lights)), lights))
+        list(in_threads(trace, range(len(lights))))
         filled = inpaint(torch.from_numpy(found), self.covered)
         return blurred(filled, _SOFT_PX)
 

@@ -21,6 +21,7 @@ from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.run.threads import count, in_threads
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
@@ -52,16 +53,18 @@ class Field:
         `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s (paper,
         'Network Architecture'). The encoder runs once a field, the decoder once a light.
         """
-        network, face, device = self._network, self.face, self.models.device
+        network, face, device, encoded = self._network, self.face, self.models.device, self._encoded
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals, grey = normals[None].to(device), is_grey(face.texture)
-        for chunk in torch.split(lights, self._batch(len(lights))):
-            # autocast does not enclose the yield, or it would stay on in the caller
+
+        def decoded(some: Tensor) -> Tensor:
             with mixed_precision(device, self.bf16):
-                olats = network.decode(self._encoded, normals, chunk[None].to(device))[0]
+                olats = network.decode(encoded, normals, some[None].to(device))[0]
             olats = olats.float().cpu()
             olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
-            yield self.quotient.corrected(olats) if self.quotient else olats
+            return self.quotient.corrected(olats) if self.quotient else olats
+
+        yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
 
     @cached_property
     def _encoded(self) -> Any:
@@ -83,7 +86,7 @@ class Field:
         """Lights that are decoded at once."""
         most = _LIGHTS_ON_CPU if self.models.device.type == "cpu" else lights
         texels = self.face.texture.shape[-1] ** 2
-        bytes_per_light = self._network.bytes_per_light(texels)
+        bytes_per_light = self._network.bytes_per_light(texels) * count()
         return max(1, min(most, self.memory_bytes // bytes_per_light))
 
 

@@ -33,6 +33,7 @@ from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.own_light import OwnLight
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
@@ -267,8 +268,8 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device
     on_device = inputs.to(device)
-    both = network(on_device).averaged(network(on_device.mirrored()).mirrored())
-    maps = PortraitMaps(*(part.cpu() for part in both))
+    seen, mirrored = in_threads(network, (on_device, on_device.mirrored()))
+    maps = PortraitMaps(*(part.cpu() for part in seen.averaged(mirrored.mirrored())))
     maps = _with_own_colours(maps, inputs)
     maps = maps._replace(gain=maps.gain * even)  # of the photo, which has the colour
     return maps.without_colours() if is_grey(inputs.image[0]) else maps

@@ -18,6 +18,7 @@ from facerf_cli.errors import InputError
 SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by default
 _CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
 _GB = 1 << 30
+_M_ARENA_MAX = -8  # of malloc.h
 _SELDOM, _USUAL = (50_000, 10, 10), gc.get_threshold()
 _set: list[int] = []  # the limit, once it was set
 _held: list[int] = []  # what is held besides what is asked for
@@ -61,15 +62,21 @@ def give_back() -> None:
 
     glibc keeps what lies between blocks in use, so a batch of thousands of items would grow by these gaps.
     """
-    if trim := _trim():
+    if trim := _of_c("malloc_trim"):
         trim(0)
 
 
+def share_freed() -> None:
+    """Let all threads take what any has freed; glibc has a store for each, and a photo would need more."""
+    if setting := _of_c("mallopt"):
+        setting(_M_ARENA_MAX, 1)
+
+
 @cache
-def _trim() -> Callable[[int], int] | None:
-    """glibc's malloc_trim; None with another library of C."""
+def _of_c(name: str) -> Callable[..., int] | None:
+    """A function of glibc; None with another library of C."""
     try:
-        return cast("Callable[[int], int]", ctypes.CDLL(None).malloc_trim)
+        return cast("Callable[..., int]", getattr(ctypes.CDLL(None), name))
     except (OSError, AttributeError, TypeError):
         return None
 

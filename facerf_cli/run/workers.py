@@ -9,10 +9,8 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any, TypeVar
 
 from facerf_cli.errors import FacerfError
@@ -33,15 +31,6 @@ class _Worker:
     row: deque[int]  # numbers of the items that it takes next
     number: int | None = None  # of the item that it processes
     started: bool = False
-
-
-def one_ahead(items: Iterator[T]) -> Iterator[T]:
-    """Yield items, of which the next one is made in a thread while one is used."""
-    with ThreadPoolExecutor(1) as thread:
-        coming = thread.submit(list, islice(items, 1))
-        while found := coming.result():
-            coming = thread.submit(list, islice(items, 1))
-            yield found[0]
 
 
 def in_processes(

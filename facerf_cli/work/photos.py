@@ -34,6 +34,7 @@ from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 from facerf_cli.work.plan import KEPT_PX, beside_photo, require_people
 from facerf_cli.work.rembg_matte import matte_by_rembg, require_rembg
@@ -140,6 +141,7 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
 @cache
 def load_models_once(options: PhotoOptions) -> Models:
     """The face model and the networks of the checkpoint, on the device, once a process."""
+    compute_apart()
     settings = options.settings
     return load_models(settings.checkpoints, options.face_model, torch_device(settings), options.form)
 

@@ -28,7 +28,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.pipeline import FittedPerson, predict_olat, reflectance_of
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.composition import Target
-from facerf_cli.run.workers import one_ahead
+from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
     directions_of,
