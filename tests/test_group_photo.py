@@ -55,7 +55,8 @@ class Plain:
     def layers(self, names: Any, relit: float) -> dict[str, Layer]:
         return {
             "person.A": self.matte(),
-            "albedo": np.full((*SIZE, 3), relit) * (self.matte() > 0)[..., None],
+            "class.skin": self.matte(),
+            "depth": np.full((*SIZE, 1), relit) * (self.matte() > 0)[..., None],
         }
 
     def exposure_ev(self, relit: float, rule: str) -> float:
@@ -87,9 +88,13 @@ def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
 
 
 def test_layers_hold_all_people() -> None:
-    layers = filled(group().layers(["albedo"], [2.0, 8.0]), *SIZE)
-    np.testing.assert_allclose(layers["person.A"][0], [1, 1, 0, 0.5, 0.5, 0])
-    np.testing.assert_allclose(layers["albedo"][0, :, 0], [2, 2, 0, 4, 4, 0])
+    """Shares add up, before others and the background; no depth lies between two people."""
+    far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
+    people = GroupComposition([far, near, faint])  # type: ignore[list-item]
+    layers = filled(people.layers(["depth", "classes"], [2.0, 8.0, 4.0]), *SIZE)
+    for name in ("person.A", "class.skin"):
+        np.testing.assert_allclose(layers[name][0], [1, 1, 1, 1, 0.6, 0])
+    np.testing.assert_allclose(layers["depth"][0, :, 0], [2, 2, 2, 8, 8, 0])
 
 
 def test_the_exposure_is_the_first_ones() -> None:

@@ -47,12 +47,17 @@ class GroupComposition:
         return layer
 
     def layers(self, names: Sequence[str], relit: Group) -> dict[str, Layer]:
-        """Layers by the names that they have in a file; positions are in each person's own camera."""
+        """Layers by the names that they have in a file; positions are in each person's own camera.
+
+        Shares are laid over each other; other layers are those of the person who shows most in a pixel.
+        """
         found = self._first.layers(names, relit[0])
         for composition, one, (_, share) in zip(self._others, relit[1:], self._people(relit), strict=True):
+            alpha = by_rows(found[_PERSON_MATTE])
             for name, layer in composition.layers(names, one).items():
-                own = _ones if name == _PERSON_MATTE else by_rows(layer)
-                found[name] = _over(own, share, by_rows(found[name]))
+                own, below = by_rows(layer), by_rows(found[name])
+                shares = name.endswith(".A") or name.startswith("class.")
+                found[name] = _added(own, share, below) if shares else _chosen(own, share, below, alpha)
         return found
 
     def exposure_ev(self, relit: Group, rule: ExposureRule) -> float:
@@ -69,6 +74,20 @@ def _over(top: Band, share: Band, below: Band) -> Band:
         under, weight = below(rows), share(rows)
         weight = weight[..., None] if under.ndim == 3 else weight
         return np.asarray(under + weight * (top(rows) - under))
+
+    return of
+
+
+def _added(top: Band, share: Band, below: Band) -> Band:
+    return lambda rows: top(rows) + (1 - share(rows)) * below(rows)
+
+
+def _chosen(top: Band, share: Band, below: Band, alpha: Band) -> Band:
+    """Values [H, W, C] of what shows more in a pixel."""
+
+    def of(rows: slice) -> np.ndarray:
+        weight = share(rows)
+        return np.where((weight > (1 - weight) * alpha(rows))[..., None], top(rows), below(rows))
 
     return of
 
