@@ -4,19 +4,20 @@ import logging
 import mmap
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.run.threads import in_threads
 
 log = logging.getLogger(LOGGER_NAME)
 STRIP_PX = 1 << 18  # pixels of a strip, about
-STRIPS_AT_ONCE = 4  # at most
+_AT_ONCE, _BUDGET = 4, 1 << 28  # strips in threads, at most, and bytes of the budget of memory for each
 _HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
 
@@ -52,12 +53,12 @@ def filled(
     """
     found = {name: layer for name, layer in layers.items() if isinstance(layer, np.ndarray)}
     bands = {name: layer for name, layer in layers.items() if not isinstance(layer, np.ndarray)}
-    beyond = 0
+    beyond, at_once = 0, max(1, min(_AT_ONCE, memory.left_bytes() // _BUDGET))
 
     def made(rows: slice) -> tuple[slice, dict[str, np.ndarray]]:
         return rows, {name: band(rows) for name, band in bands.items()}
 
-    for rows, parts in in_threads(made, strips((height_px, width_px)), STRIPS_AT_ONCE):
+    for rows, parts in in_threads(made, strips((height_px, width_px)), at_once):
         for name, values in parts.items():
             if name not in found:
                 found[name] = empty(name, (height_px, *values.shape[1:]))
@@ -76,14 +77,17 @@ def by_rows(layer: Layer) -> Band:
     return layer.__getitem__ if isinstance(layer, np.ndarray) else layer
 
 
-def remembered(band: Callable[[slice], T]) -> Callable[[slice], T]:
-    """A function of rows that keeps its last values, for images that share what no light changes."""
+def remembered(function: Callable[..., T]) -> Callable[..., T]:
+    """A function that keeps its last result, by its first argument, rows, from which the others follow.
+
+    So images share what no light changes.
+    """
     last = threading.local()
 
-    def of(rows: slice) -> T:
+    def of(rows: Any, *others: Any) -> T:
         if getattr(last, "rows", None) != rows:
-            last.rows, last.values = rows, band(rows)
-        found: T = last.values
+            last.rows, last.result = rows, function(rows, *others)
+        found: T = last.result
         return found
 
     return of

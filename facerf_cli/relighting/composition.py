@@ -17,6 +17,7 @@ negative weights, such as the paper's plain least squares gives, can make pixels
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -40,11 +41,13 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
-from facerf_cli.relighting.eyes import mirrored_in_cornea
+from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
+from facerf_cli.relighting.grain import Grain
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.whole_person import WholePerson
+from facerf_cli.run.threads import both
 
 _DARK = 0.08  # e above, a share of the source's mean
 _NOISY = 2.0  # times e: the luminance below which colours of pixels are noise
@@ -156,8 +159,11 @@ class Composition:
         shown = self.own.small if isinstance(self.own, PersonColours) else self._photo
         self._display_ev = display_ev(shown)
         self._detail = PhotoDetail(head.face, self.view, self.own)
-        self._finish = self.person.finish(self.own, self._display_ev, self.matte) if self.person else None
         self.surround = self.person or Surround(vertices, crop, head.face.texture, size_px[1])
+
+    @cached_property
+    def _finish(self) -> tuple[Grain, Eyes] | None:
+        return self.person.finish(self.own, self._display_ev, self.matte) if self.person else None
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -181,7 +187,7 @@ class Composition:
         turn = None if fit is None else self._head.fit.turn_to(fit.rotation)
         assert reflectance is not None
         if self.person and isinstance(reflectance, PortraitField):
-            lit = reflectance.lit(directions, weights, near)
+            lit, _ = both(lambda: reflectance.lit(directions, weights, near), lambda: self._finish)
             textures = reflectance.field.relit(directions, weights * (1 - from_behind(directions))[:, None])
             for points, rgb in near:
                 texture = near_texture(reflectance.field, points, self.vertices_m, side)

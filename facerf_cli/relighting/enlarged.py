@@ -13,6 +13,7 @@ from torch import Tensor
 
 from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
+from facerf_cli.image.strips import remembered
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
@@ -42,6 +43,7 @@ class Enlarged:
         hair = classes[[class_index("hair"), class_index("beard")]].sum(0, keepdim=True)
         self._hair = torch.cat([self._filled(view.maps.albedo[0].mean(0, keepdim=True)), hair])
         self._albedo_maps = torch.cat([self._gain_lines(), self._filled(view.maps.bias[0])])
+        self._seen = remembered(self._without_light)
 
     @property
     def pixel_px(self) -> float:
@@ -63,16 +65,11 @@ class Enlarged:
         With `rims` that of light from behind, the last six, is apart: [h, w, 6]. `display_ev` is the exposure
         at which the photo is shown to the guided filter.
         """
-        maps = torch.cat([self._albedo_maps, self._hair, self._smooth(lit[:6])])
-        rear = self._smooth(lit[9:])
+        front, rear = self._smooth(lit[:6]), self._smooth(lit[9:])
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-            wide = self._enlarged(maps, rows, columns)
-            hair, light = torch.split(wide[_ALBEDO_MAPS:], [2, 6])
-            albedo = self._albedo(pixels, wide, display_ev)
-            finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
-            strands = torch.lerp(torch.ones_like(finer), finer, hair[1])
-            lights = [light]
+            albedo, strands = self._seen((rows, columns), pixels, display_ev)
+            lights = [self._enlarged(front, rows, columns)]
             if rims is not None:
                 offsets_px, brightness = rims.at(rows, columns)
                 lights.append(self._enlarged(rear, rows, columns, offsets_px) * brightness)
@@ -80,6 +77,15 @@ class Enlarged:
             return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
 
         return of
+
+    def _without_light(
+        self, where: tuple[slice, slice], pixels: np.ndarray, display_ev: float
+    ) -> tuple[Tensor, Tensor]:
+        """The photo without its light [3, h, w] in rows and columns, and what strands do to highlights."""
+        wide = self._enlarged(torch.cat([self._albedo_maps, self._hair]), *where)
+        albedo, hair = self._albedo(pixels, wide, display_ev), wide[_ALBEDO_MAPS:]
+        finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
+        return albedo, torch.lerp(torch.ones_like(finer), finer, hair[1])
 
     def without_light(self, display_ev: float) -> Shown:
         """Luminances [h, w, 2] of the photo without its light, by the guided gain and by the coarse one."""

@@ -45,7 +45,9 @@ class Field:
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
-        return weighted_sum(self.olats(directions, turn), weights)
+        used = weights.abs().sum((0, 2)) > 0
+        used[0] |= not used.any()
+        return weighted_sum(self.olats(directions[used], turn), weights[:, used])
 
     def olats(self, lights: Tensor, turn: Tensor | None = None) -> Iterator[Tensor]:
         """Yield OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T].

@@ -14,8 +14,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import face_window, photo_camera
 from facerf_cli.files.atomic import hidden_folder
-from facerf_cli.image.strips import STRIPS_AT_ONCE
-from facerf_cli.run import memory, threads
+from facerf_cli.run import memory
 
 Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # an array for a layer, by its name and shape
 
@@ -70,7 +69,7 @@ def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) 
     height, width = size_px
     window = face_window(fit.vertices_camera(model), photo_camera(fit.crop, height, width))[2]
     needed = height * width * _BESIDE_FACE_PX + window.height_px * window.width_px * _FACE_PX
-    needed += needed // _BETWEEN + _STRIP_BYTES * min(threads.count(), STRIPS_AT_ONCE)
+    needed += needed // _BETWEEN + _STRIP_BYTES
     memory.require(f"a face of {window.width_px} x {window.height_px} pixels", needed, "a smaller photo")
 
 
