@@ -205,7 +205,7 @@ def test_a_lamp_behind_leaves_the_face_dark(
 
 def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: FittedPerson) -> None:
     """The field of a face knows no hair beside it: it would light a temple through the hair."""
-    directions = torch.cat([lamp(azimuth, 20).directions for azimuth in (30, 125, 160)])
+    directions = torch.cat([lamp(azimuth, 20).directions for azimuth in (30, 140, 175)])
     composition = person.composed(Target(background="none"))
     weights = torch.cat([torch.eye(3), torch.ones(1, 3)])[..., None].expand(-1, -1, 3)
     relit = list(composition.relit(Lights(directions, weights)))

@@ -15,8 +15,8 @@ from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.raster.texture import smoothstep
 
-_FROM, _WHOLE = 0.45, 0.85  # -z of the directions from which on light is partly, and wholly, from behind
-_SHARPNESS, _REACH = 3.0, 0.2  # g'(0), at most 4, and the reach, in extents of the face
+_FROM, _WHOLE = 0.6, 0.9  # -z of the directions from which on light is partly, and wholly, from behind
+_SHARPNESS, _REACH = 2.0, 0.2  # g'(0), at most 4, and the reach, in extents of the face
 _SMOOTH = 0.006  # standard deviation of the blur of the outline's distance, in extents of the face
 _OUTSIDE = 0.015  # of the outline, in extents of the face, over which brightness fades to what it was
 _SIDE_PX = 640  # longest side of the photo in which distances are measured
