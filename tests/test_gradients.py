@@ -108,6 +108,14 @@ def test_of_the_pose(person: facerf.Person, light: facerf.Light, loss: Loss) -> 
     assert expected.norm() > 10 and (found - expected).norm() < SMOOTH * expected.norm()
 
 
+def test_of_a_light_that_does_not_shine_yet(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
+    weights = torch.as_tensor(light.weights) * torch.tensor([[1.0], [0.0], [1.0]])
+    found, expected = compared(
+        lambda x: loss(person.relight(facerf.Light(light.directions, x))), weights, 0.1, torch.eye(3)[1:2].T
+    )
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
+
+
 @pytest.mark.parametrize("pose", [None, POSE])
 def test_of_the_texture(person: facerf.Person, light: facerf.Light, loss: Loss, pose: Tensor | None) -> None:
     texture = torch.from_numpy(person.texture)
@@ -147,7 +155,13 @@ def slopes(value: Callable[[], Tensor], weight: Tensor, step: float) -> tuple[fl
 def test_of_the_weights_of_the_reflectance_network(
     models: Models, person: facerf.Person, light: facerf.Light, loss: Loss
 ) -> None:
+    """Also after an image without gradients, and again: what is encoded with gradients is not kept."""
     network: Any = models.networks.reflectance
+    first = next(network.parameters()).requires_grad_(True)
+    for _ in range(2):
+        (gradient,) = torch.autograd.grad(loss(person.relight(light, alone=True)), first)
+        assert gradient.abs().sum() > 0
+    first.requires_grad_(False)
     weight = network.head.weight.requires_grad_(True)
     found, expected = slopes(lambda: loss(person.relight(light, alone=True)), weight, 0.03)
     weight.requires_grad_(False)

@@ -45,7 +45,7 @@ class Field:
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
-        used = weights.abs().sum((0, 2)) > 0
+        used = shining(weights)
         used[0] |= not used.any()
         return weighted_sum(self.olats(directions[used], turn), weights[:, used])
 
@@ -55,7 +55,8 @@ class Field:
         `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s (paper,
         'Network Architecture'). The encoder runs once a field, the decoder once a light.
         """
-        network, face, device, encoded = self._network, self.face, self.models.device, self._encoded
+        network, face, device = self._network, self.face, self.models.device
+        encoded = self._encode() if self._has_gradients else self._encoded
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals, grey = normals[None].to(device), is_grey(face.texture)
 
@@ -68,8 +69,18 @@ class Field:
 
         yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
 
+    @property
+    def _has_gradients(self) -> bool:
+        """If the encoded face has gradients, which serve one `backward` alone."""
+        network: Any = self._network
+        taken = (self.face.texture, *network.parameters())
+        return torch.is_grad_enabled() and any(values.requires_grad for values in taken)
+
     @cached_property
     def _encoded(self) -> Any:
+        return self._encode()
+
+    def _encode(self) -> Any:
         """The face as the network's encoder sees it."""
         face, device = self.face, self.models.device
         visible, shown = face.visible[None, None], face.texture
@@ -90,6 +101,11 @@ class Field:
         texels = self.face.texture.shape[-1] ** 2
         bytes_per_light = self._network.bytes_per_light(texels) * count()
         return max(1, min(most, self.memory_bytes // bytes_per_light))
+
+
+def shining(weights: Tensor) -> Tensor:
+    """The lights [L] that matter to sums of them, weights [M, L, 3]: for gradients all, else those not 0."""
+    return (weights.abs().sum((0, 2)) > 0) | weights.requires_grad
 
 
 def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:

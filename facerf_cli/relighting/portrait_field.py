@@ -29,7 +29,7 @@ from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
-from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.own_light import OwnLight
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
@@ -137,7 +137,7 @@ class PortraitView:
 
     def _far(self, directions: Tensor, weights: Tensor) -> Iterator[_Some]:
         """Batches of far lights [L, 3] with rgb weights [M, L, 3]; those of weight 0 are left out."""
-        used = weights.abs().sum((0, 2)) > 0
+        used = shining(weights)
         if used.any():
             for lights, some in zip(
                 torch.split(directions[used], _LIGHTS_AT_ONCE),
