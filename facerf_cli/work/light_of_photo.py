@@ -94,7 +94,7 @@ def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.n
 
 
 _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
-_SOFT = 0.32  # share of one lamp below which the brightest direction was 24 to 120 degrees off
+_SOFT = 0.32  # share of one lamp below which the brightest direction was 15 to 120 degrees off
 log = logging.getLogger(LOGGER_NAME)
 
 
