@@ -85,6 +85,7 @@ def test_over_a_rig_the_light_keeps_its_sum_and_the_lamp_its_place() -> None:
     assert (weights >= alone).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fill", "one_lamp"), [(0.02, True), (0.6, False)])
 def test_one_lamp_that_explains_the_photo_is_its_light(
     models: Models, face: FaceTexture, fill: float, one_lamp: bool
