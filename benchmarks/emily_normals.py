@@ -43,7 +43,7 @@ def measured(folder: Path, view: int) -> tuple[float, float, float]:
     photo, file = read_image(path).pixels, np.load(folder / f"truth_{view}.npz", allow_pickle=False)
     field = fit(models, photo, find_for(models.networks.people, "landmarks", photo, path.name)[0]).reflectance
     assert isinstance(field, PortraitField)
-    dark = torch.zeros(len(field.views), 9, *field.person.image.shape[1:])
+    dark = torch.zeros(len(field.views), 15, *field.person.image.shape[1:])
     whole = WholePerson(photo, field).layer("normal", dark, photo)["normal"]
     (found, seen), (truth, known) = unit(whole(slice(0, len(photo)))), unit(file["normal"].astype(np.float32))
     shown = known & seen & (truth[..., 2] > 0.1) & (np.asarray(Image.open(path).convert("L")) > _BLACK)
