@@ -297,7 +297,7 @@ class LightEstimate:
     """The light of a photo, the evidence for it, and the texture [3, t, t] of the face under it.
 
     If features refined the weights, `refined` holds the refinement, and `least_squares` [L, 3] are those
-    before. `lamp_share` is the share of one lamp in the light, where that was asked.
+    before. `key_share` is the share of the key light, where that was asked.
     """
 
     light: RigLight
@@ -305,7 +305,7 @@ class LightEstimate:
     explained: Tensor
     refined: RefinedLight | None = None
     least_squares: Tensor | None = None
-    lamp_share: float | None = None
+    key_share: float | None = None
 
 
 def estimate_light(
@@ -347,7 +347,7 @@ def estimate_light(
         if share > _ONE_LAMP and left[1] < _AS_WELL * left[0]:
             weights = one_lamp
     if features is None:
-        return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights), lamp_share=share)
+        return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights), key_share=share)
 
     def layers(x: Tensor) -> list[Tensor]:
         return [layer.cpu() for layer in features.layers((x / exposure).to(models.device))]

@@ -97,7 +97,7 @@ def test_one_lamp_that_explains_the_photo_is_its_light(
     head = replace(astronaut.head(), face=replace(shown, texture=shown.texture * noise))
     found = estimate_light(models, head)
     rig_alone = found.evidence.least_squares()
-    assert found.lamp_share is not None and (found.lamp_share > 0.8) == one_lamp
+    assert found.key_share is not None and (found.key_share > 0.8) == one_lamp
     assert torch.equal(found.light.weights, rig_alone) != one_lamp
 
 

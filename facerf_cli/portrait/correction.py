@@ -21,7 +21,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.raster.texture import blurred
+from facerf_cli.raster.texture import blurred_within
 
 _FLOOR = 0.05  # f, as a share of the mean of the photo's person
 _RANGE = (0.2, 5.0)  # of Q
@@ -54,7 +54,7 @@ class Correction:
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
         ratio = _ratio(photo, explained, floor)
         mean = float((explained.mean(0) * person).sum() / total)
-        excess = _blurred_within(ratio - 1, person)
+        excess = blurred_within(ratio - 1, person, _BLUR_PX) * person
         plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
         grey = olats.mean(1)
         brightness = plain._brightness(grey)
@@ -94,12 +94,6 @@ def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
     grey = (shown + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
     coloured = shown**2 / (shown**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
     return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
-
-
-def _blurred_within(maps: Tensor, person: Tensor) -> Tensor:
-    """Maps [C, S, S] on a person [S, S], blurred without what is off the person."""
-    both = blurred(torch.cat([maps * person, person[None]]), _BLUR_PX)
-    return both[:-1] / both[-1:].clamp_min(1e-6) * person
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:

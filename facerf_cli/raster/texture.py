@@ -227,3 +227,9 @@ def _inpaint(texture: Tensor, visible: Tensor) -> Tensor:
 def blurred(maps: Tensor, sigma_px: float) -> Tensor:
     """Blur maps [C, H, W] by a Gaussian; beyond their border they go on as there."""
     return torch.from_numpy(gaussian_filter(maps.numpy(), (0, sigma_px, sigma_px), mode="nearest"))
+
+
+def blurred_within(maps: Tensor, weight: Tensor, sigma_px: float) -> Tensor:
+    """Means of maps [C, H, W] by a Gaussian around each pixel, under weights [H, W]; 0 where these are 0."""
+    both = blurred(torch.cat([maps * weight, weight[None]]), sigma_px)
+    return both[:-1] / both[-1:].clamp_min(1e-6)

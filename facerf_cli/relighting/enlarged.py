@@ -65,7 +65,8 @@ class Enlarged:
         With `rims` that of light from behind, the last six, is apart: [h, w, 6]. `display_ev` is the exposure
         at which the photo is shown to the guided filter.
         """
-        front, rear = self._smooth(lit[:6]), self._smooth(lit[9:])
+        front = self._smooth(lit[:6])
+        rear = lit[9:] if rims is None else self._smooth(lit[9:])
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
             albedo, strands = self._seen((rows, columns), pixels, display_ev)

@@ -6,10 +6,9 @@ shaded skin has the colour of its lit skin. Brightness and detail stay; the corr
 photo as it is, and gives it back in its own light.
 """
 
-import torch
 from torch import Tensor
 
-from facerf_cli.raster.texture import blurred
+from facerf_cli.raster.texture import blurred_within
 
 _REACH = 0.03  # blur of colours, in sides: what is narrower, as freckles are, is the skin's own
 _SHADE = (0.3, 0.8)  # brightness over that of lit skin, below which all is shade, and from which on none
@@ -27,17 +26,11 @@ def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
     near, reach = 0.3 * _REACH * image.shape[-1], _REACH * image.shape[-1]
     brightness = image.mean(0)
     lit = (image * skin * brightness).sum((1, 2)) / (skin * brightness).sum().clamp_min(_TINY)
-    level = _mean_near(brightness[None], skin, near)[0] / lit.mean().clamp_min(_TINY)
+    level = blurred_within(brightness[None], skin, near)[0] / lit.mean().clamp_min(_TINY)
     shade = ((_SHADE[1] - level) / (_SHADE[1] - _SHADE[0])).clamp(0, 1)
     even = image / (brightness + _NOISE * lit.mean()).clamp_min(_TINY)  # each pixel counts alike
-    colour = _mean_near(even, shade * skin, reach)
+    colour = blurred_within(even, shade * skin, reach)
     typical = (lit / lit.mean().clamp_min(_TINY))[:, None, None]
     change = typical * colour.mean(0) / colour.clamp_min(_TINY)
-    amount = _mean_near(shade[None], skin, near)[0] * (2 * skin).clamp(max=1)
+    amount = blurred_within(shade[None], skin, near)[0] * (2 * skin).clamp(max=1)
     return change.clamp(1 / _MOST, _MOST) ** amount
-
-
-def _mean_near(image: Tensor, weight: Tensor, reach: float) -> Tensor:
-    """Mean of an image [C, S, S] around each pixel under weights [S, S]."""
-    *total, share = blurred(torch.cat([image * weight, weight[None]]), reach)
-    return torch.stack(total) / share.clamp_min(_TINY)

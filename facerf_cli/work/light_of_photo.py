@@ -164,7 +164,7 @@ def _estimate(
             item.input_path,
             100 * residual,
         )
-    if estimate.lamp_share is not None and estimate.lamp_share < _SOFT:
+    if estimate.key_share is not None and estimate.key_share < _SOFT:
         log.info("%s: soft light; its brightest direction is doubtful", item.input_path)
     return estimate, _facts(estimate, residual, options, name)
 
@@ -196,8 +196,8 @@ def _facts(
     if options.reflectance != "field":
         return facts | {"non_negative": bool((light.weights >= 0).all())}
     facts |= {"non_negative": options.non_negative, "features": features}
-    if estimate.lamp_share is not None:
-        facts["lamp_share"] = round(estimate.lamp_share, 3)
+    if estimate.key_share is not None:
+        facts["key_share"] = round(estimate.key_share, 3)
     if (refined := estimate.refined) is not None and estimate.least_squares is not None:
         facts |= {
             "feature_loss": [float(f"{loss:.4g}") for loss in (refined.loss_before, refined.loss_after)],
