@@ -9,9 +9,13 @@ from pathlib import Path
 
 from facerf_cli.main import main
 
+# Each command has a pipe for its answer: of one for all, the next command could find the end of this one's.
 _ASK = """#!/bin/sh
-{ printf '%s\\0' "${0##*/}" "$@"; echo; } > "$SHELL_ASKS"
-read -r code < "$SHELL_TOLD"
+told=$SHELL_ASKS.$$
+mkfifo "$told"
+{ printf '%s\\0' "$told" "${0##*/}" "$@"; echo; } > "$SHELL_ASKS"
+read -r code < "$told"
+rm "$told"
 exit "$code"
 """
 
@@ -21,18 +25,13 @@ def run_shell(folder: Path, *command: str | Path, **variables: str | Path) -> li
 
     Its first failing command, or an exit code other than 0, fails the test. One command runs at a time.
     """
-    asks, told = folder / "asks", folder / "told"
+    asks = folder / "asks"
     os.mkfifo(asks)
-    os.mkfifo(told)
     for name in ("facerf", "python"):
         (folder / name).write_text(_ASK)
         (folder / name).chmod(0o755)
     environment = os.environ | {key: str(value) for key, value in variables.items()}
-    environment |= {
-        "SHELL_ASKS": str(asks),
-        "SHELL_TOLD": str(told),
-        "PATH": f"{folder}:{os.environ['PATH']}",
-    }
+    environment |= {"SHELL_ASKS": str(asks), "PATH": f"{folder}:{os.environ['PATH']}"}
     seen: list[list[str]] = []
     text = b""
     stream = os.open(asks, os.O_RDWR | os.O_NONBLOCK)
@@ -44,10 +43,10 @@ def run_shell(folder: Path, *command: str | Path, **variables: str | Path) -> li
             text += os.read(stream, 1 << 16)
             if not text.endswith(b"\n"):
                 continue
-            words, text = text.decode().removesuffix("\0\n").split("\0"), b""
+            (told, *words), text = text.decode().removesuffix("\0\n").split("\0"), b""
             seen.append(words)
             code = _run(words)
-            told.write_text(f"{code}\n")
+            Path(told).write_text(f"{code}\n")
             assert code == 0, words
     finally:
         os.close(stream)

@@ -1,9 +1,9 @@
 """Atomic writes, and one run at a time in an output folder.
 
 An output is written into a hidden folder next to it, made durable, and renamed. The hidden folder belongs to
-this process alone, and no link that another user has put there is followed (`tempfile.mkdtemp`). A power cut
-leaves the old output or the new one: the data is on the disk before the rename, and the rename before the
-next step (Pillai et al., 'All File Systems Are Not Created Equal', OSDI 2014).
+this process alone, and no link that another user has put there is followed. A power cut leaves the old output
+or the new one: the data is on the disk before the rename, and the rename before the next step (Pillai et al.,
+'All File Systems Are Not Created Equal', OSDI 2014).
 
 A run holds the lock of its output folder; the next one waits, and then finds what the first has made. The
 lock ends with its process, however that ends.
@@ -15,8 +15,8 @@ import hashlib
 import logging
 import os
 import platform
+import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -76,10 +76,11 @@ def hidden_folder(path: Path) -> Iterator[Path]:
     """Yield a hidden folder next to an output, of this process alone, which goes with the block."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep_once(path.parent)
-    start = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-"
-    room = Path(tempfile.mkdtemp(prefix=start, dir=path.parent))
+    name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    room = path.parent / name
     _open.add(room)
-    try:
+    try:  # before it is there: an interrupt may come at any time
+        room.mkdir(mode=0o700)
         yield room
     finally:
         shutil.rmtree(room, ignore_errors=True)

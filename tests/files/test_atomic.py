@@ -55,6 +55,22 @@ def test_nothing_stays_where_the_writer_fails(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_an_interrupt_while_the_temporary_folder_is_made_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = os.mkdir
+
+    def interrupted(path: Path, mode: int = 0o777) -> None:
+        make(path, mode)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "mkdir", interrupted)
+        with pytest.raises(KeyboardInterrupt), atomic.hidden_folder(tmp_path / "a.exr"):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_link_in_the_place_of_an_output_is_replaced_not_followed(tmp_path: Path) -> None:
     (tmp_path / "theirs").write_text("theirs")
     (tmp_path / "a.txt").symlink_to(tmp_path / "theirs")
