@@ -1,6 +1,7 @@
 """The portrait field of a photo: its own light gives the photo back, and the whole person is relit."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
+from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import filled, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
@@ -266,6 +268,23 @@ def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitF
     columns, weight = Enlarged(head, np.zeros((*matte.shape, 3), np.float32)).weight(slice(0, len(matte)))
     assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
     assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
+
+
+def test_strands_break_up_light_from_behind_and_nothing_else_does(field: PortraitField) -> None:
+    """Shading of 1, from the front and from behind: skin is alike, and hair has a contrast of its own."""
+    view, photo = field.views[0], astronaut.photo()
+    enlarged, rows, columns = Enlarged(view, photo), slice(0, photo.shape[0]), slice(0, photo.shape[1])
+    lit = torch.zeros(15, *view.person.image.shape[1:])
+    lit[:3], lit[9:12] = 1, 1
+    where_they_are = SimpleNamespace(
+        at=lambda rows, columns: (torch.zeros(2, *photo[rows, columns].shape[:2]), torch.tensor(1.0))
+    )
+    relit = enlarged.relit(lit, 0.0, cast(Any, where_they_are))(photo, rows, columns)
+    ratio = luminance(relit[..., 3:]) / luminance(relit[..., :3]).clip(1e-6)
+    classes = enlarged._enlarged(view.person.classes, rows, columns).numpy()
+    hair, skin = (classes[class_index(name)] for name in ("hair", "skin"))
+    assert np.abs(ratio[skin > 0.999] - 1).max() < 0.01
+    assert 0.9 < ratio[hair > 0.8].mean() < 1.1 and ratio[hair > 0.8].std() > 0.05
 
 
 def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:

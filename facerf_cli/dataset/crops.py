@@ -27,7 +27,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.batch.made_from import Recipe, key_of, text_of_state
-from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, read_stack
+from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, people_of, read_stack
 from facerf_cli.dataset.pairs import DRAW_AGAIN, Pair, image_path, load_pairs, read_pairs
 from facerf_cli.dataset.weights import relit_images
 from facerf_cli.errors import InputError
@@ -221,11 +221,11 @@ def _lazy_sources(dataset: Dataset, pairs: tuple[Pair, ...]) -> list[Tensor]:
 
 def open_pairs(dataset: Dataset, split: str, side_px: int) -> PairReader:
     """Open the pairs of a split; raise InputError where it has none or its crops are smaller."""
-    pairs = [pair for pair in read_pairs(dataset) if pair.split == split]
+    people = set(people_of(dataset, split))
+    pairs = [pair for pair in read_pairs(dataset) if pair.subject in people]
     if not pairs:
         raise InputError(
-            f"{dataset.folder}: no pairs in the split {split}; make them with `facerf relight-dataset`, "
-            "after a prepare-dataset whose --split puts subjects there"
+            f"{dataset.folder}: no pairs in the split {split}; make them with `facerf relight-dataset`"
         )
     stack = _stack_info(dataset.stack_path(pairs[0].subject, pairs[0].source_camera))
     require_crops(dataset, stack.side_px, side_px)

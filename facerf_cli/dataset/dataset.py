@@ -14,6 +14,7 @@ those it has (`lights`, in the order of its stacks' parts) and why the others ar
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -35,6 +36,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.documents import Direction, Document, Name, digest, distinct, read_document
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
+from facerf_cli.run.logs import LOGGER_NAME
 
 Format = Literal["facerf-dataset-1"]
 FORMAT: Format = "facerf-dataset-1"
@@ -43,6 +45,7 @@ SPLITS = ("train", "validation", "test")
 LARGEST_CROP_PX = 4096
 PREPARE_AGAIN = "run prepare-dataset with --overwrite always"
 _COLOUR_SPACE = "lin_rec709"
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +102,23 @@ class Dataset(DatasetFolder):
     @cached_property
     def _split_by_subject(self) -> dict[str, str]:
         return {subject: split for split, members in self.splits.items() for subject in members}
+
+
+def people_of(dataset: Dataset, split: str) -> tuple[str, ...]:
+    """Subjects of a split, of whom a training learns ('train') or is judged ('validation').
+
+    The only person of a dataset is both, and a line says so. Raises InputError where there is nobody.
+    """
+    if split == "validation" and len(dataset.subjects) == 1 and dataset.splits["train"]:
+        log.warning(
+            "%s: has one person, so nobody is held out: the validation is of who is trained on",
+            dataset.folder,
+        )
+        return dataset.splits["train"]
+    if not dataset.splits[split]:
+        advice = "run prepare-dataset with another --split"
+        raise InputError(f"{dataset.folder}: no subject in the split {split}; {advice}")
+    return dataset.splits[split]
 
 
 class _RigLight(Document):

@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from facerf_cli.batch.made_from import is_made_from
-from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
+from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
 from facerf_cli.dataset.unwrapped import stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
@@ -107,7 +107,7 @@ def open_dataset_portraits(
 
 def _views_of(dataset: Dataset, split: str) -> list[list[Path]]:
     """Portraits of each person of a split, of those who have some."""
-    paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in dataset.splits[split]]
+    paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in people_of(dataset, split)]
     shown = [[path for path in views if _shows_a_face(path)] for views in paths]
     return [views for views in shown if views]
 

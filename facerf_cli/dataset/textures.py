@@ -6,7 +6,6 @@ the stack's textures, which is the same, for unwrapping is linear. Without pairs
 for synthetic heads.
 """
 
-import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import torch
 from safetensors import safe_open
 from torch import Tensor
 
-from facerf_cli.dataset.dataset import Dataset, provenance_of, read_dataset
+from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
 from facerf_cli.dataset.pairs import load_pairs
 from facerf_cli.dataset.unwrapped import UnwrappedView, build_textures, sources_path, texture_path
 from facerf_cli.errors import InputError
@@ -25,31 +24,15 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import inpaint, normal_map
-from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.bank.heads import HeadBakeSettings, bake_head
 from facerf_cli.synth.bank.texture_samples import Sample, draw_light, draw_target_lights, simulate_camera
 
-log = logging.getLogger(LOGGER_NAME)
-
 
 def heads_of(dataset: Dataset, held_out: int) -> tuple[Tensor, Tensor]:
-    """Places in `subjects` of the split train, and of at most `held_out` of the split validation.
-
-    The only person of a dataset is validated on, too, and a line says so.
-    """
-    if len(dataset.subjects) == 1 and dataset.splits["train"]:
-        log.warning(
-            "%s: has one person, so nobody is held out: the validation is of who is trained on",
-            dataset.folder,
-        )
-        return torch.tensor([0]), torch.tensor([0])
+    """Places in `subjects` of the people to train on, and of at most `held_out` to validate on."""
     places = {subject: place for place, subject in enumerate(dataset.subjects)}
-    for split in ("train", "validation"):
-        if not dataset.splits[split]:
-            advice = "run prepare-dataset with another --split"
-            raise InputError(f"{dataset.folder}: no subject in the split {split}; {advice}")
     train, validation = (
-        torch.tensor([places[subject] for subject in dataset.splits[split]])
+        torch.tensor([places[subject] for subject in people_of(dataset, split)])
         for split in ("train", "validation")
     )
     return train, validation[:held_out]

@@ -1,7 +1,7 @@
 """Studio lights as points: the squares of soft lights are sampled by a regular grid."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -121,13 +121,15 @@ class Lights:
     """M sums of lights: far ones from unit directions [L, 3], camera space, and J near ones; rgb weights.
 
     A light of weight 1 gives a white Lambertian surface that faces it radiance 1; of a near one, at the
-    face's centre. A rig's light is one sum.
+    face's centre. A rig's light is one sum. Those that are `even` are together the same light from all
+    around, in which a mirror shows nothing.
     """
 
     directions: Tensor
     weights: Tensor  # [M, L, 3]
     near: tuple[StudioLight, ...] = ()
     near_weights: Tensor | None = None  # [M, J, 3]
+    even: Tensor | None = None  # [L]
 
     @staticmethod
     def of_rig(light: RigLight) -> "Lights":
@@ -145,20 +147,21 @@ class Lights:
     def __getitem__(self, sums: slice) -> "Lights":
         """Some of the sums, without the near lights that shine in none of them."""
         if self.near_weights is None:
-            return Lights(self.directions, self.weights[sums])
+            return replace(self, weights=self.weights[sums])
         some = self.near_weights[sums]
         used = (some != 0).any(0).any(1)
         near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
-        return Lights(self.directions, self.weights[sums], near, some[:, used])
+        return replace(self, weights=self.weights[sums], near=near, near_weights=some[:, used])
 
     def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
         """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
         weights = () if self.near_weights is None else self.near_weights.unbind(1)
         return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
 
-    def arriving(self, place_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light that arrives at a place [3]."""
-        directions, weights = [self.directions], [self.weights]
+    def mirrored(self, place_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions [N, 3] and rgb weights [M, N, 3] of what a mirror at a place [3] shows."""
+        shown = torch.ones(len(self.directions)) if self.even is None else (~self.even).float()
+        directions, weights = [self.directions], [self.weights * shown[:, None]]
         for points, rgb in self.around(place_m):
             toward, irradiance = points.arriving(place_m[:, None, None])
             directions.append(toward[:, 0, 0])

@@ -60,21 +60,24 @@ class Enlarged:
         return columns, ((1 - away) / _FEATHER).clamp(0, 1).numpy()
 
     def relit(self, lit: Tensor, display_ev: float, rims: Rims | None) -> Shown:
-        """Radiance [h, w, 3] under shading and highlights, the first six of maps [15, S, S].
+        """Radiance [h, w, 3] under the light of maps [15, S, S], but for that from behind.
 
-        With `rims` that of light from behind, the last six, is apart: [h, w, 6]. `display_ev` is the exposure
-        at which the photo is shown to the guided filter.
+        With `rims` that from behind is there, too, apart: [h, w, 6]. `display_ev` is the exposure at which
+        the photo is shown to the guided filter.
         """
-        front = self._smooth(lit[:6])
-        rear = lit[9:] if rims is None else self._smooth(lit[9:])
+        light = PortraitLight.of(lit[None])
+        front = self._smooth(torch.cat([light.shading, light.highlights], 1)[0])
+        rear = light.behind[0] if rims is None else self._smooth(light.behind[0])
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
             albedo, strands = self._seen((rows, columns), pixels, display_ev)
-            lights = [self._enlarged(front, rows, columns)]
+            shading, highlights = self._enlarged(front, rows, columns).chunk(2)
+            parts = [albedo * shading + highlights * strands]
             if rims is not None:
                 offsets_px, brightness = rims.at(rows, columns)
-                lights.append(self._enlarged(rear, rows, columns, offsets_px) * brightness)
-            parts = [albedo * light[:3] + light[3:] * strands for light in lights]
+                shading, highlights = self._enlarged(rear, rows, columns, offsets_px).chunk(2)
+                # Strands that stand before such a light show one by one.
+                parts.append((albedo * shading + highlights * strands) * (brightness * strands))
             return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
 
         return of
@@ -106,9 +109,10 @@ class Enlarged:
                 self._albedo(pixels, self._enlarged(self._albedo_maps, rows, columns), self._display_ev)
                 * self._view.exposure
             )
+        light = PortraitLight.of(lit[None]).whole
         maps = {
-            "specular": (lit[3:6] + lit[12:]).clamp_min(0) * self._view.exposure,
-            "shadow": lit[6:9],
+            "specular": light.highlights[0].clamp_min(0) * self._view.exposure,
+            "shadow": light.reached[0],
             "normal": self._view.maps.normals[0],
         }[name]
         filled = self._filled(maps)
@@ -117,7 +121,7 @@ class Enlarged:
     def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [15, S, S]."""
         view = self._view
-        (relit,) = view.relit(PortraitLight(*torch.split(lit[None], [3, 3, 3, 6], 1)))
+        (relit,) = view.relit(PortraitLight.of(lit[None]))
         skin = view.person.classes[class_index("skin")].numpy()
         image = view.person.image.permute(1, 2, 0).numpy()
         return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())

@@ -58,6 +58,11 @@ class PortraitLight:
     reached: Tensor
     behind: Tensor
 
+    @staticmethod
+    def of(stacked: Tensor) -> "PortraitLight":
+        """The maps apart, which were `stacked`."""
+        return PortraitLight(*torch.split(stacked, [3, 3, 3, 6], 1))
+
     @property
     def stacked(self) -> Tensor:
         """All maps [M, 15, S, S], as `WholePerson` takes them."""

@@ -28,7 +28,7 @@ from facerf_cli.pipeline import FittedPerson
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.portrait_field import PortraitField, PortraitView
+from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView
 
 RATIO_PX = 320  # the longer side of a ratio
 MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept
@@ -166,9 +166,7 @@ def basis_of_photo(
     def add(relit: Relit) -> None:
         assert relit.surround is not None
         images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
-        front, behind = relit.surround[0, :6], relit.surround[0, 9:]
-        shading, highlights = (front + behind).chunk(2)
-        part = (view.maps.albedo[0] * shading + highlights) * view.exposure
+        (part,) = view.relit(PortraitLight.of(relit.surround[:1]))
         coarse.append(part.permute(1, 2, 0).numpy().astype(np.float16))
 
     mean: Relit | None = None
@@ -176,8 +174,9 @@ def basis_of_photo(
         add(relit)
         mean = relit if mean is None else mean.plus(torch.ones(1), relit)
     assert mean is not None and mean.surround is not None and mean.mirrored is not None
+    dark_eyes = torch.zeros_like(mean.mirrored)
     mean = Relit(*(part / len(rig) for part in (mean.texture, mean.surround, mean.mirrored)))
-    add(mean)
+    add(replace(mean, mirrored=dark_eyes))  # which do not mirror a room
     shown = whole(composition.light_layer(mean), *composition.size_px)
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
     samples = LightSamples.of(np.stack(coarse), 1 - classes[0], classes[class_index("skin")], source)

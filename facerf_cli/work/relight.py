@@ -1,171 +1,39 @@
-"""One photo, or one OLAT stack, under every light setup: relit, exposed, before a background, and written."""
+"""One photo, or one OLAT stack, under every light setup: relit, exposed and written (`relight_scenes.py`)."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
-from facerf_cli.face.dlib_landmarks import face_descriptor
-from facerf_cli.face.landmarks import display_ev
-from facerf_cli.face.view import photo_camera
-from facerf_cli.files.image_metadata import plate_metadata
-from facerf_cli.files.images import LinearImage, read_image
-from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
-from facerf_cli.image.strips import Band, covering, filled
-from facerf_cli.light.envmap import backdrop
-from facerf_cli.light.studio_points import Lights, intensity_of
-from facerf_cli.pipeline import FittedPerson, reflectance_of
-from facerf_cli.raster.camera import Camera, rays_of_rows
-from facerf_cli.relighting.composition import Composition, Target
-from facerf_cli.relighting.group import GroupComposition
-from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
+from facerf_cli.image.colour import most_exposure_ev
+from facerf_cli.image.strips import filled
+from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import (
-    each_alone,
-    lights_over_rig,
-    lights_over_stack,
-    off_rig_deg,
-    on_face,
-    read_map,
-    with_room,
-)
+from facerf_cli.work.lights import with_room
 from facerf_cli.work.outputs import OutputImage, write_output
-from facerf_cli.work.photos import (
-    FittedFace,
-    companion,
-    face_model,
-    facts_of,
-    fit_each,
-    fit_facts,
-    load_models_once,
-    naming,
-    provenance,
-    read_matte,
-    read_photo,
-    rotation_of,
-)
-from facerf_cli.work.plan import (
-    KEPT_PX,
-    Empty,
-    batches,
-    beside_people,
-    beside_person,
-    beside_stack,
-    image_canvas,
-    prediction_bytes,
-    require_face,
-)
-from facerf_cli.work.relight_options import BackgroundChoice, Relight
-from facerf_cli.work.sequence import frame_with_face, view_of
+from facerf_cli.work.photos import load_models_once
+from facerf_cli.work.plan import Empty, batches, beside_people, image_canvas
+from facerf_cli.work.relight_options import Relight
+from facerf_cli.work.relight_scenes import LitScene, scene_of_all, scenes_of
+from facerf_cli.work.sequence import view_of
 from facerf_cli.work.shots import shot_of
-from facerf_cli.work.stack_composers import (
-    StackImages,
-    StackTextures,
-    face_in_stack,
-    head_in_stack,
-)
 
 log = logging.getLogger(LOGGER_NAME)
-_OFF_RIG_DEG = 1.0  # from which on a light that a stack lacks is named
 _digest_once = lru_cache(maxsize=256)(file_sha256)
-
-Composer = Composition | GroupComposition | StackImages
-Behind = Callable[[LightSetup, float], Band | None]  # the image behind a person, for a setup and an exposure
-
-
-def _backdrop(work: Relight, camera: Camera) -> Behind:
-    """Images [H, W, 3] behind a person, scene-linear; None for the photo's own, or for nothing.
-
-    A file and a colour look as they are at the exposure, in EV. A map is as bright as its light; single
-    lights have a black surrounding.
-    """
-    fixed, size_px = _fixed(work.background, camera), (camera.height_px, camera.width_px)
-
-    def behind(setup: LightSetup, ev: float) -> Band | None:
-        gain = np.float32(2.0**-ev)
-        if work.background.kind != "envmap":
-            return None if fixed is None else lambda rows: fixed[rows] * gain
-        if (light := setup.envmap) is None or light.envmap is None:
-            return lambda rows: np.zeros((rows.stop - rows.start, camera.width_px, 3), np.float32)
-        with beside_person(size_px):
-            envmap = read_map(light.envmap)
-        rays, colour = partial(rays_of_rows, camera), intensity_of(light).numpy()
-        around = backdrop(envmap, size_px, rays, light.rotate_deg, work.background_blur)
-        return lambda rows: around(rows) * colour
-
-    return behind
-
-
-def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
-    height, width = camera.height_px, camera.width_px
-    if choice.colour is not None:
-        return np.broadcast_to(np.array(choice.colour, np.float32), (height, width, 3))
-    if choice.path is None:
-        return None
-    with beside_person((height, width), images=1):
-        return covering(read_image(choice.path, with_alpha=False).pixels, height, width)
-
-
-@dataclass(frozen=True, eq=False)
-class _LitScene:
-    """People of a photo, or a stack: its composer, the lights of setups, and what is behind.
-
-    `faces` are the numbers, from the left, of the people's faces in the order of the composer.
-    """
-
-    composer: Composer
-    setups: tuple[LightSetup, ...]
-    lights_of: Callable[[tuple[LightSetup, ...]], Lights]
-    faces: tuple[int, ...] = (0,)
-    alpha: np.ndarray | None = None  # of the photo
-    behind: Behind | None = None
-    plate: Mapping[str, Any] = field(default_factory=dict)  # metadata of the photo that results keep
-    identity: Callable[[np.ndarray], float] | None = None  # of an exposed image, to the photo
-
-    @cached_property
-    def lights(self) -> list[Lights]:
-        """The lights of all setups on each of the people."""
-        return [self.lights_of(_as_lit(self.setups, number)) for number in self.faces]
-
-    def relit(self, part: slice) -> list[Any]:
-        """The people under some of the setups."""
-        return list(self._composed([lights[part] for lights in self.lights]))
-
-    def relit_by_each(self, setup: LightSetup, part: slice) -> Iterator[Any]:
-        """The people under some of the lights of a setup, each alone."""
-        lit = [_as_lit((setup,), number)[0] for number in self.faces]
-        return self._composed([self.lights_of(each_alone(one)[part]) for one in lit])
-
-    def _composed(self, lights: Sequence[Lights]) -> Iterator[Any]:
-        if isinstance(self.composer, GroupComposition):
-            return self.composer.relit(lights)
-        return self.composer.relit(lights[0])
-
-
-def _as_lit(setups: Sequence[LightSetup], face: int) -> tuple[LightSetup, ...]:
-    """Setups as they shine on one of the people, with the light of their rooms."""
-    return tuple(with_room(on_face(setup, face)) for setup in setups)
-
-
-Scenes = Iterator[tuple[str, _LitScene]]  # each with the tag of its files
-Describe = Callable[[], dict[str, Any]]  # facts for the report
 
 
 def relight_item(item: Item, work: Relight) -> Outcome:
     """Relight a photo or a stack under every setup."""
-    read = _scenes_of_stack if is_olat_stack(item.input_path) else _scenes_of_photo
-    scenes, metadata, describe = read(item, work)
+    scenes, metadata, describe = scenes_of(item, work)
     shared_ev = _shared_exposures(item, work)
     written: dict[Path, dict[str, float]] = {}
     for tag, scene in scenes:
@@ -175,38 +43,6 @@ def relight_item(item: Item, work: Relight) -> Outcome:
     names = dict.fromkeys(name for facts in written.values() for name in facts)
     facts = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
     return Outcome(outputs, describe() | facts)
-
-
-def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
-    """All chosen people in one image, or each face alone; metadata of the images, and facts of the faces.
-
-    Facts of the mattes are known once the scenes are made.
-    """
-    _over_rig(work)(_as_lit(work.setups, 0))  # maps are read before the photo, not beside it
-    image, faces = _image_and_faces(item, work)
-    facts: list[dict[str, Any]] = []
-
-    def scenes() -> Scenes:
-        parts = [list(faces)[::-1]] if work.composite == "photo" else ([face] for face in faces)
-        for some in parts:
-            if not facts:
-                _check_faces(item, some[-1].number, work)
-            yield "" if work.composite == "photo" else some[0].tag, _scene(item, image, some, work)
-            facts[:0] = [face.described() for face in some]
-
-    return scenes(), _metadata(item, work), lambda: facts_of(facts, work.photo)
-
-
-def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, Iterator[FittedFace]]:
-    """The image of an item and its faces, the last first, as they are fitted.
-
-    Those of a frame of a shot are steadied by the frames around it.
-    """
-    if place := shot_of(work.shots, item):
-        image, face = frame_with_face(*place, work.photo, work.reflectance == "portrait")
-        return image, iter([face])
-    image = read_photo(item, work.photo)
-    return image, fit_each(item, image, work.photo, together=work.composite == "photo")
 
 
 def _leader_of(item: Item, work: Relight) -> Item | None:
@@ -228,166 +64,14 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     """Exposures of a photo or stack that others share; found once a process."""
     if isinstance(work.exposure, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
-    if is_olat_stack(leader.input_path):
-        scene = next(_scenes_of_stack(leader, work)[0])[1]
-    else:
-        image, faces = _image_and_faces(leader, work)
-        scene = _scene(leader, image, list(faces)[::-1], work)
+    scene = scene_of_all(leader, work)
     return _exposures_ev(scene, batches(len(scene.setups), scene.composer.nbytes), scene.relit, work)
-
-
-def _check_faces(item: Item, last: int, work: Relight) -> None:
-    """Raise InputError where a light is for a face whose number is beyond the last one's."""
-    most = max((light.face or 0 for setup in work.setups for light in setup.lights), default=0)
-    if most > last:
-        raise InputError(
-            f"{item.input_path}: a light is for face {most}, and the last is {last}; add --face all"
-        )
-
-
-def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
-    """The distance of an image [H, W, 3] from its photo by descriptors, both at the photo's landmarks."""
-    landmarks_px = face.fit.crop.to_photo(face.head.landmarks_px)
-
-    def descriptor(shown: np.ndarray) -> np.ndarray:
-        return face_descriptor(linear_to_srgb(shown.clip(0, 1)), landmarks_px)
-
-    own = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
-    return lambda shown: round(float(np.linalg.norm(descriptor(shown) - own)), 3)
-
-
-def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> _LitScene:
-    """People of one photo in one image; the nearest first."""
-    by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
-    people = [_composed(item, image, face, work) for face in by_size]
-    composer = people[0] if len(people) == 1 else GroupComposition(people)
-    numbers = tuple(face.number for face in by_size)
-    scene = _LitScene(composer, work.setups, _over_rig(work), numbers, plate=plate_metadata(image.metadata))
-    if work.composite != "photo":
-        return scene
-    if work.identity:
-        scene = replace(scene, identity=_identity_of(image.pixels, by_size[0]))
-    camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
-    alpha = image.alpha if work.background.kind == "photo" else None
-    return replace(scene, alpha=alpha, behind=_backdrop(work, camera))
-
-
-def _over_rig(work: Relight) -> Callable[[tuple[LightSetup, ...]], Lights]:
-    return partial(lights_over_rig, rig=work.rig, sampling=work.sampling)
-
-
-def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> Composition:
-    """A person, fitted and with its reflectance read, in the pose and place that the options choose."""
-    models, photo, target = load_models_once(work.photo), image.pixels, _target(item, face, image, work)
-    kind, alone = work.reflectance, work.network_alone
-    with naming(item.input_path):
-        require_face(models.face, target.fit or face.fit, photo.shape[:2])
-        reflectance = reflectance_of(
-            models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte
-        )
-        person = FittedPerson(models, photo, face.head, reflectance, face.matte)
-        if target.composite == "photo" and face.matte is None:
-            face.see(person.segmentation)
-        return person.composed(target)
-
-
-def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> Target:
-    """The head in the pose of `--pose`, composed as the options choose."""
-    rotation = rotation_of(work.pose)
-    posed = None if rotation is None else replace(face.fit, rotation=rotation)
-    if work.composite != "photo":
-        return Target(posed, "face")
-    matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
-    kind = work.background.kind
-    alpha = None if kind == "photo" else image.alpha
-    return Target(posed, "photo", matte, alpha, kind if kind in ("photo", "none") else "given")
-
-
-def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
-    network = "diffuse_sh" if work.reflectance == "diffuse-sh" else "reflectance"
-    metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name(network))
-    if work.reflectance != "portrait":
-        metadata["facerf:reflectance"] = work.reflectance
-    if work.network_alone:
-        metadata["facerf:network_alone"] = 1
-    return metadata
-
-
-def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
-    """A stack under its own lights, the metadata of its images, and facts of its fit."""
-    _check_stack(item, work)
-    _check_faces(item, 0, work)
-    header = read_olat_header(item.input_path)
-    own = torch.from_numpy(header.directions).float()
-    if (off_deg := off_rig_deg(work.setups, own)) > _OFF_RIG_DEG:
-        said = (
-            "%s: lacks a light (its nearest is %.1f degrees off): mixed of those around it; or give the photo"
-        )
-        log.warning(said, item.input_path, off_deg)
-    lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
-    composer: Composer
-    behind = None
-    if header.kind == "photo":
-        composer, behind, facts = _person_of_stack(item, header, work)
-    elif work.photo_of_stack is not None:
-        raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
-    elif header.kind == "image":
-        composer, facts = StackImages(header, item.input_path), {}
-    else:
-        composer, facts = _face_of_stack(item, header, work)
-    lit = work.setups if work.asked_for_room else tuple(replace(setup, room=0.0) for setup in work.setups)
-    scene = _LitScene(composer, lit, lights_of, behind=behind)
-    metadata = attributes_of_sum(header.metadata, item.input_path.name)
-    return iter([("", scene)]), dict(metadata), lambda: facts
-
-
-def _check_stack(item: Item, work: Relight) -> None:
-    """Raise InputError for what only a photo can have."""
-    wrong = ""
-    if work.pose is not None or work.asked_for_photo:
-        wrong = "a stack holds one pose of a face without its photo; give the photo"
-    elif work.reflectance not in ("field", "portrait"):
-        wrong = f"a stack holds the field; for {work.reflectance} give its photo"
-    elif work.network_alone:
-        wrong = "a stack holds the field as predicted; give its photo"
-    elif work.photo.has_given_person:
-        wrong = "a stack holds its person's matte; give its photo"
-    elif any(light.at_m is not None for setup in work.setups for light in setup.lights):
-        wrong = "a stack holds far lights; for near ones (at=) give its photo"
-    if wrong:
-        raise InputError(f"{item.input_path}: {wrong}")
-
-
-def _person_of_stack(
-    item: Item, header: StackHeader, work: Relight
-) -> tuple[StackImages, Behind | None, dict[str, Any]]:
-    """The composer of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
-    fit, face = face_in_stack(item, header, face_model(work.photo))
-    size_px, stack = header.seen.shape, StackImages(header, item.input_path, face)
-    if work.photo_of_stack is None:
-        return stack, None, fit_facts(fit)
-    path = companion(item, work.photo_of_stack, sorted(PHOTO_SUFFIXES), "--photo")
-    with beside_stack(size_px):
-        photo = read_image(path, work.photo.colourspace, kept_px=KEPT_PX, layer=work.photo.layer).pixels
-    scale = photo.shape[0] / size_px[0]
-    if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):
-        raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")
-    camera = photo_camera(fit.crop.of_scaled(scale), *photo.shape[:2])
-    on_photo = replace(stack, photo=photo, keeps_background=work.background.kind == "photo")
-    return on_photo, _backdrop(work, camera), fit_facts(fit)
-
-
-def _face_of_stack(item: Item, header: StackHeader, work: Relight) -> tuple[Composition, dict[str, Any]]:
-    """The composer of a stack of textures in the frame of its crop, and facts of its fit."""
-    head = head_in_stack(item, header)
-    model, textures = face_model(work.photo), StackTextures(item.input_path)
-    return Composition(model, None, head, Target(composite="face"), textures), fit_facts(head.fit)
 
 
 def _write_setups(
     item: Item,
     tag: str,
-    scene: _LitScene,
+    scene: LitScene,
     work: Relight,
     metadata: Mapping[str, Any],
     shared_ev: Mapping[str, float] | None,
@@ -440,7 +124,7 @@ def _options(work: Relight) -> str:
 
 
 def _rendered(
-    scene: _LitScene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
+    scene: LitScene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
@@ -473,7 +157,7 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    scene: _LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
+    scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(work.exposure, float):

@@ -14,7 +14,7 @@ from skimage.data import astronaut
 
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
-from facerf_cli.work import relight as relight_work
+from facerf_cli.work import relight_scenes
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
@@ -86,7 +86,7 @@ def test_an_interrupted_film_goes_on_where_it_was(
 ) -> None:
     out, made = tmp_path / "relit.mp4", []
     line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
-    frame_with_face = relight_work.frame_with_face
+    frame_with_face = relight_scenes.frame_with_face
 
     def counted(shot: Any, number: int, *rest: Any) -> Any:
         if len(made) == 1:
@@ -95,7 +95,7 @@ def test_an_interrupted_film_goes_on_where_it_was(
         made.append(number)
         return frame_with_face(shot, number, *rest)
 
-    monkeypatch.setattr(relight_work, "frame_with_face", counted)
+    monkeypatch.setattr(relight_scenes, "frame_with_face", counted)
     assert facerf(given, *line) == 130
     assert not out.exists() and made == [0, "stop"]
     assert facerf(given, *line) == 0

@@ -182,10 +182,13 @@ def test_spread_is_over_subjects_and_always_the_same(reader: PairReader) -> None
     assert spread_pairs(reader, 3, lambda pair: False) == []
 
 
-def test_a_split_without_pairs_is_named(tmp_path: Path) -> None:
+def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_path: Path) -> None:
     dataset = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=8, crop_px=32)
     with pytest.raises(InputError, match="in the split train; make them with `facerf relight-"):
         open_pairs(dataset, "train", 32)
+    write_pairs(dataset, draw_pairs(dataset, envmap_names(ProceduralMaps(1, 0, 32)), 2, 0), overwrite=False)
+    train, validation = (open_pairs(dataset, split, 32).pairs for split in ("train", "validation"))
+    assert len(train) == 2 and validation == train
 
 
 def test_heads_stand_where_their_fits_say(dataset: Dataset) -> None:

@@ -78,5 +78,5 @@ def test_finished_portraits_are_kept(portraits: DatasetPortraits) -> None:
 
 def test_a_split_without_a_face_is_refused(tmp_path: Path) -> None:
     write_small_dataset(tmp_path, (1, 0, 0), 1, lights=4, crop_px=192)
-    with pytest.raises(InputError, match="no face was found in the split validation"):
+    with pytest.raises(InputError, match="no face was found in the split train"):
         open_dataset_portraits(tmp_path, backgrounds(), SHIPPED_NETWORKS, 1)
