@@ -93,8 +93,9 @@ def open_dataset_portraits(
     Raises InputError where a split has nobody whose face is found.
     """
     dataset = read_dataset(folder)
+    people = {split: people_of(dataset, split) for split in ("train", "validation")}
     _make_missing(dataset, networks, jobs)
-    views = {split: _views_of(dataset, split) for split in ("train", "validation")}
+    views = {split: _views_of(dataset, subjects) for split, subjects in people.items()}
     for split, found in views.items():
         if not found:
             raise InputError(
@@ -105,9 +106,9 @@ def open_dataset_portraits(
     return DatasetPortraits(dataset, everyone, len(views["train"]), backgrounds, provenance)
 
 
-def _views_of(dataset: Dataset, split: str) -> list[list[Path]]:
-    """Portraits of each person of a split, of those who have some."""
-    paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in people_of(dataset, split)]
+def _views_of(dataset: Dataset, subjects: Sequence[str]) -> list[list[Path]]:
+    """Portraits of each of some people, of those who have some."""
+    paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in subjects]
     shown = [[path for path in views if _shows_a_face(path)] for views in paths]
     return [views for views in shown if views]
 

@@ -1,7 +1,7 @@
 """Studio lights as points: the squares of soft lights are sampled by a regular grid."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.sphere import RIG_LIGHTS, RigLight, azel_to_direction, rig_directions
+from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
 _AROUND = 24  # samples of a light from all around
@@ -55,17 +55,9 @@ def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     return directions, torch.ones(len(directions)) / (directions @ middle).sum()
 
 
-def seen_radii(directions: Tensor) -> Tensor:
-    """Radii [N], in radians, of the discs as which lights [N, 3] are seen, whatever other lights there are.
-
-    A light is as large as a cell of a rig of 150, a sample of light from all around as large as its share.
-    """
-    around = (directions[:, None] == rig_directions(_AROUND)).all(-1).any(-1)
-    return torch.where(around, _cell_rad(_AROUND), _cell_rad(RIG_LIGHTS))
-
-
-def _cell_rad(lights: int) -> float:
-    return math.acos(1 - 2 / lights)
+def is_around(directions: Tensor) -> Tensor:
+    """Which of lights [N, 3] are samples of light from all around, or of a rig of as many lights."""
+    return (directions[:, None] == rig_directions(_AROUND)).all(-1).any(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,15 +113,13 @@ class Lights:
     """M sums of lights: far ones from unit directions [L, 3], camera space, and J near ones; rgb weights.
 
     A light of weight 1 gives a white Lambertian surface that faces it radiance 1; of a near one, at the
-    face's centre. A rig's light is one sum. Those that are `even` are together the same light from all
-    around, in which a mirror shows nothing.
+    face's centre. A rig's light is one sum.
     """
 
     directions: Tensor
     weights: Tensor  # [M, L, 3]
     near: tuple[StudioLight, ...] = ()
     near_weights: Tensor | None = None  # [M, J, 3]
-    even: Tensor | None = None  # [L]
 
     @staticmethod
     def of_rig(light: RigLight) -> "Lights":
@@ -147,21 +137,20 @@ class Lights:
     def __getitem__(self, sums: slice) -> "Lights":
         """Some of the sums, without the near lights that shine in none of them."""
         if self.near_weights is None:
-            return replace(self, weights=self.weights[sums])
+            return Lights(self.directions, self.weights[sums])
         some = self.near_weights[sums]
         used = (some != 0).any(0).any(1)
         near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
-        return replace(self, weights=self.weights[sums], near=near, near_weights=some[:, used])
+        return Lights(self.directions, self.weights[sums], near, some[:, used])
 
     def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
         """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
         weights = () if self.near_weights is None else self.near_weights.unbind(1)
         return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
 
-    def mirrored(self, place_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions [N, 3] and rgb weights [M, N, 3] of what a mirror at a place [3] shows."""
-        shown = torch.ones(len(self.directions)) if self.even is None else (~self.even).float()
-        directions, weights = [self.directions], [self.weights * shown[:, None]]
+    def arriving(self, place_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light that arrives at a place [3]."""
+        directions, weights = [self.directions], [self.weights]
         for points, rgb in self.around(place_m):
             toward, irradiance = points.arriving(place_m[:, None, None])
             directions.append(toward[:, 0, 0])

@@ -194,7 +194,7 @@ class Composition:
                 texture = texture * (1 - from_behind(-points.toward))
                 textures = textures + rgb[..., None, None] * texture
             stacked = torch.stack([view.stacked for view in lit], 1)
-            toward, arriving = lights.mirrored(self.vertices_m.mean(0))
+            toward, arriving = lights.arriving(self.vertices_m.mean(0))
             mirrored = mirrored_in_cornea(toward, arriving, reflectance.person.reaching_irises(toward))
             yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored)
             return

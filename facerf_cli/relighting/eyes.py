@@ -15,7 +15,8 @@ from torch import Tensor
 
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Band, block_means
-from facerf_cli.light.studio_points import seen_radii
+from facerf_cli.light.sphere import RIG_LIGHTS
+from facerf_cli.light.studio_points import is_around
 from facerf_cli.portrait.mesh import SeenEyes
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import smoothstep
@@ -23,6 +24,7 @@ from facerf_cli.raster.texture import smoothstep
 _IRIS_OF_CORNEA = 5.9 / 7.8  # their radii, mm
 _REFLECTED = 0.025  # by Fresnel's law, of light that arrives at a right angle
 _SIDE = 64  # of the mirror image
+_LIGHT_RAD = math.acos(1 - 2 / RIG_LIGHTS)  # radius of a light's disc, which fills a cell of the rig
 _LEAST_PX = 2.0  # radius of an iris in which something can be seen
 _RIM = 0.85  # of the radius: beyond it what is bright is the white of the eye
 _FINE = 4  # parts of a pixel at the lids, along each side
@@ -33,20 +35,20 @@ def mirrored_in_cornea(directions: Tensor, weights: Tensor, arrives: Tensor) -> 
     """Radiance [M, N, 3, s, s] that N irises mirror under M sums, rgb weights [M, L, 3], of lights [L, 3].
 
     `arrives` [N, L] is the share of each light that reaches each iris, past nose and brows. The square lies
-    around the iris, as the camera sees it; the eye looks at the camera.
+    around the iris, as the camera sees it; the eye looks at the camera. The same light from all around, as a
+    room's, is not mirrored: it has nothing to show, and would lie before dark irises as a grey disc.
     """
     at = 2 * (torch.arange(_SIDE) + PIXEL_CENTRE) / _SIDE - 1
     down, right = torch.meshgrid(at, at, indexing="ij")
     x, y = right * _IRIS_OF_CORNEA, -down * _IRIS_OF_CORNEA
     normals = torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()])
     seen = 2 * normals[2] * normals - normals.new_tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
-    radii = seen_radii(directions)[:, None, None]
-    outer, inner = (1.2 * radii).cos(), (0.8 * radii).cos()
+    outer, inner = math.cos(1.2 * _LIGHT_RAD), math.cos(0.8 * _LIGHT_RAD)
     inside = (right.square() + down.square()) < 1
     discs = inside * smoothstep((torch.einsum("lc,cij->lij", directions, seen) - outer) / (inner - outer))
     # a disc that gives a white surface radiance 1 has itself the radiance 1 / sin^2
-    shown = discs * (_REFLECTED / radii.sin().square())
-    return torch.einsum("mlc,nl,lij->mncij", weights, arrives, shown)
+    shown = discs * (_REFLECTED / math.sin(_LIGHT_RAD) ** 2)
+    return torch.einsum("mlc,nl,lij->mncij", weights, arrives * ~is_around(directions), shown)
 
 
 @dataclass(frozen=True, eq=False)

@@ -75,9 +75,7 @@ def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling
     maps = (tuple(light for light in setup.lights if light.envmap is not None) for setup in setups)
     every, of_maps = _maps_over_rig(tuple(LightSetup("", lights=lights) for lights in maps), rig, sampling)
     directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
-    assert single.even is not None
-    even = torch.cat([torch.zeros(len(every), dtype=torch.bool), single.even])
-    return replace(single, directions=directions, weights=weights, even=even)
+    return replace(single, directions=directions, weights=weights)
 
 
 @lru_cache(maxsize=1)
@@ -90,14 +88,12 @@ def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling)
 def single_lights(setups: Sequence[LightSetup]) -> Lights:
     """The lights of M setups without their maps; at least one far light, if dark, and each near one once."""
     directions, weights = [torch.tensor([[0.0, 0.0, 1.0]])], [torch.zeros(len(setups), 1, 3)]
-    even = [torch.tensor([False])]
-    for row, towards, rgb, is_even in _far_lights(setups):
+    for row, towards, rgb in _far_lights(setups):
         directions.append(towards)
         weights.append(torch.zeros(len(setups), len(towards), 3))
         weights[-1][row] = rgb
-        even.append(torch.full((len(towards),), is_even))
     some = slice(len(directions) > 1, None)
-    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), even=torch.cat(even[some]))
+    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -138,7 +134,7 @@ def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
 def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Lights:
     """The lights of M setups by a stack's own [L, 3]; single lights are shared by those around."""
     weights = _map_weights(setups, directions, sampling)
-    for row, towards, rgb, _ in _far_lights(setups):
+    for row, towards, rgb in _far_lights(setups):
         index, share = lights_around(towards, directions)
         weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
     return Lights(directions, weights)
@@ -151,13 +147,13 @@ def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
     return math.degrees(math.acos(min(1.0, *cosines))) if cosines else 0.0
 
 
-def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor, bool]]:
-    """For each far light its setup, directions [n, 3], rgb weights [n, 3], and if it is from all around."""
+def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """For each far light its setup, directions [n, 3] and rgb weights [n, 3]."""
     for row, setup in enumerate(setups):
         for light in setup.lights:
             if light.azel_deg is not None or light.is_around:
                 towards, shares = far_samples(light)
-                yield row, towards, shares[:, None] * intensity_of(light), light.is_around
+                yield row, towards, shares[:, None] * intensity_of(light)
 
 
 def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:

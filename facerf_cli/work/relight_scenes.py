@@ -1,4 +1,4 @@
-"""What `facerf relight` lights: the people of a photo, or an OLAT stack, and what is behind them."""
+"""The scenes of `facerf relight`: people of a photo, or an OLAT stack, and what is behind them."""
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence

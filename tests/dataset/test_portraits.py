@@ -76,7 +76,16 @@ def test_finished_portraits_are_kept(portraits: DatasetPortraits) -> None:
     assert path.stat().st_mtime_ns == before
 
 
-def test_a_split_without_a_face_is_refused(tmp_path: Path) -> None:
-    write_small_dataset(tmp_path, (1, 0, 0), 1, lights=4, crop_px=192)
-    with pytest.raises(InputError, match="no face was found in the split train"):
-        open_dataset_portraits(tmp_path, backgrounds(), SHIPPED_NETWORKS, 1)
+def test_a_split_without_a_face_or_anybody_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("facerf_cli.dataset.portraits._make_missing", lambda *_: None)
+    monkeypatch.setattr("facerf_cli.dataset.portraits._shows_a_face", lambda _: False)
+    for count, expected in (
+        (2, "no subject in the split validation"),
+        (1, "no face was found in the split train"),
+    ):
+        folder = tmp_path / str(count)
+        write_small_dataset(folder, (count, 0, 0), 1, lights=4, crop_px=192)
+        with pytest.raises(InputError, match=expected):
+            open_dataset_portraits(folder, backgrounds(), SHIPPED_NETWORKS, 1)

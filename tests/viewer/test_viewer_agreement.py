@@ -47,8 +47,7 @@ class Shown:
         """Under lights and what a room sends of them."""
         around, shares = far_samples(StudioLight())
         sent = room * shares[:, None] * weights.sum(0)
-        even = torch.arange(len(directions) + len(around)) >= len(directions)
-        lights = Lights(torch.cat([directions, around]), torch.cat([weights, sent])[None], even=even)
+        lights = Lights(torch.cat([directions, around]), torch.cat([weights, sent])[None])
         return next(self.whole.relit(lights))
 
     def truth(self, relit: Relit, ev: float) -> np.ndarray:
