@@ -16,7 +16,9 @@ _COLOURS_PX = 512  # longest side at which they are found
 _COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
 # Depths inside the outline from which a person begins to hide all, and hides all; in pixels of the classes.
 _SOLID_PX = (1.0, 3.0)
+_CLEAR_PX = (1.0, 4.0)  # distances outside it from which a person begins to be absent, and is
 _LOOSE_PX = 7  # side of the square around a pixel in which hair leaves its matte as it is
+_LEFT = 0.7  # of the background nearby, that a mixture holds at least
 _TINY = 1e-5
 
 
@@ -57,18 +59,22 @@ def local_lines(
     return mean(slope), mean(offset)
 
 
-def solid_inside(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
-    """A matte [H, W] that is 1 inside its outline, away from what is loose, as hair: a share [h, w].
+def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
+    """A matte [H, W] that is 1 inside its outline and 0 outside, but for a share [h, w] of loose hair.
 
-    Skin and cloth hide what is behind them. But a jaw that shines in the background's own light has a colour
-    between the person's and the background's.
+    Skin and cloth hide what is behind them, and end at their outline. But a jaw that shines in the light of
+    the background has a colour between both, and of a dark background a matte holds a haze.
     """
-    depth_px = distance_transform_edt(shrunk(matte, (loose.shape[0], loose.shape[1])) > 0.5)
-    first, last = _SOLID_PX
-    solid = ((depth_px - first) / (last - first)).clip(0, 1) * (1 - maximum_filter(loose, _LOOSE_PX))
+    inside = shrunk(matte, (loose.shape[0], loose.shape[1])) > 0.5
+    tight = 1 - maximum_filter(loose, _LOOSE_PX)
+    full, none = (
+        ((distance_transform_edt(part) - first) / (last - first)).clip(0, 1) * tight
+        for part, (first, last) in ((inside, _SOLID_PX), (~inside, _CLEAR_PX))
+    )
     found = np.empty_like(matte)
     for rows in strips(matte.shape):
-        found[rows] = matte[rows] + enlarged(solid[None], matte.shape, rows)[0] * (1 - matte[rows])
+        filled, cleared = enlarged(np.stack([full, none]), matte.shape, rows)
+        found[rows] = (matte[rows] + filled * (1 - matte[rows])) * (1 - cleared)
     return found
 
 
@@ -77,7 +83,8 @@ class PersonColours:
 
     Means of sure colours nearby, corrected by the mixture that the photo shows (Forte, *Approximate fast
     foreground colour estimation*, 2021). The means are those of a photo of at most `_COLOURS_PX`. A colour is
-    no brighter than it must be for the mixture.
+    no brighter than the mixture allows that holds most of the background nearby, too: where the matte is a
+    mere haze, relighting takes no more than that from a dark background.
     """
 
     def __init__(self, photo: np.ndarray, matte: np.ndarray) -> None:
@@ -110,7 +117,9 @@ class PersonColours:
             y = mixed[0] + rows.start
             own, background = np.split(_looked_up(self._means, y, mixed[1], self.shape), 2, -1)
             mixture, share = photo[mixed], matte[mixed]
-            found[mixed] = np.minimum(_unmixed(mixture, share, own, background), mixture / share[:, None])
+            own = _unmixed(mixture, share, own, background)
+            left = _LEFT * (1 - share[:, None]) * np.minimum(background, mixture)
+            found[mixed] = np.minimum(own, (mixture - left) / share[:, None])
         return found
 
 

@@ -19,7 +19,7 @@ from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.portrait.confidence import matte_facts
-from facerf_cli.portrait.matte import shrunk, solid_inside
+from facerf_cli.portrait.matte import shrunk, solid
 from facerf_cli.portrait.mesh import find_meshes, first_squares
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look
 from facerf_cli.portrait.people import HeadPlace, PersonShares, matte_of, person_among
@@ -143,7 +143,7 @@ def _neighbours(
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
     """The segmentation of an image [H, W, 3] by the classes [C, h, w] of a person with landmarks [68, 2]."""
     matte = matte_of(1 - classes[0].numpy(), image_srgb, landmarks_px)
-    return Segmentation(classes, solid_inside(matte, classes[_LOOSE].sum(0).numpy()))
+    return Segmentation(classes, solid(matte, classes[_LOOSE].sum(0).numpy()))
 
 
 def within_matte(classes: Tensor, matte: np.ndarray) -> Segmentation:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facerf_cli.portrait.matte import PersonColours, lifted, solid_inside
+from facerf_cli.portrait.matte import PersonColours, lifted, solid
 
 SIDE = 96
 
@@ -36,18 +36,19 @@ def test_where_the_matte_is_sure_no_pattern_of_the_photo_shows() -> None:
         assert (lifted(sure, pattern / np.float32(255), pattern) == value).all()
 
 
-def test_skin_hides_the_background_and_hair_may_not() -> None:
-    """A disc that looks like the background in a ring within its outline."""
+def test_skin_hides_the_background_and_ends_at_its_outline_and_hair_may_not() -> None:
+    """A disc that looks like the background in a ring within its outline, in a haze."""
     true, ring = disc(2 * SIDE), disc(2 * SIDE, 0.2)
-    guess = np.minimum(true, 0.8 + 0.2 * ring)
+    guess = np.maximum(np.minimum(true, 0.8 + 0.2 * ring), np.float32(0.2))
     loose = np.zeros((SIDE, SIDE), np.float32)
-    found = solid_inside(guess, loose)
-    inner = disc(2 * SIDE, 0.24) == 1
+    found = solid(guess, loose)
+    inner, outer = disc(2 * SIDE, 0.24) == 1, disc(2 * SIDE, 0.36) == 0
     assert guess[inner].min() < 0.81 and found[inner].min() > 0.999
-    np.testing.assert_allclose(found[true < 0.5], guess[true < 0.5], atol=0.1)
-    np.testing.assert_array_equal(found[true == 0], 0)
+    assert guess[outer].min() > 0.19 and found[outer].max() < 0.001
+    edge = (true > 0) & (true < 1)
+    np.testing.assert_allclose(found[edge], guess[edge], atol=0.1)
     loose[:, : SIDE // 2] = 1
-    np.testing.assert_array_equal(solid_inside(guess, loose)[:, :SIDE], guess[:, :SIDE])
+    np.testing.assert_array_equal(solid(guess, loose)[:, :SIDE], guess[:, :SIDE])
 
 
 @pytest.mark.parametrize("value", [0.25, 0.5, 0.9])
@@ -61,3 +62,14 @@ def test_mixed_pixels_get_the_persons_colour_back(value: float) -> None:
     assert np.abs(found[edge] - own).max() < 0.05 < np.abs(photo[edge] - own).max()
     assert (found[matte == 0] == 0).all()
     assert np.abs(found[matte == 1] - own).max() < 1e-3
+
+
+def test_a_haze_takes_little_from_the_background() -> None:
+    """A matte of .2 over a dark background that holds nothing of the person."""
+    own, other = np.array([0.6, 0.3, 0.2], np.float32), np.array([0.02, 0.05, 0.01], np.float32)
+    true = disc(SIDE)
+    photo = true[..., None] * own + (1 - true[..., None]) * other
+    matte = np.maximum(true, np.float32(0.2) * disc(SIDE, 0.34))
+    haze = (true == 0) & (matte > 0.19)
+    left = photo - matte[..., None] * PersonColours(photo, matte)[:]
+    assert (left[haze] > 0.5 * other).all()
