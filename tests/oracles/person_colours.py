@@ -24,5 +24,6 @@ def slow_person_colours(photo: np.ndarray, matte: np.ndarray, most_px: int) -> n
     wide = F.interpolate(means, matte.shape, mode="bilinear")[0].permute(1, 2, 0).numpy()
     share = matte[..., None]
     found = _unmixed(photo, matte, wide[..., :3], wide[..., 3:])
-    most = np.divide(photo, share, out=np.zeros_like(photo), where=share > 0)
+    left = 0.7 * (1 - share) * np.minimum(wide[..., 3:], photo)  # of the background nearby
+    most = np.divide(photo - left, share, out=np.zeros_like(photo), where=share > 0)
     return np.minimum(np.where(share > 0, found, 0), most)
