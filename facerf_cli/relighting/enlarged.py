@@ -71,13 +71,17 @@ class Enlarged:
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
             albedo, strands = self._seen((rows, columns), pixels, display_ev)
-            shading, highlights = self._enlarged(front, rows, columns).chunk(2)
-            parts = [albedo * shading + highlights * strands]
+
+            def radiance(light: Tensor) -> Tensor:
+                shading, highlights = light.chunk(2)
+                return albedo * shading + highlights * strands
+
+            parts = [radiance(self._enlarged(front, rows, columns))]
             if rims is not None:
                 offsets_px, brightness = rims.at(rows, columns)
-                shading, highlights = self._enlarged(rear, rows, columns, offsets_px).chunk(2)
                 # Strands that stand before such a light show one by one.
-                parts.append((albedo * shading + highlights * strands) * (brightness * strands))
+                behind = radiance(self._enlarged(rear, rows, columns, offsets_px))
+                parts.append(behind * (brightness * strands))
             return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
 
         return of

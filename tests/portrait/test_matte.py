@@ -37,10 +37,14 @@ def test_where_the_matte_is_sure_no_pattern_of_the_photo_shows() -> None:
 
 
 def test_skin_hides_the_background_and_ends_at_its_outline_and_hair_may_not() -> None:
-    """A disc that looks like the background in a ring within its outline, in a haze."""
+    """A disc that looks like the background in a ring within its outline, without and in a haze."""
     true, ring = disc(2 * SIDE), disc(2 * SIDE, 0.2)
-    guess = np.maximum(np.minimum(true, 0.8 + 0.2 * ring), np.float32(0.2))
+    clear = np.minimum(true, 0.8 + 0.2 * ring)
     loose = np.zeros((SIDE, SIDE), np.float32)
+    found = solid(clear, loose)
+    np.testing.assert_allclose(found[true < 0.5], clear[true < 0.5], atol=0.1)
+    np.testing.assert_array_equal(found[true == 0], 0)
+    guess = np.maximum(clear, np.float32(0.2))
     found = solid(guess, loose)
     inner, outer = disc(2 * SIDE, 0.24) == 1, disc(2 * SIDE, 0.36) == 0
     assert guess[inner].min() < 0.81 and found[inner].min() > 0.999
