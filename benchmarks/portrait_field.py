@@ -27,8 +27,8 @@ from facerf_cli.pipeline import FittedPerson, find_for, fit, head_of, reflectanc
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
-from facerf_cli.relighting.own_light import own_light
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.source_light import source_light
 from facerf_cli.synth.bank.portrait_samples import load_view
 from facerf_cli.synth.bank.texture_samples import draw_light, draw_target_lights
 from facerf_cli.synth.portraits import images_under
@@ -140,7 +140,7 @@ def print_speed(models: Models) -> None:
     times, _ = best_s(ways, 3)
     print(", ".join(f"{name} {seconds:.3f} s" for name, seconds in times.items()), end="; ")
     print(f"ratio {times['150 lights'] / times['a forward pass']:.1f}")
-    image = found.image(own_light(models, found.head.face).light).pixels
+    image = found.image(source_light(models, found.head.face).light).pixels
     inside = field.person.segmentation.matte > 0.9
     error = float(((image - photo)[inside] ** 2).mean())
     print(f"the photo under its own light: {10 * np.log10(1 / error):.1f} dB inside the matte")

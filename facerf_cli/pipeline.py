@@ -47,8 +47,14 @@ from facerf_cli.relighting.field import (
     shrunk,
 )
 from facerf_cli.relighting.models import Models, Sides
-from facerf_cli.relighting.own_light import OwnLight, light_of_frames, over_rig, own_light, share_of_lamp
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
+from facerf_cli.relighting.source_light import (
+    SourceLight,
+    light_of_frames,
+    over_rig,
+    share_of_lamp,
+    source_light,
+)
 from facerf_cli.run.threads import both
 
 
@@ -159,8 +165,8 @@ def reflectance_of(
     if kind == "portrait" and photo is None:
         raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
 
-    def of_face() -> tuple[OwnLight | None, Field]:
-        own = None if network_alone else own_light(models, head.face, steady.light if steady else None)
+    def of_face() -> tuple[SourceLight | None, Field]:
+        own = None if network_alone else source_light(models, head.face, steady.light if steady else None)
         quotient = own.quotient if own else None
         return own, Field(models, head.face, quotient, memory_bytes, even_shade=own is not None)
 
@@ -286,7 +292,7 @@ def predict_olat(
 
     `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's.
     """
-    quotient = None if network_alone else own_light(models, head.face).quotient
+    quotient = None if network_alone else source_light(models, head.face).quotient
     turn = None if rotation is None else head.fit.turn_to(rotation)
     even_shade = quotient is not None
     return Field(models, head.face, quotient, memory_bytes, bf16, even_shade).olats(lights, turn)
@@ -321,7 +327,7 @@ def estimate_light(
 
     Of a shot the heads of `more` frames take part in the field's least squares.
 
-    Where one lamp and light from around explain the photo as well, they are its light (`own_light.py`).
+    Where one lamp and light from around explain the photo as well, they are its light (`source_light.py`).
     The models other than the field estimate their own light. Eyes are left out, as in the paper,
     unless `keep_eyes`. Raises InputError where too little of the face is visible.
     """

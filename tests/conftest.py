@@ -95,8 +95,8 @@ def _the_same_photo_costs_once() -> None:
         kind.forward = remembered(kind.forward, applies=outside_training)
     StoredGraph.forward = remembered(StoredGraph.forward, most=200)
     head.unwrap = remembered(head.unwrap)
-    pipeline.own_light = remembered(
-        pipeline.own_light,
+    pipeline.source_light = remembered(
+        pipeline.source_light,
         lambda models, *rest: (models.networks.reflectance, models.source_colours, rest),
         lambda models, *_: type(models.networks.reflectance).__module__.startswith("facerf_cli."),
     )

@@ -23,8 +23,8 @@ from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
-from facerf_cli.relighting.own_light import OwnLight, own_light
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitView, maps_of
+from facerf_cli.relighting.source_light import SourceLight, source_light
 from tests import astronaut
 
 
@@ -69,7 +69,7 @@ def test_under_its_own_light_the_photo_comes_back(
     photo: np.ndarray, person: FittedPerson, field: PortraitField
 ) -> None:
     models, head = person.models, person.head
-    image = person.image(own_light(models, head.face).light).pixels
+    image = person.image(source_light(models, head.face).light).pixels
     inside = field.person.segmentation.matte > 0.9
     error = ((image - photo)[inside] ** 2).mean()
     assert 10 * np.log10(1 / error) > 30  # the maps are coarse, and grain is of a photo without light
@@ -155,11 +155,11 @@ def test_the_neck_is_skin_whose_shade_has_no_colour(field: PortraitField) -> Non
 
 def test_the_person_is_as_white_as_the_photos_light_leaves_them(field: PortraitField) -> None:
     """Half of the photo's blue light doubles the blue of all that the view shows under white light."""
-    view, own = field.views[0], own_light(astronaut.models(), field.field.face)
+    view, own = field.views[0], source_light(astronaut.models(), field.field.face)
 
     def exposure(blue: float) -> Tensor:
         light = RigLight(own.light.directions, own.light.weights * torch.tensor([1, 1, blue]))
-        return PortraitView.of(view.person, view.maps, OwnLight(light, own.quotient)).exposure
+        return PortraitView.of(view.person, view.maps, SourceLight(light, own.quotient)).exposure
 
     torch.testing.assert_close(exposure(0.5), exposure(1.0) * torch.tensor([1, 1, 2.0])[:, None, None])
 

@@ -30,9 +30,9 @@ from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting.field import Field, shining
-from facerf_cli.relighting.own_light import OwnLight
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.relighting.source_light import SourceLight
 from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
@@ -112,12 +112,12 @@ class PortraitView:
     correction: Correction | None = None
 
     @staticmethod
-    def of(person: SeenPerson, maps: PortraitMaps, own: OwnLight | None) -> "PortraitView":
+    def of(person: SeenPerson, maps: PortraitMaps, own: SourceLight | None) -> "PortraitView":
         """The view of a person with its maps, corrected by the photo's estimated light `own`."""
         found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
         return found if own is None else found._corrected(own)
 
-    def _corrected(self, own: OwnLight) -> "PortraitView":
+    def _corrected(self, own: SourceLight) -> "PortraitView":
         """The view in the units of the photo's light, corrected to give the photo back under it."""
         used = own.light.weights.sum(1) > 0
         directions, weights = own.light.directions[used], own.light.weights[used]
@@ -216,7 +216,7 @@ class PortraitField:
         model: MorphableModel,
         head: Head,
         field: Field,
-        own: OwnLight | None,
+        own: SourceLight | None,
         seen: Sequence[tuple[SeenPerson, PortraitMaps]],
     ) -> "PortraitField":
         """The field of a person `seen` in squares, with the maps of each; `own` is the photo's light."""

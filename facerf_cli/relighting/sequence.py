@@ -38,8 +38,8 @@ from facerf_cli.portrait.segment import (
     within_matte,
 )
 from facerf_cli.relighting.models import Models, Sides
-from facerf_cli.relighting.own_light import light_of_frames
 from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
+from facerf_cli.relighting.source_light import light_of_frames
 
 _ROWS, _COLUMNS = 12, 16  # of a thumbnail
 _LEAST = 0.05  # change at a cut, display values in 0..1

@@ -13,7 +13,7 @@ from facerf_cli.pipeline import estimate_light, fit_photo
 from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.own_light import light_of_frames, over_rig, own_light
+from facerf_cli.relighting.source_light import light_of_frames, over_rig, source_light
 from tests import astronaut
 
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
@@ -57,7 +57,7 @@ def test_a_lamp_is_found_where_it_is(
     assert min(degrees_between(one, lamp) for one in rig_directions(32)) > RIG_DEG
     colour = torch.tensor([[1.0, 0.8, 0.6]])
     shown = lit(models, face, RigLight(lamp[None], colour))
-    light = own_light(models, shown).light
+    light = source_light(models, shown).light
     assert degrees_between(light.directions[0], lamp) < OFF_DEG
     assert light.weights[0].sum() > 0.6 * light.weights.sum()
     torch.testing.assert_close(light.weights[0] / light.weights[0, 0], colour[0], rtol=COLOUR, atol=0)
@@ -68,7 +68,7 @@ def test_a_lamp_is_found_where_it_is(
 
 
 def test_light_from_all_around_has_no_lamp(models: Models, face: FaceTexture) -> None:
-    found = own_light(models, lit(models, face, AROUND)).light.weights
+    found = source_light(models, lit(models, face, AROUND)).light.weights
     assert found[0].sum() < 0.1 * found.sum()
     assert found[1:].std() < 0.3 * found[1:].mean()
 
@@ -106,6 +106,6 @@ def test_the_quotient_is_of_the_light_that_is_held(models: Models, face: FaceTex
     lamp, other = (RigLight(azel_to_direction(x, 0.0)[None], torch.ones(1, 3)) for x in (30.0, -30.0))
     shown = lit(models, face, lamp)
     held = light_of_frames(models, [lit(models, face, other)])
-    own, wrong = own_light(models, shown), own_light(models, shown, held)
+    own, wrong = source_light(models, shown), source_light(models, shown, held)
     assert wrong.light is held
     assert (wrong.quotient.ratio.log().abs().mean()) > 2 * own.quotient.ratio.log().abs().mean()

@@ -29,7 +29,7 @@ _TINY = 1e-12  # avoids divisions by 0
 
 
 @dataclass(frozen=True, eq=False)
-class OwnLight:
+class SourceLight:
     """The estimated light of a photo, the lamp first, and the field's quotient under it."""
 
     light: RigLight
@@ -37,7 +37,7 @@ class OwnLight:
 
 
 @torch.no_grad()
-def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> OwnLight:
+def source_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> SourceLight:
     """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it.
 
     A light that is `held` over the frames of a shot, by `light_of_frames`, is not estimated again.
@@ -46,7 +46,7 @@ def own_light(models: Models, face: FaceTexture, held: RigLight | None = None) -
     light = _estimated([frame]) if held is None else held
     small = frame.field.face
     explained = weighted_sum([frame.under(light.directions[:1]), frame.around], light.weights[None])[0]
-    return OwnLight(light, Quotient.of(small.texture, explained, small.visible))
+    return SourceLight(light, Quotient.of(small.texture, explained, small.visible))
 
 
 @torch.no_grad()
