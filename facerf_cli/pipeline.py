@@ -30,6 +30,7 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.image.colour import without_fireflies
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
+from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
@@ -39,10 +40,12 @@ from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
 from facerf_cli.portrait.segment import Segmentation, segment
+from facerf_cli.relighting import White
 from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
 from facerf_cli.relighting.field import (
     MEMORY_BYTES,
     Field,
+    balance_of,
     photo_evidence,
     shrunk,
 )
@@ -151,6 +154,7 @@ def reflectance_of(
     photo: np.ndarray | None = None,
     steady: SteadyFrame | None = None,
     matte: np.ndarray | None = None,
+    white: White | None = None,
 ) -> Reflectance:
     """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
 
@@ -158,7 +162,8 @@ def reflectance_of(
     `matte` [H, W].
 
     The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
-    with `network_alone` they are not. The models that the paper compares with have no such correction.
+    with `network_alone` they are not. By `white` skin under even white light has the photo's colours, or
+    those of skin (`white.py`); None leaves the network's. The paper's baselines have neither.
     """
     if kind != "field" and kind != "portrait":
         return explain(models, head, kind).reflectance
@@ -166,9 +171,14 @@ def reflectance_of(
         raise UsageError("--reflectance portrait: needs the whole photo; give --reflectance field")
 
     def of_face() -> tuple[SourceLight | None, Field]:
-        own = None if network_alone else source_light(models, head.face, steady.light if steady else None)
-        quotient = own.quotient if own else None
-        return own, Field(models, head.face, quotient, memory_bytes, even_shade=own is not None)
+        found = None if network_alone else source_light(models, head.face, steady.light if steady else None)
+        quotient = found.quotient if found else None
+        field = Field(models, head.face, quotient, memory_bytes, even_shade=found is not None)
+        if white is None:
+            return found, field
+        even = found.even if found else field.small_under_even_light()
+        balance = steady.balance if steady else balance_of(white, [(head.face, even)])
+        return found, replace(field, balance=balance)
 
     def of_person() -> list[SeenPerson]:
         assert photo is not None
@@ -180,11 +190,11 @@ def reflectance_of(
     if photo is None or kind == "field":
         return of_face()[1]
     if steady and steady.portrait:
-        own, field = of_face()
-        return PortraitField.of(models.face, head, field, own, steady.portrait)
-    (own, field), views = both(of_face, of_person)
+        source, field = of_face()
+        return PortraitField.of(models.face, head, field, source, steady.portrait)
+    (source, field), views = both(of_face, of_person)
     seen = [(one, maps_of(models.networks.portrait, one)) for one in views]
-    return PortraitField.of(models.face, head, field, own, seen)
+    return PortraitField.of(models.face, head, field, source, seen)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,15 +297,17 @@ def predict_olat(
     network_alone: bool = False,
     memory_bytes: int = MEMORY_BYTES,
     bf16: bool = False,
+    white: White | None = None,
 ) -> Iterator[Tensor]:
     """Yield OLAT textures for unit directions [L, 3], in batches [l, 3, T, T] that fit the memory.
 
-    `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's.
+    `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's. For the rest see
+    `reflectance_of`.
     """
-    quotient = None if network_alone else source_light(models, head.face).quotient
+    field = reflectance_of(models, head, "field", network_alone, memory_bytes, white=white)
+    assert isinstance(field, Field)
     turn = None if rotation is None else head.fit.turn_to(rotation)
-    even_shade = quotient is not None
-    return Field(models, head.face, quotient, memory_bytes, bf16, even_shade).olats(lights, turn)
+    return replace(field, bf16=bf16).olats(lights, turn)
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,14 +334,16 @@ def estimate_light(
     estimator: Estimator = DEFAULT_ESTIMATOR,
     keep_eyes: bool = False,
     more: Sequence[Head] = (),
+    white: White | None = None,
 ) -> LightEstimate:
     """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
 
     Of a shot the heads of `more` frames take part in the field's least squares.
 
     Where one lamp and light from around explain the photo as well, they are its light (`source_light.py`).
-    The models other than the field estimate their own light. Eyes are left out, as in the paper,
-    unless `keep_eyes`. Raises InputError where too little of the face is visible.
+    By `white` the light is that over the photo's or over skin's own colours (`white.py`). The models other
+    than the field estimate their own light. Eyes are left out, as in the paper, unless `keep_eyes`.
+    Raises InputError where too little of the face is visible.
     """
     evidence = photo_evidence(head.face, keep_eyes)
     if kind != "field":
@@ -352,13 +366,22 @@ def estimate_light(
         left = [whole.residual(whole.relit(either)) for either in (weights, one_lamp)]
         if share > _ONE_LAMP and left[1] < _AS_WELL * left[0]:
             weights = one_lamp
+
+    def balanced(weights: Tensor) -> RigLight:
+        """The light of weights [L, 3] over a face of the white that is wanted."""
+        if white is None:
+            return RigLight(rig, weights)
+        quotient = Quotient.of(evidence.photo, evidence.relit(weights), shrunk(head.face).visible)
+        even = quotient.corrected(evidence.olats).mean(0)
+        return RigLight(rig, weights / balance_of(white, [(head.face, even)]).gain)
+
     if features is None:
-        return LightEstimate(RigLight(rig, weights), evidence, evidence.relit(weights), key_share=share)
+        return LightEstimate(balanced(weights), evidence, evidence.relit(weights), key_share=share)
 
     def layers(x: Tensor) -> list[Tensor]:
         return [layer.cpu() for layer in features.layers((x / exposure).to(models.device))]
 
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
     refined = refine_light(evidence, weights, layers, estimator.non_negative)
-    light = RigLight(rig, refined.weights)
-    return LightEstimate(light, evidence, evidence.relit(light.weights), refined, weights, share)
+    shown = evidence.relit(refined.weights)
+    return LightEstimate(balanced(refined.weights), evidence, shown, refined, weights, share)

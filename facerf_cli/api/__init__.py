@@ -22,6 +22,7 @@ from facerf_cli.face.fit import Geometry
 from facerf_cli.files import images
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import FaceBox, face_at
+from facerf_cli.relighting import White
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
 from facerf_cli.relighting.models import load_models as load
 
@@ -78,6 +79,7 @@ def fit(
     network_alone: bool = False,
     matte: Any = None,
     texture_side: int | None = None,
+    white: White = "photo",
 ) -> Person | list[Person]:
     """Fit the person with the largest face of a photo, once for all lights.
 
@@ -92,11 +94,14 @@ def fit(
         network_alone: Leave out the correction by which the photo's own light gives the photo back.
         matte: The person's share [H, W] of the photo, in place of the networks'.
         texture_side: Side of the face's texture in texels; by default that of the networks' training.
+        white: Under even white light skin has the colours of the photo; or, of a photo in coloured light, the
+            "scene", those without that light.
 
     Of a list of photos landmarks and mattes are lists, too. Raises InputError where no face is found or the
     fit fails.
     """
     one_of(RelightKind, "reflectance", reflectance)
+    one_of(White, "white", white)
     if geometry is not None:
         one_of(Geometry, "geometry", geometry)
     if texture_side is not None and not 16 <= texture_side <= LARGEST_TEXTURE:
@@ -118,7 +123,8 @@ def fit(
             if matte.shape != pixels.shape[:2]:
                 raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
         head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)
-        return read_person(models, pixels, head, reflectance, network_alone, matte, isinstance(photo, Tensor))
+        kind, tensors = reflectance, isinstance(photo, Tensor)
+        return read_person(models, pixels, head, kind, network_alone, matte, tensors, white)
 
     if not isinstance(photo, Sequence):
         return fitted("photo", photo, landmarks_px, matte)

@@ -31,6 +31,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
+from facerf_cli.relighting import White
 from facerf_cli.relighting.composition import FACE_LAYERS, PERSON_LAYERS, Composition, Relit, Target
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
@@ -63,6 +64,7 @@ class Person(pipeline.FittedPerson):
     kind: RelightKind = "portrait"
     network_alone: bool = False
     tensors: bool = False
+    white: White = "photo"
 
     def __repr__(self) -> str:
         """A line for a notebook."""
@@ -134,7 +136,9 @@ class Person(pipeline.FittedPerson):
         """
         kind = "field" if self.kind == "portrait" else self.kind
         with torch.no_grad():
-            found = pipeline.estimate_light(self.models, self.head, kind, rig_directions(lights)).light
+            found = pipeline.estimate_light(
+                self.models, self.head, kind, rig_directions(lights), white="scene"
+            ).light
         return Light(found.directions.numpy(), found.weights.numpy())
 
     def backdrop(self, envmap: Array, rotate_deg: float = 0.0, blur: float = 0.0) -> Array:
@@ -230,7 +234,7 @@ class Person(pipeline.FittedPerson):
         arrays: dict[str, Any] = {"photo": self.photo, "cropped": self.head.cropped, "kind": self.kind}
         maps = {name: getattr(self.head.face, name) for name in FaceTexture.__dataclass_fields__}
         arrays |= {name: tensor.detach().numpy() for name, tensor in maps.items()}
-        arrays |= {"network_alone": self.network_alone, **fit_to_arrays(self.head.fit)}
+        arrays |= {"network_alone": self.network_alone, "white": self.white, **fit_to_arrays(self.head.fit)}
         arrays |= {} if self.given_matte is None else {"matte": self.given_matte}
         with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -253,10 +257,12 @@ class Person(pipeline.FittedPerson):
             fit.vertices_camera(models.face)
             one_of(RelightKind, "kind", kind := str(arrays["kind"]))
             alone = bool(arrays["network_alone"])
+            one_of(White, "white", white := str(arrays.get("white", "photo")))
         except (ValueError, TypeError, LookupError, OverflowError) as error:
             said = f"{path}: not a person that facerf wrote ({error}); fit the photo again"
             raise InputError(said) from None
-        return read_person(models, photo, Head(cropped, fit, face), kind, alone, matte)  # type: ignore[arg-type]
+        head = Head(cropped, fit, face)
+        return read_person(models, photo, head, kind, alone, matte, white=white)  # type: ignore[arg-type]
 
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
@@ -379,11 +385,14 @@ def read_person(
     network_alone: bool,
     matte: np.ndarray | None,
     tensors: bool = False,
+    white: White = "photo",
 ) -> Person:
     """Read the reflectance of a head in its photo [H, W, 3]; the matte [H, W] is the person's, if given."""
     with torch.no_grad():
-        reflectance = pipeline.reflectance_of(models, head, kind, network_alone, photo=photo, matte=matte)
-    return Person(models, photo, head, reflectance, matte, kind, network_alone, tensors)
+        found = pipeline.reflectance_of(
+            models, head, kind, network_alone, photo=photo, matte=matte, white=white
+        )
+    return Person(models, photo, head, found, matte, kind, network_alone, tensors, white)
 
 
 def one_of(choices: Any, name: str, value: str) -> None:

@@ -11,7 +11,8 @@ from facerf_cli.batch.run import sums_up
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import UsageError
 from facerf_cli.option import IMAGE, Without, option
-from facerf_cli.work.photo_options import PhotoOptions, networks_of
+from facerf_cli.relighting import White
+from facerf_cli.work.photo_options import PhotoOptions, networks_of, white_option
 from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written, end_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
@@ -27,6 +28,7 @@ class MakePage(PhotoWork):
 
     photo: Annotated[PhotoOptions, Without("texture_side")]
     size_px: int = option(1024, metavar="PX", least=256, most=4096, panel=IMAGE)
+    white: White = white_option()
     verb, endings, networks = "view", (_PAGE,), networks_of(["portrait"])
     alone_as = (_PAGE,)
 
@@ -34,7 +36,7 @@ class MakePage(PhotoWork):
         """Write the page of every chosen face."""
         from facerf_cli.work.view_photos import write_pages
 
-        return write_pages(item, self.photo, self.size_px)
+        return write_pages(item, self.photo, self.size_px, self.white)
 
 
 def view(

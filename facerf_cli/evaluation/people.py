@@ -21,6 +21,7 @@ from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, reg
 from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.image.metrics import tone_of
+from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.stored_graph import PeopleNetworks
@@ -39,7 +40,6 @@ from facerf_cli.raster.texture import sample_texture
 from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.synth.appearance.people import skin_albedo
 
 _MASK_SIDE = 256  # texels of the masks
 log = logging.getLogger(LOGGER_NAME)

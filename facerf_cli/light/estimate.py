@@ -53,12 +53,8 @@ class LightEvidence:
 
     @property
     def clipped(self) -> Tensor:
-        """Texels [3, T, T] bool that are white in the photo, where the true radiance may be higher.
-
-        A photo with any value above 1 is not clipped.
-        """
-        ends_at_white = bool(self.photo[:, self.mask].max() <= 1) if self.mask.any() else False
-        return (self.photo >= _WHITE) & self.mask & ends_at_white
+        """Texels [3, T, T] bool that are white in the photo, where the true radiance may be higher."""
+        return clipped(self.photo, self.mask)
 
     def require_a_face(self) -> None:
         """Raise InputError if too little of the face is visible, or if it is black."""
@@ -89,6 +85,15 @@ class LightEvidence:
         if not non_negative:
             return estimate_signed_weights(olats, photo)
         return estimate_smooth_weights(self.directions, olats, photo, self.clipped[:, self.mask])
+
+
+def clipped(photo: Tensor, mask: Tensor) -> Tensor:
+    """Texels [3, ...] bool of a mask [...] that are white in a photo [3, ...].
+
+    A photo with any value above 1 there is not clipped.
+    """
+    ends_at_white = bool(photo[:, mask].max() <= 1) if mask.any() else False
+    return (photo >= _WHITE) & mask & ends_at_white
 
 
 def joined(frames: Sequence[LightEvidence]) -> LightEvidence:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,17 +15,21 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
 from facerf_cli.light.quotient import Quotient
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import is_grey, mixed_precision, without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.raster.texture import bake_attributes
+from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.relighting.white import Balance
 from facerf_cli.run.threads import count, in_threads
 
 MEMORY_BYTES = 2 << 30  # for the prediction, by default
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
 _LIGHT_SIDE = 128  # texels on which light is estimated
+_AROUND = 32  # lights that shine as even light does
 SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo's
 
 
@@ -33,7 +37,8 @@ SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo'
 class Field:
     """The field of a face, by the network alone or corrected by a photo's quotient; a `Reflectance`.
 
-    With `even_shade` the network sees the face `without_colour_of_shade`, as the quotient's field does.
+    With `even_shade` the network sees the face `without_colour_of_shade`, as the quotient's field does. A
+    `balance` holds the gain of its white.
     """
 
     models: Models
@@ -42,6 +47,7 @@ class Field:
     memory_bytes: int = MEMORY_BYTES
     bf16: bool = False
     even_shade: bool = False
+    balance: Balance | None = None
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
@@ -65,9 +71,15 @@ class Field:
                 olats = network.decode(encoded, normals, some[None].to(device))[0]
             olats = olats.float().cpu()
             olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
-            return self.quotient.corrected(olats) if self.quotient else olats
+            olats = self.quotient.corrected(olats) if self.quotient else olats
+            return olats if self.balance is None else olats * self.balance.gain[:, None, None]
 
         yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
+
+    def small_under_even_light(self) -> Tensor:
+        """The face's small texture [3, t, t] under even white light."""
+        rig = rig_directions(_AROUND)
+        return replace(self, face=shrunk(self.face)).relit(rig, torch.full((1, _AROUND, 3), 1 / _AROUND))[0]
 
     @property
     def _has_gradients(self) -> bool:
@@ -129,6 +141,14 @@ def shrunk(face: FaceTexture) -> FaceTexture:
     fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
     small = F.interpolate(fields, side, mode="area")[0]
     return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
+
+
+def balance_of(white: White, shown: Iterable[tuple[FaceTexture, Tensor]]) -> Balance:
+    """The balance of a face by its photos: each a texture, and the small face under even white light."""
+    faces, even = zip(*((shrunk(face), relit) for face, relit in shown), strict=True)
+    skin = torch.stack([face.visible > SEEN_WELL for face in faces]) * region_mask("skin", _LIGHT_SIDE)
+    photos = torch.stack([face.texture for face in faces], 1)
+    return Balance.of(white, torch.stack(even, 1), photos, skin)
 
 
 def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:

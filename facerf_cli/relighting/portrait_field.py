@@ -33,13 +33,14 @@ from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
 from facerf_cli.relighting.source_light import SourceLight
+from facerf_cli.relighting.white import BARE, Balance
 from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
+_EVEN_LIGHTS = 32  # that shine as even light does
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
-_BARE = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
 _CLOTH = ("garment", "headwear")
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
@@ -80,12 +81,14 @@ class PortraitLight:
 class SteadyFrame:
     """A person in one frame of a shot, steadied by the frames around it, and the light held over the shot.
 
-    `portrait` is for the portrait field alone: the person in each view, and their maps.
+    `portrait` is for the portrait field alone: the person in each view, and their maps. `balance` is that of
+    the shot.
     """
 
     light: RigLight
     segmentation: Segmentation
     portrait: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()
+    balance: Balance | None = None
 
 
 class _Some(NamedTuple):
@@ -112,15 +115,15 @@ class PortraitView:
     correction: Correction | None = None
 
     @staticmethod
-    def of(person: SeenPerson, maps: PortraitMaps, own: SourceLight | None) -> "PortraitView":
-        """The view of a person with its maps, corrected by the photo's estimated light `own`."""
+    def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
+        """The view of a person with its maps, corrected by the photo's estimated light."""
         found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
-        return found if own is None else found._corrected(own)
+        return found if source is None else found._corrected(source)
 
-    def _corrected(self, own: SourceLight) -> "PortraitView":
+    def _corrected(self, source: SourceLight) -> "PortraitView":
         """The view in the units of the photo's light, corrected to give the photo back under it."""
-        used = own.light.weights.sum(1) > 0
-        directions, weights = own.light.directions[used], own.light.weights[used]
+        used = source.light.weights.sum(1) > 0
+        directions, weights = source.light.directions[used], source.light.weights[used]
         shade, glow, _ = self._shaded(directions, self.person.visibility(directions))
         olats = self.maps.albedo * shade[:, None] + glow[:, None]
         skin = self.person.classes[_SKIN]
@@ -129,6 +132,16 @@ class PortraitView:
         exposure = shown / found.clamp_min(1e-6)  # white, as the photo's light leaves it
         correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
         return replace(self, exposure=exposure, correction=correction)
+
+    def balanced(self, balance: Balance | None) -> "PortraitView":
+        """The view whose albedo has the white of a balance."""
+        if balance is None:
+            return self
+        rig, person = rig_directions(_EVEN_LIGHTS), self.person
+        even = self.relit(self.lit(rig, torch.full((1, len(rig), 3), 1 / len(rig))))[0]
+        gains = balance.gains(even, person.image, person.classes)
+        colours = {name: getattr(self.maps, name) * gains for name in ("gain", "bias", "albedo")}
+        return replace(self, maps=self.maps._replace(**colours))
 
     def _shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Shading, highlights and the share that arrives [l, S, S] of single lights, given their visibility.
@@ -216,12 +229,20 @@ class PortraitField:
         model: MorphableModel,
         head: Head,
         field: Field,
-        own: SourceLight | None,
+        source: SourceLight | None,
         seen: Sequence[tuple[SeenPerson, PortraitMaps]],
     ) -> "PortraitField":
-        """The field of a person `seen` in squares, with the maps of each; `own` is the photo's light."""
-        views = tuple(PortraitView.of(*one, own) for one in seen)
+        """The field of a person `seen` in squares, with the maps of each; `source` is the photo's light.
+
+        The balance of the face's field is that of the whole person.
+        """
+        views = tuple(PortraitView.of(*one, source).balanced(field.balance) for one in seen)
         return PortraitField(views, field, _texels_in_square(model, head, seen[0][0]))
+
+    @property
+    def balance(self) -> Balance | None:
+        """The balance of the person's white."""
+        return self.field.balance
 
     @property
     def person(self) -> SeenPerson:
@@ -269,7 +290,7 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """
     rig = rig_directions(_SUMMARY_LIGHTS)
     inputs = person.inputs(rig, person.visibility(rig))
-    even = without_colour_of_shade(inputs.image[0], inputs.classes[0, _BARE].sum(0))
+    even = without_colour_of_shade(inputs.image[0], inputs.classes[0, BARE].sum(0))
     inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device
     on_device = inputs.to(device)
@@ -296,7 +317,7 @@ def _with_own_colours(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMap
         / person.mean((2, 3), keepdim=True).clamp_min(1e-6)
     )
     of_classes = torch.einsum("bkij,bcij->bkc", inputs.classes, own)
-    of_classes[:, _BARE] = of_classes[:, _BARE].sum(1, keepdim=True)
+    of_classes[:, BARE] = of_classes[:, BARE].sum(1, keepdim=True)
     of_classes = of_classes / of_classes.mean(2, keepdim=True).clamp_min(1e-9)
     typical = torch.einsum("bkij,bkc->bcij", inputs.classes, of_classes)
     colour = torch.lerp(

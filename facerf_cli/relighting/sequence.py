@@ -20,7 +20,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_batch, fit_landmarks, trust_inside
-from facerf_cli.face.head import Head, unwrap_face
+from facerf_cli.face.head import FaceTexture, Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
@@ -37,9 +37,12 @@ from facerf_cli.portrait.segment import (
     small_image,
     within_matte,
 )
+from facerf_cli.relighting import White
+from facerf_cli.relighting.field import balance_of
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
-from facerf_cli.relighting.source_light import light_of_frames
+from facerf_cli.relighting.source_light import light_of_frames, source_light
+from facerf_cli.relighting.white import Balance
 
 _ROWS, _COLUMNS = 12, 16  # of a thumbnail
 _LEAST = 0.05  # change at a cut, display values in 0..1
@@ -304,6 +307,7 @@ class ShotView:
         self._classes = lru_cache(_KEPT)(self._look)
         self.head: Callable[[int], Head] = lru_cache(_KEPT)(self._seen_head)  # without what covers its skin
         self.segmentation: Callable[[int], Segmentation] = lru_cache(_KEPT)(self._segmentation)
+        self._balance = lru_cache(1)(self._balance_of)
         self._people = lru_cache(_KEPT)(self._seen_people)
         self._maps = lru_cache(_KEPT)(
             lambda frame: [maps_of(models.networks.portrait, person) for person in self._people(frame)]
@@ -320,16 +324,25 @@ class ShotView:
         except InputError:  # all of it is covered: in this frame something passes before it
             return head
 
-    def steady(self, frame: int, portrait: bool = True) -> SteadyFrame:
+    def steady(self, frame: int, portrait: bool = True, white: White | None = None) -> SteadyFrame:
         """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
         views = tuple(zip(self._people(frame), self._steady_maps(frame), strict=True)) if portrait else ()
-        return SteadyFrame(self.light, self.segmentation(frame), views)
+        balance = None if white is None else self._balance(white)
+        return SteadyFrame(self.light, self.segmentation(frame), views, balance)
 
     @cached_property
     def light(self) -> RigLight:
         """The light of the shot, from key frames together."""
-        heads = [self.head(frame) for frame in self.key_frames]
-        return light_of_frames(self._models, [head.face for head in heads])
+        return light_of_frames(self._models, self._key_faces)
+
+    def _balance_of(self, white: White) -> Balance:
+        """The balance of the shot, from key frames together."""
+        faces = self._key_faces
+        return balance_of(white, [(one, source_light(self._models, one, self.light).even) for one in faces])
+
+    @property
+    def _key_faces(self) -> list[FaceTexture]:
+        return [self.head(frame).face for frame in self.key_frames]
 
     @cached_property
     def key_frames(self) -> list[int]:

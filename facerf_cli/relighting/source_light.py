@@ -30,10 +30,14 @@ _TINY = 1e-12  # avoids divisions by 0
 
 @dataclass(frozen=True, eq=False)
 class SourceLight:
-    """The estimated light of a photo, the lamp first, and the field's quotient under it."""
+    """The estimated light of a photo, the lamp first, and the field's quotient under it.
+
+    `even` [3, t, t] is the small face under even white light.
+    """
 
     light: RigLight
     quotient: Quotient
+    even: Tensor
 
 
 @torch.no_grad()
@@ -46,7 +50,8 @@ def source_light(models: Models, face: FaceTexture, held: RigLight | None = None
     light = _estimated([frame]) if held is None else held
     small = frame.field.face
     explained = weighted_sum([frame.under(light.directions[:1]), frame.around], light.weights[None])[0]
-    return SourceLight(light, Quotient.of(small.texture, explained, small.visible))
+    quotient = Quotient.of(small.texture, explained, small.visible)
+    return SourceLight(light, quotient, quotient.corrected(frame.around).mean(0))
 
 
 @torch.no_grad()

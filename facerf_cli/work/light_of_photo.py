@@ -153,6 +153,7 @@ def _estimate(
             Estimator(options.non_negative, features),
             options.keep_eyes,
             more,
+            white="scene",
         )
     except InputError as error:
         raise InputError(f"{item.input_path}: {error}") from None

@@ -42,6 +42,16 @@ def network_alone_option() -> Any:
     )
 
 
+def white_option() -> Any:
+    """Make the field of `--white`."""
+    return option(
+        "photo",
+        "Keep the photo's white, or take the colour of the scene's light out, such as sodium or party light.",
+        flags=("--white",),
+        panel=IMAGE,
+    )
+
+
 @dataclass(frozen=True)
 class FieldOptions:
     """The making of the field of a photo."""

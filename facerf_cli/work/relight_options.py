@@ -18,6 +18,7 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.light.entries import is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
+from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
     LightSetup,
     LightSources,
@@ -43,6 +44,7 @@ from facerf_cli.work.photo_options import (
     network_alone_option,
     networks_of,
     parse_pose,
+    white_option,
 )
 from facerf_cli.work.shots import (
     FRAMES_IN_A_ROW,
@@ -184,6 +186,7 @@ class Relight:
     ball: bool = option(False, in_recipe=False, panel=IMAGE)
     identity: bool = option(False, in_recipe=False, panel=METHOD)
     network_alone: bool = network_alone_option()
+    white: White = white_option()
     fps: Fraction | None = option(
         None, metavar="RATE", in_recipe=False, shown_default="24", parse=film_rate, panel=IMAGE
     )
@@ -255,6 +258,8 @@ class Relight:
         parse_lights(self.rig)
         if self.network_alone and self.reflectance not in ("field", "portrait"):
             raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
+        if self.white != "photo" and self.reflectance not in ("field", "portrait"):
+            raise UsageError("--white: is for the fields; leave it out, or use --reflectance field")
         photo = replace(self.photo, ocio_config=self.output.config)
         photo.check()
         if self.background.kind != "photo" and alone:

@@ -24,7 +24,9 @@ from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.pipeline import FittedPerson, reflectance_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.composition import Composition, Target
+from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.group import GroupComposition
+from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (
@@ -189,7 +191,7 @@ def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, Iterator[F
     Those of a frame of a shot are steadied by the frames around it.
     """
     if place := shot_of(work.shots, item):
-        image, face = frame_with_face(*place, work.photo, work.reflectance == "portrait")
+        image, face = frame_with_face(*place, work.photo, work.reflectance == "portrait", work.white)
         return image, iter([face])
     image = read_photo(item, work.photo)
     return image, fit_each(item, image, work.photo, together=work.composite == "photo")
@@ -242,8 +244,11 @@ def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -
     with naming(item.input_path):
         require_face(models.face, target.fit or face.fit, photo.shape[:2])
         reflectance = reflectance_of(
-            models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte
+            models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte, work.white
         )
+        balance = reflectance.balance if isinstance(reflectance, Field | PortraitField) else None
+        if balance is not None and balance.is_far and work.white == "photo" and face.steady is None:
+            log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
         person = FittedPerson(models, photo, face.head, reflectance, face.matte)
         if target.composite == "photo" and face.matte is None:
             face.see(person.segmentation)
@@ -307,6 +312,8 @@ def _check_stack(item: Item, work: Relight) -> None:
         wrong = "a stack holds one pose of a face without its photo; give the photo"
     elif work.reflectance not in ("field", "portrait"):
         wrong = f"a stack holds the field; for {work.reflectance} give its photo"
+    elif work.white != "photo":
+        wrong = "a stack holds the white with which it was predicted; give its photo"
     elif work.network_alone:
         wrong = "a stack holds the field as predicted; give its photo"
     elif work.photo.has_given_person:

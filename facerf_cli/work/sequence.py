@@ -18,6 +18,7 @@ from facerf_cli.files.images import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.portrait.segment import Segmentation
+from facerf_cli.relighting import White
 from facerf_cli.relighting.models import described_file
 from facerf_cli.relighting.sequence import LONGEST_GAP, CutFinder, Follower, ShotView, Sighting, gaps, takes
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
@@ -262,12 +263,12 @@ def segmented_frame(shot: Shot, number: int, options: PhotoOptions) -> tuple[Lin
 
 
 def frame_with_face(
-    shot: Shot, number: int, options: PhotoOptions, portrait: bool = True
+    shot: Shot, number: int, options: PhotoOptions, portrait: bool = True, white: White | None = None
 ) -> tuple[LinearImage, FittedFace]:
     """A frame, and its head with what is steadied by the frames around it; see `ShotView.steady`."""
     view = view_of(shot, number, options)
     with _named(shot, number):
-        head, steady = view.head(number), view.steady(number, portrait)
+        head, steady = view.head(number), view.steady(number, portrait, white)
     landmarks_px = head.fit.crop.to_photo(head.landmarks_px)
     found, matte = face_at(landmarks_px), steady.segmentation.matte
     face = FittedFace("", f"frame {number}", found, head=head, steady=steady, matte=matte)

@@ -68,7 +68,7 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             {"exr": write_olat_stack, "npz": write_olat_npz}[work.format](stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
-            write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px)
+            write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px, work.white)
         return face.described()
 
     tags, facts = write_each(item, image, work.photo, write)
@@ -120,7 +120,9 @@ def _of_person(
     )
     memory = prediction_bytes()
     with naming(item.input_path):
-        field = reflectance_of(models, head, "portrait", work.network_alone, memory, photo, matte=matte)
+        field = reflectance_of(
+            models, head, "portrait", work.network_alone, memory, photo, matte=matte, white=work.white
+        )
     composition = FittedPerson(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
     size = composition.size_px
 
@@ -168,7 +170,7 @@ def _of_face(
     def olats() -> Iterator[Tensor]:
         alone, bf16 = work.network_alone, work.precision == "bf16"
         for textures in predict_olat(
-            models, face.head, directions, rotation, alone, prediction_bytes(), bf16
+            models, face.head, directions, rotation, alone, prediction_bytes(), bf16, work.white
         ):
             tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
             yield render_face(textures, *large) if work.frame == "face" else textures

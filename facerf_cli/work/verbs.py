@@ -18,7 +18,14 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
 from facerf_cli.option import IMAGE, LIGHT, METHOD, option
-from facerf_cli.work.photo_options import PhotoOptions, network_alone_option, networks_of, parse_pose
+from facerf_cli.relighting import White
+from facerf_cli.work.photo_options import (
+    PhotoOptions,
+    network_alone_option,
+    networks_of,
+    parse_pose,
+    white_option,
+)
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, Shot, ShotOptions, collect_frames, recipe_of_shots
 
 
@@ -174,6 +181,7 @@ class PredictOlat(PhotoWork):
     )
     size_px: int = option(1024, metavar="PX", least=64, most=16384, panel=IMAGE)
     network_alone: bool = network_alone_option()
+    white: White = white_option()
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
     format: Literal["exr", "npz", "relight"] = option("exr", panel=IMAGE)
     page: bool = option(False, panel=IMAGE)

@@ -19,6 +19,7 @@ from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.pipeline import FittedPerson, reflectance_of
+from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
@@ -41,7 +42,9 @@ _STRIP_PX = 160  # longer side of an image of the strip
 _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
 
 
-def write_pages(item: Item, options: PhotoOptions, size_px: int) -> tuple[list[str], dict[str, Any]]:
+def write_pages(
+    item: Item, options: PhotoOptions, size_px: int, white: White
+) -> tuple[list[str], dict[str, Any]]:
     """Write a page for each chosen face of a photo, or for a stack; their tags, and facts for the report."""
     if is_olat_stack(item.input_path):
         tag = options.first_tag
@@ -49,28 +52,38 @@ def write_pages(item: Item, options: PhotoOptions, size_px: int) -> tuple[list[s
     image, models = read_photo(item, options), load_models_once(options)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        write_page(item.output(face.tag + ".html"), item, models, image.pixels, face, size_px)
+        write_page(item.output(face.tag + ".html"), item, models, image.pixels, face, size_px, white)
         return face.described()
 
     return write_each(item, image, options, write)
 
 
 def write_page(
-    path: Path, item: Item, models: Models, photo: np.ndarray, face: FittedFace, size_px: int
+    path: Path,
+    item: Item,
+    models: Models,
+    photo: np.ndarray,
+    face: FittedFace,
+    size_px: int,
+    white: White,
 ) -> None:
     """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
     photo, head = shrunk_photo(photo, face.head, size_px)
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
     with naming(item.input_path):
-        basis, plate = of_photo(models, photo, head, matte)
+        basis, plate = of_photo(models, photo, head, matte, white)
     _write(path, item, face.tag.replace("_", " "), basis, plate, head_place(head.fit.crop, plate.matte))
 
 
 def of_photo(
-    models: Models, photo: np.ndarray, head: Head, matte: np.ndarray | None = None
+    models: Models,
+    photo: np.ndarray,
+    head: Head,
+    matte: np.ndarray | None = None,
+    white: White | None = None,
 ) -> tuple[Basis, Plate]:
     """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
-    field = reflectance_of(models, head, "portrait", photo=photo, matte=matte)
+    field = reflectance_of(models, head, "portrait", photo=photo, matte=matte, white=white)
     assert isinstance(field, PortraitField)
     composition = FittedPerson(models, photo, head, field).composed()
     basis = basis_of_photo(models, photo, head, field, composition)

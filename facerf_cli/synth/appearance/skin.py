@@ -13,9 +13,10 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import block_diag
 from torch import Tensor
 
+from facerf_cli.image.skin import skin_albedo
 from facerf_cli.synth import tables_of
 from facerf_cli.synth.appearance.facial_hair import FacialHair, above_hairline, draw_facial_hair, scalp_hair
-from facerf_cli.synth.appearance.people import People, draw_people, each, hair_albedo, paint_eyes, skin_albedo
+from facerf_cli.synth.appearance.people import People, draw_people, each, hair_albedo, paint_eyes
 from facerf_cli.synth.head.mesh import arc_lengths
 from facerf_cli.synth.random_fields import (
     LANDMARK_MM,

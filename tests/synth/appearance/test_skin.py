@@ -7,17 +7,9 @@ import torch
 from facerf_cli.face.topology import LANDMARK_UV
 from facerf_cli.image.colour import lab_d65
 from facerf_cli.image.metrics import ita_deg
+from facerf_cli.image.skin import WAVELENGTHS_NM, observer_weights, skin_albedo, skin_reflectance
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.synth.appearance.people import (
-    RANDOM_TEXTURES,
-    WAVELENGTHS_NM,
-    People,
-    draw_people,
-    hair_albedo,
-    observer_weights,
-    skin_albedo,
-    skin_reflectance,
-)
+from facerf_cli.synth.appearance.people import RANDOM_TEXTURES, People, draw_people, hair_albedo
 from facerf_cli.synth.appearance.skin import bare_skin, draw_skin, paint_skin
 from facerf_cli.synth.random_fields import CANVAS_SPAN, Window, blurred, inside, mask, noise, slopes, splat
 
@@ -208,3 +200,12 @@ def test_a_share_of_faces_wears_random_colours() -> None:
     spread = [np.ptp(np.arctan2(*lab_d65(x.permute(1, 2, 0).numpy())[..., 1:].reshape(-1, 2).T)) for x in
               (odd[:, 20:60, 40:150], usual[:, 60:80, 40:60])]  # fmt: skip
     assert spread[0] > 2 * spread[1]
+
+
+def test_the_same_seed_draws_the_same_people() -> None:
+    """A change here means that every shipped network is to be trained again."""
+    people, skin = draw_people(4, generator()), draw_skin(2, 32, generator())
+    assert people.melanin.tolist() == pytest.approx([0.00761, 0.010765, 0.019953, 0.008225], rel=1e-4)
+    assert people.hair_eumelanin.tolist() == pytest.approx([0.362061, 2.488394, 0.554631, 2.675644], rel=1e-4)
+    colours = [[0.3284, 0.2460, 0.2854], [0.4218, 0.3191, 0.2125]]
+    assert np.allclose(skin.albedo.mean((2, 3)).numpy(), colours, atol=1e-4)

@@ -1,0 +1,161 @@
+"""The white of relit skin and cloth: the photo's, or that of skin."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.face.head import Head
+from facerf_cli.face.topology import region_mask
+from facerf_cli.image.colour import luminance
+from facerf_cli.image.skin import skin_albedo
+from facerf_cli.pipeline import estimate_light, predict_olat, reflectance_of
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.relighting import White
+from facerf_cli.relighting.field import Field, shrunk
+from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.white import SURE, Balance
+from tests import astronaut
+
+SIZE = (24, 30)
+CAST = torch.tensor([0.8, 1.0, 1.3])  # that a network leaves in a relit person
+WARM, ORANGE = torch.tensor([1.15, 1.0, 0.9]), torch.tensor([2.0, 0.8, 0.2])  # lights
+PALE = skin_albedo(torch.full((1, 1, 1, 1), 0.02), torch.full((1, 1, 1, 1), 0.015))[0, :, 0, 0]
+
+
+def of_colour(colour: Tensor) -> Tensor:
+    """An image [3, h, w] of one colour, brighter to the right."""
+    return colour[:, None, None] * torch.linspace(0.4, 1, SIZE[1]).expand(1, *SIZE)
+
+
+def balance(white: White, light: Tensor, **given: Tensor) -> Balance:
+    """The balance of pale skin in a light, which is relit with a cast."""
+    found = {"relit": of_colour(PALE * CAST), "photo": of_colour(PALE * light), "skin": torch.ones(SIZE)}
+    return Balance.of(white, **(found | given))
+
+
+def test_skin_gets_the_chromaticity_of_the_photo_and_keeps_its_luminance() -> None:
+    gain = balance("photo", WARM).gain
+    white = PALE * CAST * gain
+    torch.testing.assert_close(white / white[1], PALE * WARM / (PALE * WARM)[1], rtol=1e-4, atol=0)
+    assert luminance(white.numpy()) == pytest.approx(float(luminance((PALE * CAST).numpy())), rel=1e-4)
+
+
+def test_a_scene_far_from_white_leaves_skin_the_nearest_colour_of_skin() -> None:
+    found = balance("scene", ORANGE)
+    assert found.is_far and balance("photo", ORANGE).is_far
+    white = PALE * CAST * found.gain  # the cast skin is none, so its nearest one is taken
+    chroma = (white / white[1])[::2].log()
+    skins = torch.rand(1, 2, 300, 300, generator=torch.Generator().manual_seed(0)).square()
+    known = skin_albedo(0.6 * skins[:, :1], 0.2 * skins[:, 1:])[0].flatten(1)
+    known = (known / known[1])[::2].log()
+    assert (known - chroma[:, None]).norm(dim=0).min() < 0.02  # the spacing of the table of skins
+    torch.testing.assert_close(
+        found.light, (ORANGE * PALE / white / ORANGE[1] * white[1] / PALE[1])[::2].log()
+    )
+
+
+def test_a_balanced_photo_has_its_own_white_in_its_scene_too() -> None:
+    found = balance("scene", torch.ones(3))
+    assert not found.is_far and found.light.abs().max() < 0.02
+    torch.testing.assert_close(found.gain, balance("photo", torch.ones(3)).gain, rtol=0.02, atol=0)
+
+
+def test_few_pixels_of_skin_and_grey_photos_change_nothing() -> None:
+    few = torch.zeros(SIZE)
+    few.flatten()[:499] = 1
+    grey = of_colour(torch.full((3,), 0.5))
+    for found in (balance("photo", WARM, skin=few), balance("photo", WARM, photo=grey)):
+        assert found.gain.tolist() == [1, 1, 1] and found.light.tolist() == [0, 0] and not found.is_far
+    few.flatten()[499] = 1
+    assert balance("photo", WARM, skin=few).gain.tolist() != [1, 1, 1]
+
+
+def test_clipped_and_black_skin_has_no_colour_of_its_own() -> None:
+    clean = of_colour(PALE * WARM)
+    clean[0] *= torch.linspace(0.8, 1.2, SIZE[1])  # so that a median tells what it is over
+    spoilt = clean.clone()
+    spoilt[:, :4], spoilt[:, 4:7] = 1.0, 0.001
+    gains = [balance("photo", WARM, photo=photo).gain for photo in (clean, spoilt)]
+    torch.testing.assert_close(*gains)
+
+
+def test_cloth_has_a_gain_of_its_own_by_the_same_light() -> None:
+    relit, photo = of_colour(PALE * CAST), of_colour(PALE * ORANGE)
+    half = torch.zeros(SIZE)
+    half[:, :15] = 1
+    classes = torch.zeros(len(CLASSES), 2 * SIZE[0], SIZE[1])
+    classes[class_index("neck"), : SIZE[0]] = 1
+    classes[class_index("garment"), SIZE[0] :] = 1
+    shirt = of_colour(torch.full((3,), 0.6))  # white, and relit it is
+    for white, light in (("photo", ORANGE), ("scene", torch.tensor(1.0))):
+        found = balance(white, ORANGE)  # type: ignore[arg-type]
+        gains = found.gains(
+            torch.cat([relit, shirt], 1), torch.cat([photo, shirt * ORANGE[:, None, None]], 1), classes
+        )
+        torch.testing.assert_close(gains[:, 5, 5], found.gain, rtol=1e-3, atol=0)
+        cloth = gains[:, -5, 5]
+        if white == "photo":
+            torch.testing.assert_close(cloth / cloth[1], light / light[1], rtol=1e-3, atol=0)
+        else:  # the light that is taken out of the skin is taken out of the cloth
+            taken = torch.stack([found.light[0], found.light.new_zeros(()), found.light[1]]).exp()
+            torch.testing.assert_close(cloth / cloth[1], ORANGE / ORANGE[1] / taken, rtol=1e-3, atol=0)
+
+
+def in_orange() -> Head:
+    """The astronaut's head in orange light."""
+    head = astronaut.head()
+    return replace(head, face=replace(head.face, texture=head.face.texture * ORANGE[:, None, None]))
+
+
+def error(white: White | None) -> float:
+    """How far skin under even white light is from its log chromaticity in an orange photo."""
+    head = in_orange()
+    field = reflectance_of(astronaut.models(), head, "field", white=white)
+    assert isinstance(field, Field)
+    small, even = shrunk(head.face), field.small_under_even_light()
+    skin = (small.visible * region_mask("skin", small.texture.shape[-1])) > SURE
+    both = (image[:, skin].clamp_min(1e-4).log() for image in (small.texture, even))
+    photo, found = (torch.stack([red - green, blue - green]).median(1).values for red, green, blue in both)
+    return float((found - photo).norm())
+
+
+def test_skin_keeps_the_photos_white_and_loses_the_light_of_the_scene() -> None:
+    assert error("photo") < 0.03 < 0.3 < error("scene")
+
+
+def test_the_whole_person_has_the_same_white() -> None:
+    photo = astronaut.photo() * ORANGE.numpy()
+    skin, shirt = {}, {}
+    for white in ("photo", "scene"):
+        found = reflectance_of(astronaut.models(), in_orange(), "portrait", photo=photo, white=white)  # type: ignore[arg-type]
+        assert isinstance(found, PortraitField)
+        maps, classes = found.views[0].maps, found.views[0].person.classes
+        skin[white], shirt[white] = (
+            maps.albedo[0][:, classes[class_index(name)] > 0.95].mean(1) for name in ("skin", "garment")
+        )
+    for part in (skin, shirt):  # both lose the same light
+        taken = (part["photo"] / part["scene"]).log()
+        light = [float(taken[k] - taken[1]) for k in (0, 2)]
+        assert light[0] > 0.3 and light[1] < -0.3
+
+
+def test_the_faces_own_field_has_the_same_white_in_every_light() -> None:
+    light = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
+    shown = [
+        next(predict_olat(astronaut.models(), astronaut.head(), light, white=white, network_alone=alone))
+        for white in ("photo", None)
+        for alone in (False, True)
+    ]
+    for balanced, plain in zip(shown[:2], shown[2:], strict=True):
+        ratio = (balanced / plain.clamp_min(1e-6))[0][:, plain[0].amin(0) > 0.01]
+        assert ratio.std(1).max() < 1e-3 and (ratio.mean(1) - 1).abs().max() > 0.01
+
+
+def test_the_light_of_a_balanced_photo_is_white_and_that_of_a_party_is_not() -> None:
+    head, models = astronaut.head(), astronaut.models()
+    white = estimate_light(models, head, white="scene").light.weights.sum(0)
+    assert ((white / white[1]).log().abs() < 0.1).all()
+    orange = estimate_light(models, in_orange(), white="scene").light.weights.sum(0)
+    assert orange[0] > 1.7 * orange[1] and orange[2] < 0.5 * orange[1]
