@@ -70,7 +70,7 @@ def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
     photo, head = shrunk_photo(photo, head_of(models, photo, face), size_px)
     basis, plate = of_photo(models, photo, head)
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), page_maps())
-    text = page(path.stem, path.name, document, "")
+    text = page(path.name, [path.name], document, "")
     print(f"{path.name}: {photo.shape[1]} x {photo.shape[0]}, {len(text) / 2**20:.1f} MiB")
     begun = time.perf_counter()
     given = setups(count)

@@ -540,6 +540,4 @@ def pages() -> Samples:
     """A page of `facerf view`, of which the index reads the strip."""
     from facerf_cli.viewer.page import page
 
-    return {
-        "a.html": page("a", "data:image/jpeg;base64,AAAA", {"a": 1}, "data:image/jpeg;base64,AAAA").encode()
-    }
+    return {"a.html": page("a", ["a.jpg"], {"a": 1}, "data:image/jpeg;base64,AAAA").encode()}

@@ -136,9 +136,9 @@ def _brightest(some: Brightest) -> dict[str, Any]:
     }
 
 
-def page(title: str, photo: str, document: Mapping[str, Any], strip: str) -> str:
-    """The page of a photo; `photo` is its path on a command line, `strip` a JPEG in base64."""
-    data = json_text({**document, "title": title, "source": shlex.quote(photo)}).replace("<", "\\u003c")
+def page(title: str, photo: Sequence[str], document: Mapping[str, Any], strip: str) -> str:
+    """The page of a photo; `photo` is its path and options on a command line, `strip` a JPEG in base64."""
+    data = json_text({**document, "title": title, "source": shlex.join(photo)}).replace("<", "\\u003c")
     script = '"use strict";\n' + "".join(map(_text, SCRIPTS))
     return _filled("page.html", script, title=title, data=data, strip=strip)
 

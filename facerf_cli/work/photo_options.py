@@ -4,7 +4,7 @@ Light to import: the help reads them without torch and numpy.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from facerf_cli.batch.inputs import OF_FILES, NamePattern
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
-from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, option
+from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
 from facerf_cli.work.matte_models import MatteModel, parse_matte_from
 
 MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
@@ -137,6 +137,18 @@ class PhotoOptions:
         written last and mark the photo as finished.
         """
         return "_face0" if self.face == "all" else ""
+
+
+def photo_words(options: PhotoOptions, number: int = 0) -> list[str]:
+    """Options that are not defaults, as they are typed; of all faces that of a `number` alone."""
+    words, settings = [], options.settings
+    for one in fields(options):
+        value, about = getattr(options, one.name), one.metadata.get("option")
+        if about and value != one.default:
+            text = number if value == "all" else getattr(value, "matte_from", value)
+            words += [about.flags[0] if about.flags else flag(one.name), str(text)]
+    checkpoints = () if settings.checkpoints_by_default else settings.checkpoints
+    return words + [word for path in checkpoints for word in ("--checkpoint", str(path))]
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,7 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             {"exr": write_olat_stack, "npz": write_olat_npz}[work.format](stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
-            write_page(page, item, load_models_once(work.photo), image.pixels, face, work.size_px, work.white)
+            write_page(page, item, work.photo, image.pixels, face, work.size_px, work.white)
         return face.described()
 
     tags, facts = write_each(item, image, work.photo, write)

@@ -25,7 +25,7 @@ from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
-from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
@@ -49,10 +49,10 @@ def write_pages(
     if is_olat_stack(item.input_path):
         tag = options.first_tag
         return [tag], write_page_of_stack(item.output(tag + ".html"), item, options, size_px)
-    image, models = read_photo(item, options), load_models_once(options)
+    image = read_photo(item, options)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        write_page(item.output(face.tag + ".html"), item, models, image.pixels, face, size_px, white)
+        write_page(item.output(face.tag + ".html"), item, options, image.pixels, face, size_px, white)
         return face.described()
 
     return write_each(item, image, options, write)
@@ -61,7 +61,7 @@ def write_pages(
 def write_page(
     path: Path,
     item: Item,
-    models: Models,
+    options: PhotoOptions,
     photo: np.ndarray,
     face: FittedFace,
     size_px: int,
@@ -71,8 +71,11 @@ def write_page(
     photo, head = shrunk_photo(photo, face.head, size_px)
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
     with naming(item.input_path):
-        basis, plate = of_photo(models, photo, head, matte, white)
-    _write(path, item, face.tag.replace("_", " "), basis, plate, head_place(head.fit.crop, plate.matte))
+        basis, plate = of_photo(load_models_once(options), photo, head, matte, white)
+    title = item.input_path.name + face.tag.replace("_", " ")
+    whites = ["--white", white] if white != "photo" else []
+    words = [str(item.input_path), *photo_words(options, face.number), *whites]
+    _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte))
 
 
 def of_photo(
@@ -104,7 +107,7 @@ def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: 
     )
     size = basis.guide.shape[:2]
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
-    _write(path, item, "", basis, plate, head)
+    _write(path, item.input_path.name, [str(item.input_path), *photo_words(options)], basis, plate, head)
     return {"lights": len(header.directions)}
 
 
@@ -116,10 +119,10 @@ def head_place(crop: Crop, matte: np.ndarray) -> tuple[float, float, float]:
 
 
 def _write(
-    path: Path, item: Item, tag: str, basis: Basis, plate: Plate, head: tuple[float, float, float]
+    path: Path, title: str, words: Sequence[str], basis: Basis, plate: Plate, head: tuple[float, float, float]
 ) -> None:
     document = packed(basis, plate, head, page_maps())
-    text = page(Path(item.name).name + tag, str(item.input_path), document, _strip(basis, plate))
+    text = page(title, words, document, _strip(basis, plate))
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

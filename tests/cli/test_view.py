@@ -13,8 +13,9 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
+from facerf_cli.work.matte_models import MatteModel
 from facerf_cli.work.output_options import parse_exposure
-from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.view_photos import write_index
 
 
@@ -73,9 +74,27 @@ def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
     write_olat_stack(tmp_path / "captured.exr", header, [olats])
     assert main(["view", str(tmp_path / "captured.exr"), "-o", str(tmp_path / "page.html")]) == 0
     made = (tmp_path / "page.html").read_text()
+    assert "<title>captured.exr · facerf</title>" in made  # the input's name, not that of the page
     data = json.loads(made.partition('id="data">')[2].partition("</script>")[0])
     assert len(data["ratios"]) == 12 and data["size"] == [32, 24] and not data["background"]
     assert data["exposure"]["plate"] is None and data["source"].endswith("captured.exr")
+
+
+def test_the_command_of_a_page_has_the_options_that_it_was_made_with() -> None:
+    options = PhotoOptions(
+        Settings(checkpoints=(Path("my net.safetensors"),)),
+        colourspace="ACEScg",
+        face="all",
+        landmarks=Path("points"),
+        landmarks_from="dlib",
+    )
+    line = "--input-colourspace ACEScg --face 2 --landmarks points --landmarks-from dlib --checkpoint"
+    assert photo_words(options, 2) == [*line.split(), "my net.safetensors"]
+    rembg = MatteModel("rembg:u2net", Path("models/u2net.onnx"))
+    alone = PhotoOptions(Settings(), face="1", person=Path("mattes"), matte_from=rembg)
+    assert photo_words(alone) == ["--face", "1", "--person", "mattes", "--matte-from", "rembg:u2net"]
+    shipped = Settings(checkpoints=(Path("shipped"),), checkpoints_by_default=True)
+    assert photo_words(PhotoOptions(shipped)) == []
 
 
 def test_links_of_an_index_are_addresses(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ def shown() -> Shown:
     sun = [one for one in page_maps() if one.name == "sun"]
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), sun)
     whole = FittedPerson(models, photo, head, field).composed()
-    return Shown(whole, page("me", "me.jpg", document, ""))
+    return Shown(whole, page("me", ["me.jpg"], document, ""))
 
 
 def towards(*lights: tuple[float, float]) -> torch.Tensor:

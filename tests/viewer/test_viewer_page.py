@@ -17,7 +17,7 @@ from facerf_cli.viewer.page import IndexEntry, index_page, page, strip_jpeg, str
 
 
 def text(title: str = "me", photo: str = "me.jpg") -> str:
-    return page(title, photo, {"size": [4, 3]}, "c3RyaXA=")
+    return page(title, [photo, "--face", "1"], {"size": [4, 3]}, "c3RyaXA=")
 
 
 def document_of(made: str) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def test_the_page_loads_nothing_and_names_are_escaped() -> None:
     assert "<b>" not in made and made.count("</script>") == 2
     assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", made)
     assert "https://" not in made and "http://" not in made
-    assert document_of(made)["source"] == "'a b/me'\"'\"'s.jpg'"
+    assert document_of(made)["source"] == "'a b/me'\"'\"'s.jpg' --face 1"
     for element in ("style", "script"):
         body = re.search(rf"<{element}>(.*?)</{element}>", made, re.S)
         assert body
@@ -102,7 +102,7 @@ def test_the_page_loads_nothing_and_names_are_escaped() -> None:
 
 def test_an_index_shows_the_strips_of_its_pages() -> None:
     strip = strip_jpeg([np.full((6, 4, 3), 0.5), np.zeros((6, 4, 3))])
-    made = page("me", "me.jpg", {}, strip)
+    made = page("me", ["me.jpg"], {}, strip)
     assert strip_of(made) == strip and strip_of("no page") == ""
     listed = index_page([IndexEntry("a<b", "dir/a&b.html", strip)])
     assert "a&lt;b" in listed and 'href="dir/a&amp;b.html"' in listed and strip in listed
