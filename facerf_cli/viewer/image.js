@@ -2,6 +2,7 @@
 
 const SHOULDER = 0.8; // brightest channel from which on the soft view bends a colour (image/colour.py)
 const WHITENING = 0.3;
+const BALL = 0.6; // its albedo
 const TEXTURES = ["guide", "plate", "matte", "weights", "ratios", "sum"]; // each in the unit of its place here
 
 const HEADER = `#version 300 es
@@ -171,6 +172,29 @@ class CanvasView {
     }
     this.context.putImageData(shown, 0, 0);
   }
+}
+
+// A grey ball seen from the front, matte, under weights [lights * 3] of lights, and of a room.
+function drawBall(canvas, lights, weights) {
+  const { width } = canvas;
+  const context = canvas.getContext("2d");
+  const shown = context.createImageData(width, width);
+  const on = lights.map((light, i) => [light, weights.subarray(3 * i, 3 * i + 3)]).filter(([, rgb]) => rgb.some(Boolean));
+  const room = [...weights.subarray(3 * lights.length)].map((value) => (BALL * value) / 4);
+  for (let i = 0; i < width * width; i++) {
+    const [x, y] = [(2 * (i % width) + 1) / width - 1, 1 - (2 * Math.floor(i / width) + 1) / width];
+    if (x * x + y * y > 1) continue;
+    const normal = [x, y, Math.sqrt(1 - x * x - y * y)];
+    const sum = room.length ? [...room] : [0, 0, 0];
+    for (const [light, rgb] of on) {
+      const cosine = BALL * Math.max(0, dot(normal, light));
+      sum[0] += cosine * rgb[0];
+      sum[1] += cosine * rgb[1];
+      sum[2] += cosine * rgb[2];
+    }
+    shown.data.set([...softened(sum).map((value) => 255 * encoded(value)), 255], 4 * i);
+  }
+  context.putImageData(shown, 0, 0);
 }
 
 async function imageOf(base64, type) {

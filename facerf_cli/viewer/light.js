@@ -25,7 +25,7 @@ class Rig {
   constructor(data) {
     this.lights = groups(floatsOf(data.directions), 3);
     this.triangles = groups(new Uint16Array(bytesOf(data.triangles).buffer), 3);
-    this.shares = groups(floatsOf(data.shares), 9); // a matrix for each triangle, from a direction to its shares
+    this.shares = floatsOf(data.shares); // a matrix [3, 3] for each triangle, from a direction to its shares
   }
 
   nearest(toward) {
@@ -35,13 +35,18 @@ class Rig {
 
   // Lights around a direction and their shares; the nearest one where no triangle is.
   around(toward) {
-    for (const [t, matrix] of this.shares.entries()) {
-      const shares = groups(matrix, 3).map((row) => dot(row, toward));
-      const total = shares[0] + shares[1] + shares[2];
-      const inside = Math.min(...shares) >= -1e-4 && total > 0;
-      if (inside) return shares.map((share, i) => [this.triangles[t][i], share / total]);
+    const share = (row) => this.shares[row] * toward[0] + this.shares[row + 1] * toward[1] + this.shares[row + 2] * toward[2];
+    for (const [t, lights] of this.triangles.entries()) {
+      const [a, b, c] = [share(9 * t), share(9 * t + 3), share(9 * t + 6)];
+      const total = a + b + c;
+      if (Math.min(a, b, c) >= -1e-4 && total > 0) return [a, b, c].map((one, i) => [lights[i], one / total]);
     }
     return [[this.nearest(toward), 1]];
+  }
+
+  // Lights around directions that have shares, and theirs.
+  sharesOf(samples) {
+    return samples.flatMap(([toward, part]) => this.around(toward).map(([i, share]) => [i, part * share]));
   }
 
   // Weights [lights * 3] under a turned map: its integral over the directions nearest to each light, over pi.

@@ -1,58 +1,47 @@
 // The page: controls change the state; every change is shown in the next frame, in the address and as a command.
 
-const MOST_LIGHTS = 9;
 // Of new lights: azimuth and elevation.
 const PLACES = [[-60, 10], [40, 25], [145, 25], [-145, 25], [0, 80], [75, -10], [-90, 40], [0, -50], [180, 15]];
+// Controls, in their sections: label, unit, least, most and step of the slider, and what may be typed, if more.
+const CONTROLS = {
+  light: {
+    azimuth: ["Azimuth", "°", -180, 180, 1],
+    elevation: ["Elevation", "°", -90, 90, 1],
+    stops: ["Intensity", "stops", -6, 6, 0.1, -20, 20],
+    kelvin: ["Colour", "K", 1700, 12000, 50, 1667, 25000],
+    size: ["Softness", "°", 0, 120, 1],
+  },
+  room: { room: ["Room", "%", 0, 30, 1, 0, 100] },
+  map: { rotate: ["Rotate", "°", -180, 180, 1], mapStops: ["Intensity", "stops", -6, 6, 0.1] },
+  image: { exposure: ["Exposure", "EV", -6, 8, 0.05, -20, 20] },
+};
+const SHOWN = { room: 100 }; // a value in the state, times this, is that of its control
+const MARK_MARGIN = 14; // pixels that a mark keeps from the edge of the picture
+const BEHIND = 1.98; // how far from the head's middle a light can be dragged, where 1 is its outline and 2 behind it
 
-const newLight = (azimuth, elevation, colour = "#ffffff", stops = 0) => ({ azimuth, elevation, colour, stops });
-const byteText = (value) => Math.round(255 * encoded(value)).toString(16).padStart(2, "0");
-const rounded = (value, digits) => Number(value.toFixed(digits));
-const inDegrees = (value) => `${Math.round(value)}°`;
-const signed = (value, digits, unit) => `${value < 0 ? "−" : "+"}${Math.abs(value).toFixed(digits)} ${unit}`;
-const inStops = (value) => signed(value, 1, "stops");
-// What the controls change: of the light that is chosen, of all lights, of the map and of the image; in words.
-const LIGHT = { azimuth: inDegrees, elevation: inDegrees, stops: inStops, colour: (text) => text };
-const ROOM = { room: (share) => `${Math.round(100 * share)} %` };
-const MAP = { rotate: inDegrees, mapStops: inStops };
-const IMAGE = { exposure: (value) => signed(value, 2, "EV") };
-
-// Linear rgb [3] of a light: its colour, as shown on a screen, times its intensity.
-function rgbOf(light) {
-  const rgb = light.rgb ?? [1, 3, 5].map((i) => decoded(parseInt(light.colour.slice(i, i + 2), 16) / 255));
-  return rgb.map((value) => value * 2 ** light.stops);
-}
-
-// The lights of "az,el[,r,g,b][;...]", as --light takes them; null where it is none.
-function lightsOf(text) {
-  const all = (text ?? "").split(";").slice(0, MOST_LIGHTS).map((part) => part.split(",").map(Number));
-  if (all.some((values) => ![2, 5].includes(values.length) || !values.every(Number.isFinite))) return null;
-  return all.map(([azimuth, elevation, ...given]) => {
-    const light = newLight(turned(azimuth), limited(elevation, -90, 90));
-    if (!given.length) return light;
-    const rgb = given.map((value) => Math.max(0, value));
-    const hex = rgb.map((value) => byteText(value / Math.max(...rgb, 1e-6)));
-    return { ...light, rgb, colour: "#" + hex.join("") };
-  });
-}
-
-function lightText(light) {
-  const rgb = rgbOf(light).map((value) => Number(value.toPrecision(4)));
-  const where = [rounded(light.azimuth, 1), rounded(light.elevation, 1)];
-  return (rgb.every((value) => value === 1) ? where : [...where, ...rgb]).join(",");
-}
-
-// Read ?light=... or #light=75,20;-120,10&room=0.1&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
-function stateOf(address, maps) {
+// Read #light=key=40,20;stops=-1&light=rim&room=0.1&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
+function stateOf(address, maps, presets) {
   const given = new URLSearchParams(address.hash.length > 1 ? address.hash.slice(1) : address.search);
   const number = (name, low, high) => {
     const value = Number.parseFloat(given.get(name));
     return Number.isFinite(value) ? limited(value, low, high) : null;
   };
-  const map = maps.find((one) => one.name === given.get("env")) ?? null;
+  const named = (name) => maps.find((map) => map.name === given.get(name));
+  const map = named("env") ?? named("room") ?? null; // a map may be the room
+  const found = { lights: map ? [] : [newLight({ azimuth: 40, elevation: 25 })], message: "" };
+  try {
+    if (given.has("light")) found.lights = given.getAll("light").flatMap((text) => lightsOf(text, presets));
+    if (found.lights.length > MOST_LIGHTS) found.message = `The first ${MOST_LIGHTS} of ${found.lights.length} lights are shown`;
+    else if (found.lights.some(({ near }) => near)) found.message = NEAR;
+  } catch (error) {
+    found.message = error.message;
+  }
+  if (!map && given.has("env")) found.message = `env=${given.get("env")}: give ${maps.map(({ name }) => name).join(", ")}`;
   return {
-    lights: lightsOf(given.get("light")) ?? (map ? [] : [newLight(40, 25)]),
+    lights: found.lights.slice(0, MOST_LIGHTS),
+    message: found.message,
     selected: 0,
-    room: number("room", 0, 1), // what it sends back; null: by the background
+    room: named("room") || given.get("room") === "none" ? 0 : number("room", 0, 1), // null: by the background
     map,
     rotate: turned(number("rotate", -3600, 3600) ?? 0),
     mapStops: number("mapstops", -6, 6) ?? 0,
@@ -62,41 +51,70 @@ function stateOf(address, maps) {
   };
 }
 
+const NEAR = "A near light is shown as a far one from its side; the command names what is shown";
+
 function addressOf({ lights, room, map, rotate, mapStops, exposure, background, compare }) {
-  const parts = lights.length ? ["light=" + lights.map(lightText).join(";")] : [];
-  if (room !== null) parts.push("room=" + room);
+  const parts = textsOf(lights).map((text) => "light=" + text);
+  if (room !== null) parts.push("room=" + rounded(room, 4));
   if (map?.command) {
     parts.push("env=" + map.name);
     if (rotate) parts.push("rotate=" + rotate);
     if (mapStops) parts.push("mapstops=" + mapStops);
   }
-  if (exposure !== null) parts.push("ev=" + exposure);
+  if (exposure !== null) parts.push("ev=" + rounded(exposure, 2));
   if (!background) parts.push("background=none");
   if (compare !== null) parts.push("compare=" + compare);
   return "#" + parts.join("&");
 }
 
-// The share of the lights that comes from all around, too, as `facerf relight` has it.
-function roomOf({ room, background }, data) {
-  if (!data.room) return 0;
-  return room ?? (background && data.background ? data.room.bright : data.room.dark);
+// The share that comes from all around, as `facerf relight` has it: of the lights; of a map alone where it is asked for.
+function roomOf({ room, background, lights, map }, data) {
+  if (!data.room || hasRoom(lights) || !(lights.length || map)) return 0;
+  return room ?? (!lights.length ? 0 : background && data.background ? data.room.bright : data.room.dark);
 }
 
+// True where a light stands for the room.
+const hasRoom = (lights) => lights.some(({ around, name }) => around || name === ROOM);
+
 // The command lines that make the same image; a map shines together with lights where all have names.
-function commandOf({ map, lights, room, rotate, mapStops, background }, data, ev) {
+function commandOf({ map, lights, room, rotate, mapStops, background }, data, ev, ofRoom) {
   if (!map && !lights.length) return "# add a light, or choose an environment";
   const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : "'" + text.replaceAll("'", `'"'"'`) + "'");
-  const both = Boolean(map) && lights.length > 0;
-  const texts = lights.map((light, i) => (both ? `light${i + 1}=` : "") + lightText(light));
-  let line = `facerf relight ${data.source}`;
+  const both = Boolean(map) && (lights.length > 0 || ofRoom.some(Boolean));
   const keys = [`map=${map?.path}`, rotate && `rotate=${rotate}`, mapStops && `stops=${mapStops}`];
-  if (both) line += ` --light ${quoted(["name=map", ...keys.filter(Boolean)].join(";"))}`;
-  else if (map) line += ` --envmap ${quoted(map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
-  if (lights.length) line += ` --light '${texts.join(";")}'`;
-  if (lights.length && data.room && room !== null) line += ` --room ${room || "none"}`;
+  const texts = both ? [["name=envmap", ...keys.filter(Boolean)].join(";")] : [];
+  texts.push(...textsOf(lights, both));
+  if (both && !lights.length) texts.push(`name=${ROOM};${partsOf(newLight({ around: true, rgb: ofRoom })).keys}`);
+  let line = `facerf relight ${data.source}`;
+  if (map && !both) line += ` --envmap ${quoted(map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
+  line += texts.map((text) => ` --light ${quoted(text)}`).join("");
+  if (lights.length && data.room && room !== null && !hasRoom(lights)) line += ` --room ${rounded(room, 4) || "none"}`;
   line += ` --exposure ${rounded(ev + (map && !both ? mapStops : 0), 2)}`; // stops of a map alone are exposure
   if (data.background && !background) line += " --background none";
   return (map?.command ? map.command + "\n" : "") + line + " -o out";
+}
+
+// Where a light stands on a flat picture of all directions, in radii of the head: 1 is its outline, 2 behind it.
+function flatOf({ azimuth, elevation }) {
+  const [x, y, z] = directionOf(azimuth, elevation);
+  const ring = Math.acos(limited(z, -1, 1)) / DEGREE / 90;
+  const side = Math.hypot(x, y);
+  return side < 1e-6 ? [ring, 0] : [(x / side) * ring, (y / side) * ring];
+}
+
+// The light at a place of that picture.
+function azelAt(x, y) {
+  const ring = Math.hypot(x, y) || 1e-9;
+  const angle = Math.min(ring, BEHIND) * 90 * DEGREE;
+  const { azimuth, elevation } = azelOf([(Math.sin(angle) * x) / ring, (Math.sin(angle) * y) / ring, Math.cos(angle)]);
+  return { azimuth: Math.round(azimuth), elevation: Math.round(elevation) };
+}
+
+// As many children of an element as there are lights: what has the focus or the pointer is kept.
+function fill(element, count, make) {
+  while (element.children.length > count) element.lastChild.remove();
+  while (element.children.length < count) element.append(make(element.children.length));
+  return [...element.children];
 }
 
 class Page {
@@ -109,10 +127,14 @@ class Page {
     byId("before").src = images.photo.src;
     byId("frame").style.setProperty("--sides", data.size[0] / data.size[1]);
     byId("background").hidden = !data.background;
-    byId("room").parentElement.hidden = !data.room;
-    this.state = stateOf(location, this.maps);
-    this.connect();
+    byId("aroundRow").hidden = byId("roomRows").hidden = !data.room;
+    for (const [section, controls] of Object.entries(CONTROLS)) {
+      byId(`${section}Rows`).append(...Object.entries(controls).map(([id, control]) => this.row(id, control)));
+    }
+    byId("presets").append(...Object.keys(data.presets).map((name) => new Option(name)));
     this.fillMaps();
+    this.connect();
+    this.load(location);
     this.frame();
   }
 
@@ -124,12 +146,45 @@ class Page {
     return new CanvasView(byId("view"), this.data, images);
   }
 
+  // A slider and a number for a value; a double click sets it back.
+  row(id, [label, unit, min, max, step, least = min, most = max]) {
+    const row = Object.assign(document.createElement("div"), { className: "control" });
+    const title = Object.assign(document.createElement("label"), { textContent: label, htmlFor: id });
+    const slider = Object.assign(document.createElement("input"), { type: "range", id, min, max, step });
+    const typed = Object.assign(document.createElement("input"), { type: "number", id: `${id}Typed`, min: least, max: most, step: "any" });
+    const change = (text) => {
+      const value = Number.parseFloat(text);
+      if (Number.isFinite(value)) this.set(id, limited(value, least, most) / (SHOWN[id] ?? 1));
+    };
+    slider.oninput = () => change(slider.value);
+    typed.oninput = () => change(typed.value);
+    typed.onblur = () => this.change({});
+    row.ondblclick = (event) => event.target !== typed && this.set(id, null);
+    typed.ariaLabel = `${label}, ${unit}`;
+    row.append(title, slider, typed, Object.assign(document.createElement("span"), { textContent: unit }));
+    return row;
+  }
+
+  // Set a value of the light or the image; null is what it begins with.
+  set(id, value) {
+    if (id in CONTROLS.light) this.changeLight({ [id]: value ?? newLight()[id] });
+    else this.change({ [id]: value ?? (id in CONTROLS.map ? 0 : null) });
+  }
+
   get light() {
     return this.state.lights[this.state.selected];
   }
 
   say(text) {
     byId("message").textContent = text;
+  }
+
+  // Show the state of an address.
+  load(address) {
+    const { message, ...state } = stateOf(address, this.maps, this.data.presets);
+    if (message || this.state) this.say(message);
+    this.state ??= state;
+    this.change(state);
   }
 
   change(values) {
@@ -149,12 +204,18 @@ class Page {
     if (map && key !== this.mapKey) [this.mapKey, this.mapWeights] = [key, this.rig.mapWeights(map, rotate)];
     const weights = new Float64Array(3 * this.data.scales.length);
     if (map) this.mapWeights.forEach((value, i) => (weights[i] = value * 2 ** mapStops));
-    const [room, last] = [4 * roomOf(this.state, this.data), weights.length - 3];
+    const sent = [0, 1, 2].map((c) => lights.length ? 0 : groups(weights, 3).reduce((sum, rgb) => sum + rgb[c] / 4, 0));
+    const last = weights.length - 3;
     for (const light of lights) {
-      const [rgb, around] = [rgbOf(light), this.rig.around(directionOf(light.azimuth, light.elevation))];
-      for (const [i, share] of around) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
-      rgb.forEach((value, c) => (weights[last + c] += room * value));
+      const rgb = rgbOf(light);
+      rgb.forEach((value, c) => (sent[c] += value));
+      if (light.around) rgb.forEach((value, c) => (weights[last + c] += 4 * value));
+      else {
+        for (const [i, share] of this.rig.sharesOf(samplesOf(light))) rgb.forEach((value, c) => (weights[3 * i + c] += share * value));
+      }
     }
+    this.ofRoom = sent.map((value) => value * roomOf(this.state, this.data));
+    this.ofRoom.forEach((value, c) => (weights[last + c] += 4 * value));
     return weights;
   }
 
@@ -163,8 +224,9 @@ class Page {
     const { state, data } = this;
     const weights = this.weights();
     this.ev = state.exposure ?? automaticEv(data.exposure, weights);
-    const exposed = scaled(weights, data.scales).map((value) => value * 2 ** this.ev);
-    this.view.draw(exposed, state.background && data.background);
+    const exposed = weights.map((value) => value * 2 ** this.ev);
+    this.view.draw(scaled(exposed, data.scales), state.background && data.background);
+    drawBall(byId("ballView"), this.rig.lights, exposed);
     this.update();
     document.body.dataset.settled = "true";
     clearTimeout(this.later);
@@ -174,39 +236,79 @@ class Page {
   // Show the state in the controls.
   update() {
     const { state, light, data } = this;
-    this.show(LIGHT, light ?? newLight(0, 0), !light);
-    this.show(ROOM, { room: roomOf(state, data) }, !light);
-    this.show(MAP, state, !state.map);
-    this.show(IMAGE, { exposure: this.ev }, false);
+    const around = light?.around;
+    this.show(CONTROLS.light, light ?? newLight(), (id) => !light || (around && ["azimuth", "elevation", "size"].includes(id)));
+    this.show(CONTROLS.room, { room: roomOf(state, data) }, () => hasRoom(state.lights) || !(light || state.map));
+    this.show(CONTROLS.map, state, () => !state.map);
+    this.show(CONTROLS.image, { exposure: this.ev }, () => false);
     byId("envmap").value = this.maps.indexOf(state.map);
-    byId("remove").disabled = !light;
     byId("add").disabled = state.lights.length >= MOST_LIGHTS;
+    for (const id of ["remove", "name", "tint", "around"]) byId(id).disabled = !light;
+    if (document.activeElement !== byId("name")) byId("name").value = light?.name ?? "";
+    byId("name").placeholder = light ? `light${state.selected + 1}` : "";
+    byId("tint").value = hexOf(light?.rgb ?? [1, 1, 1]);
+    byId("around").checked = Boolean(around);
     const pressed = { auto: state.exposure === null, background: state.background, compare: state.compare !== null };
-    for (const [id, is] of Object.entries(pressed)) byId(id).setAttribute("aria-pressed", String(is));
-    byId("chips").replaceChildren(...state.lights.map((one, i) => this.chip(one, i)));
-    byId("command").textContent = commandOf(state, data, this.ev);
-    for (const id of ["before", "split"]) byId(id).hidden = state.compare === null;
+    for (const [id, is] of Object.entries(pressed)) byId(id).ariaPressed = String(is);
+    this.showLights();
+    byId("command").textContent = commandOf(state, data, this.ev, this.ofRoom);
+    for (const id of ["before", "split", "sides"]) byId(id).hidden = state.compare === null;
     byId("before").style.clipPath = `inset(0 ${100 - state.compare}% 0 0)`;
     byId("split").value = state.compare;
   }
 
-  // Show values in their controls, which work unless they are `idle`.
-  show(controls, values, idle) {
-    for (const [id, inWords] of Object.entries(controls)) {
-      Object.assign(byId(id), { value: values[id], disabled: idle });
-      const text = idle ? "–" : inWords(values[id]);
-      byId(id).setAttribute("aria-valuetext", text);
-      document.querySelector(`output[for="${id}"]`).textContent = text;
+  // Show values in their controls, which work unless they are idle; what is being typed stays.
+  show(controls, values, isIdle) {
+    for (const [id, [, unit, , , step]] of Object.entries(controls)) {
+      const value = rounded(values[id] * (SHOWN[id] ?? 1), step < 1 ? 2 : 1);
+      const typed = byId(`${id}Typed`);
+      byId(id).value = value;
+      byId(id).setAttribute("aria-valuetext", `${value} ${unit}`);
+      byId(id).disabled = typed.disabled = isIdle(id);
+      if (document.activeElement !== typed) typed.value = value;
     }
   }
 
-  chip(light, i) {
-    const chip = Object.assign(document.createElement("button"), { type: "button", textContent: i + 1 });
-    chip.style.setProperty("--light", light.colour);
-    chip.ariaLabel = `Light ${i + 1}: azimuth ${Math.round(light.azimuth)}, elevation ${Math.round(light.elevation)}`;
-    chip.ariaPressed = String(i === this.state.selected);
-    chip.onclick = () => this.change({ selected: i });
-    return chip;
+  // A button for each light in the panel, and a mark of it on the picture and on the ball.
+  showLights() {
+    const { lights, selected } = this.state;
+    for (const place of [byId("chips"), ...this.pads()]) {
+      const isList = place === byId("chips");
+      const box = place.getBoundingClientRect();
+      fill(place, lights.length, (i) => this.newMark(i)).forEach((mark, i) => {
+        const light = lights[i];
+        const where = light.around ? "from all around" : `azimuth ${Math.round(light.azimuth)}, elevation ${Math.round(light.elevation)} degrees`;
+        mark.textContent = isList ? light.name || i + 1 : i + 1;
+        mark.ariaLabel = `Light ${i + 1}${light.name && `, ${light.name}`}: ${where}`;
+        mark.title = mark.ariaLabel;
+        mark.ariaPressed = String(i === selected);
+        mark.style.setProperty("--light", hexOf(rgbOf(light)));
+        if (isList) return;
+        const [x, y] = flatOf(light);
+        const { left, top, radius } = this.middleOf(place, box);
+        mark.hidden = light.around;
+        mark.classList.toggle("behind", Math.hypot(x, y) > 1);
+        mark.style.left = `${limited(left + radius * x, MARK_MARGIN, box.width - MARK_MARGIN)}px`;
+        mark.style.top = `${limited(top - radius * y, MARK_MARGIN, box.height - MARK_MARGIN)}px`;
+      });
+    }
+  }
+
+  // What has marks: the picture and the ball.
+  pads() {
+    return [byId("marks"), byId("ball")];
+  }
+
+  // The middle of the head on one of them, from its corner, and the head's radius, in pixels.
+  middleOf(pad, { width, height }) {
+    const [x, y, radius] = pad === byId("ball") ? [0.5, 0.5, 0.25] : this.data.head;
+    return { left: width * x, top: height * y, radius: radius * Math.min(width, height) };
+  }
+
+  newMark(i) {
+    const mark = Object.assign(document.createElement("button"), { type: "button", className: "mark" });
+    mark.onclick = mark.onfocus = () => this.change({ selected: i });
+    return mark;
   }
 
   fillMaps() {
@@ -215,17 +317,22 @@ class Page {
 
   connect() {
     const on = (id, apply) => byId(id).addEventListener("input", (event) => apply(event.target.value));
-    for (const id of Object.keys({ ...ROOM, ...MAP, ...IMAGE })) on(id, (value) => this.change({ [id]: Number(value) }));
-    for (const id of ["azimuth", "elevation", "stops"]) on(id, (value) => this.changeLight({ [id]: Number(value) }));
-    on("colour", (colour) => this.changeLight({ colour, rgb: undefined }));
     on("split", (percent) => this.change({ compare: Number(percent) }));
     on("envmap", (i) => this.change({ map: this.maps[i] ?? null }));
+    on("presets", (name) => this.choose(name));
+    on("name", (text) => this.rename(text.trim()));
+    byId("name").addEventListener("blur", () => (byId("name").setCustomValidity(""), this.change({})));
+    on("tint", (hex) => this.changeLight({ rgb: [1, 3, 5].map((i) => decoded(parseInt(hex.slice(i, i + 2), 16) / 255)) }));
+    on("around", () => this.changeLight({ around: byId("around").checked }));
     const actions = {
       add: () => this.add(),
       remove: () => this.remove(),
+      mirror: () => this.change({ lights: this.state.lights.map((light) => ({ ...light, azimuth: turned(-light.azimuth) })) }),
       auto: () => this.change({ exposure: this.state.exposure === null ? this.ev : null }),
       background: () => this.change({ background: !this.state.background }),
       compare: () => this.change({ compare: this.state.compare === null ? 50 : null }),
+      showMarks: () => (byId("showMarks").ariaPressed = String(!(byId("marks").hidden = !byId("marks").hidden))),
+      reset: () => this.load({ hash: "", search: "" }),
       copy: () => this.copy(),
       save: () => this.save(),
       open: () => byId("file").click(),
@@ -234,55 +341,86 @@ class Page {
     byId("file").addEventListener("change", (event) => this.open(event.target.files[0]));
     addEventListener("dragover", (event) => event.preventDefault());
     addEventListener("drop", (event) => (event.preventDefault(), this.open(event.dataTransfer.files[0])));
-    addEventListener("hashchange", () => this.change(stateOf(location, this.maps)));
+    addEventListener("hashchange", () => this.load(location));
+    for (const begun of ["pointerdown", "keydown"]) addEventListener(begun, () => this.say(""), true); // until the next action
     addEventListener("keydown", (event) => this.key(event));
-    const view = byId("view");
-    view.addEventListener("pointerdown", (event) => {
-      if (event.button) return;
-      view.setPointerCapture(event.pointerId);
-      if (!this.light) this.add();
-      this.drag(event);
+    addEventListener("resize", () => this.change({}));
+    for (const pad of this.pads()) this.listen(pad);
+  }
+
+  // A drag of a mark moves its light; elsewhere the chosen light comes from where one points.
+  listen(pad) {
+    let from = null; // of a drag: its pointer, and how far the mark's middle is from that
+    const move = (event) => {
+      const box = pad.getBoundingClientRect();
+      const { left, top, radius } = this.middleOf(pad, box);
+      const [x, y] = [event.clientX + from.x - box.left - left, box.top + top - event.clientY - from.y];
+      this.changeLight({ ...azelAt(x / radius, y / radius), around: false });
+    };
+    pad.addEventListener("pointerdown", (event) => {
+      if (event.button || from) return;
+      event.preventDefault();
+      const mark = event.target.closest(".mark");
+      const box = mark?.getBoundingClientRect();
+      from = { id: event.pointerId, x: 0, y: 0 };
+      if (box) Object.assign(from, { x: box.left + box.width / 2 - event.clientX, y: box.top + box.height / 2 - event.clientY });
+      pad.setPointerCapture(event.pointerId);
+      (mark ?? byId("view")).focus({ preventScroll: true });
+      if (mark) this.change({ selected: [...pad.children].indexOf(mark) });
+      else {
+        if (!this.light) this.add();
+        move(event);
+      }
     });
-    view.addEventListener("pointermove", (event) => view.hasPointerCapture(event.pointerId) && this.drag(event));
+    pad.addEventListener("pointermove", (event) => event.pointerId === from?.id && move(event));
+    for (const end of ["pointerup", "pointercancel"]) pad.addEventListener(end, () => (from = null));
   }
 
-  // The light comes from where one points: as far from the head's middle as on a ball around it.
-  drag(event) {
-    const box = byId("view").getBoundingClientRect();
-    const [headX, headY, headRadius] = this.data.head;
-    const radius = headRadius * Math.min(box.width, box.height);
-    const x = (event.clientX - box.left - box.width * headX) / radius;
-    const y = (box.top + box.height * headY - event.clientY) / radius;
-    const ring = Math.hypot(x, y) || 1;
-    const angle = Math.min(ring, 1.95) * 90 * DEGREE;
-    const [aside, up] = [(Math.sin(angle) * x) / ring, (Math.sin(angle) * y) / ring];
-    const azimuth = Math.round(Math.atan2(aside, Math.cos(angle)) / DEGREE);
-    this.changeLight({ azimuth, elevation: Math.round(Math.asin(up) / DEGREE) });
-  }
-
-  // Arrows move the light, but where they move a control.
+  // Arrows move the chosen light, but where they move a control; digits choose one, letters press buttons.
   key(event) {
-    if (event.target.closest("select, input, button") || event.ctrlKey || event.metaKey || event.altKey) return;
+    const isTyped = event.target.closest("select, input, summary") || (event.key.startsWith("Enter") && event.target.closest("button"));
+    if (isTyped || event.ctrlKey || event.metaKey || event.altKey) return;
     const step = event.shiftKey ? 1 : 5;
     const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
-    if (!moves[event.key] || !this.light) return;
+    const buttons = { a: "add", Delete: "remove", m: "mirror", b: "background", c: "compare", l: "showMarks" };
+    if (moves[event.key] && this.light) {
+      const [aside, up] = moves[event.key];
+      const { azimuth, elevation } = this.light;
+      this.changeLight(towards(azimuth + aside, elevation + up));
+    } else if (this.state.lights[event.key - 1]) this.change({ selected: event.key - 1 });
+    else if (buttons[event.key]) byId(buttons[event.key]).click();
+    else return;
     event.preventDefault();
-    const [aside, up] = moves[event.key];
-    const { azimuth, elevation } = this.light;
-    this.changeLight({ azimuth: turned(azimuth + aside), elevation: limited(elevation + up, -90, 90) });
   }
 
   // Add a light where no other one is.
   add() {
     const { lights } = this.state;
     const isFree = ([x, y]) => lights.every((light) => Math.hypot(light.azimuth - x, light.elevation - y) > 10);
-    lights.push(newLight(...(PLACES.find(isFree) ?? PLACES[0])));
+    const [azimuth, elevation] = PLACES.find(isFree) ?? PLACES[0];
+    lights.push(newLight({ azimuth, elevation }));
     this.change({ selected: lights.length - 1 });
   }
 
   remove() {
     this.state.lights.splice(this.state.selected, 1);
     this.change({ selected: Math.max(0, this.state.selected - 1) });
+  }
+
+  // Take the lights of a preset in place of all others.
+  choose(name) {
+    byId("presets").value = "";
+    const lights = lightsOf(name, this.data.presets);
+    this.say(lights.some(({ near }) => near) ? NEAR : "");
+    this.change({ lights, selected: 0 });
+  }
+
+  rename(name) {
+    const isTaken = this.state.lights.some((light) => light !== this.light && light.name === name);
+    const isGood = !name || (isName(name) && !isTaken);
+    byId("name").setCustomValidity(isGood ? "" : "letters and digits, not a key of --light, and once");
+    byId("name").reportValidity();
+    if (isGood) this.changeLight({ name });
   }
 
   async open(file) {
@@ -308,7 +446,7 @@ class Page {
   save() {
     byId("view").toBlob((blob) => {
       const link = document.createElement("a");
-      Object.assign(link, { href: URL.createObjectURL(blob), download: `${this.data.title}_relit.png` });
+      Object.assign(link, { href: URL.createObjectURL(blob), download: `${this.data.title.replace(/\.\w+(?= |$)/, "")}_relit.png` });
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 1000);
       this.say(`${link.download} is saved`);

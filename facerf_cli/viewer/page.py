@@ -5,7 +5,7 @@ import hashlib
 import io
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,12 @@ from facerf_cli.image.colour import (
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
-from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK
+from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK, lit_images, preset_names
 from facerf_cli.light.envmap import rig_triangles
 from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
 _HERE = Path(__file__).parent
-SCRIPTS = ("light.js", "readers.js", "image.js", "page.js")
+SCRIPTS = ("light.js", "lights.js", "readers.js", "image.js", "page.js")
 _RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
 
 
@@ -83,6 +83,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "room": _room(basis),
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
+        "presets": packed_presets(),
         "envmaps": [
             {
                 "name": one.name,
@@ -104,6 +105,17 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
     corners = rig_triangles(directions)
     to_shares = np.linalg.pinv(directions[corners].astype(float).mT)
     return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
+
+
+def packed_presets() -> dict[str, list[dict[str, Any]]]:
+    """The lights of each rig that facerf ships, with their names."""
+    images = {preset: lit_images([preset])[0] for preset in preset_names()}
+    return {
+        preset: [
+            {"name": name, **asdict(light)} for name, light in zip(image.names, *image.frames, strict=True)
+        ]
+        for preset, image in images.items()
+    }
 
 
 def _room(basis: Basis) -> dict[str, float] | None:
