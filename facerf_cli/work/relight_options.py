@@ -59,7 +59,7 @@ from facerf_cli.work.shots import (
 Composite = Literal["photo", "face"]
 ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
-_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
+_LAYERS = ("matte", "albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
 _FORMS = "photo, envmap, none, an image file, black or another name, #RRGGBB or R,G,B"
 
@@ -97,11 +97,12 @@ def parse_background(text: str) -> BackgroundChoice:
 
 
 def parse_aov(text: str) -> tuple[str, ...]:
-    """Parse `--aov`, names with commas; the matte may be named, too."""
-    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
-    if unknown := [name for name in names if name not in (*_LAYERS, "matte")]:
-        raise UsageError(f"--aov {unknown[0]!r}: no such layer; give some of matte, {', '.join(_LAYERS)}")
-    return tuple(name for name in names if name != "matte")
+    """Parse `--aov`, names with commas, singular or plural; the matte, which is always there, is left out."""
+    known = {form: name for name in _LAYERS for form in (name, f"{name}s", name.removesuffix("es"))}
+    names = dict.fromkeys(name.strip() for name in text.split(",") if name.strip())
+    if unknown := [name for name in names if name not in known]:
+        raise UsageError(f"--aov {unknown[0]!r}: no such layer; give some of {', '.join(_LAYERS)}")
+    return tuple(dict.fromkeys(known[name] for name in names if known[name] != "matte"))
 
 
 def _named(text: str) -> tuple[float, float, float] | None:
@@ -135,8 +136,8 @@ class Relight:
         background: Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which
             keep their look; the envmap; or none (alpha).
         background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
-        aov: Add layers to the EXR: albedo, normal, position, depth, shadow, specular, classes; of the face
-            alone face and uv.
+        aov: Add layers to the EXR besides its matte: albedo, normal, position, depth, shadow, specular,
+            classes, face, uv.
         matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
             matte.
         photo_of_stack: Put an OLAT stack back on its photo, at the photo's resolution.

@@ -1,6 +1,7 @@
 """`facerf relight` from the command line, with a network that is Lambert's law until it is trained."""
 
 import json
+import re
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,13 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facerf_cli.errors import UsageError
 from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, write_olat_stack
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
+from facerf_cli.option import attributes_of
 from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.field import Field
 from facerf_cli.synth.sky.skies import kind_of
+from facerf_cli.work.relight_options import Relight, parse_aov
 from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
 from tests.stacks import read_olat_stack
@@ -103,6 +107,16 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
     monkeypatch.setattr(Composition, "relit", watched)
     assert relight(given, tmp_path, *lights, "--composite", composite) == 0
     assert len(held) > 2
+
+
+def test_layers_have_a_singular_and_a_plural_and_are_listed_as_in_the_help() -> None:
+    assert parse_aov("normals,mattes, class,uvs") == ("normal", "classes", "uv")
+    assert parse_aov("normal,normals,matte,shadow") == ("normal", "shadow")
+    with pytest.raises(UsageError, match="--aov 'beauty': no such layer") as caught:
+        parse_aov("normal,beauty")
+    listed = str(caught.value).partition("give some of ")[2].split(", ")
+    text = attributes_of(Relight)["aov"]
+    assert listed == [word for word in re.findall(r"\w+", text) if word in listed] and "albedo" in listed
 
 
 def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
