@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_bytes, read_rig, text_of
@@ -24,12 +24,12 @@ _FORMS = ("AZ,EL", "AZ,EL,STRENGTH", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of lights: what a room sends back, by the background
-_AROUND = "around"  # as a direction: from all of them
 _PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has those of one
 # Keys of one kind of light.
 _NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=, az=, el=)", "maps (map=)"
 _OF_KIND = {"size": _NEAR, "spot": _NEAR, "size_deg": _FAR, "rotate": _MAP}
 KEYS = ("at", "from", "az", "el", "map", "rgb", "kelvin", "stops", *_OF_KIND, "face")
+_NO_PLACES = ("name", "map", "kelvin", "stops", *_OF_KIND, "face")  # whose values are no directions
 # Limits of values.
 _KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
 _SIZE_M, _SIZE_DEG, _SPOT_DEG, _RGB = (0.0, 10.0), (0.0, 120.0), (1.0, 170.0), (0.0, 1e6)
@@ -77,6 +77,17 @@ class StudioLight:
     def is_around(self) -> bool:
         """True of a light from all around."""
         return self.azel_deg is None and self.at_m is None and self.envmap is None
+
+
+WORDS = {  # lights that have a word
+    "left": StudioLight((-90.0, 0.0)),
+    "right": StudioLight((90.0, 0.0)),
+    "above": StudioLight((0.0, 90.0)),
+    "below": StudioLight((0.0, -90.0)),
+    "behind": StudioLight((180.0, 0.0)),
+    "front": StudioLight((0.0, 0.0)),
+    "around": StudioLight(),
+}
 
 
 def numbers(text: str, forms: tuple[str, ...], option: str) -> list[float]:
@@ -155,33 +166,29 @@ class LitImage:
     frames: tuple[tuple[StudioLight, ...], ...]
     is_numbered: bool = False
     names: tuple[str, ...] = ()
-    name: str = ""  # of the image; '' while others may join its lights
+    name: str = ""  # of the image, or of the light that others may join
+    is_shared: bool = False  # by all lights that have names
 
 
-def read_keys(text: str) -> dict[str, str] | None:
-    """Read the settings of `key=value;...`; None where no part has one of `KEYS`."""
-    pairs = [part.partition("=") for part in text.split(";") if part.strip()]
-    keys = [key.strip() for key, _, _ in pairs]
-    if not set(keys) & {"name", *KEYS}:
-        return None
-    if any("=" in value for _, _, value in pairs):
-        raise UsageError(f"--light {text!r}: give ; between keys, as in 'az=60;el=10'")
-    if twice := {key for key in keys if keys.count(key) > 1}:
-        raise UsageError(
-            f"--light {text!r}: {min(twice)} is given twice; a light has one, give --light again"
-        )
-    return {key: value.strip() for key, (_, _, value) in zip(keys, pairs, strict=True)}
+def light_by_keys(
+    given: Mapping[str, str], where: str, name: str | None, place: str | None = None
+) -> LitImage:
+    """Check the settings of a light and make it; raises UsageError that begins with `where`.
 
-
-def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> LitImage:
-    """Check the settings of a light and make it; raises UsageError that begins with `where`."""
+    Its `place` may be given without a key: a direction, a word, a preset or a rig file.
+    """
     if wrong := [key for key in given if key not in KEYS]:
         raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
-    if sum(bool(given.keys() & keys) for keys in _PLACES) != 1:
-        raise UsageError(f"{where} {_typed(given)}: give one of at=X,Y,Z, from=AZ,EL, map=FILE, or az and el")
-    if "size_deg" in given and given.get("from") == _AROUND:
+    if (place is not None) + sum(bool(given.keys() & keys) for keys in _PLACES) != 1:
+        one = "AZ,EL, " if place is not None else ""
+        raise UsageError(
+            f"{where} {_typed(given)}: give one of {one}at=X,Y,Z, from=AZ,EL, map=FILE, or az and el"
+        )
+    placed = _by_key(given, where) if place is None else _placed(place, where)
+    first = placed.frames[0][0]
+    kind = "" if placed.names else _NEAR if first.at_m else _MAP if first.envmap else _FAR
+    if "size_deg" in given and first.is_around:
         raise UsageError(f"{where} {_typed(given)}: a light from all around has no size; leave size_deg out")
-    kind = _NEAR if "at" in given else _MAP if "map" in given else _FAR
     if wrong := [key for key in given if _OF_KIND.get(key, kind) != kind]:
         raise UsageError(f"{where} {_typed(given)}: {wrong[0]} is of {_OF_KIND[wrong[0]]}; leave it out")
 
@@ -191,25 +198,59 @@ def light_by_keys(given: Mapping[str, str], where: str, name: str | None) -> Lit
     face = number("face", "NUMBER", _FACE)
     if face is not None and not face.is_integer():
         raise UsageError(f"{where} face {given['face']!r}: give the number of one; 0 is on the left")
-    rgb = _numbers(given.get("rgb", "1,1,1"), "R,G,B", _RGB, f"{where} rgb")
-    common = StudioLight(
-        rgb=(rgb[0], rgb[1], rgb[2]),
-        kelvin=number("kelvin", "KELVIN", _KELVIN),
-        stops=number("stops", "STOPS", _STOPS) or 0.0,
-        size_m=number("size", "METRES", _SIZE_M) or 0.0,
-        size_deg=number("size_deg", "DEG", _SIZE_DEG) or 0.0,
-        spot_deg=number("spot", "DEG", _SPOT_DEG),
-        face=None if face is None else int(face),
-    )
-    names = () if name is None else (name,)
-    if kind == _MAP:
-        rotate_deg = number("rotate", "DEG", _TURN_DEG) or 0.0
-        return LitImage(((replace(common, envmap=Path(given["map"]), rotate_deg=rotate_deg),),), names=names)
-    if kind == _FAR:
-        sweeps = any(is_sweep(given.get(key, "")) for key in ("az", "el"))
-        frames = tuple((replace(common, azel_deg=azel_deg),) for azel_deg in _directions(given, where))
-        return LitImage(frames, sweeps, names)
-    return LitImage(((replace(common, at_m=_place(given["at"], where)),),), names=names)
+    red, green, blue = _numbers(given.get("rgb", "1,1,1"), "R,G,B", _RGB, f"{where} rgb")
+    stops = number("stops", "STOPS", _STOPS) or 0.0
+    settings: dict[str, Any] = {
+        "kelvin": number("kelvin", "KELVIN", _KELVIN),
+        "size_m": number("size", "METRES", _SIZE_M),
+        "size_deg": number("size_deg", "DEG", _SIZE_DEG),
+        "spot_deg": number("spot", "DEG", _SPOT_DEG),
+        "rotate_deg": number("rotate", "DEG", _TURN_DEG),
+        "face": None if face is None else int(face),
+    }
+    settings = {key: value for key, value in settings.items() if value is not None}
+
+    def lit(light: StudioLight) -> StudioLight:
+        rgb = (light.rgb[0] * red, light.rgb[1] * green, light.rgb[2] * blue)
+        return replace(light, rgb=rgb, stops=light.stops + stops, **settings)
+
+    frames = tuple(tuple(map(lit, frame)) for frame in placed.frames)
+    if name is None:
+        return replace(placed, frames=frames)
+    names = tuple(f"{name}_{one}" for one in placed.names) or (name,)
+    return LitImage(frames, placed.is_numbered, names, name)
+
+
+def _by_key(given: Mapping[str, str], where: str) -> LitImage:
+    """The light of rgb 1 at the place that keys give."""
+    if "map" in given:
+        return LitImage(((StudioLight(envmap=Path(given["map"])),),))
+    if "at" in given:
+        return LitImage(((StudioLight(at_m=_place(given["at"], where)),),))
+    if "from" in given:
+        return LitImage(((_far(given["from"], ("AZ,EL",), f"{where} from"),),))
+    sweeps = any(is_sweep(given.get(key, "")) for key in ("az", "el"))
+    return LitImage(tuple((StudioLight(pair),) for pair in _directions(given, where)), sweeps)
+
+
+def _placed(text: str, where: str) -> LitImage:
+    """The lights of a direction, a word, a preset or a rig file."""
+    if (path := _rig_path(text)) is not None:
+        return _rig(path)
+    light = _far(text, _FORMS, where)
+    name = text if text in WORDS else "_".join(f"{float(value):g}" for value in text.split(","))
+    return LitImage(((light,),), name=name)
+
+
+def _far(text: str, forms: tuple[str, ...], option: str) -> StudioLight:
+    """Parse a direction, with its strength or colour, or a word."""
+    if text in WORDS:
+        return WORDS[text]
+    if _NAME.fullmatch(text):
+        raise UsageError(f"{option} {text!r}: give AZ,EL or one of {', '.join(WORDS)}")
+    azimuth, elevation, *colour = azel(text, forms, option)
+    red, green, blue = (3 * (colour or [1.0]))[:3]
+    return StudioLight((azimuth, elevation), rgb=(red, green, blue))
 
 
 def _typed(given: Mapping[str, str]) -> str:
@@ -233,13 +274,8 @@ def _place(text: str, where: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float] | None]:
-    """Azimuth and elevation, of each frame where they sweep; None is from all around."""
-    if given.get("from") == _AROUND:
-        return [None]
-    if "from" in given:
-        azimuth, elevation = azel(given["from"], (f"AZ,EL or {_AROUND}",), f"{where} from")
-        return [(azimuth, elevation)]
+def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float]]:
+    """Azimuth and elevation by `az` and `el`, of each frame where they sweep."""
     azimuths, elevations = (_angles(given.get(key, "0"), f"{where} {key}") for key in ("az", "el"))
     count = max(len(azimuths), len(elevations))
     if min(len(azimuths), len(elevations)) not in (1, count):
@@ -247,7 +283,7 @@ def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float
     pairs = [(azimuths[k % len(azimuths)], elevations[k % len(elevations)]) for k in range(count)]
     for pair in pairs:
         azel(f"{pair[0]},{pair[1]}", ("AZ,EL",), where)
-    return [*pairs]
+    return pairs
 
 
 def _angles(text: str, option: str) -> list[float]:
@@ -260,23 +296,68 @@ def lit_images(entries: Sequence[str], maps: Sequence[LitImage] = ()) -> list[Li
     images: list[LitImage] = []
     named = list(maps)
     for text in entries:
-        if (path := _rig_path(text)) is not None:
-            images.append(_rig(path))
-        elif (settings := read_keys(text)) is not None:
-            name = settings.pop("name", None)
-            light = light_by_keys(settings, "--light", name)
-            if not light.names:
-                images.append(_together(_file_name(text), [light], "--light"))
-            else:
-                named.append(light)
-        elif "=" in text:
-            named += [_short_named(part) for part in text.split(";")]
+        lights, image = _entry(text)
+        if image is None:
+            named += lights
         else:
-            images.append(_short(text))
+            images.append(_together(image, lights, "--light"))
     if named:
-        all_names = "+".join(name for light in named for name in light.names)
-        images.append(_together(f"light_{all_names}", named, "--light"))
+        all_names = "+".join(light.name for light in named)
+        images.append(replace(_together(f"light_{all_names}", named, "--light"), is_shared=True))
     return images
+
+
+def _entry(text: str) -> tuple[list[LitImage], str | None]:
+    """Parse `[NAME=]PLACE;KEY=VALUE;...`, keys alone, or several `[NAME=]PLACE;...`.
+
+    Returns the lights and the name of their image; None where they have names, and share one with others.
+    """
+    where, pairs = f"--light {text!r}:", _pairs(text)
+    keys = [key for key, _ in pairs if key in ("name", *KEYS)]
+    given = {key: value for key, value in pairs if key is not None and key in keys}
+    places: list[tuple[str | None, str | None]] = [pair for pair in pairs if pair[0] not in keys]
+    if len(given) < len(keys):
+        twice = min(key for key in given if keys.count(key) > 1)
+        raise UsageError(f"{where} {twice} is given twice; a light has one, give --light again")
+    by_key = given.keys() & {key for some in _PLACES for key in some}
+    first, value = pairs[0]
+    if first in _NO_PLACES and not places and not by_key - {first} and _is_place(value):
+        raise UsageError(f"{where} {first} is a key; give another name, as in {first}_light={value}")
+    if wrong := [
+        key for key, value in pairs[not by_key :] if key not in (None, *keys) and not _is_place(value)
+    ]:
+        raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
+    if given and len(places) > 1:
+        raise UsageError(f"{where} {min(given)} is of one light; give each light a --light of its own")
+    places = places or [(None, None)]
+    if "name" in given:
+        if places[0][0] is not None:
+            raise UsageError(f"{where} the light has two names; leave name= out")
+        places = [(given.pop("name"), places[0][1])]
+    lights = [light_by_keys(given, "--light", *place) for place in places]
+    if len({bool(light.names) for light in lights}) > 1:
+        raise UsageError(f"{where} some lights have names; give each one, as in key=40,20, or none")
+    if any(name is not None for name, _ in places):
+        return lights, None
+    if given:
+        return lights, _file_name(text)
+    return lights, lights[0].name if lights[0].names else "light_" + "+".join(one.name for one in lights)
+
+
+def _pairs(text: str) -> list[tuple[str | None, str]]:
+    """Split an entry into keys or names, None where a part has none, and values."""
+    if text.endswith(".toml") and os.path.isfile(text):  # whose path may hold = and ;
+        return [(None, text)]
+    parts = [part.partition("=") for part in text.split(";") if part.strip()] or [("", "", "")]
+    if any("=" in value for *_, value in parts):
+        raise UsageError(f"--light {text!r}: give ; between keys, as in 'az=60;el=10'")
+    return [(key.strip(), value.strip()) if equals else (None, key.strip()) for key, equals, value in parts]
+
+
+def _is_place(value: str) -> bool:
+    """True for what looks like a direction, a word, a preset or a rig file, and not for a map."""
+    known = value in WORDS or value in preset_names() or value.endswith(".toml")
+    return known or ("," in value and not value.lower().endswith((".exr", ".hdr", ".json")))
 
 
 @cache
@@ -288,13 +369,13 @@ def preset_names() -> tuple[str, ...]:
 def _rig_path(text: str) -> Path | None:
     """The file of a rig or preset; None for directions."""
     if text.endswith(".toml"):
-        if not Path(text).is_file():
+        if not os.path.isfile(text):
             raise UsageError(f"--light {text}: no such rig file; give one that exists")
         return Path(text)
     if text in preset_names():
         return _RIGS / f"{text}.toml"
-    if _NAME.fullmatch(text):
-        known = ", ".join(preset_names())
+    if _NAME.fullmatch(text) and text not in WORDS:
+        known = ", ".join((*preset_names(), *WORDS))
         raise UsageError(f"--light {text}: no such preset; give AZ,EL, a rig file (.toml) or one of {known}")
     return None
 
@@ -319,6 +400,8 @@ def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     """Lights in one image; those that do not sweep shine in every frame of those that do."""
     names = tuple(name for light in lights for name in light.names)
     for name in names:
+        if name in ("name", *KEYS):
+            raise UsageError(f"{where} {name!r}: is a key; give another name, as in {name}_light")
         if not _NAME.fullmatch(name) or names.count(name) > 1:
             raise UsageError(f"{where} {name!r}: give each light a name of its own, letters and digits")
     counts = {len(light.frames) for light in lights if light.is_numbered} or {1}
@@ -337,26 +420,7 @@ def named_map(entry: str, turns: Sequence[float], is_numbered: bool) -> LitImage
     if not equals or not _NAME.fullmatch(name) or Path(entry).exists():
         return None
     frames = tuple((StudioLight(envmap=Path(path), rotate_deg=degrees),) for degrees in turns)
-    return LitImage(frames, is_numbered, (name,))
-
-
-def _short(text: str) -> LitImage:
-    """Parse `az,el[,strength or r,g,b][;...]`: lights that shine together."""
-    parts = [part for part in text.split(";") if part.strip()] or [""]
-    given = [azel(part, _FORMS, "--light") for part in parts]
-    name = "+".join("_".join(f"{value:g}" for value in values) for values in given)
-    return _together(f"light_{name}", [LitImage(((_far(values),),)) for values in given], "--light")
-
-
-def _short_named(part: str) -> LitImage:
-    """Parse `NAME=az,el[,strength or r,g,b]`."""
-    name, _, text = part.partition("=")
-    return LitImage(((_far(azel(text, _FORMS, "--light")),),), names=(name.strip(),))
-
-
-def _far(values: Sequence[float]) -> StudioLight:
-    red, green, blue = (3 * list(values[2:] or [1.0]))[:3]
-    return StudioLight(azel_deg=(values[0], values[1]), rgb=(red, green, blue))
+    return LitImage(frames, is_numbered, (name,), name)
 
 
 def _file_name(text: str) -> str:

@@ -1,6 +1,7 @@
 """The light setups that `facerf relight` renders (maps, rotations, single lights) and their names."""
 
 import glob
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +19,11 @@ from facerf_cli.light.entries import (
     lit_images,
     named_map,
     numbers,
+    preset_names,
     sweep,
 )
 from facerf_cli.option import LIGHT, option
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
 
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
@@ -28,6 +31,7 @@ Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
 ROOM = "room"  # the name of a room's light, and of its layer
 _MOST_ROOM = 1.0
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
@@ -38,8 +42,8 @@ class LightSources:
         envmap: Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of
             estimate-light (.json), or procedural:N, maps of facerf envmap; NAME=MAP together with lights that
             have names. Repeatable.
-        light: Relight under AZ,EL in degrees (AZ > 0: from the right), keys (at=, size=, kelvin=), a rig
-            file or a preset (rembrandt); docs/lights.md. Repeatable.
+        light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, above, a rig file, a preset
+            (rembrandt), keys (at=, size=), or NAME=LIGHT;stops=-1; docs/lights.md. Repeatable.
         light_from: Relight under the light of another photo, as estimate-light finds it. Repeatable.
         room: Add what a room sends back to lights: a share of them, from all around; a map; or none.
         rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
@@ -141,7 +145,11 @@ def collect_setups(
         for name, frame, envmap in maps
         for turn, number, degrees in rotations
     ]
-    for image in lit_images(sources.light or (), [*together.values()]):
+    images = lit_images(sources.light or (), [*together.values()])
+    if images and images[-1].is_shared:
+        names = [setup.name for setup in setups] + [image.name for image in images[:-1]]
+        _say_apart([*dict.fromkeys(names)], images[-1].name)
+    for image in images:
         for number, shining in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
             setups.append(LightSetup(image.name, frame, shining, image.names))
@@ -153,6 +161,20 @@ def collect_setups(
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two images would be named {min(twice)}; give each light once")
     return tuple(setups)
+
+
+def _say_apart(names: Sequence[str], shared: str) -> None:
+    """Log in a line that maps and lights without names, of images `names`, are not in the shared image."""
+    if names:
+        preset = next((name for name in names if name in preset_names()), None)
+        log.warning(
+            "%s%s: apart from %s, the image of lights with names; for one image give each a name, as in "
+            "fill=40,20, fill=rembrandt or --envmap sky=MAP%s",
+            names[0],
+            f" and {len(names) - 1} more" if len(names) > 1 else "",
+            shared,
+            f" ({preset} alone is the preset, {preset}=AZ,EL a light of that name)" if preset else "",
+        )
 
 
 def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightSetup:

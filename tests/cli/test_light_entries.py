@@ -9,6 +9,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.images import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, preset_names
+from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.work.light_setups import LightSources, collect_setups
 from facerf_cli.work.lights import lights_over_rig
 
@@ -41,6 +42,81 @@ def test_lights_with_names_share_an_image_whatever_their_form() -> None:
     assert images[2].names == ("key", "rim", "top") and images[0].names == ()
     (lights,) = images[2].frames
     assert lights[1] == StudioLight((160.0, 10.0), rgb=(1.0, 0.0, 0.0)) and lights[2].at_m == (0, 1, 0)
+
+
+def test_a_name_a_place_and_options_combine_in_any_light() -> None:
+    key = lit_images(["key=40,20;stops=-1;kelvin=3200"])[0]
+    assert (key.name, key.names) == ("light_key", ("key",))
+    assert key.frames == ((StudioLight((40.0, 20.0), kelvin=3200.0, stops=-1.0),),)
+    assert lit_images(["name=key;40,20;stops=-1;kelvin=3200"]) == [key]
+    assert lit_images(["stops=-1;kelvin=3200;name=key;from=40,20"]) == [key]
+    assert single("40,20,1,0.5,0;rgb=0.5,1,1;size_deg=9") == StudioLight(
+        (40.0, 20.0), rgb=(0.5, 0.5, 0.0), size_deg=9.0
+    )
+    assert [one.name for one in lit_images(["40,20;stops=1", "40.0,20"])] == [
+        "light_40_20_stops_1",
+        "light_40_20",
+    ]
+
+
+def test_options_of_a_preset_act_on_all_its_lights(tmp_path: Path) -> None:
+    (plain,) = lit_images(["rembrandt"])
+    named, alone = (
+        lit_images(["key=rembrandt;stops=-1;rgb=1,0.5,1;face=2"]),
+        lit_images(["rembrandt;stops=-1"]),
+    )
+    assert [light.stops for light in plain.frames[0]] == [0.0, -7.5]
+    assert [light.stops for light in named[0].frames[0]] == [-1.0, -8.5]
+    assert {(light.rgb, light.face) for light in named[0].frames[0]} == {((1.0, 0.5, 1.0), 2)}
+    assert [light.at_m for light in named[0].frames[0]] == [light.at_m for light in plain.frames[0]]
+    assert (named[0].name, named[0].names) == ("light_key", ("key_key", "key_fill"))
+    assert (alone[0].name, alone[0].names) == ("light_rembrandt_stops_-1", ("key", "fill"))
+    (tmp_path / "a;b=c.toml").write_text("[top]\nfrom = 'above'\n[side]\naz = '0:90:2'\n")
+    (rig,) = lit_images([str(tmp_path / "a;b=c.toml")])
+    assert (rig.name, rig.names, len(rig.frames)) == ("a;b=c", ("top", "side"), 2)
+    assert rig.frames[1] == (StudioLight((0.0, 90.0)), StudioLight((45.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    "word, direction",
+    [
+        ("left", (-1, 0, 0)),
+        ("right", (1, 0, 0)),
+        ("above", (0, 1, 0)),
+        ("below", (0, -1, 0)),
+        ("front", (0, 0, 1)),
+        ("behind", (0, 0, -1)),
+    ],
+)
+def test_directions_have_words(word: str, direction: tuple[int, int, int]) -> None:
+    """By the axes of the camera: x to the image's right, y up, z toward the camera."""
+    azimuth, elevation = single(word).azel_deg or (0.0, 0.0)
+    np.testing.assert_allclose(azel_to_direction(azimuth, elevation), direction, atol=1e-6)
+    assert single(f"key={word}") == single(f"from={word}") == single(word)
+    assert lit_images([f"{word};40,20"])[0].name == f"light_{word}+40_20"
+    assert lit_images([f"{word}={word};stops=1"])[0].names == (word,)
+
+
+def test_a_preset_s_name_may_be_a_light_s() -> None:
+    assert lit_images(["rim"])[0].names == ("right", "left", "fill")
+    assert lit_images(["rim=-150,15"])[0].frames == ((StudioLight((-150.0, 15.0)),),)
+    assert lit_images(["rim=rim"])[0].names == ("rim_right", "rim_left", "rim_fill")
+
+
+def test_lights_apart_from_those_with_names_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    """Only what is mixed: lights without names get an image each, as documented."""
+
+    def said(*entries: str, maps: tuple[str, ...] = ()) -> str:
+        caplog.clear()
+        collect_setups(LightSources(light=[*entries], envmap=[*maps]), Path("out"))
+        return "\n".join(caplog.messages)
+
+    assert said("40,20", "rembrandt") == said("key=40,20", "fill=rembrandt") == said("key=40,20") == ""
+    mixed = said("key=40,20", "60,10", "5,6")
+    assert mixed.startswith("light_60_10 and 1 more: apart from light_key,") and "fill=rembrandt" in mixed
+    assert "rim alone is the preset, rim=AZ,EL a light of that name" in said("key=40,20", "rim")
+    assert said("key=40,20", maps=("procedural:1",)).startswith("00000_")
+    assert said("key=40,20", maps=("sky=a.exr",)) == ""
 
 
 def test_a_sweep_numbers_its_frames_and_leaves_out_its_end() -> None:
@@ -90,6 +166,23 @@ def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
         ("name=;at=0,0,1", "'': give each light a name of its own"),
         ("=40,20", "'': give each light a name"),
         ("rembrant", "no such preset; give AZ,EL, a rig file (.toml) or one of beauty, butterfly"),
+        ("rembrant", "split, left, right, above, below, behind, front, around"),
+        ("key=rembrant;stops=1", "rembrant: no such preset"),
+        ("key=40,20;colour=red", "'colour': no such key; give at, from"),
+        ("colour=red;at=0,0,1", "'colour': no such key; give at, from"),
+        ("key=40,20,stops=-1", "give ; between keys"),
+        ("key=40,20;az=3", "give one of AZ,EL, at=X,Y,Z"),
+        ("a=40,20;b=left;stops=1", "stops is of one light; give each light a --light of its own"),
+        ("key=40,20;60,30", "some lights have names; give each one, as in key=40,20, or none"),
+        ("rembrandt;60,30", "some lights have names"),
+        ("name=a;key=40,20", "the light has two names"),
+        ("map=40,20", "map is a key; give another name, as in map_light=40,20"),
+        ("size=rembrandt;stops=1", "size is a key; give another name, as in size_light=rembrandt"),
+        ("face=left", "face is a key; give another name, as in face_light=left"),
+        ("name=size;az=3", "'size': is a key; give another name, as in size_light"),
+        ("key=rembrandt;size=3", "size is of near lights"),
+        ("key=around;size_deg=3", "a light from all around has no size"),
+        ("from=up", "from 'up': give AZ,EL or one of left, right"),
         ("missing.toml", "missing.toml: no such rig file"),
     ],
 )
@@ -120,6 +213,8 @@ def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> 
         ("[key]\nname = 'a'\nat = [0, 0, 1]\n", "key: 'name': no such key"),
         ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0': give X,Y,Z"),
         ("['a b']\nat = [0, 0, 1]\n", "'a b': give each light a name"),
+        ("[face]\nat = [0, 0, 1]\n", "'face': is a key; give another name, as in face_light"),
+        ("[key]\nfrom = 'up'\n", "key: from 'up': give AZ,EL or one of left, right"),
         ("[a]\naz = '0:9:2'\n[b]\naz = '0:9:3'\n", "sweeps of 2 and 3 frames"),
     ],
 )
