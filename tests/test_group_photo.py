@@ -57,6 +57,7 @@ class Plain:
             "person.A": self.matte(),
             "class.skin": self.matte(),
             "depth": np.full((*SIZE, 1), relit) * (self.matte() > 0)[..., None],
+            "albedo": np.full((*SIZE, 3), relit) * self.matte()[..., None],
         }
 
     def exposure_ev(self, relit: float, rule: str) -> float:
@@ -88,13 +89,16 @@ def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
 
 
 def test_layers_hold_all_people() -> None:
-    """Shares add up, before others and the background; no depth lies between two people."""
+    """Shares and colours add up, before others and the background; no depth lies between two people."""
     far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
     people = GroupComposition([far, near, faint])  # type: ignore[list-item]
     layers = filled(people.layers(["depth", "classes"], [2.0, 8.0, 4.0]), *SIZE)
     for name in ("person.A", "class.skin"):
         np.testing.assert_allclose(layers[name][0], [1, 1, 1, 1, 0.6, 0])
     np.testing.assert_allclose(layers["depth"][0, :, 0], [2, 2, 2, 8, 8, 0])
+    np.testing.assert_allclose(
+        layers["albedo"][0, :, 2], [2, 0.4 * 4 + 0.6 * 2, 2, 0.6 * 8 + 0.4 * 2, 0.6 * 8, 0]
+    )
 
 
 def test_the_exposure_is_the_first_ones() -> None:

@@ -235,6 +235,27 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
         face_alone.layers(("albedo",), relit)
 
 
+def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
+    photo: np.ndarray, person: FittedPerson
+) -> None:
+    """No hard edge where a little of a neighbour is in a pixel; where the photo has no alpha is nothing."""
+    alpha = np.ones(photo.shape[:2], np.float32)
+    alpha[:, : photo.shape[1] // 2] = 0
+    composition = person.composed(Target(alpha=alpha))
+    relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
+    assert composition.person is not None and relit.surround is not None
+    whole = np.ones_like(alpha)
+    names = ("albedo", "specular", "normal", "position", "depth", "shadow")
+    cut = filled(composition.layers(names, relit), *composition.size_px)
+    matte = cut["person.A"]
+    assert ((matte > 0.02) & (matte < 0.9)).sum() > 100
+    for name in names:
+        layer = composition.person.layer(name, relit.surround, composition.own, whole)
+        all_over, share = filled(layer, *composition.size_px)[name], matte[..., None]
+        expected = all_over * (share if name in ("albedo", "specular") else share > 0.02)
+        np.testing.assert_allclose(cut[name], expected, atol=1e-6)
+
+
 def test_no_pixel_depends_on_the_strip_that_it_is_in(
     photo: np.ndarray, person: FittedPerson, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -170,7 +170,7 @@ class Person(pipeline.FittedPerson):
 
     @cached_property
     def albedo(self) -> Array:
-        """Radiance [H, W, 3] of the person in a light of rgb 1 that reaches all; of the portrait field."""
+        """Radiance [H, W, 3] of the portrait, over black, in a light of rgb 1 that reaches all."""
         return self._layer("albedo")
 
     @cached_property

@@ -304,7 +304,7 @@ class Composition:
             found["person.A"] = self.matte
         for name in names:
             if self.person is not None and relit.surround is not None and name in PERSON_LAYERS:
-                found |= self.person.layer(name, relit.surround, self.own)
+                found |= self.person.layer(name, relit.surround, self.own, self.matte)
             elif name in FACE_LAYERS:
                 found |= self._face_layer(name)
             else:

@@ -8,6 +8,7 @@ from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Band, Layer, by_rows
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.composition import Composition, Relit
+from facerf_cli.relighting.whole_person import COLOURS
 
 Group = Sequence[Relit]  # of each person, in the order of the compositions
 _PERSON_MATTE = "person.A"
@@ -49,15 +50,15 @@ class GroupComposition:
     def layers(self, names: Sequence[str], relit: Group) -> dict[str, Layer]:
         """Layers by the names that they have in a file; positions are in each person's own camera.
 
-        Shares are laid over each other; other layers are those of the person who shows most in a pixel.
+        Shares and colours are laid over each other; other layers are those of who shows most in a pixel.
         """
         found = self._first.layers(names, relit[0])
         for composition, one, (_, share) in zip(self._others, relit[1:], self._people(relit), strict=True):
             alpha = by_rows(found[_PERSON_MATTE])
             for name, layer in composition.layers(names, one).items():
                 own, below = by_rows(layer), by_rows(found[name])
-                shares = name.endswith(".A") or name.startswith("class.")
-                found[name] = _added(own, share, below) if shares else _chosen(own, share, below, alpha)
+                adds = name in COLOURS or name.endswith(".A") or name.startswith("class.")
+                found[name] = _added(own, share, below) if adds else _chosen(own, share, below, alpha)
         return found
 
     def exposure_ev(self, relit: Group, rule: ExposureRule) -> float:
@@ -79,7 +80,11 @@ def _over(top: Band, share: Band, below: Band) -> Band:
 
 
 def _added(top: Band, share: Band, below: Band) -> Band:
-    return lambda rows: top(rows) + (1 - share(rows)) * below(rows)
+    def of(rows: slice) -> np.ndarray:
+        under, left = below(rows), 1 - share(rows)
+        return np.asarray(top(rows) + (left[..., None] if under.ndim == 3 else left) * under)
+
+    return of
 
 
 def _chosen(top: Band, share: Band, below: Band, alpha: Band) -> Band:

@@ -20,6 +20,7 @@ from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.rims import Rims
 from facerf_cli.relighting.surface import Surface
 
+COLOURS = ("albedo", "specular")  # layers that are radiance
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
 
 
@@ -66,12 +67,15 @@ class WholePerson:
         """The exposure in EV, by a rule, of the person under the light of maps [views, 15, S, S]."""
         return self._views[0].exposure_ev(lit[0], rule)
 
-    def layer(self, name: str, lit: Tensor, photo: np.ndarray | PersonColours) -> dict[str, Layer]:
+    def layer(
+        self, name: str, lit: Tensor, photo: np.ndarray | PersonColours, matte: np.ndarray
+    ) -> dict[str, Layer]:
         """A layer of the photo's pixels [H, W, 3] under maps of light, by the names that it has in a file.
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
         shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
-        shares. All are 0 off the person.
+        shares. All are 0 off the person, whose share is the `matte` [H, W]: colours are multiplied by it, as
+        layers of lights are.
         """
         if name == "classes":
             return {**self._segmentation.layers()}
@@ -82,7 +86,8 @@ class WholePerson:
             shown = self._joined(photo, views)
 
         def of(rows: slice) -> np.ndarray:
-            wide = shown(rows) * (self.matte[rows] > _LEAST)[..., None]
+            share = matte[rows][..., None]
+            wide = shown(rows) * (share if name in COLOURS else share > _LEAST)
             if name == "normal":
                 wide = wide / np.maximum(np.linalg.norm(wide, axis=-1, keepdims=True), 1e-6)
             return wide
