@@ -31,6 +31,11 @@ _HAIRLINE_M, _BARE_M = (
     0.02,
 )  # distance from the face, and height, over which hair grows to its thickness
 _NAPE_M = -0.045  # lowest hair
+_TEMPLES_M = 0.05, -0.01  # depths between which hair comes down from above the forehead to the nape
+# A head is wider at its ears than where its cheeks end, which would hide them: by so much on each side,
+_WIDER_M = 0.008
+_WIDENS_M = 0.06, -0.005  # from the first depth to the second,
+_JAW_M, _TEMPLE_M = (-0.075, -0.03), (0.03, 0.07)  # and from the jaw up to the temples.
 
 
 def proxy_tensors() -> dict[str, torch.Tensor]:
@@ -40,6 +45,7 @@ def proxy_tensors() -> dict[str, torch.Tensor]:
     head = shell_head(face, (0.0, 0.0), 0)
     person, _ = draw_body(head, np.random.default_rng(0), _BODY_EDGE_M)
     vertices, triangles, label = _joined_cells(person)
+    vertices[:, 0] += _widened(vertices) * np.isin(label, [class_index("skin"), class_index("ears")])
     distance, near = cKDTree(face.numpy()).query(vertices, _CARRIERS)
     weights = 1 / (distance + 1e-4)
     return {
@@ -69,14 +75,22 @@ def _joined_cells(person: HeadMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return vertices, triangles, person.label[first]
 
 
+def _widened(vertices: np.ndarray) -> np.ndarray:
+    """Moves [N] of a head's vertices to the right, by which it widens toward its ears."""
+    x, y, z = vertices.T
+    height = smoothstep(y, *_JAW_M) * (1 - smoothstep(y, *_TEMPLE_M))
+    return _WIDER_M * np.clip(x / 0.03, -1, 1) * smoothstep(z, *_WIDENS_M) * height
+
+
 def _hair(vertices: np.ndarray, label: np.ndarray, face: np.ndarray, chin_m: float) -> np.ndarray:
     """Share [N] of the hair's thickness that a vertex is pushed out by: 1 on the scalp, 0 on the face."""
     inside = sample_texture(region_mask("face", 256)[None], grid_uv()[None])[0, :, 0].numpy() > 0.5
     off, _ = cKDTree(face[inside]).query(vertices)
     scalp = (label == class_index("skin")) & (vertices[:, 1] > chin_m + 0.02)
-    forward = vertices[:, 2] > 0.02  # before the ears hair grows only above the forehead
-    low = np.where(forward, face[inside][:, 1].max() - 0.01, _NAPE_M)
-    above = ((vertices[:, 1] - low) / _BARE_M).clip(0, 1)
+    front, back = (  # before the ears hair grows only above the forehead
+        ((vertices[:, 1] - low) / _BARE_M).clip(0, 1) for low in (face[inside][:, 1].max() - 0.01, _NAPE_M)
+    )
+    above = front + smoothstep(vertices[:, 2], *_TEMPLES_M) * (back - front)
     return scalp * above * smoothstep(off, 0.002, _HAIRLINE_M)
 
 

@@ -18,7 +18,8 @@ from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait import proxy as module
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.proxy import Proxy, Shadows, own_shading, proxy_maps, proxy_of, square_camera
-from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.raster.camera import Camera, pose_to_rotation
+from facerf_cli.raster.rasterize import front_facing, rasterize
 
 SIDE = 96
 CROP = Crop(200.0, 200.0, 200.0, 256)
@@ -81,6 +82,24 @@ def test_hair_pushes_the_scalp_to_its_outline() -> None:
     top_of = [int(np.flatnonzero(covered[:, 48].numpy()).min()) for covered in (bald, hairy)]
     assert top_of[1] < top_of[0] - 3 and top_of[1] >= 40 - 40 - 1
     assert torch.equal(bald[80:, 48], hairy[80:, 48])
+
+
+@pytest.mark.parametrize("hair_px", [0.0, 36.0])
+def test_no_step_in_depth_stands_between_a_face_and_its_ears_and_temples(hair_px: float) -> None:
+    """Seen from the front at 1 m, a millimetre a pixel; an ear stands some 20 mm off the head."""
+    head, camera = proxy(hair_px=hair_px), Camera(1000.0, 300, 200, 150.0, 100.0)
+    outside = head.triangles[front_facing(head.vertices, head.triangles)]
+    depth_m = rasterize(head.vertices, outside, camera).depth_m.numpy()
+    for row in depth_m[100 - np.arange(-10, 70, 5)]:  # from the ears' lobes to the temples
+        assert 1000 * np.abs(np.diff(row[np.isfinite(row)])).max() < 25
+
+
+def test_hair_grows_thicker_without_a_wall() -> None:
+    """Between neighbouring vertices its share grows by a third at most."""
+    person = module._mean_person()
+    ends = person.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    assert (person.hair[ends[:, 0]] - person.hair[ends[:, 1]]).abs().max() < 0.34
+    assert person.hair.max() > 0.99
 
 
 def test_heads_cast_shadows() -> None:
