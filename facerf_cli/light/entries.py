@@ -400,8 +400,6 @@ def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     """Lights in one image; those that do not sweep shine in every frame of those that do."""
     names = tuple(name for light in lights for name in light.names)
     for name in names:
-        if name in ("name", *KEYS):
-            raise UsageError(f"{where} {name!r}: is a key; give another name, as in {name}_light")
         if not _NAME.fullmatch(name) or names.count(name) > 1:
             raise UsageError(f"{where} {name!r}: give each light a name of its own, letters and digits")
     counts = {len(light.frames) for light in lights if light.is_numbered} or {1}
