@@ -26,7 +26,10 @@ SIZE = (4, 6)
 
 @dataclass
 class Plain:
-    """A person of one grey, who covers some columns by a share, before a background of 0.5."""
+    """A person of one grey, who covers some columns by a share, before a background of 0.5.
+
+    As photographed they have the background's grey.
+    """
 
     columns: slice
     share: float
@@ -37,7 +40,7 @@ class Plain:
         matte[:, self.columns] = self.share
         return matte
 
-    size_px, nbytes = SIZE, 0
+    size_px, nbytes, own = SIZE, 0, np.full((*SIZE, 3), 0.5)
 
     def person_and_share(self, relit: float) -> tuple[Band, Band]:
         return np.full((*SIZE, 3), relit).__getitem__, self.matte().__getitem__

@@ -1,13 +1,14 @@
 """The light of the Python API, and the arrays that it takes: numpy's or torch's."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.forms import rig_to_latlong
@@ -24,11 +25,12 @@ class Light:
     """Single lights that shine together: unit directions toward them [L, 3], rgb weights [L, 3].
 
     Directions are in camera space. Lights add and scale: `2 * key + sum(rims)`. Either may be a tensor, to
-    which gradients then flow.
+    which gradients then flow. `own_rgb` [3], if not None, is the share of the photo's own light.
     """
 
     directions: Array
     weights: Array
+    own_rgb: Array | None = None
     __array_ufunc__ = None  # so that numpy leaves `array * light` to the light
 
     @staticmethod
@@ -49,6 +51,12 @@ class Light:
         return Light(directions.numpy(), shares[:, None].numpy() * np.array(rgb, np.float32))
 
     @staticmethod
+    def own(rgb: Rgb | Array = (1.0, 1.0, 1.0)) -> "Light":
+        """The photo's own light, under which the person is as photographed; other lights add to it."""
+        nothing = np.zeros((0, 3), np.float32)
+        return Light(nothing, nothing, rgb if isinstance(rgb, Tensor) else np.array(rgb, np.float32))
+
+    @staticmethod
     def from_envmap(envmap: Array, rotate_deg: float = 0.0, lights: int = 150) -> "Light":
         """A lat-long map [H, 2 H, 3] as a rig of lights; `rotate_deg` is added to every azimuth.
 
@@ -60,7 +68,9 @@ class Light:
         return Light(directions.numpy(), weights if isinstance(envmap, Tensor) else weights.numpy())
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
-        """A lat-long map [height, 2 height, 3] with these lights."""
+        """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""
+        if self.own_rgb is not None:
+            raise UsageError("to_envmap: the photo's own light has no directions; take person.light")
         light = self.on_cpu()
         return rig_to_latlong(RigLight(light.directions.detach(), light.weights.detach()), height).numpy()
 
@@ -68,15 +78,22 @@ class Light:
         if not isinstance(other, Light):
             return NotImplemented
         directions = _joined(self.directions, other.directions)
-        return Light(directions, _joined(self.weights, other.weights))
+        one, two = self.own_rgb, other.own_rgb
+        own = two if one is None else one if two is None else one + two
+        return Light(directions, _joined(self.weights, other.weights), own)
 
     def __radd__(self, other: int) -> "Light":
         return self if other == 0 else NotImplemented  # where `sum` begins
 
     def __mul__(self, factor: float | Rgb | Array) -> "Light":
         """The same lights, so many times as bright: by a number, or by one for each colour."""
-        weights = as_tensor(self.weights).to(factor.device) if isinstance(factor, Tensor) else self.weights
-        return Light(self.directions, weights * (np.array(factor) if isinstance(factor, tuple) else factor))
+
+        def scaled(values: Array) -> Array:
+            values = as_tensor(values).to(factor.device) if isinstance(factor, Tensor) else values
+            return values * (np.array(factor, np.float32) if isinstance(factor, tuple) else factor)
+
+        own = None if self.own_rgb is None else scaled(self.own_rgb)
+        return Light(self.directions, scaled(self.weights), own)
 
     __rmul__ = __mul__
 
@@ -108,16 +125,22 @@ def as_light(given: Any, room: float = 0.0) -> Light:
 
 def sums_of(lights: Sequence[Light]) -> Lights:
     """Each of M lights as one sum; directions that they share are one light."""
-    rigs = [light.on_cpu() for light in lights]
+    rigs, own = [light.on_cpu() for light in lights], None
+    if any(light.own_rgb is not None for light in lights):
+        owns = [np.zeros(3) if light.own_rgb is None else light.own_rgb for light in lights]
+        own = torch.stack([as_tensor(one) for one in owns])
+        dark = RigLight(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3))
+        rigs = [rig if len(rig.directions) else dark for rig in rigs]
     if len(rigs) == 1:
-        return Lights.of_rig(rigs[0])
+        return replace(Lights.of_rig(rigs[0]), own=own)
     directions = torch.cat([rig.directions for rig in rigs])
     places = torch.arange(len(directions))
     if not directions.requires_grad:
         directions, places = torch.unique(directions, dim=0, return_inverse=True)
     each = zip(rigs, torch.split(places, [len(rig.directions) for rig in rigs]), strict=True)
     nothing = torch.zeros(len(directions), 3)
-    return Lights(directions, torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each]))
+    weights = torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each])
+    return Lights(directions, weights, own=own)
 
 
 def rig(lights: int = 150) -> np.ndarray:
@@ -127,6 +150,8 @@ def rig(lights: int = 150) -> np.ndarray:
 
 def directions_of(lights: int | Array) -> Tensor:
     """Unit directions [L, 3] that are given, or of a rig of so many lights."""
+    if isinstance(lights, Light):
+        raise TypeError("lights is a Light, not directions [L, 3] or their number")
     return rig_directions(int(lights)) if np.ndim(lights) == 0 else unit_directions(lights)
 
 

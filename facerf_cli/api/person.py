@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -95,8 +96,11 @@ class Person(pipeline.FittedPerson):
         A light or pose of tensors gives tensors, through which gradients flow (docs/gradients.md).
         """
         lights = [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
-        given = [pose, *(array for one in lights for array in (one.directions, one.weights))]
+        given = [pose, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
         with self._gradients(*given):
+            is_whole = not (alone or pose is not None) and self.kind in ("portrait", "field")
+            if not is_whole and any(one.own_rgb is not None for one in lights):
+                raise UsageError("Light.own(): is of the whole photo; leave out pose, alone and baselines")
             if alone or pose is not None:
                 shown = self._faces(lights, pose, layers)
             else:
@@ -283,12 +287,16 @@ class Person(pipeline.FittedPerson):
                 raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
             with torch.no_grad():
                 relit = list(composition.relit(some))
-            for weights, one in zip(some.weights, relit, strict=True):
+            owns = repeat(None) if some.own is None else some.own
+            for weights, own, one in zip(some.weights, owns, relit, strict=False):
                 bands = {"rgb": layer_of(one)} if cut_out else composition.bands(one, behind=behind)
                 arrays = self._with_layers(composition, one, layers, bands)
                 image = torch.from_numpy(arrays.pop("rgb"))
                 if weights.requires_grad:
                     image = _OfWeights.apply(weights, some.directions, composition, layer_of, image)  # type: ignore[no-untyped-call]
+                if own is not None and own.requires_grad:
+                    layer = torch.from_numpy(whole(composition.own_layer(cut_out), *composition.size_px))
+                    image = image + (own - own.detach()) * layer
                 if cut_out:
                     image = torch.cat([image, torch.from_numpy(composition.matte)[..., None]], -1)
                 yield {"image": image, **arrays}

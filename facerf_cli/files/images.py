@@ -329,14 +329,15 @@ def write_display(
     metadata: Attributes | None = None,
     view: View = PLAIN_VIEW,
     share: np.ndarray | None = None,
+    added: np.ndarray | None = None,
     bits: Literal[8, 16] = 8,
     quality: int = JPEG_QUALITY,
 ) -> float:
     """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
 
     "auto" is `colour.auto_exposure_ev` where alpha [H, W] exceeds one half. PNG keeps alpha, with colour that
-    is not premultiplied; JPEG has no alpha and shows the image over black. `view` and `share` are those of
-    `colour.encode_display`; `bits` are of a PNG, `quality` (1 to 100) of a JPEG.
+    is not premultiplied; JPEG has no alpha and shows the image over black. `view`, `share` and `added`, not
+    exposed, are those of `colour.encode_display`; `bits` are of a PNG, `quality` (1 to 100) of a JPEG.
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
@@ -346,8 +347,10 @@ def write_display(
         _require_finite(path, seen)
         if opaque is not None and jpeg:
             seen = seen * opaque[..., None]
-        exposed = np.nan_to_num(seen * np.float32(2.0**chosen_ev))
-        data = encode_display(exposed, view, None if share is None else rows_of(share, rows))
+        gain = np.float32(2.0**chosen_ev)
+        exposed = np.nan_to_num(seen * gain)
+        more = None if added is None else rows_of(added, rows) * gain
+        data = encode_display(exposed, view, None if share is None else rows_of(share, rows), more)
         return data if opaque is None or jpeg else np.dstack([data, opaque.astype(np.float32)])
 
     spec = _spec((*pixels.shape[:2], 3 if alpha is None or jpeg else 4), f"uint{8 if jpeg else bits}")

@@ -445,17 +445,24 @@ def softened(linear: np.ndarray) -> np.ndarray:
     return result
 
 
-def encode_display(linear: np.ndarray, view: View, share: np.ndarray | None = None) -> np.ndarray:
+def encode_display(
+    linear: np.ndarray, view: View, share: np.ndarray | None = None, added: np.ndarray | None = None
+) -> np.ndarray:
     """Encode exposed linear Rec.709 [H, W, 3] for a display, 0..1.
 
     `share` [H, W] in 0..1 is how far the soft shoulder applies to a pixel: what was photographed, and so is
-    encoded already, keeps its look without it.
+    encoded already, keeps its look without it. Where light was `added` [H, W, 3] to what was photographed,
+    the shoulder bends that alone.
     """
     if view.name == "none":
         return in_blocks(lambda block: linear_to_srgb(np.clip(block, 0, 1)), linear)
     if view.name == "soft":
         soft = in_blocks(softened, linear)
-        mixed = soft if share is None else linear + share[..., None] * (soft - linear)
+        if added is not None:
+            photographed = linear - added
+            mixed = soft + (photographed - in_blocks(softened, photographed))
+        else:
+            mixed = soft if share is None else linear + share[..., None] * (soft - linear)
         return encode_display(mixed, PLAIN_VIEW)
     for name, matrix in _ocio_bridges():
         found = ocio.displayed(

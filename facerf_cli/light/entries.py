@@ -24,6 +24,7 @@ _FORMS = ("AZ,EL", "AZ,EL,STRENGTH", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of lights: what a room sends back, by the background
+OWN = "own"  # the word, and by default the name, of the photo's own light
 _PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has those of one
 # Keys of one kind of light.
 _NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=, az=, el=)", "maps (map=)"
@@ -51,8 +52,9 @@ class MapSource(Protocol):
 class StudioLight:
     """A light from a direction (azimuth, elevation), or near, at a place in metres from the face's centre.
 
-    Or a lat-long map, with `rotate_deg` added to every azimuth. A light that has none of these comes from all
-    around, as of a room or a dull sky: every surface that nothing shades receives the same.
+    Or a lat-long map, with `rotate_deg` added to every azimuth; or the photo's `own` light, under which the
+    person is as photographed. A light that has none of these comes from all around, as of a room or a dull
+    sky: every surface that nothing shades receives the same.
 
     Camera axes. At the face's centre its irradiance is that of a far light of its colour: `rgb` times the
     colour of a blackbody of `kelvin`, times 2 to `stops`; a map's radiance is multiplied by these. `size_m`
@@ -72,11 +74,12 @@ class StudioLight:
     envmap: MapSource | None = None
     rotate_deg: float = 0.0
     face: int | None = None
+    own: bool = False
 
     @property
     def is_around(self) -> bool:
         """True of a light from all around."""
-        return self.azel_deg is None and self.at_m is None and self.envmap is None
+        return self.azel_deg is None and self.at_m is None and self.envmap is None and not self.own
 
 
 WORDS = {  # lights that have a word
@@ -87,6 +90,7 @@ WORDS = {  # lights that have a word
     "behind": StudioLight((180.0, 0.0)),
     "front": StudioLight((0.0, 0.0)),
     "around": StudioLight(),
+    OWN: StudioLight(own=True),
 }
 
 
@@ -187,8 +191,9 @@ def light_by_keys(
     placed = _by_key(given, where) if place is None else _placed(place, where)
     first = placed.frames[0][0]
     kind = "" if placed.names else _NEAR if first.at_m else _MAP if first.envmap else _FAR
-    if "size_deg" in given and first.is_around:
-        raise UsageError(f"{where} {_typed(given)}: a light from all around has no size; leave size_deg out")
+    if "size_deg" in given and (first.is_around or first.own):
+        whose = "the photo's own light" if first.own else "a light from all around"
+        raise UsageError(f"{where} {_typed(given)}: {whose} has no size; leave size_deg out")
     if wrong := [key for key in given if _OF_KIND.get(key, kind) != kind]:
         raise UsageError(f"{where} {_typed(given)}: {wrong[0]} is of {_OF_KIND[wrong[0]]}; leave it out")
 
@@ -334,6 +339,8 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
         if places[0][0] is not None:
             raise UsageError(f"{where} the light has two names; leave name= out")
         places = [(given.pop("name"), places[0][1])]
+    own = given.get("from") == OWN
+    places = [(OWN if name is None and (own or place == OWN) else name, place) for name, place in places]
     lights = [light_by_keys(given, "--light", *place) for place in places]
     if len({bool(light.names) for light in lights}) > 1:
         raise UsageError(f"{where} some lights have names; give each one, as in key=40,20, or none")
@@ -398,6 +405,8 @@ def _light_of_rig(path: Path, name: str, table: Mapping[str, str]) -> LitImage:
 
 def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     """Lights in one image; those that do not sweep shine in every frame of those that do."""
+    if sum(one.own for light in lights for one in light.frames[0]) > 1:
+        raise UsageError(f"{where} the photo's own light ({OWN}) is there twice; give it once")
     names = tuple(name for light in lights for name in light.names)
     for name in names:
         if not _NAME.fullmatch(name) or names.count(name) > 1:

@@ -120,6 +120,7 @@ class Lights:
     weights: Tensor  # [M, L, 3]
     near: tuple[StudioLight, ...] = ()
     near_weights: Tensor | None = None  # [M, J, 3]
+    own: Tensor | None = None  # [M, 3], of the photo's own light
 
     @staticmethod
     def of_rig(light: RigLight) -> "Lights":
@@ -136,12 +137,13 @@ class Lights:
 
     def __getitem__(self, sums: slice) -> "Lights":
         """Some of the sums, without the near lights that shine in none of them."""
+        own = None if self.own is None else self.own[sums]
         if self.near_weights is None:
-            return Lights(self.directions, self.weights[sums])
+            return Lights(self.directions, self.weights[sums], own=own)
         some = self.near_weights[sums]
         used = (some != 0).any(0).any(1)
         near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
-        return Lights(self.directions, self.weights[sums], near, some[:, used])
+        return Lights(self.directions, self.weights[sums], near, some[:, used], own)
 
     def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
         """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
@@ -165,6 +167,8 @@ class Lights:
         total = self.weights.sum(1)
         if self.near_weights is not None:
             total = total + self.near_weights.sum(1)
+        if self.own is not None:
+            total = total + self.own
         return [float(value) for value in luminance(total.numpy())]
 
 

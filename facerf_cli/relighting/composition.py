@@ -16,8 +16,9 @@ negative weights, such as the paper's plain least squares gives, can make pixels
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import repeat
 from typing import Literal
 
 import numpy as np
@@ -93,12 +94,14 @@ class Relit:
     """A head under one light: its texture [3, T, T], and the light around it.
 
     `surround` is [3, s, s] of a `Surround`, [views, 15, S, S] of a `WholePerson`; None of a face alone.
-    `mirrored` is what the eyes of a whole person mirror [N, 3, s, s].
+    `mirrored` is what the eyes of a whole person mirror [N, 3, s, s]; `own` [3] the share of
+    the photo's own light.
     """
 
     texture: Tensor
     surround: Tensor | None = None
     mirrored: Tensor | None = None
+    own: Tensor | None = None
 
     def plus(self, rgb: Tensor, other: "Relit") -> "Relit":
         """This and another light of rgb 1, made so bright [3]."""
@@ -176,6 +179,11 @@ class Composition:
         return self._head.face.texture.nbytes + (self.surround.nbytes if self.surround else 0)
 
     def relit(self, lights: Lights) -> Iterator[Relit]:
+        """Relight the head under each sum of lights, the photo's own light among them; see `_by_lights`."""
+        own = repeat(None) if lights.own is None else lights.own
+        return (replace(one, own=share) for one, share in zip(self._by_lights(lights), own, strict=False))
+
+    def _by_lights(self, lights: Lights) -> Iterator[Relit]:
         """Relight the head under each sum of lights (paper, 'Relighting'); one prediction serves all sums.
 
         Of the field, which is linear in light, the surround is summed over its lights, too; the models that
@@ -248,6 +256,13 @@ class Composition:
 
     def _relit_pixels(self, relit: Relit) -> Band:
         """Pixels [H, W, 3], by rows, of the person or the face alone, also where its share leaves none."""
+        pixels = self._by_light(relit)
+        if relit.own is None:
+            return pixels
+        return in_own_light(pixels, self.own, relit.own)
+
+    def _by_light(self, relit: Relit) -> Band:
+        """Pixels as `_relit_pixels`, without the photo's own light."""
         if self._photo is None:
             return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
         assert self.surround is not None and relit.surround is not None
@@ -293,6 +308,11 @@ class Composition:
         """Pixels [H, W, 3] of the person or the face alone, not multiplied by the matte; see `bands`."""
         return self._relit_pixels(relit)
 
+    def own_layer(self, straight: bool) -> Band:
+        """The person [H, W, 3] as photographed, over black, or `straight`: not multiplied by its share."""
+        photo, share = self.own, by_rows(self._share)
+        return lambda rows: photo[rows] if straight else photo[rows] * share(rows)[..., None]
+
     def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
         """Layers of the image by the names that they have in a file; of a photo always the matte, person.A.
 
@@ -325,12 +345,20 @@ class Composition:
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV of a relit head, by a rule."""
+        own = torch.zeros(3) if relit.own is None else relit.own.detach()
         if self.person is not None and relit.surround is not None:
-            return self.person.exposure_ev(relit.surround, rule)
-        textures = relit.texture, self._head.face.texture
+            return self.person.exposure_ev(relit.surround, own, rule)
+        source = self._head.face.texture
+        textures = relit.texture + own[:, None, None] * source, source
         lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
         seen = self._head.face.visible.numpy()
         return chosen_exposure_ev(rule, lit, plate, seen, seen)
+
+
+def in_own_light(pixels: Band, photo: Pixels, share: Tensor) -> Band:
+    """Pixels [H, W, 3], by rows, to which the photo's own light adds its share [3] of the photo."""
+    rgb = share.detach().numpy()
+    return lambda rows: pixels(rows) + rgb * photo[rows] if rgb.any() else pixels(rows)
 
 
 class PhotoDetail:

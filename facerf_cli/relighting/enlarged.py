@@ -122,10 +122,11 @@ class Enlarged:
         filled = self._filled(maps)
         return lambda pixels, rows, columns: _by_pixel(self._enlarged(filled, rows, columns))
 
-    def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the person under the light of maps [15, S, S]."""
+    def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
+        """The exposure in EV, by a rule, of the person under the light of maps [15, S, S] and its own [3]."""
         view = self._view
         (relit,) = view.relit(PortraitLight.of(lit[None]))
+        relit = relit + own[:, None, None] * view.person.image
         skin = view.person.classes[class_index("skin")].numpy()
         image = view.person.image.permute(1, 2, 0).numpy()
         return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())

@@ -7,7 +7,7 @@ import numpy as np
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Band, Layer, by_rows
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.composition import Composition, Relit
+from facerf_cli.relighting.composition import Composition, Pixels, Relit
 from facerf_cli.relighting.whole_person import COLOURS
 
 Group = Sequence[Relit]  # of each person, in the order of the compositions
@@ -31,9 +31,11 @@ class GroupComposition:
         """The people in the photo's frame; see `Composition.bands`."""
         first = self._first.bands(relit[0], ev, behind)
         pixels, alpha = by_rows(first["rgb"]), first.get("A")
-        for person, share in self._people(relit):
+        others = zip(self._others, self._people(relit), strict=True)
+        for composition, (person, share) in others:
             if alpha is None:
-                pixels = _over(person, share, pixels)
+                taken = composition.own if behind is None else None
+                pixels = _in_place(person, share, pixels, taken, 2.0**-ev)
                 continue
             whole = _over(_ones, share, by_rows(alpha))
             both = _over(person, share, _times(pixels, by_rows(alpha)))
@@ -68,6 +70,20 @@ class GroupComposition:
     def _people(self, relit: Group) -> Iterator[tuple[Band, Band]]:
         for composition, one in zip(self._others, relit[1:], strict=True):
             yield composition.person_and_share(one)
+
+
+def _in_place(top: Band, share: Band, below: Band, taken: Pixels | None, gain: float) -> Band:
+    """Lay a person over others, in place of the colours `taken` out of a photo that is shown at a gain."""
+    if taken is None:
+        return _over(top, share, below)
+
+    def of(rows: slice) -> np.ndarray:
+        weight = share(rows)[..., None]
+        return np.asarray(
+            (below(rows) - weight * taken[rows] * np.float32(gain)).clip(min=0) + weight * top(rows)
+        )
+
+    return of
 
 
 def _over(top: Band, share: Band, below: Band) -> Band:

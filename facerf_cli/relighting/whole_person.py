@@ -63,9 +63,12 @@ class WholePerson:
         grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px)
         return grain, Eyes(photo.__getitem__, self._person.eyes, self._size_px)
 
-    def exposure_ev(self, lit: Tensor, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the person under the light of maps [views, 15, S, S]."""
-        return self._views[0].exposure_ev(lit[0], rule)
+    def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
+        """The exposure in EV, by a rule, of the person under the light of maps [views, 15, S, S].
+
+        The photo's own light has the share `own` [3].
+        """
+        return self._views[0].exposure_ev(lit[0], own, rule)
 
     def layer(
         self, name: str, lit: Tensor, photo: np.ndarray | PersonColours, matte: np.ndarray

@@ -42,8 +42,8 @@ class LightSources:
         envmap: Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of
             estimate-light (.json), or procedural:N, maps of facerf envmap; NAME=MAP together with lights that
             have names. Repeatable.
-        light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, above, a rig file, a preset
-            (rembrandt), keys (at=, size=), or NAME=LIGHT;stops=-1; docs/lights.md. Repeatable.
+        light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, own (the photo's), a preset
+            (rembrandt), a rig file, keys (at=, size=), or NAME=LIGHT;stops=-1; docs/lights.md. Repeatable.
         light_from: Relight under the light of another photo, as estimate-light finds it. Repeatable.
         room: Add what a room sends back to lights: a share of them, from all around; a map; or none.
         rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
@@ -86,7 +86,7 @@ class LightSetup:
     """The lights of one image of every photo: a map, rotated, or single lights, or both.
 
     Lights with `names` are layers of the image, too. `room` is the share of the lights, without maps, that
-    comes from all around besides.
+    comes from all around besides. `exposure_ev` is the image's, where none is asked for.
     """
 
     name: str
@@ -94,6 +94,7 @@ class LightSetup:
     lights: tuple[StudioLight, ...] = ()
     names: tuple[str, ...] = ()
     room: float = 0.0
+    exposure_ev: float | None = None
 
     @property
     def envmap(self) -> StudioLight | None:
@@ -102,8 +103,13 @@ class LightSetup:
 
     @property
     def has_single(self) -> bool:
-        """True where some light is not a map."""
-        return any(light.envmap is None for light in self.lights)
+        """True where some light is neither a map nor the photo's own."""
+        return any(light.envmap is None and not light.own for light in self.lights)
+
+    @property
+    def has_own(self) -> bool:
+        """True where the photo's own light is one of the lights."""
+        return any(light.own for light in self.lights)
 
     def output(self, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None) -> Path:
         """The image's file, by a pattern of --name or the default: the photo's own frame number goes last."""
@@ -185,7 +191,7 @@ def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightS
     if not setup.has_single:
         return setup
     if room is None:
-        has_one = ROOM in setup.names or any(light.is_around for light in setup.lights)
+        has_one = ROOM in setup.names or any(light.is_around or light.own for light in setup.lights)
         default = ROOM_BEFORE_DARK if is_before_dark else ROOM_BEFORE_BRIGHT
         return replace(setup, room=0.0 if has_one else default)
     if room == "none":

@@ -93,7 +93,7 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
         weights.append(torch.zeros(len(setups), len(towards), 3))
         weights[-1][row] = rgb
     some = slice(len(directions) > 1, None)
-    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1))
+    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), own=own_weights(setups))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -109,6 +109,12 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
     return replace(far, near=lights, near_weights=near_weights)
 
 
+def own_weights(setups: Sequence[LightSetup]) -> Tensor | None:
+    """Weights [M, 3] of the photo's own light in M setups; None where it shines in none."""
+    each = [[intensity_of(light) for light in setup.lights if light.own] for setup in setups]
+    return torch.stack([sum(own, torch.zeros(3)) for own in each]) if any(each) else None
+
+
 def on_face(setup: LightSetup, number: int) -> LightSetup:
     """A setup in which the lights of other faces than one are dark."""
     dark = (0.0, 0.0, 0.0)
@@ -120,7 +126,8 @@ def with_room(setup: LightSetup) -> LightSetup:
     """A setup with the light of its room as one of its lights."""
     if not setup.room:
         return setup
-    sent = torch.stack([intensity_of(light) for light in setup.lights if light.envmap is None]).sum(0)
+    lights = [light for light in setup.lights if light.envmap is None and not light.own]
+    sent = torch.stack([intensity_of(light) for light in lights]).sum(0)
     red, green, blue = (setup.room * float(value) for value in sent)
     names = (*setup.names, ROOM) if setup.names else ()
     return replace(setup, lights=(*setup.lights, StudioLight(rgb=(red, green, blue))), names=names)
@@ -137,7 +144,7 @@ def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampli
     for row, towards, rgb in _far_lights(setups):
         index, share = lights_around(towards, directions)
         weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
-    return Lights(directions, weights)
+    return Lights(directions, weights, own=own_weights(setups))
 
 
 def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:

@@ -23,14 +23,16 @@ log = logging.getLogger(LOGGER_NAME)
 class OutputImage:
     """An image to write: linear Rec.709 [H, W, 3], not multiplied by alpha [H, W], and its layers.
 
-    `share` [H, W] is how far a soft view applies to each pixel (`colour.encode_display`); None: to all.
-    `header` is further metadata of the EXR alone.
+    `share` [H, W] is how far a soft view applies to each pixel, or `added` [H, W, 3] what was not
+    photographed (`colour.encode_display`); without both it applies to all. `header` is further metadata of
+    the EXR alone.
     """
 
     pixels: np.ndarray
     alpha: np.ndarray | None = None
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
     share: np.ndarray | None = None
+    added: np.ndarray | None = None
     header: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -63,8 +65,9 @@ def write_output(
         else:
             bits: Literal[8, 16] = 16 if name == "png16" else 8
             shown = {"facerf:view": view.name, **(metadata or {})}
+            kept = image.share, image.added
             write_display(
-                target, image.pixels, exposure, image.alpha, shown, view, image.share, bits, options.quality
+                target, image.pixels, exposure, image.alpha, shown, view, *kept, bits, options.quality
             )
 
     at_once = len(options.formats) if not isinstance(image.pixels, np.memmap) else 1

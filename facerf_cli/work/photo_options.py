@@ -46,7 +46,7 @@ def white_option() -> Any:
     """Make the field of `--white`."""
     return option(
         "photo",
-        "Keep the photo's white, or take the colour of the scene's light out, such as sodium or party light.",
+        "Keep the photo's white, or take the colour of the scene's light out (sodium, party).",
         flags=("--white",),
         panel=IMAGE,
     )

@@ -15,7 +15,7 @@ from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import most_exposure_ev
-from facerf_cli.image.strips import filled
+from facerf_cli.image.strips import Band, filled
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import with_room
@@ -62,8 +62,8 @@ def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
 @lru_cache(maxsize=4)
 def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     """Exposures of a photo or stack that others share; found once a process."""
-    if isinstance(work.exposure, float):
-        return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
+    if isinstance(work.exposure_rule, float):
+        return dict.fromkeys((setup.name for setup in work.setups), work.exposure_rule)
     scene = scene_of_all(leader, work)
     return _exposures_ev(scene, batches(len(scene.setups), scene.composer.nbytes), scene.relit, work)
 
@@ -128,7 +128,8 @@ def _rendered(
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
-    A soft view leaves what was photographed, and a given background, as it looks.
+    A soft view leaves what was photographed, and a given background, as it looks; in the photo's own light it
+    bends what other lights add.
     """
     composer, size_px = scene.composer, scene.composer.size_px
     behind = scene.behind(setup, ev) if scene.behind else None
@@ -136,13 +137,29 @@ def _rendered(
     layers = filled(composer.layers(work.aov, relit), *size_px, empty)
     keeps = "A" not in arrays and work.background.kind != "envmap"
     share = layers.get("person.A") if keeps else None
-    names = with_room(setup).names
-    for part in batches(len(names), composer.nbytes):
+    lit = with_room(setup)
+    for part in batches(len(lit.names), composer.nbytes):
         each = scene.relit_by_each(setup, part)
-        for name, one in zip(names[part], each, strict=True):
+        for name, one in zip(lit.names[part], each, strict=True):
             layers |= filled({name: composer.light_layer(one)}, *size_px, empty)
         del each, one  # before others are relit
-    return OutputImage(arrays["rgb"], arrays.get("A", scene.alpha), layers, share)
+    added = None
+    if setup.has_own:
+        others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
+        added = filled({"added": _sum_of(others, size_px[1], arrays.get("A"))}, *size_px, empty)["added"]
+    return OutputImage(arrays["rgb"], arrays.get("A", scene.alpha), layers, share, added)
+
+
+def _sum_of(layers: Sequence[np.ndarray], width: int, alpha: np.ndarray | None) -> Band:
+    """The sum [H, W, 3] of layers over black, by rows, not multiplied by alpha [H, W]."""
+
+    def of(rows: slice) -> np.ndarray:
+        total = np.zeros((rows.stop - rows.start, width, 3), np.float32)
+        for layer in layers:
+            total += layer[rows]
+        return total if alpha is None else total / np.maximum(alpha[rows], 1e-3)[..., None]
+
+    return of
 
 
 def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
@@ -160,14 +177,16 @@ def _exposures_ev(
     scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
-    if isinstance(work.exposure, float):
-        return dict.fromkeys((setup.name for setup in work.setups), work.exposure)
+    if isinstance(rule := work.exposure_rule, float):
+        return dict.fromkeys((setup.name for setup in work.setups), rule)
     found: dict[str, float] = {}
     strengths = scene.lights[0].strengths()
     for part in parts:
         for setup, light, relit in zip(scene.setups[part], strengths[part], relit_by(part), strict=True):
-            most_ev = most_exposure_ev(work.exposure, light)
-            chosen_ev = round(min(scene.composer.exposure_ev(relit, work.exposure), most_ev), 2)
+            chosen_ev = setup.exposure_ev
+            if chosen_ev is None:
+                most_ev = most_exposure_ev(rule, light)
+                chosen_ev = round(min(scene.composer.exposure_ev(relit, rule), most_ev), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
             del relit  # a view of one holds all of its part, beside the next
     return found

@@ -130,7 +130,7 @@ class Relight:
         pose: Turn the head to a pose, in degrees; shows the face alone.
         reflectance: Relight the whole portrait, or the face by the paper's field; or by a baseline:
             diffuse-sh, specular-sh, prt.
-        exposure: Expose PNG and JPEG: the face as bright as in the photo (auto), well lit (face), or by EV.
+        exposure: Expose PNG and JPEG by EV, or the face as in the photo (auto) or well lit (face).
         exposure_group: Share an exposure: of each photo, or the first one's by folder or sequence of frames.
         composite: Show the photo with its face relit, or the rendered face alone, with alpha.
         background: Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which
@@ -154,8 +154,12 @@ class Relight:
     sampling: Sampling = "cell"
     pose: str | None = option(None, metavar="YAW,PITCH,ROLL", shown_default="the photo's", panel=IMAGE)
     reflectance: RelightKind = option("portrait", metavar="KIND", panel=METHOD)
-    exposure: Exposure = option(
-        "auto", metavar="auto|face|EV", default_text="auto", parse=parse_exposure, panel=IMAGE
+    exposure: Exposure | None = option(
+        None,
+        metavar="auto|face|EV",
+        shown_default="auto; 0 with own",
+        parse=parse_exposure,
+        panel=IMAGE,
     )
     exposure_group: ExposureGroup = option("photo", metavar="KIND", panel=IMAGE)
     output: OutputOptions = field(default_factory=OutputOptions)
@@ -274,6 +278,10 @@ class Relight:
         of_light: Kind = "field" if self.reflectance == "portrait" else self.reflectance
         how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
         setups = collect_setups(sources, batch.output, photo.settings.seed, how)
+        if any(one.has_own for one in setups):
+            self._check_own(alone)
+            if self.exposure is None:
+                setups = tuple(replace(one, exposure_ev=0.0) if one.has_own else one for one in setups)
         if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
             raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
         sweeps = sources.rotate is not None and is_sweep(sources.rotate)
@@ -285,8 +293,21 @@ class Relight:
             composite="face" if alone else "photo",
             asked_for_photo=self.composite == "photo",
             asked_for_room=sources.room is not None,
+            exposure=self.exposure_rule,
             reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
         )
+
+    def _check_own(self, alone: bool) -> None:
+        """Raise UsageError for what the photo's own light cannot shine on."""
+        if alone:
+            raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
+        if self.reflectance not in ("field", "portrait"):
+            raise UsageError(f"--light own: is not for --reflectance {self.reflectance}; leave one out")
+
+    @property
+    def exposure_rule(self) -> Exposure:
+        """EV, or the rule that chooses it."""
+        return "auto" if self.exposure is None else self.exposure
 
     @property
     def maps(self) -> list[LightSetup]:
@@ -417,6 +438,6 @@ def _write_balls(work: Relight, options: BatchOptions) -> None:
 
         drawn = readable(missing)
         paths = [path_of(setup) for setup in drawn]
-        write_balls(drawn, paths, work.exposure, work.output)
+        write_balls(drawn, paths, work.exposure_rule, work.output)
         for path, suffix in itertools.product(paths, work.output.suffixes):
             print_path(path.with_suffix(suffix))

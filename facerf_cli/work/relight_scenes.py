@@ -318,6 +318,8 @@ def _check_stack(item: Item, work: Relight) -> None:
         wrong = "a stack holds the field as predicted; give its photo"
     elif work.photo.has_given_person:
         wrong = "a stack holds its person's matte; give its photo"
+    elif work.photo_of_stack is None and any(setup.has_own for setup in work.setups):
+        wrong = "the photo's own light (own) needs its photo; give that with --photo"
     elif any(light.at_m is not None for setup in work.setups for light in setup.lights):
         wrong = "a stack holds far lights; for near ones (at=) give its photo"
     if wrong:

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from facerf_cli.files.olat_stack import StackHeader, stream_olats
 from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
 from facerf_cli.image.strips import Band, Layer, resized_rows
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.composition import Relit
+from facerf_cli.relighting.composition import Relit, in_own_light
 from facerf_cli.relighting.field import weighted_sum
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
@@ -64,7 +65,9 @@ class StackImages:
 
     def relit(self, lights: Lights) -> Iterator[Relit]:
         """Sums of the stack's lights."""
-        return map(Relit, weighted_sum(stream_olats(self.path), lights.weights))
+        textures = weighted_sum(stream_olats(self.path), lights.weights)
+        own = repeat(None) if lights.own is None else lights.own
+        return (Relit(texture, own=share) for texture, share in zip(textures, own, strict=False))
 
     def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The person before the photo's background at `ev`, before another, or with alpha."""
@@ -95,21 +98,30 @@ class StackImages:
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule; a face alone is shown well, for it has no photo to compare with."""
-        own, seen = self._own(relit), self.header.seen
+        lit, seen = self._lit(relit), self.header.seen
+        if relit.own is not None:
+            lit = lit + relit.own.numpy() * self.header.source
         if rule == "face" or self.face is None:
-            return auto_exposure_ev(own, seen)
-        return anchored_exposure_ev(own, self.header.source, self.face * seen, seen)
+            return auto_exposure_ev(lit, seen)
+        return anchored_exposure_ev(lit, self.header.source, self.face * seen, seen)
 
     def _person(self, relit: Relit) -> tuple[Band, Band]:
         """The person's own colours [H, W, 3], and its matte [H, W]."""
-        own, photo, seen = self._own(relit), self.photo, self.header.seen
+        lit, photo, seen = self._lit(relit), self.photo, self.header.seen
         if photo is None or self.size_px == seen.shape:
-            return lambda rows: own[rows], lambda rows: seen[rows]
-        source = self.header.source
-        change = resized_rows(own / (source + _DARK * source.mean()), self.size_px)
-        return lambda rows: photo[rows] * change(rows), self._matte()
+            person: Band = lit.__getitem__
+        else:
+            source = self.header.source
+            change = resized_rows(lit / (source + _DARK * source.mean()), self.size_px)
 
-    def _own(self, relit: Relit) -> np.ndarray:
+            def person(rows: slice) -> np.ndarray:
+                return photo[rows] * change(rows)
+
+        if photo is not None and relit.own is not None:
+            person = in_own_light(person, photo, relit.own)
+        return person, self._matte()
+
+    def _lit(self, relit: Relit) -> np.ndarray:
         """Colours [h, w, 3] that are not multiplied by the coverage; 0 where that is."""
         pixels = np.asarray(relit.texture.permute(1, 2, 0).numpy())
         if self.face is None:

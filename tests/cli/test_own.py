@@ -1,0 +1,162 @@
+"""The photo's own light, to which other lights add."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import facerf_cli as facerf
+from facerf_cli.errors import UsageError
+from facerf_cli.files.images import read_image
+from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb
+from facerf_cli.light.entries import OWN, LitImage, lit_images
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.relighting.composition import Target
+from facerf_cli.relighting.group import GroupComposition
+from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
+from facerf_cli.work.lights import lights_over_rig, with_room
+from tests import astronaut
+from tests.astronaut import PATH as PHOTO
+from tests.cli.test_relight import relight
+from tests.exr_layers import exr_layers
+
+HALF = 2.0**-11  # relative error of half floats
+
+
+def image_of(*entries: str) -> LitImage:
+    (image,) = lit_images(entries)
+    return image
+
+
+@pytest.mark.parametrize("entry", ["own", "from=own", "name=own;from=own", "own;stops=-1"])
+def test_own_is_a_light_of_that_name(entry: str) -> None:
+    image = image_of(entry)
+    assert image.names == (OWN,) and image.name == "light_own"
+    (light,) = image.frames[0]
+    assert light.own and not light.is_around and light.stops == (-1.0 if "stops" in entry else 0.0)
+
+
+def test_it_joins_lights_that_have_names_and_takes_colour() -> None:
+    image = image_of("key=40,20", "name=day;from=own;rgb=1,.9,.8")
+    assert image.names == ("key", "day") and image.frames[0][1].rgb == (1.0, 0.9, 0.8)
+    assert not image_of("own=40,20").frames[0][0].own  # a light of that name
+
+
+@pytest.mark.parametrize(
+    ("entries", "words"),
+    [
+        (["own", "name=day;from=own"], "twice"),
+        (["own;at=0,0,1"], "one of"),
+        (["own;size=1"], "near lights"),
+        (["own;size_deg=5"], "no size"),
+        (["own;spot=20"], "near lights"),
+        (["own;rotate=5"], "of maps"),
+    ],
+)
+def test_what_it_cannot_have_is_refused(entries: list[str], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        lit_images(entries)
+
+
+def test_the_room_is_off_unless_asked_and_counts_the_other_lights() -> None:
+    (both,) = collect_setups(LightSources(light=["own", "key=40,20;stops=1"]), Path("out"))
+    assert in_room(both, None, False).room == 0
+    asked = with_room(in_room(both, "0.1", False))
+    assert asked.names == ("own", "key", "room") and asked.lights[2].rgb == pytest.approx((0.2, 0.2, 0.2))
+    (alone,) = collect_setups(LightSources(light=["own"]), Path("out"))
+    assert not alone.has_single
+    lights = lights_over_rig((alone, both), "12", "cell")
+    assert lights.own is not None and lights.own.tolist() == [[1, 1, 1], [1, 1, 1]]
+    assert lights.weights.abs().sum((1, 2)).tolist() == [0, 6]
+
+
+def test_alone_it_gives_the_photo_back(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path, "--light", "own") == 0
+    image, photo = read_image(tmp_path / "astronaut_light_own.exr").pixels, read_image(PHOTO).pixels
+    assert np.abs(image - photo).max() <= HALF
+    shown, plate = (read_image(path).pixels for path in (tmp_path / "astronaut_light_own.png", PHOTO))
+    assert np.abs(linear_to_srgb(shown) - linear_to_srgb(plate)).max() < 1.5 / 255
+    (ev,) = json.loads((tmp_path / "report.jsonl").read_text())["exposure_ev"].values()
+    assert ev == 0
+
+
+def test_layers_of_lights_and_the_background_add_up_to_the_image(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "own;stops=-1", "--light", "key=40,25;kelvin=3200", "--format", "exr"]
+    assert relight(given, tmp_path, *line) == 0
+    path, photo = tmp_path / "astronaut_light_own+key.exr", read_image(PHOTO).pixels
+    channels = exr_layers(path)
+    own, key = (np.stack([channels[f"{name}.{c}"] for c in "RGB"], -1) for name in ("own", "key"))
+    sure, image = channels["person.A"] == 1, read_image(path).pixels
+    assert np.abs(own - 0.5 * photo)[sure].max() < 2 * HALF
+    behind = photo - 2 * own  # of the background what is seen
+    assert np.abs(image - behind - own - key).max() < 6 * HALF
+    assert key[sure].mean() > 0.01 and np.abs(behind[sure]).max() < 4 * HALF
+
+
+def test_exposure_is_chosen_where_it_is_asked(given: Path, tmp_path: Path) -> None:
+    line = ["--light", "own;stops=-3", "--exposure", "auto", "--format", "png"]
+    assert relight(given, tmp_path, *line) == 0
+    (ev,) = json.loads((tmp_path / "report.jsonl").read_text())["exposure_ev"].values()
+    assert 2.5 < ev < 3.5
+
+
+@pytest.mark.parametrize(
+    "line", [["--pose", "10,0,0"], ["--composite", "face"], ["--reflectance", "diffuse-sh"]]
+)
+def test_what_it_does_not_shine_on_is_refused(
+    line: list[str], given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert relight(given, tmp_path, "--light", "own", *line) == 2
+    assert "--light own" in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
+def test_the_soft_view_bends_what_other_lights_add() -> None:
+    photo = np.linspace(0, 1, 33, dtype=np.float32).repeat(3).reshape(3, 11, 3)
+    plain = encode_display(photo, SOFT_VIEW, added=np.zeros_like(photo))
+    assert np.abs(plain - linear_to_srgb(photo)).max() < 1e-6
+    more = encode_display(photo + 0.5, SOFT_VIEW, added=np.full_like(photo, 0.5))
+    bent = encode_display(photo + 0.5, SOFT_VIEW)
+    assert (more >= plain - 1e-6).all() and np.abs(more[0] - bent[0]).max() < 1e-6  # dark: all of it is added
+    assert (more >= bent - 1e-6).all() and (more[-1, 4:] > bent[-1, 4:]).all()
+
+
+def test_two_people_in_their_own_light_are_the_photo() -> None:
+    photo, person = astronaut.photo(), astronaut.person()
+    height, width = photo.shape[:2]
+    left = np.clip((width / 2 - np.arange(width)) / 40 + 0.5, 0, 1).astype(np.float32)[None].repeat(height, 0)
+    both = GroupComposition([person.composed(Target(matte=side)) for side in (left, 1 - left)])
+    dark = Lights(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own=torch.ones(1, 3))
+    (relit,) = both.relit([dark, dark])
+    pixels = both.bands(relit, 0.0, None)["rgb"]
+    assert callable(pixels)
+    assert np.abs(pixels(slice(0, height)) - photo).max() < 1e-5
+
+
+def test_python_adds_lights_to_it_and_gradients_reach_its_weight() -> None:
+    fitted = astronaut.person()
+    person = facerf.Person(fitted.models, fitted.photo, fitted.head, fitted.reflectance)
+    key = facerf.Light.single(40, 20)
+    photo, half, lit = person.relight([facerf.Light.own(), 0.5 * facerf.Light.own() + key, key])
+    assert np.abs(photo - astronaut.photo()).max() < 1e-5
+    sure = person.matte == 1
+    assert np.abs(half - lit - 0.5 * photo)[sure].max() < 1e-5
+    weight = torch.ones(3, requires_grad=True)
+    slopes = torch.rand(photo.shape, generator=torch.Generator().manual_seed(0))
+    (person.relight(facerf.Light.own(weight) + key) * slopes).sum().backward()
+    layer = person.relight(facerf.Light.own(), background="none")
+    expected = (torch.from_numpy(layer[..., :3] * layer[..., 3:]) * slopes).sum((0, 1))
+    torch.testing.assert_close(weight.grad, expected, rtol=1e-4, atol=0)
+
+
+def test_python_refuses_what_it_has_not() -> None:
+    fitted = astronaut.person()
+    person = facerf.Person(fitted.models, fitted.photo, fitted.head, fitted.reflectance)
+    own = facerf.Light.own() + facerf.Light.single(0, 0)
+    with pytest.raises(UsageError, match="own light"):
+        own.to_envmap()
+    with pytest.raises(UsageError, match="whole photo"):
+        person.relight(own, pose=(5.0, 0.0, 0.0))
+    with pytest.raises(TypeError, match="directions"):
+        person.olat(own)  # type: ignore[arg-type]
