@@ -36,6 +36,7 @@ _UNSUPPORTED = re.compile(
 )
 _WHITE_IS_ZERO, _SEPARATED, _CIELAB = 0, 5, 8  # a TIFF's photometric interpretations
 _EXTRA_SAMPLES, _ASSOCIATED, _UNASSOCIATED = 338, 1, 2  # a TIFF's tag, and its values
+_CINEON_LITTLE = b"\xd7\x5f\x2a\x80"  # the first four bytes of a little-endian Cineon file
 _INKS = 4  # cyan, magenta, yellow, black
 
 log = logging.getLogger(LOGGER_NAME)
@@ -117,18 +118,30 @@ def _decode_by_oiio(
 def _stored_values(path: Path, opened: OpenedImage, first: int, past: int, kind: oiio.TypeDesc) -> np.ndarray:
     """Decode some channels [H, W, C]."""
     stream, radiance, spec = opened.stream, opened.radiance, opened.spec
+    if stream.format_name() == "cineon":
+        _require_whole_cineon(path, spec)
     values = read_old_runs(path, radiance) if radiance else None
     if values is None:
         values = stream.read_image(opened.layer.part, 0, first, past, kind)
-    message = reason(path, oiio_error(stream))
+    said = f"{opened.said}\n{oiio_error(stream)}"
+    message = reason(path, said)
     if values is None and _UNSUPPORTED.search(message):
         raise InputError(f"{path}: its compression is not supported; save it with another ({message})")
-    if values is None or "premature end" in message.lower():  # a JPEG cut short decodes to grey
+    if values is None or "premature end" in said.lower():  # a JPEG cut short decodes to grey
         raise InputError(f"{path}: damaged or cut short; copy it again ({message or 'no pixels in it'})")
     if message:
         log.warning("%s: %s", path, message)
     values = np.asarray(values).reshape(spec.height, spec.width, past - first)
     return values / radiance.scale if radiance and (radiance.scale != 1).any() else values
+
+
+def _require_whole_cineon(path: Path, spec: oiio.ImageSpec) -> None:
+    """Raise InputError where 10-bit pixels are missing, three in 32 bits, which OpenImageIO leaves black."""
+    with path.open("rb") as stream:
+        order = "little" if stream.read(4) == _CINEON_LITTLE else "big"
+        start = int.from_bytes(stream.read(4), order)
+    if path.stat().st_size < start + 4 * -(-spec.width * spec.height * spec.nchannels // 3):
+        raise InputError(f"{path}: damaged or cut short; copy it again (pixels are missing)")
 
 
 def _black_is_zero(values: np.ndarray, alpha: int | None) -> np.ndarray:

@@ -56,7 +56,8 @@ class OpenedImage:
     """An open file, and its layer that is read.
 
     `spec` is the layer's header, with windows and an orientation that are valid in its format. `choice` says
-    which layer that is, where it is not what any program shows.
+    which layer that is, where it is not what any program shows; `said` is what its reader says at once, as of a
+    progressive JPEG that is cut short.
     """
 
     stream: Any
@@ -64,6 +65,7 @@ class OpenedImage:
     layer: ImageLayer
     choice: str = ""
     radiance: RadianceHeader | None = None  # of a .hdr
+    said: str = ""
 
     @property
     def is_associated(self) -> bool:
@@ -100,6 +102,7 @@ def open_image(path: Path, layer: str | None = None) -> OpenedImage:
 
 def _at_layer(path: Path, stream: Any, wanted: str | None) -> OpenedImage:
     is_exr = stream.format_name() == "openexr"
+    said = oiio_error(stream)
     specs = [stream.spec()]
     is_tiff = stream.format_name() == "tiff"
     while (is_exr or (is_tiff and len(specs) == 1)) and stream.seek_subimage(len(specs), 0):
@@ -123,7 +126,7 @@ def _at_layer(path: Path, stream: Any, wanted: str | None) -> OpenedImage:
         spec.full_width, spec.full_height = spec.width, spec.height
     if not 1 <= spec.get_int_attribute("Orientation", 1) <= 8:
         spec.attribute("Orientation", 1)
-    return OpenedImage(stream, spec, chosen, _choice(chosen, layers, specs), radiance)
+    return OpenedImage(stream, spec, chosen, _choice(chosen, layers, specs), radiance, said)
 
 
 def _choice(chosen: ImageLayer, layers: Sequence[ImageLayer], specs: Sequence[oiio.ImageSpec]) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 import tifffile
+from PIL import Image
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.image_metadata import read_header
@@ -224,6 +225,18 @@ def test_a_jpeg_that_lacks_its_last_byte_and_a_png_with_a_flipped_bit(
     with pytest.raises(InputError, match="checksum"):
         read_image(path)
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_progressive_jpeg_that_is_cut_short(tmp_path: Path, share: float) -> None:
+    """Its reader says so when the file is opened, since all scans are read at once."""
+    path = tmp_path / "a.jpg"
+    levels = np.random.default_rng(0).integers(0, 256, (48, 80, 3), np.uint8)
+    Image.fromarray(levels).save(path, progressive=True)
+    assert read_image(path).pixels.shape == (48, 80, 3)
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(InputError, match=r"a\.jpg: damaged or cut short; copy it again"):
+        read_image(path)
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.jpg", "a", "a b#%04d.png"])

@@ -186,6 +186,15 @@ def test_every_orientation_is_another_image(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found, expected)
 
 
+def test_a_film_scan_that_is_cut_short(tmp_path: Path) -> None:
+    path = save_cineon(tmp_path / "a.cin", LEVELS[:5, :7].astype(int))
+    path.write_bytes(path.read_bytes()[: 2048 + 4 * 35])
+    assert read_image(path).pixels.shape == (5, 7, 3)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(InputError, match=r"a\.cin: damaged or cut short"):
+        read_image(path)
+
+
 def test_film_scans_are_decoded_by_the_cineon_curve(tmp_path: Path) -> None:
     """Code values of black, of 18 % grey and of white."""
     codes = np.broadcast_to([95, 445, 685], (6, 9, 3))
