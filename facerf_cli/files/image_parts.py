@@ -23,6 +23,8 @@ _RAW = (
 )
 _RAW_SUFFIXES = frozenset(_RAW.split())
 _HAVE_WINDOWS = ("openexr", "rla")
+# Formats whose two resolutions are for print, and differ by mistake; viewers show their pixels square.
+_PRINTED = ("jpeg", "png", "tiff")
 # Formats whose colour is multiplied by alpha, unless the header says otherwise.
 _ASSOCIATED = ("openexr", "tiff", "targa", "rla", "iff", "dpx", "softimage")
 _TGA_ASSOCIATED = 4
@@ -124,6 +126,8 @@ def _at_layer(path: Path, stream: Any, wanted: str | None) -> OpenedImage:
     if stream.format_name() not in _HAVE_WINDOWS:
         spec.x = spec.y = spec.full_x = spec.full_y = 0
         spec.full_width, spec.full_height = spec.width, spec.height
+    if stream.format_name() in _PRINTED:
+        spec.erase_attribute("PixelAspectRatio")
     if not 1 <= spec.get_int_attribute("Orientation", 1) <= 8:
         spec.attribute("Orientation", 1)
     return OpenedImage(stream, spec, chosen, _choice(chosen, layers, specs), radiance, said)

@@ -107,6 +107,23 @@ def test_pixels_become_square(tmp_path: Path, aspect: float, orientation: int, s
     np.testing.assert_allclose(image.pixels[2, 2], corner, atol=1e-6)
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "bmp"])
+def test_resolutions_for_print_change_no_shape(tmp_path: Path, suffix: str) -> None:
+    """300 x 72 dots an inch, and two dots to one without a unit, are shown as square pixels everywhere."""
+    Image.fromarray(QUADS).save(path := tmp_path / f"a.{suffix}", dpi=(300, 72))
+    image, header = read_image(path), read_header(path)
+    assert header is not None and image.pixels.shape[:2] == (header.height_px, header.width_px) == (H, W)
+    if suffix == "jpg":
+        data = bytearray(path.read_bytes())
+        data[13:18] = struct.pack(">BHH", 0, 2, 1)  # of the JFIF segment: no unit
+        path.write_bytes(data)
+    elif suffix == "png":
+        write_png(path, QUADS, (b"pHYs", struct.pack(">IIB", 2, 1, 0)))
+    elif suffix == "tif":
+        tifffile.imwrite(path, QUADS, resolution=(2, 1), resolutionunit=1)
+    assert read_image(path).pixels.shape[:2] == (H, W)
+
+
 # Alpha
 
 
