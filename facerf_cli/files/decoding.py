@@ -109,10 +109,13 @@ def _decode_by_oiio(
     if has_inks:
         spec.attribute("oiio:ColorSpace", "")
         return _without_inks(values, spec, _extra_channel(path) if with_alpha else 0)
+    is_associated = opened.is_associated and alpha is not None
+    if is_associated and stream.format_name() == "tiff":  # without the tag OpenImageIO takes it for associated
+        is_associated = _extra_channel(path) == _ASSOCIATED
     alpha = None if alpha is None else alpha - first
     if colours == _WHITE_IS_ZERO:
         values = _black_is_zero(values, alpha)
-    return Decoded(values, spec, [channel - first for channel in layer.colour], alpha, opened.is_associated)
+    return Decoded(values, spec, [channel - first for channel in layer.colour], alpha, is_associated)
 
 
 def _stored_values(path: Path, opened: OpenedImage, first: int, past: int, kind: oiio.TypeDesc) -> np.ndarray:
@@ -177,7 +180,7 @@ def _by_profile_of_inks(path: Path, spec: oiio.ImageSpec) -> np.ndarray | None:
 
 
 def _extra_channel(path: Path) -> int:
-    """The kind of a TIFF's channel after the inks, such as `_ASSOCIATED` alpha; 0 says nothing."""
+    """The kind of a TIFF's first channel after its colours, such as `_ASSOCIATED` alpha; 0 says nothing."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     with path.open("rb") as stream:

@@ -141,6 +141,18 @@ def test_alpha_that_is_not_multiplied_in_is_not_divided_out(tmp_path: Path, suff
     np.testing.assert_allclose(255 * linear_to_srgb(image.pixels), QUADS, atol=1.5)
 
 
+def test_a_fourth_sample_of_a_tiff_without_a_tag_is_not_multiplied_in(tmp_path: Path) -> None:
+    """Integers above their alpha cannot be multiplied by it; Pillow reads such a file so, too."""
+    values = np.dstack([QUADS, np.full((H, W), 100, np.uint8)])
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="rgb", extrasamples=["assocalpha"])
+    data = (tmp_path / "a.tif").read_bytes()
+    extra_samples, unknown = struct.pack("<HHI", 338, 3, 1), struct.pack("<HHI", 65000, 3, 1)
+    assert data.count(extra_samples) == 1
+    (tmp_path / "a.tif").write_bytes(data.replace(extra_samples, unknown))
+    np.testing.assert_allclose(levels_of(tmp_path / "a.tif"), QUADS, atol=0.1)
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif").alpha, 100 / 255, atol=1e-6)
+
+
 def test_associated_integers_stay_within_white(tmp_path: Path) -> None:
     """Rounding makes a colour of small alpha larger than it."""
     values = np.dstack([np.full((H, W, 3), 3, np.uint8), np.full((H, W), 2, np.uint8)])
