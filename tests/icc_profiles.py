@@ -44,8 +44,8 @@ def described(name: str) -> dict[bytes, bytes]:
     return {b"desc": content, b"cprt": content, b"wtpt": b"XYZ " + bytes(4) + fixed(0.9642, 1.0, 0.8249)}
 
 
-def grey_profile(name: str, curve: bytes) -> bytes:
-    return profile({**described(name), b"kTRC": curve}, b"GRAY")
+def grey_profile(name: str, curve: bytes, connection: bytes = b"XYZ ") -> bytes:
+    return profile({**described(name), b"kTRC": curve}, b"GRAY", connection=connection)
 
 
 def rgb_profile(name: str, colorants: Sequence[Sequence[float]], curve: bytes) -> bytes:

@@ -110,7 +110,7 @@ def _decode_by_oiio(
         spec.attribute("oiio:ColorSpace", "")
         return _without_inks(values, spec, _extra_channel(path) if with_alpha else 0)
     is_associated = opened.is_associated and alpha is not None
-    if is_associated and stream.format_name() == "tiff":  # without the tag OpenImageIO takes it for associated
+    if is_associated and stream.format_name() == "tiff":  # OpenImageIO says so without the tag, too
         is_associated = _extra_channel(path) == _ASSOCIATED
     alpha = None if alpha is None else alpha - first
     if colours == _WHITE_IS_ZERO:

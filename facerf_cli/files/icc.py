@@ -28,6 +28,7 @@ from facerf_cli.image.colour import (
     rgb_to_xyz,
 )
 
+GREY = b"GRAY"  # of a profile's bytes 16 to 20: the colour space of the image
 Curve = Callable[[np.ndarray], np.ndarray]
 _D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the profile connection space
 _KNOWN = (SRGB, DISPLAY_P3, ADOBE_RGB, REC2020, LINEAR, LINEAR_P3, LINEAR_REC2020, ACESCG, ACES)
@@ -51,8 +52,11 @@ def space_of_profile(profile: bytes, name: str) -> ColourSpace | None:
 
 def _space(profile: bytes, name: str) -> ColourSpace | None:
     tags, kind = _tags(profile), profile[16:20]
-    if kind == b"GRAY" and b"kTRC" in tags:
-        return ColourSpace(name, REC709_CHROMATICITIES, _by_channel(*[_curve(tags[b"kTRC"])] * 3))
+    if kind == GREY and b"kTRC" in tags:
+        curve = _curve(tags[b"kTRC"])
+        if profile[20:24] == b"Lab ":  # the connection space, in which the curve gives the lightness L*
+            curve = _luminance_of(curve)
+        return ColourSpace(name, REC709_CHROMATICITIES, _by_channel(curve, curve, curve))
     wanted = [letter + part for part in (b"XYZ", b"TRC") for letter in (b"r", b"g", b"b")]
     if kind != b"RGB " or not all(tag in tags for tag in wanted):
         return None
@@ -63,6 +67,16 @@ def _space(profile: bytes, name: str) -> ColourSpace | None:
         return None
     xy = np.vstack([colorants / sums, white / white.sum()])[:, :2]
     return ColourSpace(name, tuple(xy.ravel()), _by_channel(*(_curve(tags[tag]) for tag in wanted[3:])))
+
+
+def _luminance_of(lightness: Curve) -> Curve:
+    """Luminance of white 1 of a curve of L* / 100 (CIE 15)."""
+
+    def curve(encoded: np.ndarray) -> np.ndarray:
+        value = 100 * lightness(encoded)
+        return np.where(value > 8, ((value + 16) / 116) ** 3, value * 27 / 24389)
+
+    return curve
 
 
 def _tags(profile: bytes) -> dict[bytes, bytes]:

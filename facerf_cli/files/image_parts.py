@@ -58,8 +58,8 @@ class OpenedImage:
     """An open file, and its layer that is read.
 
     `spec` is the layer's header, with windows and an orientation that are valid in its format. `choice` says
-    which layer that is, where it is not what any program shows; `said` is what its reader says at once, as of a
-    progressive JPEG that is cut short.
+    which layer that is, where it is not what any program shows; `said` is what its reader says as it
+    opens, as of a progressive JPEG that is cut short.
     """
 
     stream: Any

@@ -12,8 +12,8 @@ from typing import Any
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.icc import space_of_profile
-from facerf_cli.files.image_parts import is_floating
+from facerf_cli.files.icc import GREY, space_of_profile
+from facerf_cli.files.image_parts import is_floating, pick_channels
 from facerf_cli.image.cicp import HDR_CURVES, space_of_codes
 from facerf_cli.image.colour import (
     ADOBE_RGB,
@@ -57,7 +57,12 @@ def stated_space(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
     description = spec.get_string_attribute("ICCProfile:profile_description")
     profile = spec.getattribute("ICCProfile")
     if profile is not None or description:
-        return _space_of_icc(path, b"" if profile is None else bytes(profile), description, default)
+        profile = b"" if profile is None else bytes(profile)
+        if profile[16:20] == GREY and len(pick_channels(spec)[0]) > 1:
+            kind = f"embedded profile '{one_line(description)}' is for grey images"
+            log.warning("%s: the %s; taken for %s", path, kind, default.name)
+            return default
+        return _space_of_icc(path, profile, description, default)
     if (found := _space_of_exif(path, spec) or _space_of_png(path)) is not None:
         return found
     name = spec.get_string_attribute("oiio:ColorSpace") or spec.get_string_attribute(OCIO_SPACE)

@@ -92,6 +92,37 @@ def test_a_grey_profile(tmp_path: Path) -> None:
     assert read_image(tmp_path / "a.png").pixels == pytest.approx((128 / 255) ** 2, rel=1e-4)
 
 
+@pytest.mark.parametrize("gamma", [1, 2])
+def test_a_grey_profile_that_gives_lightness(tmp_path: Path, gamma: int) -> None:
+    """The connection space is Lab, so the curve gives L*, not luminance."""
+    ramp = np.arange(0, 256, 5, np.uint8)[None].repeat(3, 0)
+    grey = icc_profiles.grey_profile("Grey L*", icc_profiles.sampled(256 * gamma), b"Lab ")
+    Image.fromarray(ramp).save(tmp_path / "a.png", icc_profile=grey)
+    found = read_image(tmp_path / "a.png").pixels
+    lightness = 100 * (ramp / 255.0) ** gamma
+    luminance = np.where(lightness > 8, ((lightness + 16) / 116) ** 3, lightness / 903.2963)
+    np.testing.assert_allclose(found[..., 1], luminance, atol=1e-6)
+    source = ImageCms.ImageCmsProfile(io.BytesIO(grey))
+    shown = ImageCms.profileToProfile(Image.fromarray(ramp), source, SRGB, 1, "RGB")
+    assert shown is not None
+    assert np.abs(255 * colour.linear_to_srgb(found) - np.asarray(shown)).max() < 1.5  # of 8 bits
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
+def test_a_grey_profile_of_an_image_with_colours_is_left_out(
+    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    grey = icc_profiles.grey_profile("Dot Gain", icc_profiles.sampled(512))
+    lossless = {"lossless": True} if suffix == "webp" else {}
+    levels = np.full((16, 32, 3), (200, 60, 40), np.uint8)
+    Image.fromarray(levels).save(path := tmp_path / f"a.{suffix}", icc_profile=grey, quality=98, **lossless)
+    image = read_image(path)
+    np.testing.assert_allclose(255 * colour.linear_to_srgb(image.pixels), levels, atol=1.5)
+    assert image.colourspace_name == "sRGB"
+    if suffix != "png":  # libpng leaves it out itself
+        assert "profile 'Dot Gain' is for grey images; taken for sRGB" in caplog.text
+
+
 def test_broken_profiles_are_no_space() -> None:
     whole = icc_profiles.DISPLAY_P3
     assert all(space_of_profile(whole[:size], "x") is None for size in range(0, len(whole) - 60, 13))
