@@ -41,8 +41,9 @@ _XMP_NAMESPACES = {
 _XMP_PROPERTIES = {"IPTC:DigitalSourceType": "Iptc4xmpExt:DigitalSourceType", "Software": "xmp:CreatorTool"}
 
 _OF_PLATE = re.compile(
-    r"smpte:TimeCode|FramesPerSecond|DateTime|Make|Model|ExposureTime|FNumber|reelName|Exif:(?!GPS|.*Note)\w+"
-    r"|(camera|lens)\w*|(nominal|effective|entrancePupil|pinhole)\w*|focus|aperture|expTime|isoSpeed|shutterAngle"
+    r"(?!.*(GPS|Note|Comment|Owner|Serial|Unique|Uuid|Photographer|Editor))"
+    r"(smpte:TimeCode|FramesPerSecond|DateTime|Make|Model|ExposureTime|FNumber|reelName|Exif:\w+"
+    r"|(camera|lens)\w*|(nominal|effective|entrancePupil|pinhole)\w*|focus|aperture|expTime|isoSpeed|shutterAngle)"
 )
 _TUPLES = {"smpte:TimeCode": "timecode", "FramesPerSecond": "rational"}
 log = logging.getLogger(LOGGER_NAME)
@@ -103,7 +104,7 @@ def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
 
 
 def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Select metadata of a photo that its results keep: how it was made, not where."""
+    """Select metadata of a photo that its results keep: how it was made, not where or by whom."""
     return {name: value for name, value in metadata.items() if _OF_PLATE.fullmatch(name)}
 
 

@@ -10,9 +10,10 @@ from xml.etree import ElementTree
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.image_metadata import embed_xmp, read_header, xmp_packet
+from facerf_cli.files.image_metadata import embed_xmp, plate_metadata, read_header, xmp_packet
 from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.image.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
@@ -142,3 +143,22 @@ def test_a_packet_is_added_without_the_file_in_memory(tmp_path: Path, suffix: st
 
 def test_attributes_without_an_xmp_name_are_left_out() -> None:
     assert b"compression" not in xmp_packet({"compression": "zip"})
+
+
+def test_results_keep_how_a_photo_was_made_and_no_names_or_numbers_of_people_and_devices(
+    tmp_path: Path,
+) -> None:
+    exif = Image.Exif()
+    exif[0x010F], exif[0x013B], exif[0x8298] = "Maker", "Jane Artist", "(c) Jane"
+    exif.get_ifd(0x8769).update({0x829D: 2.8, 0x8827: 400, 0xA434: "50 mm"})
+    private = {0xA420: "UNIQUE-ID", 0xA430: "Jane Owner", 0xA431: "SN-1", 0xA435: "LENS-SN-2"}
+    exif.get_ifd(0x8769).update({**private, 0x9286: b"ASCII\0\0\0remark", 0x927C: b"note"})
+    Image.fromarray(np.zeros((6, 9, 3), np.uint8)).save(tmp_path / "a.jpg", exif=exif)
+    header = read_header(tmp_path / "a.jpg")
+    assert header is not None and "Jane Owner" in header.metadata.values()  # which the file has
+    kept = plate_metadata(header.metadata)
+    assert kept.items() >= {"Make": "Maker", "Exif:LensModel": "50 mm"}.items()
+    assert kept.keys() <= {"Make", "Exif:LensModel", "Exif:PhotographicSensitivity", "FNumber"}
+    assert plate_metadata({"cameraSerialNumber": "1", "cameraUuid": "2", "lensModel": "x"}) == {
+        "lensModel": "x"
+    }
