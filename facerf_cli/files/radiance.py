@@ -60,6 +60,8 @@ def read_radiance_header(path: Path) -> RadianceHeader:
         scale = np.prod(np.array([[1.0] * 3, *exposures, *colours]), 0).astype(np.float32)
         aspect = 1 / float(np.prod([float(text) for text in fields["PIXASPECT"]]))
         primaries = tuple(float(word) for text in fields["PRIMARIES"][-1:] for word in text.split())
+        if not any(primaries):  # of the maps of Poly Haven, all 0
+            primaries = ()
         slow, rows, fast, columns = resolution.decode("ascii").split()
         orientation, size = _ORIENTATIONS[slow + fast], (int(rows), int(columns))
         if not (np.isfinite(scale).all() and (scale > 0).all()) or len(primaries) not in (0, 8):

@@ -390,12 +390,18 @@ def test_long_old_runs_and_ones_cut_short(tmp_path: Path) -> None:
         read_image(path)
 
 
-def test_exposures_corrections_and_primaries_are_undone(tmp_path: Path) -> None:
+def test_exposures_corrections_and_primaries_are_undone(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     head = "EXPOSURE=2.0\nEXPOSURE= 3\nCOLORCORR= 1 0.5 .25\n"
     stored = MAP * 6 * (1, 0.5, 0.25)
     np.testing.assert_allclose(
         read_image(write_hdr(tmp_path / "a.hdr", stored, head)).pixels, MAP, rtol=0.02, atol=0.005
     )
+    for zeros in ("0 0 0", "0 0 0 0 0 0 0 0"):  # as in the maps of Poly Haven
+        found = read_image(write_hdr(tmp_path / "0.hdr", MAP, f"PRIMARIES={zeros}\n"))
+        np.testing.assert_allclose(found.pixels, MAP, rtol=0.02, atol=0.005)
+    assert caplog.text == ""
     head = "PRIMARIES=0.708 0.292 0.170 0.797 0.131 0.046 0.3127 0.3290\n"
     to_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
     found = read_image(write_hdr(tmp_path / "b.hdr", MAP, head)).pixels
