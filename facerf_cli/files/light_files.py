@@ -5,6 +5,7 @@ of DPR and SfSNet; any image can be an environment map.
 """
 
 import json
+import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,15 +20,19 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.decoding import LINEAR_BYTES
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import ENVMAP_LIMIT_PX, read_image
+from facerf_cli.files.images import ENVMAP_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.texts import read_bytes, text_of
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.run import memory
+from facerf_cli.run.logs import LOGGER_NAME
 
+log = logging.getLogger(LOGGER_NAME)
 Format = Literal["facerf-light-1"]
 FORMAT: Format = "facerf-light-1"
 AXES = "camera: x to the picture's right, y up, z toward the camera; directions point to the light"
@@ -36,6 +41,9 @@ _LIMIT_BYTES = 4 << 20
 _MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441  # 441: spherical harmonics of order 20
 _TEXT_LIMIT_BYTES = 1 << 16  # of a text file of numbers; the longest format has 27
 _LARGEST = 1e30  # magnitude of a number; its square still fits double precision
+_GPANO = (
+    "FullPanoHeight FullPanoWidth CroppedAreaImageHeight CroppedAreaImageWidth CroppedAreaTop CroppedAreaLeft"
+)
 _LENGTH_TOLERANCE = 1e-2  # a direction's length may differ from 1 by this, since other programs round
 _ADVICE = "give a .json that estimate-light or convert-light wrote"
 
@@ -194,12 +202,41 @@ def read_map_file(path: Path | str) -> Tensor:
     """Read a lat-long map [H, W, 3], linear Rec.709; a JSON light is converted to one."""
     if Path(path).suffix.lower() == ".json":
         return _latlong(Path(path))
-    envmap = torch.from_numpy(read_image(path, limit_px=ENVMAP_LIMIT_PX, with_alpha=False).pixels)
+    image = read_image(path, limit_px=ENVMAP_LIMIT_PX, with_alpha=False)
+    envmap = torch.from_numpy(_in_sphere(path, image))
     try:
         check_envmap(envmap)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return envmap
+
+
+def _in_sphere(path: Path | str, image: LinearImage) -> np.ndarray:
+    """Return a map's pixels [H, W, 3]; those of a part of the sphere in their place, and black around them.
+
+    GPano, metadata of panoramas, has sizes in pixels of the camera's image; the file may be a smaller one.
+    """
+    try:
+        numbers = [int(image.metadata[f"GPano:{name}Pixels"]) for name in _GPANO.split()]
+    except (KeyError, ValueError, OverflowError):  # there is none, or it is no number
+        return image.pixels
+    full, part, start = numbers[:2], numbers[2:4], numbers[4:]
+    if full == part:
+        return image.pixels
+    fits = all(0 <= a < a + b <= c < 1 << 31 for a, b, c in zip(start, part, full, strict=True))
+    if not fits:
+        raise InputError(f"{path}: its GPano metadata name no part of a sphere; correct or remove them")
+    height, width = image.pixels.shape[:2]
+    rows = round(full[0] * height / part[0])
+    columns = round(rows * full[1] / full[0])
+    said = f"{path}: a part of a sphere (GPano) of {columns} x {rows} pixels"
+    memory.require(said, rows * columns * LINEAR_BYTES, "make it smaller")
+    log.info("%s; the rest is black", said)
+    sphere = np.zeros((rows, columns, 3), np.float32)
+    top, left = round(start[0] * height / part[0]), round(start[1] * width / part[1])
+    place = sphere[top : top + height, left : left + width]
+    place[:] = image.pixels[: place.shape[0], : place.shape[1]]  # roundings may differ by a pixel
+    return sphere
 
 
 def face_model_of_map(path: Path) -> dict[str, str]:

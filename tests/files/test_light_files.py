@@ -5,13 +5,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.images import read_image
 from facerf_cli.files.light_files import (
     FORMAT,
     Harmonics,
     LightRecord,
     read_light,
+    read_map_file,
     read_numbers,
     write_light,
     write_numbers,
@@ -104,3 +107,48 @@ def test_numbers_are_written_one_in_each_line(tmp_path: Path) -> None:
     path.write_text("1 2 three")
     with pytest.raises(InputError, match="not a text file of numbers"):
         read_numbers(path, (3,))
+
+
+def pano(
+    path: Path, levels: np.ndarray, full: tuple[int, int], start: tuple[int, int], scale: int = 1
+) -> Path:
+    """An image of `scale` times fewer pixels than its GPano metadata have; sizes are height and width."""
+    part = levels.shape[0] * scale, levels.shape[1] * scale
+    named = zip(("FullPano", "CroppedAreaImage", "CroppedArea"), (full, part, start), strict=True)
+    sides = [("Height", "Width"), ("Height", "Width"), ("Top", "Left")]
+    said = " ".join(
+        f'GPano:{name}{side}Pixels="{value}"'
+        for (name, values), pair in zip(named, sides, strict=True)
+        for side, value in zip(pair, values, strict=True)
+    )
+    space = 'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+    rdf = 'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
+    packet = (
+        f'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF {rdf}><rdf:Description rdf:about="" {space} {said}/>'
+    )
+    Image.fromarray(levels).save(path, xmp=f"{packet}</rdf:RDF></x:xmpmeta>".encode(), quality=98)
+    return path
+
+
+def test_a_part_of_a_sphere_stands_in_its_place(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    levels = np.full((16, 40, 3), 200, np.uint8)
+    for path in (
+        pano(tmp_path / "a.jpg", levels, (32, 64), (4, 10)),
+        pano(tmp_path / "b.jpg", levels, (96, 192), (12, 30), scale=3),
+    ):
+        found = read_map_file(path)
+        expected = torch.zeros(32, 64, 3)
+        expected[4:20, 10:50] = 0.5776  # 200 of 255 in sRGB
+        torch.testing.assert_close(found, expected, rtol=0, atol=0.01)
+    assert "b.jpg: a part of a sphere (GPano) of 64 x 32 pixels; the rest is black" in caplog.text
+    assert read_image(tmp_path / "a.jpg").pixels.shape == (16, 40, 3)  # a photo is what it shows
+
+
+def test_a_part_that_lies_outside_its_sphere_is_refused(tmp_path: Path) -> None:
+    levels = np.full((16, 32, 3), 200, np.uint8)
+    assert read_map_file(pano(tmp_path / "a.jpg", levels, (16, 32), (0, 0))).shape == (16, 32, 3)
+    for full, start in (((32, 64), (20, 0)), ((32, 64), (-1, 0)), ((8, 16), (0, 0))):
+        with pytest.raises(InputError, match=r"a\.jpg: its GPano metadata name no part of a sphere"):
+            read_map_file(pano(tmp_path / "a.jpg", levels, full, start))
+    with pytest.raises(InputError, match=r"a\.jpg: a part of a sphere .* needs .* GB of memory"):
+        read_map_file(pano(tmp_path / "a.jpg", levels, (1 << 20, 1 << 21), (0, 0)))
