@@ -141,8 +141,8 @@ def _stored_values(path: Path, opened: OpenedImage, first: int, past: int, kind:
 def _require_whole_cineon(path: Path, spec: oiio.ImageSpec) -> None:
     """Raise InputError where 10-bit pixels are missing, three in 32 bits, which OpenImageIO leaves black."""
     with path.open("rb") as stream:
-        order = "little" if stream.read(4) == _CINEON_LITTLE else "big"
-        start = int.from_bytes(stream.read(4), order)
+        magic, at = stream.read(4), stream.read(4)
+    start = int.from_bytes(at, "little" if magic == _CINEON_LITTLE else "big")
     if path.stat().st_size < start + 4 * -(-spec.width * spec.height * spec.nchannels // 3):
         raise InputError(f"{path}: damaged or cut short; copy it again (pixels are missing)")
 
