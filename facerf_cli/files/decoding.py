@@ -37,6 +37,7 @@ _UNSUPPORTED = re.compile(
 _WHITE_IS_ZERO, _SEPARATED, _CIELAB = 0, 5, 8  # a TIFF's photometric interpretations
 _EXTRA_SAMPLES, _ASSOCIATED, _UNASSOCIATED = 338, 1, 2  # a TIFF's tag, and its values
 _CINEON_LITTLE = b"\xd7\x5f\x2a\x80"  # the first four bytes of a little-endian Cineon file
+_PSD_VERSION, _HAS_COMPOSITE = 1057, 4  # a PSD's resource, and the place of a byte in it
 _INKS = 4  # cyan, magenta, yellow, black
 
 log = logging.getLogger(LOGGER_NAME)
@@ -94,6 +95,11 @@ def _decode_by_oiio(
     colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
     if colours == _CIELAB:
         raise InputError(f"{path}: a TIFF in CIELAB is not read; save it in RGB")
+    if stream.format_name() == "psd":
+        resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
+        if resources.get(_PSD_VERSION, b"")[_HAS_COMPOSITE:][:1] == b"\0":
+            advice = "save it with Maximize Compatibility, or as PNG"
+            raise InputError(f"{path}: a PSD without a composite of its layers is not read; {advice}")
     if opened.choice:
         log.info("%s: %s", path, opened.choice)
     alpha = layer.alpha if with_alpha and opened.has_alpha and not is_ultra_hdr(path, spec) else None

@@ -131,7 +131,7 @@ def by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about large images, whose pixels are not decoded here
-            with Image.open(path, formats=["JPEG", "PNG", "TIFF", "WEBP"]) as image:
+            with Image.open(path, formats=["JPEG", "PNG", "PSD", "TIFF", "WEBP"]) as image:
                 return read(image)
     except Exception:  # whatever damage makes Pillow raise
         return None

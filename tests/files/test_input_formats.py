@@ -42,13 +42,14 @@ def save_by_oiio(path: Path, values: np.ndarray, kind: str = "uint8", **attribut
     return path
 
 
-def save_psd(path: Path, values: np.ndarray, profile: bytes = b"") -> Path:
-    """A flattened PSD of 8 bits, by its specification."""
+def save_psd(path: Path, values: np.ndarray, *numbered: tuple[int, bytes]) -> Path:
+    """A flattened PSD of 8 bits, by its specification, with image resources."""
     height, width, _ = values.shape
-    size = struct.pack(">I", len(profile))
-    resource = b"8BIM" + struct.pack(">H", 1039) + b"\0\0" + size + profile + bytes(len(profile) % 2)
+    resources = b"".join(
+        b"8BIM" + struct.pack(">HHI", number, 0, len(data)) + data + bytes(len(data) % 2)
+        for number, data in numbered
+    )
     head = b"8BPS" + struct.pack(">H6xHIIHHI", 1, 3, height, width, 8, 3, 0)
-    resources = resource if profile else b""
     body = struct.pack(">I", len(resources)) + resources + struct.pack(">IH", 0, 0)
     path.write_bytes(head + body + np.moveaxis(values, -1, 0).tobytes())
     return path
@@ -216,9 +217,18 @@ def test_a_dpx_on_its_side_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_psd_has_its_profile(tmp_path: Path) -> None:
-    assert read_image(save_psd(tmp_path / "a.psd", LEVELS, icc_profiles.DISPLAY_P3)).colourspace_name == (
-        "Display P3"
-    )
+    image = read_image(save_psd(tmp_path / "a.psd", LEVELS, (1039, icc_profiles.DISPLAY_P3)))
+    assert image.colourspace_name == "Display P3"
+
+
+def test_a_psd_without_its_composite_is_called_that(tmp_path: Path) -> None:
+    """Photoshop then stores white in its place, and says so in the resource of its version."""
+    version = struct.pack(">IB", 1, 1) + bytes(12)
+    resources = (1039, b"odd"), (1057, version)
+    assert read_image(save_psd(tmp_path / "a.psd", LEVELS, *resources)).pixels.shape == LEVELS.shape
+    save_psd(tmp_path / "a.psd", LEVELS, resources[0], (1057, version[:4] + b"\0" + version[5:]))
+    with pytest.raises(InputError, match=r"a\.psd: a PSD without a composite .* Maximize Compatibility"):
+        read_image(tmp_path / "a.psd")
 
 
 def test_the_colour_code_of_a_png(tmp_path: Path) -> None:
