@@ -25,7 +25,7 @@ _WIDTH = re.compile(r"0?[1-9]?")
 _FRAME = re.compile(r"(.+?)((?:\.\d+)*)", re.DOTALL)  # a name, and the frame numbers that it ends in
 PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".webp", ".jxl", ".heic"}
-    | {".heif", ".jp2", ".psd", ".tga", ".bmp", ".gif", ".dpx", ".cin", ".pgm", ".ppm"}
+    | {".heif", ".avif", ".jp2", ".psd", ".tga", ".bmp", ".gif", ".dpx", ".cin", ".pgm", ".ppm"}
 )
 FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo

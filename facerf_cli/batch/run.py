@@ -125,7 +125,7 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
 
 
 _FILE_SUFFIX = re.compile(
-    r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
+    r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|avif|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
     r"|mp4|mov|m4v|webm|avi|mkv)",
     re.IGNORECASE,
 )

@@ -34,7 +34,8 @@ _LONE_SUBJECT = "subject"  # id where it has no {subject}, and the folder's name
 _LEAST_LIGHTS = 3  # fewer determine no normals
 _HEADERS = 12  # read per camera, spread over the capture
 _FOCAL = 4  # times the longer side: the crop camera's focal length, and about what stages use
-_DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")  # with 8 bits a value, sRGB unless a profile says else
+# Formats with 8 bits a value, sRGB unless a profile says else.
+_DISPLAY_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".avif")
 _LISTED = 3  # names of a note
 _WANTED = {
     "direction": "a unit vector in world space, toward the light",

@@ -24,7 +24,7 @@ from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces
 
 SUFFIXES = frozenset(
-    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".pgm", ".ppm", ".npy"}
+    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif", ".pgm", ".ppm", ".npy"}
 )
 _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file

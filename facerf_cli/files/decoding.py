@@ -11,6 +11,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.avif import AVIF_BYTES, decode_avif, is_avif, open_avif
 from facerf_cli.files.heif import HEIF_BYTES, decode_heif, is_heif
 from facerf_cli.files.image_metadata import require_whole_png
 from facerf_cli.files.image_parts import (
@@ -69,6 +70,12 @@ def decode(
     require_regular(path, "give an image file")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; give an image file")
+    if is_avif(path):
+        image = open_avif(path)
+        _require_room(path, image.spec, limit_px, AVIF_BYTES, kept_px)
+        values, is_associated = decode_avif(image)
+        colour, alpha = pick_channels(image.spec)
+        return Decoded(values, image.spec, colour, alpha if with_alpha else None, is_associated)
     if is_heif(path):
         values, spec = decode_heif(path, limit_px, LINEAR_BYTES + max(HEIF_BYTES, kept_px))
         colour, alpha = pick_channels(spec)

@@ -20,6 +20,7 @@ from xml.sax.saxutils import quoteattr
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.avif import is_avif, open_avif
 from facerf_cli.files.heif import decode_heif, is_heif
 from facerf_cli.files.image_parts import is_floating, open_image, shown_size, utf8_path
 from facerf_cli.files.stated_space import default_space, stated_space
@@ -77,6 +78,8 @@ def read_header(path: Path) -> Header | None:
 
 
 def _spec_of(path: Path) -> oiio.ImageSpec:
+    if is_avif(path):
+        return open_avif(path).spec
     if is_heif(path):
         return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
     opened = open_image(path)

@@ -28,6 +28,7 @@ BLOCKS = np.repeat(np.repeat(LEVELS[::8, ::8], 8, 0), 8, 1)  # which lossy forma
 LOSSY = {
     **dict.fromkeys((".jpg", ".jpeg", ".jpe", ".jfif"), 3),
     ".gif": 1,
+    ".avif": 2,
     ".webp": 12,
 }  # largest error inside a block, of 255
 
@@ -81,6 +82,8 @@ def save(path: Path, levels: np.ndarray) -> Path:
         save_cineon(path, levels.astype(int) * 4)
     elif suffix == ".jp2":
         Image.fromarray(levels).save(path)  # OpenImageIO writes files that it does not read
+    elif suffix == ".avif":
+        Image.fromarray(levels).save(path, quality=100, subsampling="4:4:4")
     elif suffix in (".exr", ".hdr"):
         save_by_oiio(path, levels / np.float32(255), "float")
     else:
