@@ -302,6 +302,7 @@ _FITS = (mutations.zip_, mutations.zip_, mutations.bytes_)
 DOORS: dict[str, Door] = {
     "images": Door(samples.images, _image, (mutations.png, mutations.bytes_), 6),
     "HEIC": Door(samples.phone_photos, _image, weight=0.03),
+    "AVIF": Door(samples.avif, _image, weight=0.5),
     "environment maps": Door(samples.images, _map, (mutations.png, mutations.bytes_), 1),
     "OLAT stacks": Door(samples.stacks, _stack, (mutations.json_inside, mutations.bytes_), 3),
     "light JSON": Door(samples.lights, _light, _JSON, 2),

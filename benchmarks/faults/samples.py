@@ -16,6 +16,7 @@ import numpy as np
 import OpenImageIO as oiio
 import tifffile
 import torch
+from PIL import Image
 from safetensors.torch import save
 
 from facerf_cli.evaluation.report import FORMAT
@@ -125,6 +126,25 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
 def phone_photos() -> Samples:
     """A HEIC photo; each is decoded in a process of its own."""
     return {"a.heic": (Path(__file__).parents[2] / "tests" / "files" / "phone.heic").read_bytes()}
+
+
+@cache
+def avif() -> Samples:
+    """AVIF images: deep ones of the tests; with alpha and a profile, grey, multiplied and turned ones."""
+    folder = Path(__file__).parents[2] / "tests" / "files"
+    files = {name: (folder / name).read_bytes() for name in ("deep.avif", "multiplied.avif", "limited.avif")}
+    values = _draw().integers(0, 256, (_HEIGHT, _WIDTH, 4), np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    kinds = {
+        "alpha.avif": (values, {"icc_profile": _profile()}),
+        "grey.avif": (values[..., 0], {}),
+        "multiplied8.avif": (values, {"alpha_premultiplied": True}),
+        "turned.avif": (values[..., :3], {"exif": exif}),
+    }
+    for name, (stored, options) in kinds.items():
+        files |= _written(lambda path, v=stored, o=options: Image.fromarray(v).save(path, **o), name)  # type: ignore[misc]
+    return files
 
 
 def _profile() -> bytes:

@@ -138,7 +138,7 @@ def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
         properties = dict(_properties(meta[b"pitm"], dict(_boxes(meta[b"iprp"]))))
         flags = properties.get(b"av1C", bytes(4))[2]
         bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
-        bits = max(bits, *properties.get(b"pixi", b"")[5:])
+        bits = max([bits, *properties.get(b"pixi", b"")[5:]])
         colours = properties.get(b"colr", b"")
         codes = struct.unpack_from(">HH", colours, 4) if colours[:4] == b"nclx" else None
         return bits, codes, b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
