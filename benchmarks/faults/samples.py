@@ -36,6 +36,7 @@ from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, De
 
 Samples = dict[str, bytes]  # files by name
 _HEIGHT, _WIDTH, _LIGHTS = 12, 24, 3
+_TESTS = Path(__file__).parents[2] / "tests" / "files"
 _RIGS = BUILTIN_PATH.parent / "rigs"
 
 
@@ -105,6 +106,7 @@ def _stated() -> Samples:
     )
     sound = _written(_oiio, "a.png")["a.png"]
     files["primaries.png"] = sound[:33] + body + sound[33:]
+    files["multiplied16.jxl"] = (_TESTS / "multiplied16.jxl").read_bytes()
     files["codes.png"] = sound[:33] + _chunk(b"cICP", bytes([9, 14, 0, 0])) + sound[33:]
     values = (255 * _draw().random((_HEIGHT, _WIDTH, 5))).astype(np.uint8)
     kinds = {"separated": values, "miniswhite": values[..., :2].astype(np.uint16)}
@@ -125,14 +127,13 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
 @cache
 def phone_photos() -> Samples:
     """A HEIC photo; each is decoded in a process of its own."""
-    return {"a.heic": (Path(__file__).parents[2] / "tests" / "files" / "phone.heic").read_bytes()}
+    return {"a.heic": (_TESTS / "phone.heic").read_bytes()}
 
 
 @cache
 def avif() -> Samples:
     """AVIF images: deep ones of the tests; with alpha and a profile, grey, multiplied and turned ones."""
-    folder = Path(__file__).parents[2] / "tests" / "files"
-    files = {name: (folder / name).read_bytes() for name in ("deep.avif", "multiplied.avif", "limited.avif")}
+    files = {name: (_TESTS / name).read_bytes() for name in ("deep.avif", "multiplied.avif", "limited.avif")}
     values = _draw().integers(0, 256, (_HEIGHT, _WIDTH, 4), np.uint8)
     exif = Image.Exif()
     exif[0x0112] = 6

@@ -134,20 +134,20 @@ def _frame(av: Any, opened: AvifImage, number: int) -> Any:
 def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
     """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12."""
     try:
-        meta = dict(_boxes(dict(_boxes(content))[b"meta"][4:]))
-        properties = dict(_properties(meta[b"pitm"], dict(_boxes(meta[b"iprp"]))))
+        meta = dict(boxes(dict(boxes(content))[b"meta"][4:]))
+        properties = dict(_properties(meta[b"pitm"], dict(boxes(meta[b"iprp"]))))
         flags = properties.get(b"av1C", bytes(4))[2]
         bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
         bits = max([bits, *properties.get(b"pixi", b"")[5:]])
         colours = properties.get(b"colr", b"")
         codes = struct.unpack_from(">HH", colours, 4) if colours[:4] == b"nclx" else None
-        return bits, codes, b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
+        return bits, codes, b"prem" in dict(boxes(meta.get(b"iref", b"")[4:]))
     except (KeyError, IndexError, struct.error):
         return 8, None, False
 
 
-def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the kind and the content of each box in order."""
+def boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the kind and the content of each box (ISO 14496-12) in order."""
     at = 0
     while at + 8 <= len(content):
         size, kind = struct.unpack_from(">I4s", content, at)
@@ -161,9 +161,9 @@ def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
         at = end
 
 
-def _properties(primary: bytes, boxes: dict[bytes, bytes]) -> Iterator[tuple[bytes, bytes]]:
+def _properties(primary: bytes, inside: dict[bytes, bytes]) -> Iterator[tuple[bytes, bytes]]:
     """Yield the properties of the primary item, by the boxes `ipco` and `ipma`."""
-    every, table = list(_boxes(boxes[b"ipco"])), boxes[b"ipma"]
+    every, table = list(boxes(inside[b"ipco"])), inside[b"ipma"]
     main = int.from_bytes(primary[4 : 8 if primary[0] else 6], "big")
     of_item, of_index = (4 if table[0] else 2), 1 + (table[3] & 1)
     at = 8

@@ -22,6 +22,7 @@ from facerf_cli.files.image_parts import (
     reason,
     shown_size,
 )
+from facerf_cli.files.jpeg_xl import multiplies_alpha
 from facerf_cli.files.radiance import read_old_runs
 from facerf_cli.files.stated_space import by_pillow, is_ultra_hdr
 from facerf_cli.files.texts import require_regular
@@ -125,6 +126,8 @@ def _decode_by_oiio(
     is_associated = opened.is_associated and alpha is not None
     if is_associated and stream.format_name() == "tiff":  # OpenImageIO says so without the tag, too
         is_associated = _extra_channel(path) == _ASSOCIATED
+    elif alpha is not None and stream.format_name() == "jpegxl":
+        is_associated = multiplies_alpha(path)
     alpha = None if alpha is None else alpha - first
     if colours == _WHITE_IS_ZERO:
         values = _black_is_zero(values, alpha)

@@ -141,6 +141,15 @@ def test_alpha_that_is_not_multiplied_in_is_not_divided_out(tmp_path: Path, suff
     np.testing.assert_allclose(255 * linear_to_srgb(image.pixels), QUADS, atol=1.5)
 
 
+@pytest.mark.parametrize(("name", "tolerance"), [("multiplied", 1.3), ("multiplied16", 0.01)])
+def test_the_alpha_of_a_jpeg_xl_may_be_multiplied_in(name: str, tolerance: float) -> None:
+    """In 8 bits; and in 16, in a container, turned, with an intrinsic size and a name of its alpha."""
+    path = Path(__file__).with_name(f"{name}.jxl")
+    alpha = np.linspace(102, 255, W).round()[None].repeat(H, 0) / 255
+    np.testing.assert_allclose(read_image(path).alpha, alpha, atol=1e-4)
+    np.testing.assert_allclose(levels_of(path), QUADS, atol=tolerance)  # of rounding, divided by .4
+
+
 def test_a_fourth_sample_of_a_tiff_without_a_tag_is_not_multiplied_in(tmp_path: Path) -> None:
     """Integers above their alpha cannot be multiplied by it; Pillow reads such a file so, too."""
     values = np.dstack([QUADS, np.full((H, W), 100, np.uint8)])
