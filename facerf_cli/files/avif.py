@@ -5,7 +5,6 @@ import io
 import logging
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,25 +21,10 @@ _DEEP, _TWELVE = 0x40, 0x20  # bits of an av1C box
 _ORIENTATION = 0x0112  # of Exif
 _UNKNOWN, _BT601 = 2, 5  # matrices (ITU-T H.273), and
 _MATRICES = (1, 4, _BT601, 6, 7, 9)  # those that FFmpeg converts
-_LIMITED, _FULL = 1, 1  # ranges, by FFmpeg and in a file
+_FULL = 1  # range
 _MOST = np.iinfo(np.uint16).max
 
 log = logging.getLogger(LOGGER_NAME)
-
-
-@dataclass(frozen=True, eq=False)
-class AvifImage:
-    """A file's content, its image as opened by Pillow, its header, and the bits of a value in the file.
-
-    Values of more than 8 bits are multiplied by alpha if `is_associated`; of 8 bits Pillow divides them.
-    """
-
-    path: Path
-    content: bytes
-    image: Any
-    spec: oiio.ImageSpec
-    bits: int
-    is_associated: bool
 
 
 def is_avif(path: Path) -> bool:
@@ -51,8 +35,8 @@ def is_avif(path: Path) -> bool:
     return start[4:8] == b"ftyp" and any(brands[at : at + 4] in _BRANDS for at in range(0, len(brands), 4))
 
 
-def open_avif(path: Path) -> AvifImage:
-    """Open the main image: its size, orientation and colour space; nothing is decoded."""
+def open_avif(path: Path) -> tuple[Any, oiio.ImageSpec]:
+    """Open the main image by Pillow without decoding it, and describe it: size, depth, colour space."""
     try:
         from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
     except ImportError:
@@ -67,68 +51,67 @@ def open_avif(path: Path) -> AvifImage:
         raise _damaged(path, error) from None
     bits, codes, is_associated = _stated(content)
     spec = oiio.ImageSpec(*image.size, len(image.mode), "uint8" if bits == 8 else "uint16")
+    spec.attribute("oiio:BitsPerSample", bits)
+    spec.attribute("oiio:UnassociatedAlpha", int(not is_associated))
     spec.attribute("Orientation", orientation if orientation in range(1, 9) else 1)
     if profile := image.info.get("icc_profile"):
         values = np.frombuffer(profile, np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), values)
     elif codes:
         spec.attribute("CICP", oiio.TypeDesc("int[4]"), (*codes, 0, _FULL))
-    return AvifImage(path, content, image, spec, bits, is_associated)
+    return image, spec
 
 
-def decode_avif(opened: AvifImage) -> tuple[np.ndarray, bool]:
-    """Decode values [H, W, C] uint8 or uint16 as they are stored, and tell if alpha is multiplied in."""
-    shape = opened.spec.height, opened.spec.width, -1
-    if opened.bits > 8 and (values := _deep_values(opened)) is not None:
-        return values.reshape(shape), opened.is_associated
+def decode_avif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
+    """Decode an opened image [H, W, C] uint8, or uint16 where it is deeper, not upright."""
+    shape, bits = (spec.height, spec.width, -1), spec.get_int_attribute("oiio:BitsPerSample")
+    if bits > 8 and (values := _deep_values(image)) is not None:
+        return values.reshape(shape)
     try:
-        values = np.asarray(opened.image)
+        values = np.asarray(image)
     except Exception as error:
-        raise _damaged(opened.path, error) from None
-    if opened.bits > 8:
+        raise _damaged(path, error) from None
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # Pillow divides by alpha
+    if bits > 8:
         advice = "" if importlib.util.find_spec("av") else "; pip install 'facerf[video]' to keep them"
-        log.warning("%s: has %d bits, read as 8 bits%s", opened.path, opened.bits, advice)
-    return values.reshape(shape), False
+        log.warning("%s: has %d bits, read as 8 bits%s", path, bits, advice)
+    return values.reshape(shape)
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
     return InputError(f"{path}: damaged or cut short; copy it again ({one_line(str(error))})")
 
 
-def _deep_values(opened: AvifImage) -> np.ndarray | None:
+def _deep_values(image: Any) -> np.ndarray | None:
     """Colour and alpha [H, W, C] uint16; None without PyAV, and for what it does not read whole."""
     try:
         import av
     except ImportError:
         return None
+
+    def frame_of(number: int) -> Any:
+        with av.open(io.BytesIO(image.fp.getvalue()), "r") as container:
+            frame = next(container.decode(container.streams.video[number]))
+        if (frame.width, frame.height) != image.size:
+            raise ValueError("a tile")
+        return frame
+
     try:
-        frame = _frame(av, opened, 0)
-        name, is_limited = frame.format.name, frame.color_range == _LIMITED
+        frame = frame_of(0)
+        name, bits, is_limited = frame.format.name, frame.format.components[0].bits, frame.color_range == 1
         matrix = _BT601 if frame.colorspace == _UNKNOWN else int(frame.colorspace)
         if name.startswith("gbr"):
             values, white = frame.to_ndarray(format="rgb48le"), _MOST
         elif matrix in _MATRICES and not (name.startswith("gray") and is_limited):
-            # white as FFmpeg's converter has it
-            bits = frame.format.components[0].bits
-            white = 255 << 8 if is_limited else ((1 << bits) - 1) << (16 - bits)
             values = frame.to_ndarray(format="rgb48le", src_colorspace=matrix)
+            white = 255 << 8 if is_limited else ((1 << bits) - 1) << (16 - bits)  # as it comes from FFmpeg
         else:
             return None
         values = (values * np.float32(_MOST / white)).round().clip(max=_MOST).astype(np.uint16)
-        if opened.image.mode == "RGBA":
-            values = np.dstack([values, _frame(av, opened, 1).to_ndarray(format="gray16le")])
-        return values[..., : opened.spec.nchannels]
+        alpha = [frame_of(1).to_ndarray(format="gray16le")] if image.mode == "RGBA" else []
+        return np.dstack([values[..., : min(len(image.mode), 3)], *alpha])
     except (av.error.FFmpegError, OSError, ValueError, IndexError, StopIteration):
         return None
-
-
-def _frame(av: Any, opened: AvifImage, number: int) -> Any:
-    """The main image, or another of the file that is as large."""
-    with av.open(io.BytesIO(opened.content)) as container:
-        frame = next(container.decode(container.streams.video[number]))
-    if (frame.width, frame.height) != opened.image.size:  # a tile
-        raise ValueError
-    return frame
 
 
 def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:

@@ -71,14 +71,13 @@ def decode(
     require_regular(path, "give an image file")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; give an image file")
-    if is_avif(path):
-        image = open_avif(path)
-        _require_room(path, image.spec, limit_px, AVIF_BYTES, kept_px)
-        values, is_associated = decode_avif(image)
-        colour, alpha = pick_channels(image.spec)
-        return Decoded(values, image.spec, colour, alpha if with_alpha else None, is_associated)
-    if is_heif(path):
-        values, spec = decode_heif(path, limit_px, LINEAR_BYTES + max(HEIF_BYTES, kept_px))
+    if is_avif(path) or is_heif(path):
+        if is_avif(path):
+            image, spec = open_avif(path)
+            _require_room(path, spec, limit_px, AVIF_BYTES, kept_px)
+            values = decode_avif(path, image, spec)
+        else:
+            values, spec = decode_heif(path, limit_px, LINEAR_BYTES + max(HEIF_BYTES, kept_px))
         colour, alpha = pick_channels(spec)
         is_associated = not spec.get_int_attribute("oiio:UnassociatedAlpha")
         return Decoded(values, spec, colour, alpha if with_alpha else None, is_associated)

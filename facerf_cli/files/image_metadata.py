@@ -79,7 +79,7 @@ def read_header(path: Path) -> Header | None:
 
 def _spec_of(path: Path) -> oiio.ImageSpec:
     if is_avif(path):
-        return open_avif(path).spec
+        return open_avif(path)[1]
     if is_heif(path):
         return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
     opened = open_image(path)

@@ -32,29 +32,23 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 def readable(setups: Sequence[LightSetup]) -> tuple[LightSetup, ...]:
-    """The setups whose maps serve; a line says what is wrong with each other map.
-
-    Raises the InputError of the last where no setup is left.
-    """
-    wrong: dict[MapSource, InputError] = {}
-    for envmap in dict.fromkeys(_maps_of(setups)):
-        try:
-            if not isinstance(envmap, DrawnMap):
-                read_map(envmap)
-        except InputError as error:
-            wrong[envmap] = error
-    kept = tuple(setup for setup in setups if not wrong.keys() & set(_maps_of([setup])))
-    problems = list(wrong.values())
-    last = problems.pop() if problems and not kept else None
-    for problem in problems:
-        log.error("%s", problem)
-    if last is not None:
-        raise last
-    return kept
+    """The setups whose maps can be read; each map that cannot is logged in one line."""
+    good = {envmap: _is_readable(envmap) for envmap in dict.fromkeys(_maps_of(setups))}
+    return tuple(setup for setup in setups if all(good[envmap] for envmap in _maps_of([setup])))
 
 
 def _maps_of(setups: Sequence[LightSetup]) -> list[MapSource]:
     return [light.envmap for setup in setups for light in setup.lights if light.envmap is not None]
+
+
+def _is_readable(envmap: MapSource) -> bool:
+    try:
+        if not isinstance(envmap, DrawnMap):
+            read_map(envmap)
+    except InputError as error:
+        log.error("%s", error)
+        return False
+    return True
 
 
 def read_map(envmap: MapSource) -> Tensor:

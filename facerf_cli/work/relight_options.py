@@ -15,7 +15,7 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_i
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.light.entries import is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
@@ -380,7 +380,7 @@ class Relight:
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
     def readable(self, dry_run: bool) -> "Relight":
-        """Load the models, and keep the setups whose maps serve.
+        """Load the models, and keep the setups whose maps can be read.
 
         A dry run loads no networks, and so estimates no light of a photo.
         """
@@ -398,7 +398,10 @@ class Relight:
             follow_all(self.shots, self.photo)
         elif lights:
             return self
-        return replace(self, setups=readable(self.setups))
+        setups = readable(self.setups)
+        if not setups:
+            raise FacerfError("none of the maps serves; give others, or procedural:8 to draw some")
+        return replace(self, setups=setups)
 
 
 def _holds_a_stack(items: Sequence[Item]) -> bool:

@@ -366,8 +366,9 @@ def test_a_dry_run_checks_what_a_run_would_load(
     write_display(tmp_path / "picture.png", np.full((6, 9, 3), 0.2, np.float32))
     line = ["--light", "1,2", "--dry-run"]
     assert relight(given, tmp_path / "out", "--dry-run", "--envmap", str(tmp_path / "picture.png")) == 1
-    (said,) = capsys.readouterr().err.splitlines()
-    assert "picture.png: the environment map has 9 x 6 pixels, but must be twice as wide as high" in said
+    what, last = capsys.readouterr().err.splitlines()
+    assert "picture.png: the environment map has 9 x 6 pixels, but must be twice as wide as high" in what
+    assert last.endswith("none of the maps serves; give others, or procedural:8 to draw some")
     assert relight(given, tmp_path / "out", *line, "--envmap", str(tmp_path / "bad.exr")) == 1
     said = capsys.readouterr()
     assert "bad.exr" in said.err and "bad" not in said.out
