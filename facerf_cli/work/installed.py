@@ -14,7 +14,7 @@ EXTRAS = {
     "tensorboard": "the curves of `train`",
     "ray": "`--ray`, on clusters",
     "heic": "HEIC photos of phones",
-    "video": "films in and out, AVIF of 10 and 12 bits; its wheel holds GPL codecs",
+    "video": "films in and out; its wheel holds GPL codecs",
     "rembg": "`--matte-from rembg:NAME`; its models have licences of their own",
     "dlib": "`--landmarks-from dlib`, not for commercial use",
 }
