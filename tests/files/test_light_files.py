@@ -1,4 +1,5 @@
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,7 @@ def pano(
 
 
 def test_a_part_of_a_sphere_stands_in_its_place(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "facerf")
     levels = np.full((16, 40, 3), 200, np.uint8)
     for path in (
         pano(tmp_path / "a.jpg", levels, (32, 64), (4, 10)),
