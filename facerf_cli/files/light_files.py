@@ -218,7 +218,7 @@ def _in_sphere(path: Path | str, image: LinearImage) -> np.ndarray:
     """
     try:
         numbers = [int(image.metadata[f"GPano:{name}Pixels"]) for name in _GPANO.split()]
-    except (KeyError, ValueError, OverflowError):  # there is none, or it is no number
+    except (KeyError, TypeError, ValueError, OverflowError):  # there is none, or it is no number
         return image.pixels
     full, part, start = numbers[:2], numbers[2:4], numbers[4:]
     if full == part:
