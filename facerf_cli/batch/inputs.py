@@ -9,10 +9,11 @@ import re
 import sys
 import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path, PurePosixPath
 from string import Formatter
+from typing import Any
 
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
@@ -27,6 +28,8 @@ PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".webp", ".jxl", ".heic"}
     | {".heif", ".avif", ".jp2", ".psd", ".tga", ".bmp", ".gif", ".dpx", ".cin", ".pgm", ".ppm"}
 )
+LANDMARK_SUFFIXES = frozenset({".pts", ".json"})
+COMPANION = "FILE|DIR|PATTERN"  # the placeholder of options that name a file for each input
 FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
@@ -197,16 +200,65 @@ def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
 
 
 def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:
-    """The one item whose output is the file that `-o` names.
-
-    Raises UsageError where there are several items, or outputs of one, and where the file is the input.
-    """
+    """The one item whose output is the file that `-o` names; UsageError for several, or outputs of one."""
     item = items[0]
     if several or len(items) > 1 or item.frame is not None:
         raise UsageError(f"-o {output}: is one file; give one photo, face and light, or a folder")
-    if output.exists() and item.input_path.exists() and os.path.samefile(output, item.input_path):
-        raise UsageError(f"-o {output}: is the input; give another name")
     return replace(item, output_base=output.with_suffix(""), name=output.stem)
+
+
+def refuse_read(outputs: Iterable[Path], read: Iterable[Path]) -> None:
+    """Raise UsageError for an output that is a file to be read, by whatever link or spelling of its name."""
+    planned = {_place(path): path for path in outputs}
+    planned.pop(None, None)
+    for path in read if planned else ():
+        if (output := planned.get(_place(path))) is not None:
+            raise UsageError(f"-o {output}: is the input {path}; give another name or folder")
+
+
+def _place(path: Path) -> tuple[int, int] | None:
+    """The place of a file on its disk, one for all of its names; None where there is no file."""
+    try:
+        state = os.stat(path)
+    except (OSError, ValueError):  # ValueError: a name that no file can have
+        return None
+    return state.st_dev, state.st_ino
+
+
+def files_read(given: Any, items: Sequence[Item]) -> Iterator[Path]:
+    """Yield the items' files, and those that settings name; of a folder of companions those of the items."""
+    if isinstance(given, Item):
+        yield given.input_path
+    elif isinstance(given, (list, tuple)):
+        for one in given:
+            yield from files_read(one, items)
+    elif is_dataclass(given) and not isinstance(given, type):
+        for part in fields(given):
+            value, about = getattr(given, part.name), part.metadata.get("option")
+            if about and about.metavar == COMPANION and value is not None:
+                for item in items:
+                    yield from filter(os.path.isfile, companions(item, value, f"--{part.name}"))
+            else:
+                yield from files_read(value, items)
+    elif isinstance(given, (str, Path)) and os.path.isfile(given):
+        yield Path(given)
+
+
+def companions(item: Item, given: Path, option: str) -> list[Path]:
+    """The places of the file of an option that goes with an item; it may be in any of several of a folder.
+
+    A folder mirrors the items', or holds all files in one place; a pattern has fields, as in
+    `mattes/{dir}/{stem}.png`.
+    """
+    if given.is_dir():
+        suffixes = sorted(LANDMARK_SUFFIXES if option == "--landmarks" else PHOTO_SUFFIXES)
+        names = dict.fromkeys((item.name, item.input_path.stem))
+        return [given / f"{name}{suffix}" for name in names for suffix in suffixes]
+    text = given.as_posix()
+    if "{" not in text or given.exists():
+        return [given]
+    pattern = NamePattern.parse(text.lstrip("/"), option, OF_FILES)
+    return [Path("/" if text.startswith("/") else "") / item.pattern_text(pattern)]
 
 
 def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterator[str]:

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.batch.inputs import Item, NamePattern, file_pattern
+from facerf_cli.batch.inputs import Item, NamePattern, file_pattern, files_read, refuse_read
 from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, json_rows, lines_of, read_row
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
@@ -223,8 +223,9 @@ def run_items(
         index: The index that was read already, in place of that of `recipes_of`.
 
     Raises:
-        UsageError: The output folder cannot be used.
+        UsageError: The output folder cannot be used, or an output is a file to be read.
     """
+    refuse_read((path for item in items for path in outputs_of(item)), files_read((items, process), items))
     items = options.shard.share(items)
     is_new, lock_name = not options.output.exists(), f".facerf-lock{options.shard.suffix}"
     with ExitStack() as stack:

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from facerf_cli.batch.inputs import refuse_read
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 
@@ -60,6 +61,7 @@ def import_model(
     """
     if output.suffix != ".npz":
         raise UsageError(f"-o {output}: not a face model; give a file that ends in .npz")
+    refuse_read([output], [path for path in (source, landmarks) if path])
     _refuse_existing(output, overwrite)
     from facerf_cli.work.face_model_files import import_to
 
@@ -127,6 +129,7 @@ def show_model(
     if output is not None and output.suffix.lower() not in _IMAGES:
         raise UsageError(f"-o {output}: not an image; give a file that ends in {', '.join(_IMAGES)}")
     if output is not None:
+        refuse_read([output], [Path(model)])
         _refuse_existing(output, overwrite)
     from facerf_cli.work.face_model_files import show
 

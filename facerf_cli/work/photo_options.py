@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from facerf_cli.baselines import Kind
-from facerf_cli.batch.inputs import OF_FILES, NamePattern
+from facerf_cli.batch.inputs import COMPANION, OF_FILES, NamePattern
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
@@ -89,7 +89,7 @@ class PhotoOptions:
     layer: str | None = option(None, metavar="NAME", shown_default="the image", panel=IMAGE)
     face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
     face: str = option("largest", metavar="largest|all|INDEX", panel=FACE)
-    landmarks: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default="detect them", panel=FACE)
+    landmarks: Path | None = option(None, metavar=COMPANION, shown_default="detect them", panel=FACE)
     geometry: Geometry | None = option(None, shown_default="as the checkpoint was trained", panel=FACE)
     texture_side: int | None = option(
         None,
@@ -100,7 +100,7 @@ class PhotoOptions:
     )
     form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
     landmarks_from: LandmarksFrom = option("facerf", panel=FACE)
-    person: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default=False, panel=FACE)
+    person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
     matte_from: MatteModel | None = option(
         None, metavar="rembg:NAME", shown_default=False, parse=parse_matte_from, panel=FACE
     )
@@ -188,9 +188,7 @@ class LightOptions(SolveOptions):
         panel=METHOD,
     )
     keep_eyes: bool = option(False, panel=FACE)
-    matte: Path | None = option(
-        None, metavar="FILE|DIR|PATTERN", shown_default="the photo's alpha", panel=FACE
-    )
+    matte: Path | None = option(None, metavar=COMPANION, shown_default="the photo's alpha", panel=FACE)
 
     @property
     def networks(self) -> frozenset[str]:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.batch.inputs import OF_FILES, PHOTO_SUFFIXES, Item, NamePattern
+from facerf_cli.batch.inputs import Item, companions
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
@@ -40,30 +40,16 @@ from facerf_cli.work.plan import KEPT_PX, beside_photo, require_people
 from facerf_cli.work.rembg_matte import matte_by_rembg, require_rembg
 
 
-def companion(item: Item, given: Path, suffixes: Iterable[str], option: str) -> Path:
-    """The file of an option that goes with a photo.
-
-    A folder mirrors the photos', or holds all files in one place; a pattern has fields, as in
-    `mattes/{dir}/{stem}.png`. Raises InputError for a photo without a file.
-    """
-    if "{" in str(given) and not given.exists():
-        text = given.as_posix()
-        pattern = NamePattern.parse(text.lstrip("/"), option, OF_FILES)
-        found = Path("/" if text.startswith("/") else "") / item.pattern_text(pattern)
-        candidates = [found]
-    elif given.is_dir():
-        names = dict.fromkeys((item.name, item.input_path.stem))
-        candidates = [given / f"{name}{suffix}" for name in names for suffix in suffixes]
-    else:
-        return given
-    for path in candidates:
-        if path.is_file():
+def companion(item: Item, given: Path, option: str) -> Path:
+    """The file of an option that goes with a photo, as `companions` lists; InputError where there is none."""
+    places = companions(item, given, option)
+    for path in places:
+        if path == given or path.is_file():
             return path
-    raise InputError(f"{item.input_path}: {option} has no {candidates[0]}; add it there")
+    raise InputError(f"{item.input_path}: {option} has no {places[0]}; add it there")
 
 
 _MOST_RADIANCE = 1e10  # in a photo: the sun in cd/m2 is below it, and sums of its square are finite
-LANDMARK_SUFFIXES = (".pts", ".json")
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -260,7 +246,7 @@ def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> 
 
 def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
     """The face whose landmarks a file holds, or a folder for this photo."""
-    path = companion(item, landmarks, LANDMARK_SUFFIXES, "--landmarks")
+    path = companion(item, landmarks, "--landmarks")
     landmarks_px = read_landmarks(path)
     with naming(path):
         return face_at(check_in_photo(landmarks_px, *image.pixels.shape[:2]))
@@ -294,7 +280,7 @@ def _fitted(
 
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
     """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
-    path = companion(item, given, sorted(PHOTO_SUFFIXES), "--matte")
+    path = companion(item, given, "--matte")
     matte = _grey_or_alpha(path, size_px)
     if matte.shape != tuple(size_px):
         raise InputError(f"{path}: {_sizes(matte, size_px)}; give one of the photo's size")
@@ -305,7 +291,7 @@ def person_matte(item: Item, pixels: np.ndarray, options: PhotoOptions) -> np.nd
     """The person's matte [H, W] in 0..1 that is given for a photo [H, W, 3], at its size; None if none is."""
     height, width = pixels.shape[:2]
     if options.person is not None:
-        path = companion(item, options.person, sorted(PHOTO_SUFFIXES), "--person")
+        path = companion(item, options.person, "--person")
         matte = _grey_or_alpha(path, (height, width))
     elif options.matte_from is not None:
         path, matte = item.input_path, matte_by_rembg(to_display(pixels), options.matte_from)

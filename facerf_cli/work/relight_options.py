@@ -11,7 +11,17 @@ from pathlib import Path
 from typing import Literal, Self
 
 from facerf_cli.baselines import Kind, RelightKind
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, only_item, split_frame
+from facerf_cli.batch.inputs import (
+    COMPANION,
+    PHOTO_SUFFIXES,
+    Item,
+    NamePattern,
+    collect_items,
+    files_read,
+    only_item,
+    refuse_read,
+    split_frame,
+)
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
@@ -184,9 +194,9 @@ class Relight:
     aov: tuple[str, ...] = option(
         (), metavar="NAME,...", shown_default="none", default_text="", parse=parse_aov, panel=IMAGE
     )
-    matte: Path | None = option(None, metavar="FILE|DIR|PATTERN", shown_default=False, panel=IMAGE)
+    matte: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=IMAGE)
     photo_of_stack: Path | None = option(
-        None, metavar="FILE|DIR|PATTERN", flags=("--photo",), shown_default=False, panel=IMAGE
+        None, metavar=COMPANION, flags=("--photo",), shown_default=False, panel=IMAGE
     )
     ball: bool = option(False, in_recipe=False, panel=IMAGE)
     identity: bool = option(False, in_recipe=False, panel=METHOD)
@@ -238,6 +248,8 @@ class Relight:
         work = replace(work.with_leaders(items), shots=shots)
         work.refuse_meeting(items)
         images = [path for item in items for path in work.outputs_of(item)]
+        balls = [path for setup in work.maps if work.ball for path in _balls_of(setup, work, batch.output)]
+        refuse_read([film.path] if film else images + balls, files_read((items, work, sources), items))
         key = film.key_of_new(items, shots, images, work.recipes_of, batch) if film else ""
         if film is not None and not key:
             return 0
@@ -355,10 +367,7 @@ class Relight:
         return replace(self, output=output, name=NamePattern.literal(file.stem))
 
     def refuse_meeting(self, items: Sequence[Item]) -> None:
-        """Raise UsageError where two images would have one path, as a --name may make them.
-
-        A file that -o names is one image, and no input.
-        """
+        """Raise UsageError where two images would have one path: that which -o names, or a --name makes."""
         for path in self.outputs_of(items[0]) if self.output.file_suffix else ():
             all_faces = self.photo.face == "all" and self.composite == "face"
             only_item(items, path, several=all_faces or len(self.setups) > 1)
@@ -421,23 +430,20 @@ def _write_to_stdout(inputs: Sequence[str], work: Relight) -> None:
         sys.stdout.buffer.flush()
 
 
+def _balls_of(setup: LightSetup, work: Relight, folder: Path) -> list[Path]:
+    """The files of the balls under a map, of each format."""
+    return [folder / "balls" / f"{setup.name}{setup.frame}{suffix}" for suffix in work.output.suffixes]
+
+
 def _write_balls(work: Relight, options: BatchOptions) -> None:
     """Write the balls under each map to `balls/NAME` in each format, unless they are there."""
-
-    def path_of(setup: LightSetup) -> Path:
-        return options.output / "balls" / f"{setup.name}{setup.frame}.exr"
-
-    missing = [
-        setup
-        for setup in work.maps
-        if options.overwrite == "always"
-        or not all(path_of(setup).with_suffix(suffix).exists() for suffix in work.output.suffixes)
-    ]
+    files = {setup: _balls_of(setup, work, options.output) for setup in work.maps}
+    always = options.overwrite == "always"
+    missing = [setup for setup, paths in files.items() if always or not all(map(Path.exists, paths))]
     if missing:
         from facerf_cli.work.lights import readable, write_balls
 
         drawn = readable(missing)
-        paths = [path_of(setup) for setup in drawn]
-        write_balls(drawn, paths, work.exposure_rule, work.output)
-        for path, suffix in itertools.product(paths, work.output.suffixes):
-            print_path(path.with_suffix(suffix))
+        write_balls(drawn, [files[setup][0] for setup in drawn], work.exposure_rule, work.output)
+        for path in itertools.chain.from_iterable(files[setup] for setup in drawn):
+            print_path(path)

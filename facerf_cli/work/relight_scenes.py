@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item
+from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
 from facerf_cli.face.dlib_landmarks import face_descriptor
 from facerf_cli.face.landmarks import display_ev
@@ -334,7 +334,7 @@ def _person_of_stack(
     size_px, stack = header.seen.shape, StackImages(header, item.input_path, face)
     if work.photo_of_stack is None:
         return stack, None, fit_facts(fit)
-    path = companion(item, work.photo_of_stack, sorted(PHOTO_SUFFIXES), "--photo")
+    path = companion(item, work.photo_of_stack, "--photo")
     with beside_stack(size_px):
         photo = read_image(path, work.photo.colourspace, kept_px=KEPT_PX, layer=work.photo.layer).pixels
     scale = photo.shape[0] / size_px[0]

@@ -24,7 +24,6 @@ from facerf_cli.relighting.sequence import LONGEST_GAP, CutFinder, Follower, Sho
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
-    LANDMARK_SUFFIXES,
     FittedFace,
     companion,
     load_models_once,
@@ -117,7 +116,7 @@ def _sight(
 ) -> Sighting | None:
     if options.landmarks is None:
         return follower.see(show(number))
-    path = companion(shot.frames[number], options.landmarks, LANDMARK_SUFFIXES, "--landmarks")
+    path = companion(shot.frames[number], options.landmarks, "--landmarks")
     return Sighting(read_landmarks(path), 0.0)
 
 

@@ -203,8 +203,6 @@ class FilmOutput:
                 f"-o {self.path}: is one film; give one film and one light, or one photo and --rotate "
                 "FROM:TO:N, or a folder with -o"
             )
-        if any(item.input_path.resolve() == self.path.resolve() for item in items):
-            raise UsageError(f"-o {self.path}: is the input; give another name")
         if self.rate and shots and shots[0].film:
             raise UsageError("--fps: a film keeps its own times; leave it out")
         if batch.dry_run:
