@@ -4,7 +4,7 @@ import logging
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -138,8 +138,13 @@ def face_model(options: PhotoOptions) -> MorphableModel:
     return load_face_model(options.face_model)
 
 
-def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> LinearImage:
-    """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel."""
+def read_photo(
+    item: Item, options: PhotoOptions, kept_px: int = KEPT_PX, in_shot: bool = False
+) -> LinearImage:
+    """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel.
+
+    Alpha that is 0 everywhere, over colour, is none, with a warning; of a frame of a shot it is kept.
+    """
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
     image = read_image(item.input_path, space, kept_px=kept_px, layer=options.layer)
     if (most := float(image.pixels.max())) > _MOST_RADIANCE:
@@ -147,6 +152,9 @@ def read_photo(item: Item, options: PhotoOptions, kept_px: int = KEPT_PX) -> Lin
             f"{item.input_path}: its brightest value is {most:.3g}, and {_MOST_RADIANCE:.0e} is the most; "
             "clip it"
         )
+    if image.alpha is not None and not in_shot and not image.alpha.any() and most > 0:
+        log.warning("%s: its alpha is 0 everywhere, over colour; read without alpha", item.input_path)
+        return replace(image, alpha=None)
     return image
 
 

@@ -51,7 +51,7 @@ class ShotFrames:
     def image(self, number: int) -> LinearImage:
         """Frame `number`."""
         if self._decoded is None:
-            return read_photo(self._shot.frames[number], self._options)
+            return read_photo(self._shot.frames[number], self._options, in_shot=True)
         pixels = np.ascontiguousarray(to_linear_rec709(self._decoded(number), self._space), np.float32)
         return LinearImage(pixels, None, self._space.name)
 

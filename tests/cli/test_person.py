@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 from skimage.data import astronaut as photograph
@@ -23,7 +24,7 @@ from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.work.matte_models import UNKNOWN, parse_matte_from
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.photos import fit_faces, load_models_once, person_matte
+from facerf_cli.work.photos import fit_faces, load_models_once, person_matte, read_photo
 from tests.exr_layers import exr_layers
 
 HEIGHT, WIDTH = 192, 224
@@ -162,6 +163,30 @@ def test_each_frame_of_a_sequence_has_its_own_matte(
     said = " ".join(capsys.readouterr().err.split())
     assert said.count("--person has no") == 1 and str(mattes / "me.0001") in said.replace(" ", "")
     assert (tmp_path / "again/me.0000_segment.exr").is_file()
+
+
+@pytest.mark.parametrize("name", ["plate.exr", "cut.png"])
+def test_alpha_that_is_0_everywhere_over_colour_is_none(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A renderer's plate in EXR holds colour that alpha 0 has not multiplied; a PNG's never is."""
+    colour = np.linspace(0.25, 0.75, 5 * 4 * 3, dtype=np.float32).reshape(5, 4, 3)
+    path, options = tmp_path / name, PhotoOptions(Settings())
+    for opaque in ((0, 0, 0), (0, 0, 1)):
+        alpha = np.resize(np.array(opaque, np.float32), (5, 4))
+        spec = oiio.ImageSpec(4, 5, 4, "half" if path.suffix == ".exr" else "uint16")
+        spec.attribute("oiio:UnassociatedAlpha", 1)
+        stream = oiio.ImageOutput.create(str(path))
+        assert stream.open(str(path), spec)
+        assert stream.write_image(np.dstack([colour, alpha]))
+        stream.close()
+        caplog.clear()
+        photo = read_photo(Item(path, tmp_path / "out", "me"), options)
+        frame = read_photo(Item(path, tmp_path / "out", "me"), options, in_shot=True)
+        assert frame.alpha is not None and (frame.alpha == alpha).all()
+        assert (photo.pixels == frame.pixels).all() and photo.pixels.min() > 0.04
+        said = f"{path}: its alpha is 0 everywhere, over colour; read without alpha"
+        assert (photo.alpha is None) == (said in caplog.text) == (not alpha.any())
 
 
 def test_a_matte_of_the_same_aspect_is_resampled(tmp_path: Path, item: Item) -> None:
