@@ -49,6 +49,7 @@ def companion(item: Item, given: Path, option: str) -> Path:
     raise InputError(f"{item.input_path}: {option} has no {places[0]}; add it there")
 
 
+_WHITE, _LABEL = 0.9, 1.5 / 255  # of mattes: the least white, and what only label 1 of 8 or 16 bits is below
 _MOST_RADIANCE = 1e10  # in a photo: the sun in cd/m2 is below it, and sums of its square are finite
 log = logging.getLogger(LOGGER_NAME)
 
@@ -286,21 +287,28 @@ def _fitted(
     return FittedFace(face.tag, face.name, face.found, facts, number=face.number, head=head, matte=matte)
 
 
-def read_matte(item: Item, given: Path, size_px: tuple[int, ...]) -> np.ndarray:
+def read_matte(item: Item, given: Path, size_px: tuple[int, ...], in_shot: bool = False) -> np.ndarray:
     """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
     path = companion(item, given, "--matte")
-    matte = _grey_or_alpha(path, size_px)
+    matte = _grey_or_alpha(path, size_px, _LABEL)
     if matte.shape != tuple(size_px):
         raise InputError(f"{path}: {_sizes(matte, size_px)}; give one of the photo's size")
+    if not in_shot and not matte.any():
+        log.warning("%s: the matte is black, and leaves out all of %s", path, item.input_path)
     return matte
 
 
-def person_matte(item: Item, pixels: np.ndarray, options: PhotoOptions) -> np.ndarray | None:
-    """The person's matte [H, W] in 0..1 that is given for a photo [H, W, 3], at its size; None if none is."""
+def person_matte(
+    item: Item, pixels: np.ndarray, options: PhotoOptions, in_shot: bool = False
+) -> np.ndarray | None:
+    """The person's matte [H, W] in 0..1 that is given for a photo [H, W, 3], at its size; None if none is.
+
+    Raises InputError where it is black, or `--person` of a photo alone nowhere white.
+    """
     height, width = pixels.shape[:2]
     if options.person is not None:
         path = companion(item, options.person, "--person")
-        matte = _grey_or_alpha(path, (height, width))
+        matte = _grey_or_alpha(path, (height, width), _WHITE)
     elif options.matte_from is not None:
         path, matte = item.input_path, matte_by_rembg(to_display(pixels), options.matte_from)
     else:
@@ -310,16 +318,27 @@ def person_matte(item: Item, pixels: np.ndarray, options: PhotoOptions) -> np.nd
         raise InputError(f"{path}: {_sizes(matte, (height, width))}; give one of the photo's aspect")
     if not matte.any():
         raise InputError(f"{path}: the matte is black and shows nobody; make it white where the person is")
+    if options.person is not None and not in_shot and (most := matte.max()) < _WHITE:
+        at_most = f"nowhere white, {255 * most:.0f} of 255 at most"
+        raise InputError(f"{path}: the matte is {at_most}; make it white where the person is")
     return matte if matte.shape == (height, width) else resized(matte, height, width).clip(0, 1)
 
 
-def _grey_or_alpha(path: Path, size_px: tuple[int, ...]) -> np.ndarray:
-    """Values [h, w] in 0..1 of an image for a photo [H, W]: its alpha, if that varies, or its grey."""
+def _grey_or_alpha(path: Path, size_px: tuple[int, ...], white: float) -> np.ndarray:
+    """Values [h, w] in 0..1 of an image for a photo [H, W]: its alpha, if that varies, or its grey.
+
+    Of black and one colour, less bright than `white`, the colour is a label, as of a palette: it reads white.
+    """
     with beside_photo(size_px):
         image = read_image(path, "linear")
     alpha = image.alpha
-    matte = image.pixels.mean(-1) if alpha is None or alpha.min() == alpha.max() else alpha
-    return np.asarray(matte.clip(0, 1))
+    values = image.pixels if alpha is None or alpha.min() == alpha.max() else alpha[..., None]
+    matte = values.mean(-1).clip(0, 1)
+    labelled = (values == values.reshape(matte.size, -1)[matte.argmax()]).all(-1)
+    if 0 < matte.max() < white and not matte.min() and not matte[~labelled].any():
+        log.info("%s: has black and one colour, which is read as white", path)
+        return labelled.astype(np.float32)
+    return np.asarray(matte)
 
 
 def _sizes(matte: np.ndarray, size_px: tuple[int, ...]) -> str:

@@ -261,7 +261,8 @@ def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> 
     posed = None if rotation is None else replace(face.fit, rotation=rotation)
     if work.composite != "photo":
         return Target(posed, "face")
-    matte = None if work.matte is None else read_matte(item, work.matte, image.pixels.shape[:2])
+    size_px, in_shot = image.pixels.shape[:2], face.steady is not None
+    matte = None if work.matte is None else read_matte(item, work.matte, size_px, in_shot)
     kind = work.background.kind
     alpha = None if kind == "photo" else image.alpha
     return Target(posed, "photo", matte, alpha, kind if kind in ("photo", "none") else "given")

@@ -226,7 +226,7 @@ def _view(shot: Shot, take: range, options: PhotoOptions) -> ShotView:
     read = _opened(shot, options).pixels
 
     def given(number: int) -> np.ndarray:
-        matte = person_matte(shot.frames[number], read(number), options)
+        matte = person_matte(shot.frames[number], read(number), options, in_shot=True)
         assert matte is not None
         return matte
 

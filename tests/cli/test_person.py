@@ -4,11 +4,13 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 import torch
+from PIL import Image
 from skimage.data import astronaut as photograph
 
 from facerf_cli.batch.inputs import Item
@@ -24,7 +26,7 @@ from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.work.matte_models import UNKNOWN, parse_matte_from
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.photos import fit_faces, load_models_once, person_matte, read_photo
+from facerf_cli.work.photos import fit_faces, load_models_once, person_matte, read_matte, read_photo
 from tests.exr_layers import exr_layers
 
 HEIGHT, WIDTH = 192, 224
@@ -187,6 +189,61 @@ def test_alpha_that_is_0_everywhere_over_colour_is_none(
         assert (photo.pixels == frame.pixels).all() and photo.pixels.min() > 0.04
         said = f"{path}: its alpha is 0 everywhere, over colour; read without alpha"
         assert (photo.alpha is None) == (said in caplog.text) == (not alpha.any())
+
+
+@pytest.mark.parametrize(
+    ("mode", "white", "said"),
+    [
+        ("L", 1, True),  # 0 and 1 of 8 bits
+        ("I;16", 1, True),
+        ("P", 1, True),  # an index, whose colour is Pascal VOC's of people
+        ("RGB", (255, 0, 0), True),
+        ("1", 1, False),
+        ("L", 255, False),
+    ],
+)
+def test_a_label_is_read_as_white(
+    tmp_path: Path, item: Item, mode: str, white: Any, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    mask, path = Image.new(mode, (WIDTH, HEIGHT)), tmp_path / "mask.png"
+    if mode == "P":
+        mask.putpalette((0, 0, 0, 192, 128, 128))
+    mask.paste(white, (20, 0, 100, HEIGHT))
+    mask.save(path)
+    photo, truth = np.zeros((HEIGHT, WIDTH, 3)), np.zeros((HEIGHT, WIDTH))
+    truth[:, 20:100] = 1
+    matte = person_matte(item, photo, PhotoOptions(Settings(), person=path))
+    assert (matte == truth).all()
+    assert (f"{path}: has black and one colour, which is read as white" in caplog.text) == said
+    if mode in ("L", "I;16", "1"):
+        assert (read_matte(item, path, (HEIGHT, WIDTH)) == truth).all()
+
+
+@pytest.mark.parametrize("levels", [(0, 1, 2), (0, 100, 229), (100, 100, 100)])
+def test_a_matte_that_is_nowhere_white_is_none(tmp_path: Path, item: Item, levels: tuple[int, ...]) -> None:
+    """Labels of several classes, and greys, do not say who the person is; in a shot a frame may be faint."""
+    stripes = np.resize(np.array(levels, np.uint8), (HEIGHT, WIDTH))
+    path, photo = tmp_path / "grey.png", np.zeros((HEIGHT, WIDTH, 3))
+    Image.fromarray(stripes).save(path)
+    options = PhotoOptions(Settings(), person=path)
+    refusal = rf"grey\.png: the matte is nowhere white, {max(levels)} of 255 at most; make it white where"
+    with pytest.raises(InputError, match=refusal):
+        person_matte(item, photo, options)
+    faint = person_matte(item, photo, options, in_shot=True)
+    assert faint is not None and np.abs(faint - stripes / 255).max() < 1e-6  # of float32
+    assert np.abs(read_matte(item, path, (HEIGHT, WIDTH)) - stripes / 255).max() < 1e-6  # a strength
+
+
+def test_a_black_matte_that_limits_is_said(
+    tmp_path: Path, item: Item, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "black.png"
+    Image.new("L", (WIDTH, HEIGHT)).save(path)
+    for in_shot in (True, False):  # the person may leave a frame
+        assert not read_matte(item, path, (HEIGHT, WIDTH), in_shot).any()
+        assert (
+            f"black.png: the matte is black, and leaves out all of {item.input_path}" in caplog.text
+        ) != in_shot
 
 
 def test_a_matte_of_the_same_aspect_is_resampled(tmp_path: Path, item: Item) -> None:
