@@ -245,20 +245,26 @@ def files_read(given: Any, items: Sequence[Item]) -> Iterator[Path]:
 
 
 def companions(item: Item, given: Path, option: str) -> list[Path]:
-    """The places of the file of an option that goes with an item; it may be in any of several of a folder.
+    """The places of the file of an option that goes with an item; it may be in any of several.
 
     A folder mirrors the items', or holds all files in one place; a pattern has fields, as in
-    `mattes/{dir}/{stem}.png`.
+    `mattes/{dir}/{stem}.png`. A name in Unicode's form NFC is the same in NFD.
     """
     if given.is_dir():
         suffixes = sorted(LANDMARK_SUFFIXES if option == "--landmarks" else PHOTO_SUFFIXES)
-        names = dict.fromkeys((item.name, item.input_path.stem))
-        return [given / f"{name}{suffix}" for name in names for suffix in suffixes]
+        names = [form for name in (item.name, item.input_path.stem) for form in _forms(name)]
+        return [given / f"{name}{suffix}" for name in dict.fromkeys(names) for suffix in suffixes]
     text = given.as_posix()
     if "{" not in text or given.exists():
         return [given]
     pattern = NamePattern.parse(text.lstrip("/"), option, OF_FILES)
-    return [Path("/" if text.startswith("/") else "") / item.pattern_text(pattern)]
+    root = Path("/" if text.startswith("/") else "")
+    return [root / form for form in _forms(item.pattern_text(pattern))]
+
+
+def _forms(name: str) -> list[str]:
+    """A name, and the other forms of Unicode in which a disk may hold it."""
+    return list(dict.fromkeys((name, *(unicodedata.normalize(form, name) for form in ("NFC", "NFD")))))
 
 
 def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterator[str]:

@@ -46,7 +46,11 @@ def companion(item: Item, given: Path, option: str) -> Path:
     for path in places:
         if path == given or path.is_file():
             return path
-    raise InputError(f"{item.input_path}: {option} has no {places[0]}; add it there")
+    missing = str(places[0])
+    if given.is_dir():
+        kinds = " ".join(dict.fromkeys(path.suffix for path in places))
+        missing = f"{places[0].with_suffix('')} with one of the suffixes {kinds}"
+    raise InputError(f"{item.input_path}: {option} has no {missing}; add it there")
 
 
 _WHITE, _LABEL = 0.9, 1.5 / 255  # of mattes: the least white, and what only label 1 of 8 or 16 bits is below

@@ -18,8 +18,9 @@ from facerf_cli.batch.inputs import (
     expand_inputs,
     split_frame,
 )
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.main import main
+from facerf_cli.work.photos import companion
 
 
 @pytest.fixture
@@ -221,3 +222,33 @@ def test_names_that_differ_by_their_unicode_form_alone_are_refused(tmp_path: Pat
     if len(list(tmp_path.iterdir())) == 2:  # not on every file system
         with pytest.raises(UsageError, match="would both be written"):
             names(tmp_path, tmp_path)
+
+
+@pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])
+def test_names_of_companions_are_one_in_both_forms_of_unicode(tmp_path: Path, forms: tuple[str, str]) -> None:
+    """A Mac's archive has NFD where most keyboards type NFC."""
+    photo, other = (unicodedata.normalize(form, "été/José") for form in forms)
+    item = Item(tmp_path / f"photos/{photo}.jpg", tmp_path / f"out/{photo}", photo)
+    mattes, name = tmp_path / "mattes", unicodedata.normalize(forms[1], "José")
+    for file in (f"{other}.tif", f"{name}.pts", f"x/{name}_matte.png"):
+        (mattes / file).parent.mkdir(parents=True, exist_ok=True)
+        (mattes / file).touch()
+    found = [
+        (mattes, "--person", f"{other}.tif"),
+        (mattes, "--landmarks", f"{name}.pts"),
+        (mattes / "x/{stem}_matte.png", "--matte", f"x/{name}_matte.png"),
+    ]
+    for given, option, file in found:
+        assert companion(item, given, option).samefile(mattes / file)
+
+
+def test_a_missing_companion_is_said_with_the_files_that_serve(tmp_path: Path) -> None:
+    item = Item(Path("a/me.0001.jpg"), Path("out/me.0001"), "me.0001")
+    with pytest.raises(InputError) as error:
+        companion(item, tmp_path, "--landmarks")
+    missing = f"{tmp_path}/me.0001 with one of the suffixes .json .pts"
+    assert str(error.value) == f"a/me.0001.jpg: --landmarks has no {missing}; add it there"
+    with pytest.raises(InputError, match=r"--person has no .*/me\.0001 with .* \.bmp .* \.png .* \.tiff "):
+        companion(item, tmp_path, "--person")
+    with pytest.raises(InputError, match=r"a/me\.0001\.jpg: --person has no mattes/me\.png; add it there"):
+        companion(item, Path("mattes/{stem}.png"), "--person")
