@@ -122,7 +122,7 @@ def head_of(
         head = fit_photo(models, photo, face.landmarks_px, sides)
     else:
         head = regress_photo(models, photo, face.box_px, sides)
-    head = replace(head, others_px=face.others_px)
+    head = replace(head, others=face.others)
     if face.view is not None:
         head = head.without(models.face, uncovered(face.view, head.fit.crop))
     return head if matte is None else head.without(models.face, uncovered_by(matte, head.fit.crop))
@@ -182,8 +182,8 @@ def reflectance_of(
 
     def of_person() -> list[SeenPerson]:
         assert photo is not None
-        people, others_px = models.networks.people, head.others_px
-        person = look_at_person(people, models.face, photo, head.fit, matte=matte, others_px=others_px)
+        people, others = models.networks.people, head.others
+        person = look_at_person(people, models.face, photo, head.fit, matte=matte, others=others)
         wide = wider_square(person.square, person.segmentation.matte)
         return [person] if wide is None else [person, person.within(wide, photo)]
 
@@ -217,8 +217,8 @@ class FittedPerson:
         if isinstance(self.reflectance, PortraitField):
             return self.reflectance.person.segmentation
         landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        people, matte, others_px = self.models.networks.people, self.given_matte, self.head.others_px
-        return segment(people, to_display(self.photo), landmarks_px, matte, others_px)
+        people, matte, others = self.models.networks.people, self.given_matte, self.head.others
+        return segment(people, to_display(self.photo), landmarks_px, matte, others)
 
     @property
     def share(self) -> np.ndarray:

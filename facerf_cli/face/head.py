@@ -1,6 +1,7 @@
 """The face of a photo: its crop, the fitted face model, and its texture in UV space."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -32,16 +33,31 @@ class FaceTexture:
 
 
 @dataclass(frozen=True, eq=False)
+class OtherHead:
+    """Another head of a photo, with landmarks [68, 2] in its pixels.
+
+    `seen` holds an image and what is seen of the head there: each of the photo's people asks for the same.
+    """
+
+    landmarks_px: np.ndarray
+    seen: list[np.ndarray] = field(default_factory=list)
+
+    def scaled(self, scale: float) -> "OtherHead":
+        """The head in the photo resized by a factor."""
+        return replace(self, landmarks_px=self.landmarks_px * scale)
+
+
+@dataclass(frozen=True, eq=False)
 class Head:
     """The face of a photo: its crop [S, S, 3], scene-linear, the fitted face model, and its texture.
 
-    `others_px` are landmarks [N, 68, 2] of the photo's other heads in its pixels; None where nobody looked.
+    `others` are the photo's other heads; None where nobody looked.
     """
 
     cropped: np.ndarray
     fit: FaceFit
     face: FaceTexture
-    others_px: np.ndarray | None = None
+    others: Sequence[OtherHead] | None = None
 
     @property
     def landmarks_px(self) -> np.ndarray:
@@ -93,5 +109,5 @@ def shrunk_photo(photo: np.ndarray, head: Head, most_px: int) -> tuple[np.ndarra
         return photo, head
     scale = width / photo.shape[1]
     fit = replace(head.fit, crop=head.fit.crop.of_scaled(scale))
-    others_px = None if head.others_px is None else head.others_px * scale
-    return resized(photo, height, width), replace(head, fit=fit, others_px=others_px)
+    others = None if head.others is None else [one.scaled(scale) for one in head.others]
+    return resized(photo, height, width), replace(head, fit=fit, others=others)

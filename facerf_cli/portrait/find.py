@@ -6,7 +6,7 @@ face that is found.
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -15,6 +15,7 @@ import numpy as np
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
 from facerf_cli.face.dlib_landmarks import detect_landmarks
+from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks
@@ -44,14 +45,14 @@ _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels i
 class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
-    There is no view of a face that was given, or found by dlib. Landmarks [N, 68, 2] of the photo's other
-    heads are there where these were looked for.
+    There is no view of a face that was given, or found by dlib. The photo's other heads are there where they
+    were looked for.
     """
 
     box_px: Box
     score: float
     view: SquareView | None = field(default=None, kw_only=True)
-    others_px: np.ndarray | None = field(default=None, kw_only=True)
+    others: Sequence[OtherHead] | None = field(default=None, kw_only=True)
 
     @property
     def area_px(self) -> float:
@@ -69,7 +70,7 @@ class Face(FaceBox):
     @property
     def box(self) -> FaceBox:
         """The face without its landmarks."""
-        return FaceBox(self.box_px, self.score, view=self.view, others_px=self.others_px)
+        return FaceBox(self.box_px, self.score, view=self.view, others=self.others)
 
 
 def face_at(landmarks_px: np.ndarray) -> Face:
@@ -137,8 +138,8 @@ def detect_faces(
             break
     faces = [face for mesh in meshes if (face := _as_face(people, image_srgb, mesh))]
     faces.sort(key=lambda face: face.box_px[0])
-    landmarks_px = np.array([face.landmarks_px for face in faces])
-    return [replace(one, others_px=np.delete(landmarks_px, n, 0)) for n, one in enumerate(faces)]
+    heads = [OtherHead(face.landmarks_px) for face in faces]
+    return [replace(one, others=heads[:n] + heads[n + 1 :]) for n, one in enumerate(faces)]
 
 
 def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:

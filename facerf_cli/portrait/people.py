@@ -19,6 +19,7 @@ from scipy.ndimage import (
     watershed_ift,
 )
 
+from facerf_cli.face.head import OtherHead
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
@@ -77,22 +78,35 @@ class PersonShares:
 
 
 def person_among(
-    people: PeopleNetworks, image: np.ndarray, heads: Sequence[HeadPlace], parsed: np.ndarray
+    people: PeopleNetworks,
+    image: np.ndarray,
+    head: HeadPlace,
+    others: Sequence[OtherHead],
+    parsed: np.ndarray,
 ) -> PersonShares:
-    """The person with the first of several heads in a small image [h, w, 3] in 0..1.
+    """The person with a head among others in a small image [h, w, 3] in 0..1.
 
     `parsed` [h, w] is the share that the Parsing Network sees; it alone knows faces that fill the photo.
     """
-    head, *others = heads
     if not _squares_around(head, image.shape):
         return PersonShares(parsed, parsed)
     anybody, body = person_share(people.person, image, head), body_share(people.body, image, head)
     share = np.maximum(anybody, body * (1 - _below_eyes(body, head)) * _near(body, head))  # hats
     if others:
-        bodies = [body, *(body_share(people.body, image, one) for one in others)]
-        anybody = np.maximum.reduce([anybody, *(person_share(people.person, image, one) for one in others)])
-        share = share * part_of_first(bodies, [head, *others], np.maximum(share, anybody), image)
+        persons, bodies = zip(*(_shares_of(one, people, image) for one in others), strict=True)
+        heads = [head, *(HeadPlace.of(one.landmarks_px) for one in others)]
+        anybody = np.maximum.reduce([anybody, *persons])
+        share = share * part_of_first([body, *bodies], heads, np.maximum(share, anybody), image)
     return PersonShares(_vetoed(share, parsed, head), anybody)
+
+
+def _shares_of(other: OtherHead, people: PeopleNetworks, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shares [h, w] of anybody and of the body of another head of an image; looked at once."""
+    if not other.seen or not np.array_equal(other.seen[0], image):
+        head = HeadPlace.of(other.landmarks_px)
+        person, body = person_share(people.person, image, head), body_share(people.body, image, head)
+        other.seen[:] = image, person, body
+    return other.seen[1], other.seen[2]
 
 
 def matte_of(share: np.ndarray, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
@@ -164,10 +178,12 @@ def part_of_first(
     Faces, and what one body alone claims, are seeds; other pixels of people go to the seed that reaches them
     along the least contrast.
     """
-    claims = np.stack(bodies)
-    order = np.sort(claims, 0)
-    alone = (order[-1] > _CLAIM) & (order[-2] < _LEAD * order[-1])
-    seeds = np.where(alone, claims.argmax(0) + 1, 0)
+    most, next_most, owner = np.zeros_like(bodies[0]), np.zeros_like(bodies[0]), np.zeros(person.shape, int)
+    for number, body in enumerate(bodies, 1):
+        owner[body > most] = number
+        next_most = np.maximum(next_most, np.minimum(most, body))
+        most = np.maximum(most, body)
+    seeds = np.where((most > _CLAIM) & (next_most < _LEAD * most), owner, 0)
     for number, head in enumerate(heads, 1):
         seeds[head.distance(person.shape) < 0.35] = number
     anybody = (person > 0.5) | (seeds > 0)

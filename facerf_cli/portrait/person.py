@@ -1,5 +1,6 @@
 """A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.image.colour import without_fireflies
@@ -155,18 +157,18 @@ def look_at_person(
     fit: FaceFit,
     segmentation: Segmentation | None = None,
     matte: np.ndarray | None = None,
-    others_px: np.ndarray | None = None,
+    others: Sequence[OtherHead] | None = None,
 ) -> SeenPerson:
     """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
 
     All is seen in the square around the landmarks; a `segmentation` may be given, or the person's `matte`
-    [H, W], or landmarks [N, 68, 2] of the other heads.
+    [H, W], or the photo's other heads.
     Raises InputError where no skin is seen, by which the person is exposed.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = portrait_square(landmarks_px)
     shown = to_display(photo)
-    segmentation = segmentation or segment(people, shown, landmarks_px, matte, others_px)
+    segmentation = segmentation or segment(people, shown, landmarks_px, matte, others)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
         raise InputError("no skin is seen around the landmarks; check them, or relight --reflectance field")

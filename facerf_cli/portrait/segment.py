@@ -4,7 +4,7 @@ The matte is that of `people.py`; the Parsing Network says what its pixels are. 
 and, for detail, at head and chest and at squares of several sizes around the head.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import pairwise
@@ -14,6 +14,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
+from facerf_cli.face.head import OtherHead
 from facerf_cli.image.strips import Band, enlarged, fitted
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
@@ -87,16 +88,16 @@ def segment(
     image_srgb: np.ndarray,
     landmarks_px: np.ndarray,
     matte: np.ndarray | None = None,
-    others_px: np.ndarray | None = None,
+    others: Sequence[OtherHead] | None = None,
 ) -> Segmentation:
     """Segment one person, with landmarks [68, 2], in an sRGB uint8 image [H, W, 3]; a matte may be given.
 
-    The other heads, whose landmarks may be given [N, 68, 2], are looked for otherwise.
+    The photo's other heads are looked for, unless they are given.
     """
     small = small_image(image_srgb)
     if matte is not None:
         return within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
-    classes, shares, head = _look(people, image_srgb, landmarks_px, small, others_px)
+    classes, shares, head = _look(people, image_srgb, landmarks_px, small, others)
     found = segmentation_of(_within_share(classes, shares.person), image_srgb, landmarks_px)
     places = _places((small.shape[1], small.shape[2]), found.matte.shape).astype(int)
     small_matte = found.matte[places[..., 1], places[..., 0]]
@@ -116,28 +117,28 @@ def _look(
     image_srgb: np.ndarray,
     landmarks_px: np.ndarray,
     small: Tensor,
-    others_px: np.ndarray | None = None,
+    others: Sequence[OtherHead] | None = None,
 ) -> tuple[Tensor, PersonShares, HeadPlace]:
     """Shares of the classes as the Parsing Network sees them, those of the person, and the head's place."""
     classes = parsed(people.parsing, image_srgb, landmarks_px, small)
     scale = small.shape[2] / image_srgb.shape[1]
-    others = _neighbours(people, image_srgb, landmarks_px) if others_px is None else others_px
-    everyone = [landmarks_px, *others]
-    heads = [HeadPlace.of(points * scale) for points in everyone]
-    shares = person_among(people, small.permute(1, 2, 0).numpy(), heads, 1 - classes[0].numpy())
-    return classes, shares, heads[0]
+    head = HeadPlace.of(landmarks_px * scale)
+    others = list(_neighbours(people, image_srgb, landmarks_px)) if others is None else others
+    around = [one.scaled(scale) for one in others]
+    shares = person_among(people, small.permute(1, 2, 0).numpy(), head, around, 1 - classes[0].numpy())
+    return classes, shares, head
 
 
 def _neighbours(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray
-) -> Iterator[np.ndarray]:
-    """Landmarks [68, 2] of the other heads in an image, those that the Parsing Network sees, too."""
+) -> Iterator[OtherHead]:
+    """The other heads in an image, those that the Parsing Network sees, too."""
     middle, extent_px = landmarks_px.mean(0), np.ptp(landmarks_px, axis=0).max()
     for mesh in find_meshes(people, image_srgb, first_squares(image_srgb)):
         if np.linalg.norm(mesh.landmarks_px.mean(0) - middle) > extent_px / 2:
             (view,) = look(people.parsing, image_srgb, [mesh.square])
             if view.presence >= LEAST_PRESENCE:
-                yield mesh.landmarks_px
+                yield OtherHead(mesh.landmarks_px)
 
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:

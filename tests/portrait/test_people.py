@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.face.head import OtherHead
 from facerf_cli.portrait.parse import Square
 from facerf_cli.portrait.people import (
     HeadPlace,
@@ -52,16 +53,50 @@ def test_two_people_are_divided_where_they_touch() -> None:
     assert part[120, 60] > 0.9 and part[120, 150] > 0.9 and part[120, 175] < 0.1 and part[120, 260] < 0.1
 
 
+def test_each_head_of_a_crowd_is_looked_at_twice_however_many_there_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Once for its own person, and once for all the others; in another image it is looked at again."""
+    looks: list[HeadPlace] = []
+
+    def person_share(network: object, image: np.ndarray, head: HeadPlace) -> np.ndarray:
+        looks.append(head)
+        return disc(head.x_px, head.y_px, head.height_px).astype(np.float32)
+
+    monkeypatch.setattr("facerf_cli.portrait.people.person_share", person_share)
+    monkeypatch.setattr("facerf_cli.portrait.people.body_share", person_share)
+    image, parsed = np.zeros((240, 320, 3), np.float32), np.ones((240, 320), np.float32)
+    landmarks_px = [FACE + np.array([x, y]) for x in (-100, 0, 100) for y in (0, 110)]
+    crowd = [OtherHead(0.5 * points) for points in landmarks_px]
+
+    def persons(crowd: list[OtherHead], image: np.ndarray) -> list[np.ndarray]:
+        heads = [HeadPlace.of(points) for points in landmarks_px]
+        return [
+            person_among(
+                white_people(), image, head, [one.scaled(2) for one in crowd if one is not crowd[n]], parsed
+            ).person
+            for n, head in enumerate(heads)
+        ]
+
+    together = persons(crowd, image)
+    assert len(looks) == 2 * 2 * len(crowd)
+    alone = [persons([OtherHead(one.landmarks_px) for one in crowd], image)[n] for n in range(len(crowd))]
+    assert np.array_equal(together, alone)
+    looks.clear()
+    persons(crowd, image + 1)
+    assert len(looks) == 2 * 2 * len(crowd)
+
+
 def test_a_face_that_fills_the_photo_is_what_the_parsing_network_sees() -> None:
     parsed = disc(160, 120, 100).astype(np.float32)
     head = HeadPlace(160, 120, 320, 280)
-    share = person_among(white_people(), np.zeros((240, 320, 3), np.float32), [head], parsed).person
+    share = person_among(white_people(), np.zeros((240, 320, 3), np.float32), head, [], parsed).person
     assert (share == parsed).all()
 
 
 def test_the_parsing_network_takes_away_below_the_eyes_alone() -> None:
     image = np.where(disc(160, 70, 55)[..., None], 1.0, 0.3).repeat(3, -1).astype(np.float32)
-    share = person_among(white_people(), image, [HEAD], np.zeros(image.shape[:2])).person
+    share = person_among(white_people(), image, HEAD, [], np.zeros(image.shape[:2])).person
     assert share[30, 160] > 0.9 and share[100, 160] < 0.3
 
 
