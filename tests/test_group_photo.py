@@ -132,3 +132,26 @@ def test_people_leave_less_memory_for_lights_at_once() -> None:
         assert len(batches(100, 4 << 20)) > 2 * alone
     with beside_people(1, (400, 600)):
         assert len(batches(100, 4 << 20)) == alone
+
+
+def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
+    """In a crowd each face would else cost the whole photo."""
+    drawn: list[int] = []
+
+    class Below(Plain):
+        def matte(self) -> np.ndarray:
+            return super().matte() * (np.arange(SIZE[0]) > 1)[:, None]
+
+        def person_and_share(self, relit: float) -> tuple[Band, Band]:
+            def person(rows: slice) -> np.ndarray:
+                drawn.append(rows.start)
+                return np.full((rows.stop - rows.start, SIZE[1], 3), relit)
+
+            return person, self.matte().__getitem__
+
+    group: Any = GroupComposition([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
+    for band in (group.bands((0.2, 0.8), 0.0, None)["rgb"], group.light_layer((0.2, 0.8))):
+        drawn.clear()
+        rows = [band(slice(row, row + 1)) for row in range(SIZE[0])]
+        assert drawn == [2, 3]
+        assert rows[0][0, 1] == pytest.approx(0.2) and rows[2][0, 1] == pytest.approx(0.5)

@@ -89,6 +89,8 @@ def _in_place(top: Band, share: Band, below: Band, taken: Pixels | None, gain: f
 def _over(top: Band, share: Band, below: Band) -> Band:
     def of(rows: slice) -> np.ndarray:
         under, weight = below(rows), share(rows)
+        if not weight.any():  # most rows of a crowd
+            return under
         weight = weight[..., None] if under.ndim == 3 else weight
         return np.asarray(under + weight * (top(rows) - under))
 
@@ -107,8 +109,10 @@ def _chosen(top: Band, share: Band, below: Band, alpha: Band) -> Band:
     """Values [H, W, C] of what shows more in a pixel."""
 
     def of(rows: slice) -> np.ndarray:
-        weight = share(rows)
-        return np.where((weight > (1 - weight) * alpha(rows))[..., None], top(rows), below(rows))
+        under, weight = below(rows), share(rows)
+        if not weight.any():
+            return under
+        return np.where((weight > (1 - weight) * alpha(rows))[..., None], top(rows), under)
 
     return of
 
