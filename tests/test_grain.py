@@ -55,3 +55,22 @@ def test_a_photo_that_is_read_in_strips_shows_no_borders(monkeypatch: pytest.Mon
     at_once = given(SMOOTH, PORES, PORES**2)
     monkeypatch.setattr(module, "_STRIP_PX", 32 * SIDE)
     np.testing.assert_allclose(given(SMOOTH, PORES, PORES**2), at_once, rtol=1e-6)
+
+
+def test_only_the_strips_that_show_the_person_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A crowd's photo is large, and each of its people small."""
+    read: list[int] = []
+    share = ALL.copy()
+    share[:40] = 0
+    truth = given(SMOOTH, PORES, PORES**2, share)
+    monkeypatch.setattr(module, "STRIP_PX", 32 * SIDE)
+    monkeypatch.setattr(module, "_STRIP_PX", 32 * SIDE)
+
+    def flat(rows: slice) -> np.ndarray:
+        read.append(rows.start)
+        return np.stack([PORES, PORES**2], -1)[rows]
+
+    found = whole(Grain(flat, share, MAP_PX).given(SMOOTH.__getitem__), SIDE, SIDE)
+    assert read == [32, 64]
+    np.testing.assert_allclose(found, truth, rtol=1e-6)  # as strips of the same photo differ
+    assert np.array_equal(found[:30], SMOOTH[:30])

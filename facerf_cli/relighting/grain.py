@@ -12,6 +12,7 @@ strands show the photo's own light, and where the photo is nearly black. R' is l
 """
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -38,9 +39,9 @@ class Grain:
         self._means_inside = remembered(
             lambda rows: self._means(self._inside[rows][..., None].astype(np.float32)).clip(min=_TINY)
         )
-        values = np.empty((*share.shape, 2), np.float16)
+        values = np.zeros((*share.shape, 2), np.float16)  # 0 where nobody is seen, as detail is
         unit, total, count = 0.0, 0.0, 0
-        for rows in strips(share.shape):
+        for rows in self._seen_strips(STRIP_PX):
             light = flat(rows)
             inside = light[self._inside[rows], 0]
             total, count = total + float(inside.sum()), count + len(inside)
@@ -50,11 +51,15 @@ class Grain:
                 unit = 2.0 ** round(math.log2(total / count))
             values[rows] = (light / (unit or 1)).clip(max=_MOST)
         scale = np.float32((unit or 1) * max(count, 1) / max(total, _TINY))
-        self._weight, self._detail = (np.empty(share.shape, np.float16) for _ in range(2))
-        for rows in strips(share.shape, _STRIP_PX):
+        self._weight, self._detail = (np.zeros(share.shape, np.float16) for _ in range(2))
+        for rows in self._seen_strips(_STRIP_PX):
             wide, own = self._around(rows, 2 * self._margin)
             weight, detail = self._read(values[wide] * scale, share[wide], wide)
             self._weight[rows], self._detail[rows] = weight[own], detail[own]
+
+    def _seen_strips(self, strip_px: int) -> Iterator[slice]:
+        """The strips in which some of the person is seen: of a crowd's people few."""
+        return (rows for rows in strips(self._inside.shape, strip_px) if self._inside[rows].any())
 
     def _read(self, values: np.ndarray, share: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """Weight w and detail D [h, W] of some rows of A and B [h, W, 2], in units of the mean of A."""
