@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from skimage.transform import SimilarityTransform, warp
 
+from facerf_cli.batch.inputs import FILM_SUFFIXES
 from facerf_cli.files.images import read_image
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.image.strips import fitted, resized
@@ -12,17 +13,16 @@ from facerf_cli.image.strips import fitted, resized
 SIDE_PX = 512  # of the longer side of a photo
 NOISE = 0.006  # standard deviation, display values: 1.5 of 255
 SEED = 101
-FILMS = (".mp4", ".mov", ".webm")
 
 
 def frames_of(path: Path, count: int) -> list[np.ndarray]:
     """At most `count` scene-linear frames [H, W, 3]."""
-    if path.suffix.lower() in FILMS:
+    if path.suffix.lower() in FILM_SUFFIXES:
         from facerf_cli.files.film import Film
 
         film = Film(path)
         coded = [film.read(n) for n in range(min(count, len(film.timing().times_s)))]
-        return [np.asarray(srgb_to_linear(x / np.iinfo(x.dtype).max), np.float32) for x in coded]
+        return [np.asarray(srgb_to_linear(x[..., :3] / np.iinfo(x.dtype).max), np.float32) for x in coded]
     photo = read_image(path).pixels
     photo = resized(photo, *fitted(*photo.shape[:2], SIDE_PX)) if max(photo.shape[:2]) > SIDE_PX else photo
     return panned(np.asarray(linear_to_srgb(photo.clip(0, 1))), count)

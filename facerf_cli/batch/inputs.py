@@ -30,7 +30,7 @@ PHOTO_SUFFIXES = frozenset(
 )
 LANDMARK_SUFFIXES = frozenset({".pts", ".json"})
 COMPANION = "FILE|DIR|PATTERN"  # the placeholder of options that name a file for each input
-FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm"})
+FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".mkv", ".m4v", ".avi", ".mxf", ".mts", ".m2ts"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
 _NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr

@@ -62,7 +62,7 @@ FramesArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="PHOTO|FILM...",
-        help="Images, films (.mp4, .mov, .webm), folders of images (walked recursively), frames "
+        help="Images, films (.mp4, .mov, .mkv and more), folders of images (walked recursively), frames "
         "(plate.%04d.exr), or - to read a list of paths.",
         show_default=False,
     ),

@@ -5,12 +5,14 @@ H.264 is written in .mp4 and ProRes in .mov, from numbered images, with another 
 The wheel of PyAV holds FFmpeg with x264 and x265, which are under the GPL; facerf does not bundle it.
 """
 
+import io
 import logging
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,7 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.decoding import decode
 from facerf_cli.files.images import PHOTO_LIMIT_PX
 from facerf_cli.image.cicp import HDR_CURVES, space_of_codes
-from facerf_cli.image.colour import SRGB, ColourSpace, unit_floats
+from facerf_cli.image.colour import SRGB, ColourSpace, linear_to_srgb, srgb_to_linear, unit_floats
 from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
@@ -31,6 +33,11 @@ _BT601, _BT709, _UNKNOWN = 5, 1, 2
 _HD_LINES = 720  # films without a stated matrix have BT.709 from here on
 _LIMITED = 1  # range (ITU-T H.273)
 _CLOCK = 90_000  # ticks a second, in which the times of frames are written
+_MICROSECONDS = 1_000_000  # a second, in which FFmpeg counts for whole files
+_WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders leave alpha out
+_EARLIER = 50  # frames by which a seek that came to a later frame begins before
+
+_Stamped = Iterator[tuple[int, Any]]  # frames, each after its time stamp
 
 
 @dataclass(frozen=True)
@@ -70,30 +77,41 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         self._path, self._av = path, require_av(path)
-        try:
-            self._container = self._av.open(str(path))
-        except (self._av.error.FFmpegError, OSError, ValueError) as error:
-            raise InputError(f"{path}: not a readable film; convert it ({_reason(error)})") from None
-        if not self._container.streams.video:
-            raise InputError(f"{path}: holds no pictures; give a film")
-        self._stream = self._container.streams.video[0]
-        self._stream.thread_type = "AUTO"
+        self._open()
+        self._is_counted = self._container.format.name == "avi"  # it has no times of presentation
+        self._clean = _clean_aperture(path) if "mp4" in self._container.format.name else ()
         self._pts = self._presented()
-        self._coming: Iterator[tuple[int, Any]] = iter(())
+        self._coming: _Stamped = iter(())
         self._next = -1  # number of the frame that is decoded next, without a seek
+
+    def _open(self) -> None:
+        try:
+            self._container = self._av.open(str(self._path))
+        except (self._av.error.FFmpegError, OSError, ValueError) as error:
+            raise InputError(f"{self._path}: not a readable film; convert it ({_reason(error)})") from None
+        self._stream = self._container.streams.best("video")
+        if self._stream is None or self._stream.codec_context is None:
+            raise InputError(
+                f"{self._path}: holds no pictures that FFmpeg decodes; give a film, or convert it"
+            )
+        self._coder = self._stream.codec_context
+        name = _WITH_ALPHA.get(self._coder.name)
+        if name in self._av.codecs_available and self._stream.metadata.get("alpha_mode") == "1":
+            self._coder = self._av.CodecContext.create(name, "r")
+        self._coder.thread_type = "AUTO"
 
     def close(self) -> None:
         """Close the file."""
         self._container.close()
 
     def _presented(self) -> list[int]:
-        """Time stamps of all frames in the order of presentation; packets are read, not decoded."""
+        """Time stamps of all frames in the order of presentation; packets are read, and hardly decoded."""
         try:
-            pts = {
-                packet.pts
-                for packet in self._container.demux(self._stream)
-                if packet.pts is not None and packet.size and not packet.is_discard
-            }
+            packets = self._container.demux(self._stream)
+            whole = (packet for packet in packets if packet.size and not packet.is_discard)
+            if self._coder.name == "h264" and self._coder.field_order > 1 and not self._is_counted:
+                whole = self._container.decode(self._stream)  # since packets may be single fields
+            pts = {one.dts if self._is_counted else one.pts for one in whole} - {None}
         except self._av.error.FFmpegError as error:
             raise InputError(
                 f"{self._path}: damaged or cut short; copy it again ({_reason(error)})"
@@ -104,13 +122,18 @@ class Film:
 
     def timing(self) -> Timing:
         """The times of the frames in order, the mean frame rate, and the film where it has sound."""
-        base = Fraction(self._stream.time_base)
-        times_s = tuple(pts * base for pts in self._pts)
+        base, start_s = Fraction(self._stream.time_base), _start_s(self._container)
+        times_s = tuple(pts * base - start_s for pts in self._pts)
         rate = Fraction(self._stream.average_rate or 0)
         if rate <= 0:
             length_s = times_s[-1] - times_s[0]
             rate = (len(times_s) - 1) / length_s if length_s else Fraction(24)
-        return Timing(times_s, rate, self._path if self._container.streams.audio else None)
+        return Timing(times_s, rate, self._path if any(self.sounds) else None)
+
+    @property
+    def sounds(self) -> list[Any]:
+        """The decoders of the sound tracks; None of an unknown codec."""
+        return [track.codec_context for track in self._container.streams.audio]
 
     @property
     def space(self) -> ColourSpace:
@@ -123,7 +146,10 @@ class Film:
         return found or SRGB
 
     def read(self, number: int) -> np.ndarray:
-        """Frame `number` [H, W, 3], square pixels, upright, in `space`: uint8, or uint16 of deeper films."""
+        """Frame `number` [H, W, 3 or, with alpha, 4], square pixels, upright, in `space`.
+
+        It is uint8, or uint16 of deeper films; its colour is not multiplied by alpha.
+        """
         try:
             return self._read(number)
         except self._av.error.FFmpegError as error:
@@ -131,18 +157,36 @@ class Film:
 
     def _read(self, number: int) -> np.ndarray:
         if number != self._next:
-            self._container.seek(self._pts[number], stream=self._stream, backward=True)
-            self._coming = self._decoded()
+            self._coming = self._from(number)
         for pts, frame in self._coming:
             if pts >= self._pts[number]:
                 self._next = number + 1
                 return self._pixels(frame)
         raise InputError(f"{self._path}: ends before frame {number}; copy it again")
 
-    def _decoded(self) -> Iterator[tuple[int, Any]]:
-        for frame in self._container.decode(self._stream):
-            if frame.pts is not None:
-                yield frame.pts, frame
+    def _from(self, number: int) -> _Stamped:
+        """Decode from the frame before `number`, which makes that progressive, or from an earlier one."""
+        start = max(number - 1, 0)
+        while not self._is_counted:
+            self._container.seek(self._pts[start], stream=self._stream, backward=True)
+            coming = self._decoded()
+            first = next(coming, None)
+            if first is not None and first[0] <= self._pts[start]:
+                return chain([first], coming)
+            if start == 0:
+                break
+            start = max(start - _EARLIER, 0)
+        self._container.close()
+        self._open()
+        return self._decoded()
+
+    def _decoded(self) -> _Stamped:
+        self._coder.flush_buffers()
+        packets = self._container.demux(self._stream)
+        frames = (frame for packet in packets for frame in self._coder.decode(packet))
+        if self._is_counted:
+            return _progressive(self._av, zip(self._pts, frames, strict=False))
+        return _progressive(self._av, ((frame.pts, frame) for frame in frames if frame.pts is not None))
 
     def _pixels(self, frame: Any) -> np.ndarray:
         width, height = self._square_size(frame)
@@ -153,15 +197,29 @@ class Film:
                 f"{self._path}: is an HDR film ({name}); convert it to Rec.709 (SDR), or give its frames as "
                 "EXR with --sequence"
             )
-        deep = max(component.bits for component in frame.format.components) > 8
+        parts, is_rgb = frame.format.components, frame.format.is_rgb
+        deep, alpha = max(part.bits for part in parts) > 8, parts[-1].is_alpha
         matrix = int(frame.colorspace)
         if matrix in (0, _UNKNOWN):
             matrix = _BT709 if min(frame.height, frame.width) >= _HD_LINES else _BT601
-        form = "rgb48le" if deep else "rgb24"
-        is_rgb = frame.format.name.startswith(("rgb", "gbr", "bgr"))
+        form = ("rgb24", "rgb48le", "rgba", "rgba64le")[2 * alpha + deep]
         colours = {} if is_rgb else {"src_colorspace": matrix, "interpolation": exact(self._av)}
         values = frame.to_ndarray(format=form, width=width, height=height, **colours)
-        return _upright(values, frame.side_data.get("DISPLAYMATRIX"))
+        if alpha and deep and not is_rgb:  # FFmpeg fills up its bits with zeros
+            white = 0x10000 - (0x10000 >> parts[-1].bits)
+            values[..., 3] = np.round(values[..., 3] * (0xFFFF / white)).clip(0, 0xFFFF)
+        return _upright(self._cropped(values, frame), frame.side_data.get("DISPLAYMATRIX"))
+
+    def _cropped(self, values: np.ndarray, frame: Any) -> np.ndarray:
+        """The clean aperture of a frame's values [H, W, C]; all of them where the frame does not hold it."""
+        for axis, (length, offset) in enumerate(self._clean):
+            whole = frame.width if axis else frame.height
+            first = (whole - length) / 2 + offset
+            if first >= 0 < length <= whole - first:
+                step = values.shape[axis] / whole
+                start, stop = round(first * step), round((first + length) * step)
+                values = values[start:stop] if axis == 0 else values[:, start:stop]
+        return values
 
     def _square_size(self, frame: Any) -> tuple[int, int]:
         """Width and height of a frame whose samples are made square; none is lost."""
@@ -172,7 +230,7 @@ class Film:
 
 
 def _upright(values: np.ndarray, matrix: Any) -> np.ndarray:
-    """Turn and mirror a frame [H, W, 3] by a film's display matrix, to quarters.
+    """Turn and mirror a frame [H, W, C] by a film's display matrix, to quarters.
 
     Its first two columns are a, b, of x, and c, d, of y: (x, y) is shown at (a x + c y, b x + d y).
     """
@@ -184,6 +242,60 @@ def _upright(values: np.ndarray, matrix: Any) -> np.ndarray:
     else:
         to_right, to_bottom = a, d
     return np.ascontiguousarray(values[:: -1 if to_bottom < 0 else 1, :: -1 if to_right < 0 else 1])
+
+
+def _start_s(container: Any) -> Fraction:
+    """The time at which pictures or sound begin, which is late in streams that were cut out of others."""
+    return max(Fraction(0), Fraction(container.start_time or 0, _MICROSECONDS))
+
+
+def _progressive(av: Any, frames: _Stamped) -> _Stamped:
+    """Frames, of which interlaced ones are made progressive."""
+    before, now = None, next(frames, None)
+    while now is not None:
+        if not now[1].interlaced_frame:
+            yield now
+            before, now = now, next(frames, None)
+        else:
+            after = next(frames, None)
+            around = [one[1] for one in (before, now, after) if one is not None]
+            yield now[0], _deinterlaced(av, around, around.index(now[1]))
+            before, now = now, after
+
+
+def _deinterlaced(av: Any, frames: list[Any], number: int) -> Any:
+    """One of some frames, at the time of its first field, by FFmpeg's bwdif, which looks at those around."""
+    frame, graph = frames[number], av.filter.Graph()
+    size = {"width": frame.width, "height": frame.height}
+    source = graph.add_buffer(format=frame.format, time_base=frame.time_base, **size)
+    bwdif = graph.add("bwdif", "mode=send_frame:deint=interlaced")
+    graph.link_nodes(source, bwdif, graph.add("buffersink")).configure()
+    for one in (*frames, None):
+        graph.vpush(one)
+    return [graph.vpull() for _ in range(number + 1)][number]
+
+
+def _clean_aperture(path: Path) -> tuple[tuple[Fraction, Fraction], ...]:
+    """Height and width of the clean aperture of an MP4 or QuickTime file, each with its middle's offset.
+
+    Nothing where the file has none (ISO 14496-12, `clap`).
+    """
+    with path.open("rb") as stream:
+        while len(head := stream.read(16)) == 16:
+            short, kind, long = struct.unpack(">I4sQ", head)
+            size = long if short == 1 else short
+            if kind == b"moov":
+                boxes = stream.read(min(size, path.stat().st_size))
+                at = boxes.find(b"\0\0\0\x28clap")
+                values = struct.unpack(">8i", boxes[at + 8 : at + 40].ljust(32, b"\0"))
+                if at < 0 or min(values[1::2]) <= 0:
+                    break
+                width, height, right, down = map(Fraction, values[::2], values[1::2])
+                return (height, down), (width, right)
+            if size < 8:
+                break
+            stream.seek(size - 16, io.SEEK_CUR)
+    return ()
 
 
 def film_timing(path: Path) -> Timing:
@@ -199,7 +311,7 @@ def _reason(error: Exception) -> str:
 
 @dataclass(frozen=True)
 class _Form:
-    """A way to write a film; `copied` sound is kept as it is, other sound is encoded again, as AAC."""
+    """A way to write a film; sound of the codecs `copied` stays as it is, other is encoded again, as AAC."""
 
     codec: str
     pixels: str
@@ -221,39 +333,87 @@ _FORMS = {
         "yuv422p10le",
         {"profile": "3", "vendor": "apl0"},
         "rgb48le",
-        ("aac", "mp3", "ac3", "alac", "pcm_s16le", "pcm_s24le"),
+        (
+            "aac",
+            "mp3",
+            "ac3",
+            "alac",
+            "pcm_s16le",
+            "pcm_s16be",
+            "pcm_s24le",
+            "pcm_s24be",
+            "pcm_s32le",
+            "pcm_f32le",
+        ),
     ),
 }
+_ALPHA_FORM = replace(
+    _FORMS[".mov"],
+    pixels="yuva444p10le",
+    options={"profile": "4", "vendor": "apl0"},
+    source="rgba64le",
+)
+
+
+def check_writable(path: Path, source: Path) -> None:
+    """Raise InputError where a film cannot have the sound of another; say what it loses of it."""
+    av = require_av(path)
+    with closing(Film(source)) as film:
+        timing, (height, width, channels) = film.timing(), film.read(0).shape
+        lost = film.sounds.count(None)
+    if lost:
+        log.warning("%s: %d of its sounds are of unknown codecs and left out", source, lost)
+    if channels == 4 and path.suffix.lower() == ".mp4":
+        log.warning("%s: has no alpha, and shows %s over black; give FILE.mov for alpha", path, source)
+    try:
+        with av.open(io.BytesIO(), "w", format=path.suffix[1:].lower()) as container:
+            _begun(av, container, _FORMS[path.suffix.lower()], (height, width), timing)
+            container.start_encoding()
+    except (av.error.FFmpegError, ValueError) as error:
+        raise InputError(
+            f"{source}: its sound cannot be written to {path} ({_reason(error)}); convert it to AAC"
+        ) from None
 
 
 def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
-    """Write PNG images as a film; it has its name when it is whole. `comment` goes into its metadata."""
+    """Write PNG images as a film; it has its name when it is whole. `comment` goes into its metadata.
+
+    Alpha is kept in ProRes 4444 in .mov, and .mp4 shows the images over black.
+    """
     av, form = require_av(path), _FORMS[path.suffix.lower()]
+    if path.suffix.lower() == ".mov" and decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
+        form = _ALPHA_FORM
     with atomic_path(path) as temporary:
         options = {"movflags": "+faststart"}
         with av.open(str(temporary), "w", options=options) as container:
             container.metadata["comment"] = comment
-            stream = container.add_stream(form.codec, rate=timing.rate)
-            stream.options = dict(form.options)
-            stream.pix_fmt = form.pixels
-            stream.time_base = stream.codec_context.time_base = Fraction(1, _CLOCK)
-            coded = stream.codec_context
-            coded.colorspace = coded.color_primaries = coded.color_trc = _BT709
-            coded.color_range = _LIMITED
-            height, width = (side + side % 2 for side in _pixels(images[0], form).shape[:2])
-            stream.width, stream.height = width, height
-            sound = _Sound(av, container, timing.sound, form.copied) if timing.sound else None
+            stream, sounds = _begun(av, container, form, _pixels(images[0], form).shape[:2], timing)
             for ticks, lasts, image in _timed(images, timing):
                 frame = av.VideoFrame.from_ndarray(_even(_pixels(image, form)), format=form.source)
                 frame = frame.reformat(format=form.pixels, dst_colorspace=_BT709, interpolation=exact(av))
                 frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, _CLOCK), lasts
                 container.mux(stream.encode(frame))
-                if sound:
-                    sound.write_until(Fraction(ticks, _CLOCK))
+                if sounds:
+                    sounds.write_until(Fraction(ticks, _CLOCK))
             container.mux(stream.encode(None))
-            if sound:
-                sound.write_until(Fraction(ticks + lasts, _CLOCK))
-                sound.close()
+            if sounds:
+                sounds.write_until(None)
+                sounds.close()
+
+
+def _begun(
+    av: Any, container: Any, form: _Form, size_px: tuple[int, ...], timing: Timing
+) -> tuple[Any, "_Sounds | None"]:
+    """The streams of a film to write: pictures, and sound where it has some."""
+    stream = container.add_stream(form.codec, rate=timing.rate)
+    stream.options = dict(form.options)
+    stream.pix_fmt = form.pixels
+    stream.time_base = stream.codec_context.time_base = Fraction(1, _CLOCK)
+    coded = stream.codec_context
+    coded.colorspace = coded.color_primaries = coded.color_trc = _BT709
+    coded.color_range = _LIMITED
+    stream.height, stream.width = (side + side % 2 for side in size_px)
+    return stream, _Sounds(av, container, timing.sound, form.copied) if timing.sound else None
 
 
 def comment_of(path: Path) -> str:
@@ -276,12 +436,19 @@ def _timed(images: Sequence[Path], timing: Timing) -> Iterator[tuple[int, int, P
 
 
 def _pixels(path: Path, form: _Form) -> np.ndarray:
-    """An image's first three channels [H, W, 3], uint8 or uint16."""
+    """An image's colour [H, W, 3], and alpha [H, W, 4] where the form has it, uint8 or uint16."""
     found = decode(path, PHOTO_LIMIT_PX)
     if len(found.colour) < 3:
         raise InputError(f"{path}: is not an image of a film; remove it and make it again")
-    kind = np.uint16 if form.source == "rgb48le" else np.uint8
+    kind = np.uint16 if form.source.endswith("le") else np.uint8
     values = unit_floats(found.values[..., found.colour])
+    alpha = np.ones_like(values[..., :1])
+    if found.alpha is not None:
+        alpha = unit_floats(found.values[..., found.alpha])[..., None]
+    if form is _ALPHA_FORM:
+        values = np.concatenate([values, alpha], -1)
+    elif found.alpha is not None:
+        values = linear_to_srgb(srgb_to_linear(values) * alpha)
     return np.round(values * np.iinfo(kind).max).astype(kind)
 
 
@@ -291,36 +458,61 @@ def _even(pixels: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), "edge"))
 
 
-class _Sound:
-    """Sound of a film, copied into another one; encoded again where that cannot hold it."""
+class _Sounds:
+    """All sound of a film, copied into another one; encoded again where that cannot hold it."""
 
     def __init__(self, av: Any, container: Any, path: Path, copied: Sequence[str]) -> None:
-        self._av, self._container = av, container
+        self._av, self._container, self._path = av, container, path
         self._source = av.open(str(path))
-        track = self._source.streams.audio[0]
-        self._copies = track.codec_context.name in copied
-        if self._copies:
-            self._stream = container.add_stream_from_template(track)
-        else:
-            self._stream = container.add_stream("aac", rate=track.codec_context.sample_rate)
-            self._stream.layout = track.codec_context.layout.name
-        self._packets = self._source.demux(track)
-        self._until_s = Fraction(-1)
+        self._start_s, self._until_s, self._damaged = _start_s(self._source), Fraction(-1), 0
+        tracks = [track for track in self._source.streams.audio if track.codec_context]
+        self._copies = {track.index: track.codec_context.name in copied for track in tracks}
+        self._streams = {track.index: self._begun(track) for track in tracks}
+        self._packets = self._source.demux(tracks)
 
-    def write_until(self, time_s: Fraction) -> None:
-        """Write what begins before a time; frames and sound alternate in the file."""
-        while self._until_s <= time_s and (packet := next(self._packets, None)) is not None:
+    def _begun(self, track: Any) -> Any:
+        if self._copies[track.index]:
+            stream = self._container.add_stream_from_template(track)
+        else:
+            coded, rates = track.codec_context, self._av.Codec("aac", "w").audio_rates
+            rate = max((rate for rate in rates if rate <= coded.sample_rate), default=min(rates))
+            stream = self._container.add_stream("aac", rate=rate)
+            stream.layout = coded.layout.name.replace(" channels", "c")  # the usual layout of as many
+        stream.metadata.update({"language": track.language} if track.language else {})
+        return stream
+
+    def write_until(self, time_s: Fraction | None) -> None:
+        """Write what begins before a time, or all; pictures and sound alternate in the file."""
+        while time_s is None or self._until_s <= time_s:
+            packet = next(self._packets, None)
+            if packet is None:
+                return
             if packet.dts is not None:
-                self._until_s = packet.dts * Fraction(packet.time_base)
-            if not self._copies:
-                for frame in packet.decode():
-                    self._container.mux(self._stream.encode(frame))
-            elif packet.dts is not None:
-                packet.stream = self._stream
+                self._until_s = packet.dts * Fraction(packet.time_base) - self._start_s
+            self._write(packet, self._streams[packet.stream.index])
+
+    def _write(self, packet: Any, stream: Any) -> None:
+        late = round(self._start_s / packet.time_base)
+        if self._copies[packet.stream.index]:
+            if packet.dts is not None:
+                packet.dts, packet.pts, packet.stream = packet.dts - late, packet.pts - late, stream
                 self._container.mux(packet)
+            return
+        try:
+            frames = packet.decode()
+        except self._av.error.FFmpegError:
+            self._damaged += 1
+            return
+        for frame in frames:
+            if frame.pts is not None:
+                frame.pts -= late
+            self._container.mux(stream.encode(frame))
 
     def close(self) -> None:
-        """End the stream and close the source."""
-        if not self._copies:
-            self._container.mux(self._stream.encode(None))
+        """End the streams and close the source."""
+        for index, stream in self._streams.items():
+            if not self._copies[index]:
+                self._container.mux(stream.encode(None))
         self._source.close()
+        if self._damaged:
+            log.warning("%s: %d parts of its sound are damaged and left out", self._path, self._damaged)

@@ -281,8 +281,8 @@ class Relight:
         photo.check()
         if self.background.kind != "photo" and alone:
             raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
-        if film and (self.background.kind == "none" or alone):
-            raise UsageError(f"-o {film.path}: a film has no alpha; give a folder, or --background COLOUR")
+        if film and not film.holds_alpha and (self.background.kind == "none" or alone):
+            raise UsageError(f"-o {film.path}: has no alpha; give FILE.mov, a folder, or --background COLOUR")
         if self.identity and alone:
             raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
         check_companion(self.matte, "--matte")

@@ -15,7 +15,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.images import LinearImage
-from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709
+from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709, unit_floats
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting import White
@@ -52,8 +52,10 @@ class ShotFrames:
         """Frame `number`."""
         if self._decoded is None:
             return read_photo(self._shot.frames[number], self._options, in_shot=True)
-        pixels = np.ascontiguousarray(to_linear_rec709(self._decoded(number), self._space), np.float32)
-        return LinearImage(pixels, None, self._space.name)
+        values = self._decoded(number)
+        pixels = np.ascontiguousarray(to_linear_rec709(values[..., :3], self._space), np.float32)
+        alpha = unit_floats(values[..., 3]) if values.shape[2] == 4 else None
+        return LinearImage(pixels, alpha, self._space.name)
 
     def pixels(self, number: int) -> np.ndarray:
         """Frame `number` [H, W, 3]; raises InputError where its size is not that of the first."""

@@ -180,6 +180,11 @@ class FilmOutput:
         return self.path.with_name(f"{self.path.name}.frames")
 
     @property
+    def holds_alpha(self) -> bool:
+        """True if the film has alpha where its frames have it."""
+        return self.path.suffix.lower() == ".mov"
+
+    @property
     def formats(self) -> tuple[Format, ...]:
         """The format of the frames."""
         return (_FORMATS[self.path.suffix.lower()],)
@@ -208,12 +213,16 @@ class FilmOutput:
         if batch.dry_run:
             print(f"{items[0].input_path} -> {self.path}")
             return ""
+        from facerf_cli.files.film import check_writable
+
         digest_of = cache(file_sha256)
         made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
         key = key_of(made_from)
         if self._is_finished(key, batch.overwrite):
             log.info("%s: already finished", self.path)
             return ""
+        if shots and shots[0].film:
+            check_writable(self.path, shots[0].film)
         return key
 
     def _is_finished(self, key: str, overwrite: Overwrite) -> bool:

@@ -170,6 +170,49 @@ def test_a_sequence_with_a_hole_is_said(
     assert "plate.2.exr: no such file; a shot needs all of its frames" in capsys.readouterr().err
 
 
+def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a photo's: in frames, and in a film of frames that can have it; the other is said."""
+    clear = np.zeros((192, 224), np.uint8)
+    clear[:, 112:] = 255
+    with av.open(str(tmp_path / "cut.mov"), "w") as container:
+        stream = container.add_stream("qtrle", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 224, 192, "argb"
+        for number in range(2):
+            frame = av.VideoFrame.from_ndarray(np.dstack([frame_of(number), clear]), format="rgba")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    line = ("relight", tmp_path / "cut.mov", "--light", "70,20", *CHEAP)
+    assert facerf(given, *line, "--format", "exr", "-o", tmp_path / "out") == 0
+    for number in range(2):
+        alpha = read_image(tmp_path / "out" / f"cut_light_70_20.{number:04d}.exr").alpha
+        np.testing.assert_array_equal(alpha, clear / np.float32(255))
+    assert facerf(given, *line, "-o", tmp_path / "out.mov") == 0
+    with av.open(str(tmp_path / "out.mov")) as container:
+        found = next(container.decode(video=0)).to_ndarray(format="rgba")[..., 3]
+    np.testing.assert_allclose(found, clear, atol=1)
+    capsys.readouterr()
+    assert facerf(given, *line, "-o", tmp_path / "out.mp4") == 0
+    assert "cut.mov over black; give FILE.mov for alpha" in capsys.readouterr().err
+
+
+def test_sound_that_cannot_be_written_is_said_before_the_first_frame(
+    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """AAC has no 24 channels."""
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 224, 192, "yuv420p"
+        sound = container.add_stream("pcm_s16le", rate=48000, layout="22.2")
+        container.mux([*stream.encode(av.VideoFrame.from_ndarray(frame_of(0))), *stream.encode(None)])
+        silence = av.AudioFrame.from_ndarray(np.zeros((1, 24 * 960), np.int16), "s16", "22.2")
+        silence.sample_rate = 48000
+        container.mux(sound.encode(silence))
+    out = tmp_path / "out.mp4"
+    assert facerf(given, "relight", tmp_path / "a.mkv", "--light", "70,20", "-o", out, *CHEAP) == 1
+    assert "a.mkv: its sound cannot be written" in capsys.readouterr().err
+    assert names(tmp_path) == ["a.mkv"]
+
+
 def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert facerf(given, "estimate-light", given / "me.mp4", "--lights", "20", "-o", out) == 0

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.film import Film, Timing, comment_of, film_timing, write_film
+from facerf_cli.files.film import Film, Timing, check_writable, comment_of, film_timing, write_film
 from facerf_cli.files.images import read_image, write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
 from tests.files.test_stated_by_files import bt2020_of, write_png
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
+PCM = "pcm_s16le"
 COLOURS = np.array([[0.8, 0.3, 0.2], [0.2, 0.6, 0.3], [0.3, 0.3, 0.7], [0.5, 0.5, 0.5], [0.9, 0.8, 0.4]])
 
 
@@ -217,6 +218,249 @@ def test_codes_of_a_film(tmp_path: Path) -> None:
     np.testing.assert_allclose(quarters_of(wide)[0], QUARTERS, atol=7)
     frame = write_png(tmp_path / "frame.png", SHOWN, (b"cICP", bytes([1, 1, 0, 1])))
     assert read_image(frame).pixels == pytest.approx(srgb_to_linear(SHOWN / np.float32(255)), abs=1e-6)
+
+
+def film_of(path: Path, codec: str, form: str, frames: list[np.ndarray], **options: str) -> Path:
+    """A film of RGB or RGBA frames in uint8, by a codec and a pixel format of FFmpeg."""
+    muxer = "mpegts" if path.suffix == ".mts" else "mp4" if path.suffix == ".m4v" else None
+    with av.open(str(path), "w", format=muxer) as container:
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.height, stream.width, stream.pix_fmt = *frames[0].shape[:2], form
+        for number, pixels in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgba" if pixels.shape[2] == 4 else "rgb24")
+            frame = frame.reformat(format=form, dst_colorspace=5)
+            frame.pts, frame.time_base = number, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def bands() -> np.ndarray:
+    """A frame [64, 96, 4] of alpha 0, 128 and 255 from the left, with colour under all of it."""
+    alpha = np.uint8([0, 128, 255]).repeat(32)
+    return np.dstack([SHOWN, np.broadcast_to(alpha, SHOWN.shape[:2])])
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "form"),
+    [
+        ("a.mov", "prores_ks", "yuva444p10le"),
+        ("b.mov", "qtrle", "argb"),
+        ("a.webm", "libvpx-vp9", "yuva420p"),
+        ("a.mkv", "libvpx", "yuva420p"),
+    ],
+)
+def test_alpha_is_read(tmp_path: Path, name: str, codec: str, form: str) -> None:
+    """White is white in any number of bits, and the colour under alpha stays."""
+    options = (
+        {"profile": "4"}
+        if codec == "prores_ks"
+        else {}
+        if codec == "qtrle"
+        else {"b": "9M", "auto-alt-ref": "0"}
+    )
+    with closing(Film(film_of(tmp_path / name, codec, form, [bands()] * 3, **options))) as film:
+        frame = film.read(2)
+    most = np.iinfo(frame.dtype).max
+    assert most == (65535 if "10" in form else 255)
+    found = frame[:, [4, 40, 92], 3] / most
+    # lossy alpha is a level off; half of a code in 10 bits
+    np.testing.assert_allclose(found, np.broadcast_to([0, 128 / 255, 1], found.shape), atol=1.1 / 255)
+    assert (frame[:, 70:, 3] == most).all()
+    np.testing.assert_allclose(frame[16::32, 24::48, :3] / most, QUARTERS / 255, atol=6 / 255)
+
+
+def test_alpha_is_written(tmp_path: Path) -> None:
+    """ProRes 4444 keeps it, and H.264 shows the image over black, as a JPEG does."""
+    image = write_png(tmp_path / "a.png", bands())
+    for name in ("a.mov", "a.mp4"):
+        write_film(tmp_path / name, [image], Timing.steady(1, Fraction(24)), "")
+    with closing(Film(tmp_path / "a.mov")) as film:
+        kept = film.read(0) / 65535
+    np.testing.assert_allclose(kept[:, [8, 40, 88], 3], [[0, 128 / 255, 1]] * 64, atol=1 / 1023)
+    np.testing.assert_allclose(kept[16::32, 24::48, :3], QUARTERS / 255, atol=4 / 255)
+    with closing(Film(tmp_path / "a.mp4")) as film:
+        shown = film.read(0) / 255
+    alpha = np.array([0, 128 / 255, 1])
+    expected = linear_to_srgb(srgb_to_linear(SHOWN[:, [8, 40, 88]] / 255) * alpha[:, None])
+    np.testing.assert_allclose(shown[8:24, [8, 40, 88]], expected[8:24], atol=4 / 255)
+
+
+def bars(number: int, second: int) -> np.ndarray:
+    """A bar that moves by 3 pixels a field: at frame `number` in odd rows, `second` fields later in even."""
+    frame = np.full((64, 96, 3), 40, np.uint8)
+    for row in range(64):
+        left = 3 * (2 * number + second * (1 - row % 2))
+        frame[row, left : left + 24] = 200
+    return frame
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mts", "a.avi"])
+def test_interlaced_frames_become_progressive(tmp_path: Path, name: str) -> None:
+    """Both rows show the time of the field that is first, in any order of reading."""
+    frames = [bars(number, 1) for number in range(11)]
+    coded = {"x264-params": "interlaced=1", "crf": "1", "g": "4"}
+    path = film_of(tmp_path / name, "libx264", "yuv420p", frames, **coded)
+    with closing(Film(path)) as film:
+        assert len(film.timing().times_s) == 11
+        read = [film.read(number) for number in range(11)]
+    for number, frame in enumerate(read):
+        inside = np.s_[4:60]  # at the edge of the first frame bwdif has too little to go by
+        np.testing.assert_allclose(frame[inside], bars(number, 0)[inside], atol=5)
+
+
+def test_an_interlaced_frame_is_the_same_in_any_order(tmp_path: Path) -> None:
+    """The first frame after a cut is coded without others, and made progressive with the one before."""
+    noise = np.random.default_rng(8).integers(0, 256, (2, 32, 48, 1), np.uint8)
+    frames = list(noise.repeat(3, 3).repeat(3, 0).repeat(2, 1).repeat(2, 2))
+    coded = {"x264-params": "interlaced=1:scenecut=0:bframes=0", "g": "3"}
+    path = film_of(tmp_path / "a.mp4", "libx264", "yuv420p", frames, **coded)
+    with closing(Film(path)) as film, closing(Film(path)) as other:
+        inside = [film.read(number) for number in range(6)]
+        np.testing.assert_array_equal(other.read(3), inside[3])
+        assert np.abs(inside[3].astype(int) - inside[4]).max() > 9  # what is before counts
+
+
+def test_a_progressive_film_is_not_filtered(tmp_path: Path) -> None:
+    frames = [bars(number, 1) for number in range(3)]  # combs that nothing states
+    with closing(Film(film_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1"))) as film:
+        np.testing.assert_allclose(film.read(1), frames[1], atol=5)
+
+
+@pytest.mark.parametrize(("size", "offset", "seen"), [((40, 64), (4, 8), True), ((40, 64), (20, 30), False)])
+def test_the_clean_aperture_is_what_is_shown(
+    tmp_path: Path, size: tuple[int, int], offset: tuple[int, int], seen: bool
+) -> None:
+    """A box `clap` says it, in samples, which are twice as wide here; one beyond the frame is left alone."""
+    pixels = np.random.default_rng(4).integers(0, 256, (16, 24, 3), np.uint8).repeat(4, 0).repeat(4, 1)
+    whole = coded_film(tmp_path / "a.mp4", pixels, "2")
+    numbers = (size[1], 1, size[0], 1, 2 * offset[1], 2, offset[0], 1)
+    data = whole.read_bytes()
+    for kind in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stsd"):
+        at = data.index(kind) - 4
+        data = data[:at] + struct.pack(">I", struct.unpack_from(">I", data, at)[0] + 40) + data[at + 4 :]
+    at = data.index(b"avc1", data.index(b"stsd")) - 4
+    length = struct.unpack_from(">I", data, at)[0]
+    clap = struct.pack(">I4s8i", 40, b"clap", *numbers)
+    clean = tmp_path / "clean.mp4"
+    clean.write_bytes(
+        data[:at] + struct.pack(">I", length + 40) + data[at + 4 : at + length] + clap + data[at + length :]
+    )
+    with closing(Film(whole)) as film, closing(Film(clean)) as cut:
+        shown = film.read(1)[16:56, 48:176] if seen else film.read(1)
+        np.testing.assert_array_equal(cut.read(1), shown)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "form"),
+    [
+        ("a.mkv", "libx264", "yuv420p"),
+        ("a.m4v", "libx264", "yuv420p"),
+        ("a.mts", "libx264", "yuv420p"),
+        ("a.mts", "mpeg2video", "yuv420p"),
+        ("a.avi", "libx264", "yuv420p"),
+        ("a.avi", "mpeg4", "yuv420p"),
+        ("a.mxf", "mpeg2video", "yuv422p"),
+    ],
+)
+def test_containers(tmp_path: Path, name: str, codec: str, form: str) -> None:
+    """Frames with references to later ones, in their order and at their times, from the first to the last."""
+    frames = [np.full((64, 96, 3), 12 * number, np.uint8) for number in range(20)]
+    path = film_of(tmp_path / name, codec, form, frames, bf="2", g="6", b="4M")
+    with closing(Film(path)) as film:
+        assert film.timing().times_s == tuple(Fraction(number, 25) for number in range(20))
+        for number in (*range(20), 19, 7, 0, 13):
+            assert film.read(number).mean() == pytest.approx(12 * number, abs=4)
+
+
+def with_sounds(path: Path, tones: list[tuple[str, int, float, float]], late_s: int = 0) -> Path:
+    """Two frames, 0.08 s, and tones, each by codec, rate, frequency in Hz, and length in s."""
+    with av.open(str(path), "w") as container:
+        pictures = container.add_stream("libx264", rate=25)
+        pictures.width, pictures.height, pictures.pix_fmt = 48, 32, "yuv420p"
+        tracks = [container.add_stream(codec, rate=rate, layout="mono") for codec, rate, *_ in tones]
+        for track, language in zip(tracks, ("eng", "ger"), strict=False):
+            track.metadata["language"] = language
+        for number in range(2):
+            frame = av.VideoFrame.from_ndarray(np.full((32, 48, 3), 99, np.uint8))
+            frame.pts, frame.time_base = 25 * late_s + number, Fraction(1, 25)
+            container.mux(pictures.encode(frame))
+        container.mux(pictures.encode(None))
+        for track, (_, rate, hertz, length_s) in zip(tracks, tones, strict=True):
+            wave = 0.3 * np.sin(2 * np.pi * hertz * np.arange(round(rate * length_s)) / rate)
+            sound = av.AudioFrame.from_ndarray(wave[None].astype(np.float32), "fltp", "mono")
+            sound.sample_rate, sound.pts, sound.time_base = rate, late_s * rate, Fraction(1, rate)
+            container.mux(track.encode(sound))
+            container.mux(track.encode(None))
+    return path
+
+
+def heard(path: Path) -> list[tuple[str, int, str | None, float, float]]:
+    """Codec, rate, language, frequency and length of each tone of a film."""
+    found = []
+    with av.open(str(path)) as container:
+        count = len(container.streams.audio)
+    for number in range(count):
+        with av.open(str(path)) as container:
+            track = container.streams.audio[number]
+            wave = np.concatenate([frame.to_ndarray().ravel() for frame in container.decode(track)]).astype(
+                float
+            )
+            coded, rate = track.codec_context, track.codec_context.sample_rate
+            loudest = np.abs(np.fft.rfft(wave)).argmax() * rate / len(wave)
+            found.append((coded.name, rate, track.language, loudest, len(wave) / rate))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("tones", "made", "codecs"),
+    [
+        ([("aac", 48000, 440, 0.08), ("aac", 48000, 880, 0.08)], "b.mp4", [("aac", 48000)] * 2),
+        ([("aac", 44100, 440, 2.0)], "b.mp4", [("aac", 44100)]),
+        ([(PCM, 192000, 440, 1.0), (PCM, 48000, 880, 2.0)], "b.mp4", [("aac", 96000), ("aac", 48000)]),
+        ([(PCM, 5000, 440, 1.0)], "b.mp4", [("aac", 7350)]),
+        ([(PCM, 192000, 440, 1.0), (PCM, 50000, 880, 0.5)], "b.mov", [(PCM, 192000), (PCM, 50000)]),
+    ],
+)
+def test_all_sound_is_kept(
+    tmp_path: Path, tones: list[tuple[str, int, float, float]], made: str, codecs: list[tuple[str, int]]
+) -> None:
+    """Every track, as long as it is, at a rate that the codec takes."""
+    timing, path = film_timing(with_sounds(tmp_path / "a.mov", tones)), tmp_path / made
+    check_writable(path, tmp_path / "a.mov")
+    write_film(path, images_of(tmp_path)[:2], timing, "")
+    found = heard(path)
+    assert [one[:2] for one in found] == codecs
+    assert [one[2] for one in found] == ["eng", "ger"][: len(tones)]
+    for (_, rate, hertz, length_s), (*_, loudest, lasts_s) in zip(tones, found, strict=True):
+        assert loudest == pytest.approx(hertz, abs=1.5 / length_s)  # a step of the transform, and padding
+        assert length_s - 1 / rate <= lasts_s < length_s + 3 * 1024 / min(rate, 7350)  # frames of AAC
+
+
+@pytest.mark.parametrize("codec", ["aac", "pcm_s16le"])
+def test_a_film_that_begins_late(tmp_path: Path, codec: str) -> None:
+    """Cut out of another, at 2 s: it begins at 0, and its sound with it."""
+    source = with_sounds(tmp_path / "a.mkv", [(codec, 48000, 440, 1.0)], late_s=2)
+    timing = film_timing(source)
+    assert timing.times_s == (0, Fraction(1, 25))
+    write_film(tmp_path / "b.mp4", images_of(tmp_path)[:2], timing, "")
+    with av.open(str(tmp_path / "b.mp4")) as container:
+        starts = [float(stream.start_time * stream.time_base) for stream in container.streams]
+    assert starts == pytest.approx([0, 0], abs=0.03)  # a frame of AAC
+
+
+def test_sound_that_cannot_be_kept_is_said_before_the_first_frame(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    data = bytearray(with_sounds(tmp_path / "a.mp4", [("aac", 48000, 440, 0.1)] * 2).read_bytes())
+    at = data.rindex(b"mp4a")
+    data[at : at + 4], config = b"apac", data.index(b"esds", at)
+    data[config : config + 4] = b"free"
+    (tmp_path / "b.mp4").write_bytes(data)
+    check_writable(tmp_path / "out.mp4", tmp_path / "b.mp4")
+    assert "b.mp4: 1 of its sounds are of unknown codecs and left out" in caplog.text
+    write_film(tmp_path / "out.mp4", images_of(tmp_path)[:2], film_timing(tmp_path / "b.mp4"), "")
+    assert len(heard(tmp_path / "out.mp4")) == 1
 
 
 def test_without_av_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
