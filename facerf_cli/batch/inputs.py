@@ -3,6 +3,7 @@
 Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an input fills.
 """
 
+import glob
 import logging
 import os
 import re
@@ -33,7 +34,9 @@ COMPANION = "FILE|DIR|PATTERN"  # the placeholder of options that name a file fo
 FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".mkv", ".m4v", ".avi", ".mxf", ".mts", ".m2ts"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
 _FRAMES = re.compile(r"(.*?)(\d+)-(\d+)(\.\w+)", re.DOTALL)  # plate.1001-1050.exr
-_NUMBERED = re.compile(r"(.*)%0?\d*d(.*)", re.DOTALL)  # plate.%04d.exr
+_NUMBERED = re.compile(r"(.*?)(?:%0?(\d*)d|(#{2,}))([^/\\]*)", re.DOTALL)  # plate.%04d.exr, plate.####.exr
+DOTTED = re.compile(r"(.+)\.(\d+)", re.DOTALL)  # a frame's name and number
+_DIGITS = re.compile(r"(\d+)")
 _MOST_FRAMES = 100_000
 _MOST_NAMED = 8  # kinds of files, or folders, that a line names
 _LONGEST_PATH = 4096  # characters
@@ -150,13 +153,15 @@ def collect_items(
     suffixes: frozenset[str] = PHOTO_SUFFIXES,
     pattern: NamePattern | None = None,
     null_separated: bool = False,
+    sequence: bool = False,
 ) -> list[Item]:
     """List the files of the inputs, sorted, each once; UsageError if there are none.
 
     Folders are walked recursively for `suffixes`, and a file keeps the path that it has in its folder; a file
     that is named alone has its name only. So an item's place depends on no other input, and two that meet in
     one place are refused. `-` reads paths from stdin. Hidden files and folders are left out, and so is an
-    output folder inside an input folder.
+    output folder inside an input folder. In a `sequence` images are named as frames: `shot_0001.png` as
+    `shot.0001.png`.
     """
     output_real = os.path.realpath(output_folder)  # resolve() fails for links in a circle
     found: dict[Path, tuple[Path, PurePosixPath]] = {}  # absolute -> as the user would write it, mirrored
@@ -174,12 +179,39 @@ def collect_items(
         kinds = " ".join(sorted(suffixes))
         raise UsageError(f"{' '.join(inputs) or 'standard input'}: no inputs found (looked for {kinds})")
     items = []
-    for _, (path, mirrored) in sorted(found.items()):
+    files = [found[absolute] for absolute in sorted(found)]
+    for path, mirrored in _as_frames(files) if sequence else files:
         own = mirrored.with_suffix("").as_posix()
         name = pattern.filled(fields_of(path, mirrored)) if pattern else own
         items.append(Item(path, output_folder / name, name, mirrored=mirrored))
     _refuse_meeting(items, pattern)
     return items
+
+
+def _as_frames(found: Sequence[tuple[Path, PurePosixPath]]) -> Iterator[tuple[Path, PurePosixPath]]:
+    """Images with the names of frames: a name, a dot, and the number.
+
+    That is what stands after the last dot, or the last number in which files differ whose names are alike
+    but for numbers: `plate_v2_0001_beauty.exr` is `plate_v2_beauty.0001.exr`. A number alone is named by its
+    folder.
+    """
+    alike: dict[tuple[object, ...], list[tuple[Path, PurePosixPath, list[str]]]] = {}
+    for path, mirrored in found:
+        parts = _DIGITS.split(mirrored.stem)
+        alike.setdefault((mirrored.parent, *parts[::2]), []).append((path, mirrored, parts))
+    for files in alike.values():
+        columns = list(zip(*(parts[1::2] for *_, parts in files), strict=True))
+        differ = [number for number, column in enumerate(columns) if len(set(column)) > 1]
+        at = 2 * (differ or [len(columns) - 1])[-1] + 1
+        for path, mirrored, parts in files:
+            is_film = mirrored.suffix.lower() in FILM_SUFFIXES
+            if not columns or is_film or DOTTED.fullmatch(mirrored.stem):
+                yield path, mirrored
+                continue
+            before, after = "".join(parts[:at]), "".join(parts[at + 1 :])
+            stem = (before.rstrip(_SEPARATORS + " ") + after).strip(_SEPARATORS + " ")
+            stem = stem or path.absolute().parent.name
+            yield path, mirrored.with_name(f"{stem}.{parts[at]}{mirrored.suffix}")
 
 
 def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
@@ -252,7 +284,9 @@ def companions(item: Item, given: Path, option: str) -> list[Path]:
     """
     if given.is_dir():
         suffixes = sorted(LANDMARK_SUFFIXES if option == "--landmarks" else PHOTO_SUFFIXES)
-        names = [form for name in (item.name, item.input_path.stem) for form in _forms(name)]
+        stem = item.input_path.stem  # of frames of a sequence, whose items have other names
+        beside = PurePosixPath(item.name).with_name(stem).as_posix()
+        names = [form for name in (item.name, beside, stem) for form in _forms(name)]
         return [given / f"{name}{suffix}" for name in dict.fromkeys(names) for suffix in suffixes]
     text = given.as_posix()
     if "{" not in text or given.exists():
@@ -277,9 +311,10 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
         elif frames := _FRAMES.fullmatch(entry):
             yield from _range(entry, *frames.groups())
         elif numbered := _NUMBERED.fullmatch(entry):
-            yield from _numbered(entry, *numbered.groups())
+            before, digits, marks, after = numbered.groups()
+            yield from _numbered(entry, before, int(digits or len(marks or "")), after)
         else:
-            yield entry
+            yield from sorted(glob.glob(entry)) or [entry]
 
 
 def _stdin_names(null_separated: bool) -> list[str]:
@@ -294,10 +329,11 @@ def _range(entry: str, before: str, first: str, last: str, after: str) -> list[s
     return [f"{before}{number:0{len(first)}}{after}" for number in range(int(first), int(last) + 1)]
 
 
-def _numbered(entry: str, before: str, after: str) -> list[str]:
-    """The files of `plate.%04d.exr`, by number."""
+def _numbered(entry: str, before: str, digits: int, after: str) -> list[str]:
+    """The files of `plate.%04d.exr`, by number; numbers of more digits begin with none of 0."""
     folder, begin = os.path.split(before)
-    form = re.compile(re.escape(begin) + r"(\d+)" + re.escape(after))
+    number = rf"(\d{{{digits}}}|[1-9]\d{{{digits},}})" if digits > 1 else r"(\d+)"
+    form = re.compile(re.escape(begin) + number + re.escape(after))
     matches = (
         form.fullmatch(name) for name in (os.listdir(folder or ".") if os.path.isdir(folder or ".") else ())
     )

@@ -1,6 +1,5 @@
 """The light setups that `facerf relight` renders (maps, rotations, single lights) and their names."""
 
-import glob
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -138,7 +137,7 @@ def collect_setups(
     together = {entry: named for entry in envmaps if (named := named_map(entry, turns, is_numbered))}
     envmaps = [entry for entry in envmaps if entry not in together]
     words = [entry for entry in envmaps if entry.startswith(DRAWN)]
-    paths = [path for entry in envmaps if entry not in words for path in _expand_glob(entry)]
+    paths = [entry for entry in envmaps if entry not in words]
     files = collect_items(paths, output, MAP_SUFFIXES) if paths else []
     short = map(split_frame, _short_names(files))
     maps: list[tuple[str, str, MapSource]] = [
@@ -224,8 +223,7 @@ def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
 
 def photo_lights(entries: Sequence[str], output: Path, options: LightOptions) -> list[PhotoLight]:
     """Name the lights of photos (files, folders, quoted patterns) as `estimate-light` names its maps."""
-    paths = [path for entry in entries for path in _expand_glob(entry)]
-    items = collect_items(paths, output, PHOTO_SUFFIXES) if paths else []
+    items = collect_items(entries, output, PHOTO_SUFFIXES) if entries else []
     names = _short_names(items)
     return [
         PhotoLight(f"{name}_light", item.input_path, options) for name, item in zip(names, items, strict=True)
@@ -249,8 +247,3 @@ def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
         degrees = numbers(text, ("DEG or FROM:TO:N",), "--rotate")[0]
         return [(f"_rot{degrees:g}", "", degrees)]
     return [("", f".{frame:04d}", degrees) for frame, degrees in enumerate(sweep(text, "--rotate"))]
-
-
-def _expand_glob(entry: str) -> list[str]:
-    found = [] if Path(entry).exists() else sorted(glob.glob(entry))
-    return found or [entry]

@@ -2,7 +2,6 @@
 
 import hashlib
 import logging
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -11,13 +10,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from facerf_cli.batch.inputs import (
+    DOTTED,
     FILM_SUFFIXES,
     PHOTO_SUFFIXES,
     Item,
     NamePattern,
     collect_items,
     fields_of,
-    split_frame,
 )
 from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf, key_of
 from facerf_cli.batch.run import BatchOptions, folder_not_file
@@ -42,7 +41,8 @@ class ShotOptions:
     """The inputs that are the frames of one shot.
 
     Attributes:
-        sequence: Take numbered images (plate.0001.exr, ...) as the frames of one shot, as a film's are.
+        sequence: Take numbered images (plate.0001.exr, plate_0001.exr, 0001.exr, ...) as the frames of one
+            shot, as a film's are.
         no_cuts: Take a film that cuts as one shot.
     """
 
@@ -79,7 +79,9 @@ def collect_frames(
     cannot have.
     """
     pattern = batch.name
-    found = collect_items(inputs, batch.output, PHOTO_SUFFIXES, pattern, photo.settings.null_separated)
+    found = collect_items(
+        inputs, batch.output, PHOTO_SUFFIXES, pattern, photo.settings.null_separated, wanted.sequence
+    )
     films = [item for item in found if item.input_path.suffix.lower() in FILM_SUFFIXES]
     photos = [item for item in found if item not in films]
     shots = [_of_film(item, pattern) for item in films if item.input_path.exists()]
@@ -87,6 +89,9 @@ def collect_frames(
     if wanted.sequence:
         shots += _of_images(photos)
         photos = []
+        for shot in shots:
+            if len(shot.frames) == 1:
+                log.warning("%s: is a shot of one frame; number the others alike", shot.frames[0].input_path)
     shots = [replace(shot, cuts=not wanted.no_cuts) for shot in shots]
     _check_shots(shots, photo)
     if shots and batch.shard.of > 1:
@@ -112,16 +117,14 @@ def _of_film(item: Item, pattern: NamePattern | None) -> Shot:
 
 def _of_images(photos: Sequence[Item]) -> list[Shot]:
     """Images grouped by folder and name without number; each group is a shot, by number."""
-    groups: dict[Path, list[Item]] = {}
+    groups: dict[PurePosixPath, list[tuple[int, str, Item]]] = {}
     for item in photos:
-        base = item.output_base
-        groups.setdefault(base.with_name(split_frame(base.name)[0]), []).append(item)
-    return [Shot(base, tuple(sorted(items, key=_number))) for base, items in groups.items()]
-
-
-def _number(item: Item) -> tuple[int, str]:
-    digits = re.findall(r"\d+", item.output_base.name)
-    return int(digits[-1]) if digits else 0, item.name
+        place = item.mirrored or PurePosixPath(item.input_path.name)
+        match = DOTTED.fullmatch(place.stem)
+        stem, number = match.groups() if match else (place.stem, "0")
+        groups.setdefault(place.with_name(stem), []).append((int(number), item.name, item))
+    shots = ((stem.name, [item for *_, item in sorted(group)]) for stem, group in groups.items())
+    return [Shot(frames[0].output_base.with_name(name), tuple(frames)) for name, frames in shots]
 
 
 def shot_of(shots: Sequence[Shot], item: Item) -> tuple[Shot, int] | None:

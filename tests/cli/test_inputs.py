@@ -16,11 +16,16 @@ from facerf_cli.batch.inputs import (
     NamePattern,
     collect_items,
     expand_inputs,
+    file_pattern,
     split_frame,
 )
+from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.main import main
+from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import companion
+from facerf_cli.work.shots import ShotOptions, collect_frames
 
 
 @pytest.fixture
@@ -150,6 +155,75 @@ def test_frames(tmp_path: Path) -> None:
             list(expand_inputs([wrong]))
     (tmp_path / "2020-2021.jpg").touch()
     assert list(expand_inputs([str(tmp_path / "2020-2021.jpg")])) == [str(tmp_path / "2020-2021.jpg")]
+
+
+def test_frames_of_several_sequences_stay_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As printf and Nuke count: with zeros up to the width, and more digits where the number needs them."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("a_9999", "a_10000", "a_00003", "a_0998", "ab_0001", "a_0998_b", "a9999", "a#1"):
+        Path(f"{name}.png").touch()
+    for pattern in ("a_%04d.png", "a_####.png"):
+        assert list(expand_inputs([pattern])) == ["a_0998.png", "a_9999.png", "a_10000.png"]
+    assert list(expand_inputs(["a_%d.png"])) == ["a_00003.png", "a_0998.png", "a_9999.png", "a_10000.png"]
+    assert list(expand_inputs(["a_####_b.png"])) == ["a_0998_b.png"]
+    assert list(expand_inputs(["a_99*.png", "a?.png", "a#1.png"])) == ["a_9999.png", "a?.png", "a#1.png"]
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["shot_9999", "shot_10000"], {"shot": ["9999", "10000"]}),
+        (["shot0001", "shot0002"], {"shot": ["0001", "0002"]}),
+        (["0001", "0002", "0010"], {"plates": ["0001", "0002", "0010"]}),
+        (["shot.9999", "shot.10000"], {"shot": ["9999", "10000"]}),
+        (["shot.01.0001", "shot.02.0001"], {"shot.01": ["0001"], "shot.02": ["0001"]}),
+        (["a_0001", "a_0002", "b_0001", "b_0002"], {"a": ["0001", "0002"], "b": ["0001", "0002"]}),
+        (["cam1_01", "cam1_02", "cam2_01"], {"cam1": ["01", "02"], "cam2": ["01"]}),
+        (["me_v2_1001_beauty", "me_v2_1002_beauty"], {"me_v2_beauty": ["1001", "1002"]}),
+        (["me_1001_v02", "me_1002_v02"], {"me_v02": ["1001", "1002"]}),
+        (["sub/x 1", "sub/x 2", "x 1"], {"sub/x": ["1", "2"], "x": ["1"]}),
+        (["portrait"], {"portrait": [""]}),
+    ],
+)
+def test_images_become_the_frames_of_shots(
+    tmp_path: Path, given: list[str], expected: dict[str, list[str]], caplog: pytest.LogCaptureFixture
+) -> None:
+    folder, out = tmp_path / "plates", tmp_path / "out"
+    for name in given:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / f"{name}.png").touch()
+    batch = BatchOptions(output=out)
+    items, shots = collect_frames([str(folder)], ShotOptions(sequence=True), batch, PhotoOptions(Settings()))
+    found = {
+        shot.base.relative_to(out).as_posix(): [
+            item.pattern_text(file_pattern("n{frame}"))[1:] for item in shot.frames
+        ]
+        for shot in shots
+    }
+    assert found == expected and len(items) == len(given)
+    assert sum("a shot of one frame" in record.message for record in caplog.records) == sum(
+        len(frames) == 1 for frames in expected.values()
+    )
+    if "plates" in found:
+        assert [item.name for item in items] == [f"plates.{name}" for name in given]
+    photos, none = collect_frames([str(folder)], ShotOptions(), batch, PhotoOptions(Settings()))
+    assert sorted(item.name for item in photos) == sorted(given) and not none
+
+
+def test_sequences_that_would_meet_are_refused(tmp_path: Path) -> None:
+    for name in ("shot_0001", "shot0001"):
+        (tmp_path / f"{name}.png").touch()
+    with pytest.raises(UsageError, match=r"shot0001\.png and .*shot_0001\.png: would both be written"):
+        collect_items([str(tmp_path)], tmp_path / "out", sequence=True)
+
+
+def test_mattes_of_a_sequence_have_the_names_of_its_images(tmp_path: Path) -> None:
+    for folder in ("plates/a", "roto/a"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "shot_0001.png").touch()
+    (item,) = collect_items([str(tmp_path / "plates")], tmp_path / "out", sequence=True)
+    assert item.name == "a/shot.0001"
+    assert companion(item, tmp_path / "roto", "--person") == tmp_path / "roto/a/shot_0001.png"
 
 
 def test_patterns_of_names(tmp_path: Path) -> None:
