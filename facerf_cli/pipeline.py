@@ -158,8 +158,8 @@ def reflectance_of(
 ) -> Reflectance:
     """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
 
-    A frame of a shot comes with what is steadied by the frames around it; a photo may come with the person's
-    `matte` [H, W].
+    A frame of a shot comes with what is steadied by the frames around it, and has the face's field alone
+    where it shows nobody; a photo may come with the person's `matte` [H, W].
 
     The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
     with `network_alone` they are not. By `white` skin under even white light has the photo's colours, or
@@ -187,9 +187,9 @@ def reflectance_of(
         wide = wider_square(person.square, person.segmentation.matte)
         return [person] if wide is None else [person, person.within(wide, photo)]
 
-    if photo is None or kind == "field":
+    if photo is None or kind == "field" or (steady and not steady.portrait):
         return of_face()[1]
-    if steady and steady.portrait:
+    if steady:
         source, field = of_face()
         return PortraitField.of(models.face, head, field, source, steady.portrait)
     (source, field), views = both(of_face, of_person)

@@ -288,7 +288,8 @@ _UNIT = ("normals", "strands")  # maps of unit vectors
 class ShotView:
     """A person through a shot, whose face was sighted in some frames.
 
-    `read` gives frames [H, W, 3], scene-linear, by number; `given`, if not None, the person's matte [H, W].
+    `read` gives frames [H, W, 3], scene-linear, by number; `given`, if not None, the person's matte [H, W],
+    which is black in frames without the person.
     """
 
     def __init__(
@@ -326,9 +327,14 @@ class ShotView:
 
     def steady(self, frame: int, portrait: bool = True, white: White | None = None) -> SteadyFrame:
         """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
-        views = tuple(zip(self._people(frame), self._steady_maps(frame), strict=True)) if portrait else ()
+        views: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()
+        if portrait and self._shows(frame):
+            views = tuple(zip(self._people(frame), self._steady_maps(frame), strict=True))
         balance = None if white is None else self._balance(white)
         return SteadyFrame(self.light, self.segmentation(frame), views, balance)
+
+    def _shows(self, frame: int) -> bool:
+        return self._given is None or bool(self._given(frame).any())
 
     @cached_property
     def light(self) -> RigLight:
@@ -346,10 +352,14 @@ class ShotView:
 
     @cached_property
     def key_frames(self) -> list[int]:
-        """Frames that stand for the shot, evenly spread over those in which the face was sighted."""
+        """Frames that stand for the shot, evenly spread over those in which the face was sighted.
+
+        Those whose given matte is black are left out.
+        """
         if not self._sighted:
             raise InputError("no frame shows a face")
-        return spread_over(self._sighted, KEY_FRAMES)
+        keys = spread_over(self._sighted, KEY_FRAMES)
+        return [frame for frame in keys if self._shows(frame)] or keys
 
     @property
     def middle_first(self) -> list[int]:
@@ -431,7 +441,7 @@ class ShotView:
 
     def _steady_maps(self, frame: int) -> list[PortraitMaps]:
         """Maps of a frame, averaged with its neighbours' in the squares, which follow the head."""
-        around = self._around(frame)
+        around = [one for one in self._around(frame) if self._shows(one)]
         people, maps = [self._people(one) for one in around], [self._maps(one) for one in around]
         middle = around.index(frame)
         return [

@@ -307,7 +307,7 @@ def person_matte(
 ) -> np.ndarray | None:
     """The person's matte [H, W] in 0..1 that is given for a photo [H, W, 3], at its size; None if none is.
 
-    Raises InputError where it is black, or `--person` of a photo alone nowhere white.
+    Raises InputError where that of a photo alone is black, or that of `--person` nowhere white.
     """
     height, width = pixels.shape[:2]
     if options.person is not None:
@@ -320,7 +320,7 @@ def person_matte(
     scale = height / len(matte)
     if abs(width - scale * matte.shape[1]) > 2 * max(1.0, scale):  # sides were rounded
         raise InputError(f"{path}: {_sizes(matte, (height, width))}; give one of the photo's aspect")
-    if not matte.any():
+    if not in_shot and not matte.any():
         raise InputError(f"{path}: the matte is black and shows nobody; make it white where the person is")
     if options.person is not None and not in_shot and (most := matte.max()) < _WHITE:
         at_most = f"nowhere white, {255 * most:.0f} of 255 at most"

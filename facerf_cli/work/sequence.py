@@ -5,6 +5,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -49,7 +50,21 @@ class ShotFrames:
         self._decoded = lru_cache(_DECODED)(self._film.read) if self._film else None
 
     def image(self, number: int) -> LinearImage:
-        """Frame `number`."""
+        """Frame `number`; alpha that is 0 in every frame is none."""
+        image = self.read(number)
+        kept = image.alpha is None or image.alpha.any() or self._has_alpha
+        return image if kept else replace(image, alpha=None)
+
+    @cached_property
+    def _has_alpha(self) -> bool:
+        alphas = (self.read(number).alpha for number in range(len(self._shot.frames)))
+        found = any(alpha is not None and alpha.any() for alpha in alphas)
+        if not found:
+            log.warning("%s: its alpha is 0 in every frame; read without alpha", self._shot.base.name)
+        return found
+
+    def read(self, number: int) -> LinearImage:
+        """Frame `number` with the alpha that it has itself."""
         if self._decoded is None:
             return read_photo(self._shot.frames[number], self._options, in_shot=True)
         values = self._decoded(number)
@@ -59,14 +74,14 @@ class ShotFrames:
 
     def pixels(self, number: int) -> np.ndarray:
         """Frame `number` [H, W, 3]; raises InputError where its size is not that of the first."""
-        pixels = self.image(number).pixels
+        pixels = self.read(number).pixels
         if pixels.shape != self._shape:
             raise InputError("is not of the size of the first frame; give frames of one size")
         return pixels
 
     @cached_property
     def _shape(self) -> tuple[int, ...]:
-        return self.image(0).pixels.shape
+        return self.read(0).pixels.shape
 
 
 def follow_all(shots: Sequence[Shot], options: PhotoOptions) -> None:
@@ -104,7 +119,7 @@ def _followed(shot: Shot, rows: Sequence[dict[str, Any]], options: PhotoOptions)
     networks = load_models_once(options).networks.people
     follower = Follower(networks, options.face, options.landmarks_from, last)
     frames = ShotFrames(shot, options)
-    show = lru_cache(_AHEAD)(lambda number: to_display(frames.image(number).pixels))
+    show = lru_cache(_AHEAD)(lambda number: to_display(frames.read(number).pixels))
     finder = CutFinder(len(shot.frames), show)
     for number in _with_progress(range(len(rows), len(shot.frames)), shot, options.settings):
         cut = shot.cuts and finder.is_cut(number)
@@ -227,10 +242,16 @@ def _view(shot: Shot, take: range, options: PhotoOptions) -> ShotView:
     inside = [seen if number in take else None for number, seen in enumerate(sightings)]
     read = _opened(shot, options).pixels
 
+    def matte(number: int) -> np.ndarray:
+        found = person_matte(shot.frames[number], read(number), options, in_shot=True)
+        assert found is not None
+        return found
+
     def given(number: int) -> np.ndarray:
-        matte = person_matte(shot.frames[number], read(number), options, in_shot=True)
-        assert matte is not None
-        return matte
+        found = matte(number)
+        if not found.any() and not any(matte(other).any() for other in take):
+            raise InputError("its mattes are black in every frame; make them white where the person is")
+        return found
 
     sides = models.sides(options.texture_side)
     return ShotView(models, sides, read, inside, given if options.has_given_person else None)

@@ -12,9 +12,14 @@ import pytest
 from PIL import Image
 from skimage.data import astronaut
 
+from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import Settings
 from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.main import main
 from facerf_cli.work import relight_scenes
+from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.sequence import ShotFrames
+from facerf_cli.work.shots import ShotOptions, collect_frames
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
@@ -43,6 +48,16 @@ def write_source(path: Path, frames: Iterator[np.ndarray] | list[np.ndarray]) ->
             container.mux(sound.encode(silence))
         container.mux(stream.encode(None))
         container.mux(sound.encode(None))
+
+
+def write_qtrle(path: Path, frames: list[np.ndarray]) -> None:
+    """A film of frames [192, 224, 4], without loss."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("qtrle", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 224, 192, "argb"
+        for pixels in frames:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format="rgba")))
+        container.mux(stream.encode(None))
 
 
 @pytest.fixture(scope="module")
@@ -174,13 +189,7 @@ def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: pytest.Cap
     """As a photo's: in frames, and in a film of frames that can have it; the other is said."""
     clear = np.zeros((192, 224), np.uint8)
     clear[:, 112:] = 255
-    with av.open(str(tmp_path / "cut.mov"), "w") as container:
-        stream = container.add_stream("qtrle", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 224, 192, "argb"
-        for number in range(2):
-            frame = av.VideoFrame.from_ndarray(np.dstack([frame_of(number), clear]), format="rgba")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    write_qtrle(tmp_path / "cut.mov", [np.dstack([frame_of(number), clear]) for number in range(2)])
     line = ("relight", tmp_path / "cut.mov", "--light", "70,20", *CHEAP)
     assert facerf(given, *line, "--format", "exr", "-o", tmp_path / "out") == 0
     for number in range(2):
@@ -193,6 +202,67 @@ def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: pytest.Cap
     capsys.readouterr()
     assert facerf(given, *line, "-o", tmp_path / "out.mp4") == 0
     assert "cut.mov over black; give FILE.mov for alpha" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["plates", "shot.mov"])
+def test_alpha_that_is_0_in_every_frame_is_none(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One frame alone is empty: the person has not entered."""
+    for shown in (0, 255):
+        frames = [np.dstack([frame_of(0), np.full((192, 224), alpha, np.uint8)]) for alpha in (0, shown, 0)]
+        given = tmp_path / str(shown) / name
+        (given if name == "plates" else given.parent).mkdir(parents=True)
+        if name == "plates":
+            for number, pixels in enumerate(frames):
+                Image.fromarray(pixels).save(given / f"me_{number}.png")
+        else:
+            write_qtrle(given, frames)
+        options = PhotoOptions(Settings())
+        batch = BatchOptions(output=tmp_path / "out")
+        (shot,) = collect_frames([str(given)], ShotOptions(sequence=True), batch, options)[1]
+        read = ShotFrames(shot, options)
+        alphas = [read.image(number).alpha for number in (2, 0, 1)]
+        if shown:
+            assert [float(alpha.mean()) for alpha in alphas if alpha is not None] == [0, 0, 1]
+        else:
+            assert alphas == [None] * 3
+        assert (caplog.text.count("its alpha is 0 in every frame; read without alpha") == 1) == (not shown)
+        caplog.clear()
+
+
+def test_a_frame_whose_matte_is_black_is_left_as_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the portrait field, too, which its neighbours have without it; all black is refused."""
+    for folder in ("plates", "roto", "black"):
+        (tmp_path / folder).mkdir()
+    matte = np.zeros((192, 224), np.uint8)
+    matte[10:, 40:190] = 255
+    for number in range(2):
+        Image.fromarray(frame_of(number)).save(tmp_path / f"plates/me_{number}.png")
+        Image.fromarray(matte * np.uint8(number)).save(tmp_path / f"roto/me_{number}.png")
+        Image.fromarray(matte * np.uint8(0)).save(tmp_path / f"black/me_{number}.png")
+
+    def made(mattes: str) -> int:
+        line = (
+            "relight",
+            tmp_path / "plates",
+            "--sequence",
+            "--person",
+            tmp_path / mattes,
+            "--light",
+            "70,20",
+        )
+        more = ("--lights", "12", "--format", "png", "--exposure", "0", "-o", tmp_path / f"{mattes}_lit")
+        return main([str(part) for part in (*line, *more)])
+
+    assert made("roto") == 0
+    lit = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "roto_lit").glob("*.png"))]
+    np.testing.assert_array_equal(lit[0], frame_of(0))
+    assert np.abs(lit[1].astype(int) - frame_of(1))[matte > 0].mean() > 5
+    assert made("black") == 1
+    assert "its mattes are black in every frame" in capsys.readouterr().err
 
 
 def test_sound_that_cannot_be_written_is_said_before_the_first_frame(
