@@ -40,7 +40,17 @@ class Plain:
         matte[:, self.columns] = self.share
         return matte
 
-    size_px, nbytes, own = SIZE, 0, np.full((*SIZE, 3), 0.5)
+    size_px, nbytes, photo = SIZE, 0, np.full((*SIZE, 3), 0.5)
+
+    @property
+    def keeps_photo(self) -> bool:
+        return not self.keeps_alpha
+
+    def own_layer(self, straight: bool) -> Band:
+        return (self.photo if straight else self.photo * self.matte()[..., None]).__getitem__
+
+    def share_in_photo(self, rows: slice) -> np.ndarray:
+        return self.matte()[rows]
 
     def person_and_share(self, relit: float) -> tuple[Band, Band]:
         return np.full((*SIZE, 3), relit).__getitem__, self.matte().__getitem__

@@ -174,6 +174,17 @@ class Composition:
         return self.view.height_px, self.view.width_px
 
     @property
+    def keeps_photo(self) -> bool:
+        """True where the photo's own background stays behind the person."""
+        return self._photo is not None and self._target.background == "photo"
+
+    @property
+    def photo(self) -> np.ndarray:
+        """The photo [H, W, 3]."""
+        assert self._photo is not None
+        return self._photo
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the head under one sum of lights."""
         return self._head.face.texture.nbytes + (self.surround.nbytes if self.surround else 0)
@@ -291,13 +302,12 @@ class Composition:
 
     def person_and_share(self, relit: Relit) -> tuple[Band, Band]:
         """Pixels [H, W, 3] of the whole person, or of its face, and the share [H, W] of it in the photo."""
-        mask, person = self._mask, self.person
+        return self._relit_pixels(relit), self.share_in_photo
 
-        def share(rows: slice) -> np.ndarray:
-            own = mask(rows) if person is None else person.matte[rows]
-            return np.minimum(self.matte[rows], own)
-
-        return self._relit_pixels(relit), share
+    def share_in_photo(self, rows: slice) -> np.ndarray:
+        """Share [h, W] of the whole person, or of its face, in rows of the photo."""
+        own = self._mask(rows) if self.person is None else self.person.matte[rows]
+        return np.minimum(self.matte[rows], own)
 
     def light_layer(self, relit: Relit) -> Band:
         """The person [H, W, 3] under one of several lights, over black: layers of lights add up."""

@@ -7,7 +7,7 @@ import numpy as np
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Band, Layer, by_rows
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.composition import Composition, Pixels, Relit
+from facerf_cli.relighting.composition import Composition, Relit
 from facerf_cli.relighting.whole_person import COLOURS
 
 Group = Sequence[Relit]  # of each person, in the order of the compositions
@@ -29,18 +29,26 @@ class GroupComposition:
 
     def bands(self, relit: Group, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The people in the photo's frame; see `Composition.bands`."""
+        if behind is None and self._first.keeps_photo:
+            plate, people = self._plate(2.0**-ev), self.light_layer(relit)
+            return {"rgb": lambda rows: (plate(rows) + people(rows)).clip(min=0)}
         first = self._first.bands(relit[0], ev, behind)
         pixels, alpha = by_rows(first["rgb"]), first.get("A")
-        others = zip(self._others, self._people(relit), strict=True)
-        for composition, (person, share) in others:
+        for person, share in self._people(relit):
             if alpha is None:
-                taken = composition.own if behind is None else None
-                pixels = _in_place(person, share, pixels, taken, 2.0**-ev)
+                pixels = _over(person, share, pixels)
                 continue
             whole = _over(_ones, share, by_rows(alpha))
             both = _over(person, share, _times(pixels, by_rows(alpha)))
             pixels, alpha = _straight(both, whole), whole
         return {"rgb": pixels} if alpha is None else {"rgb": pixels, "A": alpha}
+
+    def _plate(self, gain: float) -> Band:
+        """The photo [H, W, 3] without its people, shown at a gain."""
+        photo, people = self._first.photo, self._first.own_layer(straight=False)
+        for other in self._others:
+            people = _over(other.own_layer(straight=True), other.share_in_photo, people)
+        return lambda rows: (photo[rows] - people(rows)) * np.float32(gain)
 
     def light_layer(self, relit: Group) -> Band:
         """The people [H, W, 3] under one of several lights, over black."""
@@ -70,20 +78,6 @@ class GroupComposition:
     def _people(self, relit: Group) -> Iterator[tuple[Band, Band]]:
         for composition, one in zip(self._others, relit[1:], strict=True):
             yield composition.person_and_share(one)
-
-
-def _in_place(top: Band, share: Band, below: Band, taken: Pixels | None, gain: float) -> Band:
-    """Lay a person over others, in place of the colours `taken` out of a photo that is shown at a gain."""
-    if taken is None:
-        return _over(top, share, below)
-
-    def of(rows: slice) -> np.ndarray:
-        weight = share(rows)[..., None]
-        return np.asarray(
-            (below(rows) - weight * taken[rows] * np.float32(gain)).clip(min=0) + weight * top(rows)
-        )
-
-    return of
 
 
 def _over(top: Band, share: Band, below: Band) -> Band:

@@ -154,7 +154,7 @@ class Relight:
         identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
             (an extra).
         ball: Write a mirror ball and a diffuse ball under each map, too.
-        fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too); a film keeps its own times.
+        fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too).
         name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
     """
 

@@ -41,8 +41,7 @@ class ShotOptions:
     """The inputs that are the frames of one shot.
 
     Attributes:
-        sequence: Take numbered images (plate.0001.exr, plate_0001.exr, 0001.exr, ...) as the frames of one
-            shot, as a film's are.
+        sequence: Take numbered images (plate_0001.exr, 0001.exr, ...) as frames of one shot.
         no_cuts: Take a film that cuts as one shot.
     """
 
