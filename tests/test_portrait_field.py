@@ -24,7 +24,7 @@ from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitView, maps_of
-from facerf_cli.relighting.source_light import SourceLight, source_light
+from facerf_cli.relighting.source_light import source_light
 from tests import astronaut
 
 
@@ -159,7 +159,7 @@ def test_the_person_is_as_white_as_the_photos_light_leaves_them(field: PortraitF
 
     def exposure(blue: float) -> Tensor:
         light = RigLight(own.light.directions, own.light.weights * torch.tensor([1, 1, blue]))
-        return PortraitView.of(view.person, view.maps, SourceLight(light, own.quotient)).exposure
+        return PortraitView.of(view.person, view.maps, replace(own, light=light)).exposure
 
     torch.testing.assert_close(exposure(0.5), exposure(1.0) * torch.tensor([1, 1, 2.0])[:, None, None])
 

@@ -260,7 +260,7 @@ def _place(path: Path) -> tuple[int, int] | None:
 def files_read(given: Any, items: Sequence[Item]) -> Iterator[Path]:
     """Yield the items' files, and those that settings name; of a folder of companions those of the items."""
     if isinstance(given, Item):
-        yield given.input_path
+        yield from [given.input_path] if given.input_path != given.output_base else []  # as of what is drawn
     elif isinstance(given, (list, tuple)):
         for one in given:
             yield from files_read(one, items)

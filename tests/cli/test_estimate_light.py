@@ -94,6 +94,7 @@ def test_a_face_that_is_not_to_be_seen_is_one_line(
     photo = read_image(PHOTO).pixels
     black, cut, matte, half = (tmp_path / f"{name}.png" for name in ("black", "cut", "matte", "half"))
     nothing = np.zeros(photo.shape[:2], np.float32)
+    nothing[:9, :9] = 1  # alpha that is 0 everywhere is none
     write_display(black, np.zeros_like(photo))
     write_display(cut, photo, alpha=nothing)
     for path, word in ((black, "black"), (cut, "masked out")):

@@ -177,7 +177,8 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(
     assert part.head.face.visible.sum() < 0.8 * seen.head.face.visible.sum()
     mean = replace(models, face=models.face.pose_only())
     assert half.by(mean).mask[:, left].max() == 0
-    Image.fromarray(np.dstack([photo, np.zeros_like(shown)])).save(path)
+    shown[:, 220:], shown[:9, :9] = 0, 255  # alpha that is 0 everywhere is none
+    Image.fromarray(np.dstack([photo, shown])).save(path)
     assert run("reconstruction", path, "-o", tmp_path / "out") == 1
     assert f"{path}: " in capsys.readouterr().err
 

@@ -9,8 +9,6 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.work.photo_options import check_companion
 from facerf_cli.work.photos import companion
 
-ENDINGS = (".pts", ".json")
-
 
 @pytest.fixture
 def item(tmp_path: Path) -> Item:
@@ -26,23 +24,23 @@ def touched(path: Path) -> Path:
 
 
 def test_a_file_serves_all_photos(item: Item, tmp_path: Path) -> None:
-    assert companion(item, tmp_path / "all.pts", ENDINGS, "--landmarks") == tmp_path / "all.pts"
+    assert companion(item, tmp_path / "all.pts", "--landmarks") == tmp_path / "all.pts"
 
 
 def test_a_folder_mirrors_the_photos_or_holds_all_in_one_place(item: Item, tmp_path: Path) -> None:
     flat = touched(tmp_path / "points" / "me.json")
-    assert companion(item, tmp_path / "points", ENDINGS, "--landmarks") == flat
+    assert companion(item, tmp_path / "points", "--landmarks") == flat
     mirrored = touched(tmp_path / "points" / "x" / "me.pts")
-    assert companion(item, tmp_path / "points", ENDINGS, "--landmarks") == mirrored
+    assert companion(item, tmp_path / "points", "--landmarks") == mirrored
 
 
 def test_a_pattern(item: Item, tmp_path: Path) -> None:
     there = touched(tmp_path / "mattes" / "x" / "me_matte.png")
     pattern = tmp_path / "mattes" / "{dir}" / "{stem}_matte.png"
-    assert companion(item, pattern, ENDINGS, "--matte") == there
+    assert companion(item, pattern, "--matte") == there
     there.unlink()
     with pytest.raises(InputError, match=r"me.jpg: --matte has no .*me_matte.png; add it there"):
-        companion(item, pattern, ENDINGS, "--matte")
+        companion(item, pattern, "--matte")
 
 
 def test_what_does_not_exist_is_refused_before_the_first_photo(tmp_path: Path) -> None:
