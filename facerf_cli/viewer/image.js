@@ -3,7 +3,8 @@
 const SHOULDER = 0.8; // brightest channel from which on the soft view bends a colour (image/colour.py)
 const WHITENING = 0.3;
 const BALL = 0.6; // its albedo
-const TEXTURES = ["guide", "plate", "matte", "weights", "ratios", "sum"]; // each in the unit of its place here
+const PICTURES = ["guide", "plate", "matte", "photo"]; // as large as the view
+const TEXTURES = [...PICTURES, "weights", "ratios", "sum"]; // each in the unit of its place here
 
 const HEADER = `#version 300 es
 precision highp float;
@@ -25,8 +26,9 @@ void main() {
   }
 }`;
 const COMPOSE = `${HEADER}
-uniform sampler2D guide, plate, matte, sum;
+uniform sampler2D guide, plate, matte, photo, sum;
 uniform float white, keep; // linear value of the guide's white; 1 over the background, 0 over nothing
+uniform vec3 own; // exposed strength of the photo's own light
 out vec4 colour;
 vec3 decoded(vec3 x) { return mix(x / 12.92, pow((x + 0.055) / 1.055, vec3(2.4)), step(0.04045, x)); }
 vec3 encoded(vec3 x) {
@@ -43,9 +45,13 @@ void main() {
   vec2 size = vec2(textureSize(guide, 0));
   ivec2 at = ivec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
   float share = texelFetch(matte, at, 0).r;
-  vec3 person = white * decoded(texelFetch(guide, at, 0).rgb) * texture(sum, (vec2(at) + 0.5) / size).rgb;
-  vec3 mixed = decoded(texelFetch(plate, at, 0).rgb) + person;
-  vec3 shown = keep > 0.0 ? mix(mixed, softened(mixed), share) : softened(person / max(share, 0.001));
+  float under = keep > 0.0 ? 1.0 : max(share, 0.001); // colours over nothing are not multiplied by the matte
+  vec3 added = white * decoded(texelFetch(guide, at, 0).rgb) * texture(sum, (vec2(at) + 0.5) / size).rgb / under;
+  vec3 background = decoded(texelFetch(plate, at, 0).rgb);
+  vec3 person = share > 0.0 ? own * (decoded(texelFetch(photo, at, 0).rgb) - background) / under : vec3(0);
+  vec3 held = keep * background + person;
+  vec3 mixed = held + added, soft = softened(mixed);
+  vec3 shown = own == vec3(0) ? mix(mixed, soft, keep > 0.0 ? share : 1.0) : soft + held - softened(held);
   float alpha = max(share, keep);
   colour = vec4(encoded(shown) * alpha, alpha);
 }`;
@@ -66,7 +72,7 @@ class GpuView {
     [this.weigh, this.compose] = [this.program(WEIGH), this.program(COMPOSE)];
     gl.uniform1f(gl.getUniformLocation(this.compose, "white"), data.white);
     gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
-    for (const name of ["guide", "plate", "matte"]) {
+    for (const name of PICTURES) {
       this.texture(name, gl.NEAREST);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, images[name]);
     }
@@ -88,8 +94,8 @@ class GpuView {
     gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, light, ...data.small, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
   }
 
-  // Draw the sum by weights [lights * 3], over the photo's background or over nothing.
-  draw(weights, withBackground) {
+  // Draw the sum by weights [lights * 3] and the photo's own light [3], over its background or over nothing.
+  draw(weights, own, withBackground) {
     const { gl, data } = this;
     const texels = Float32Array.from({ length: 4 * data.scales.length }, (_, i) => weights[3 * (i >> 2) + Math.min(2, i % 4)]);
     gl.activeTexture(gl.TEXTURE0 + TEXTURES.indexOf("weights"));
@@ -98,7 +104,10 @@ class GpuView {
       gl.useProgram(program);
       gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
       gl.viewport(0, 0, ...size);
-      if (!buffer) gl.uniform1f(gl.getUniformLocation(program, "keep"), withBackground ? 1 : 0);
+      if (!buffer) {
+        gl.uniform1f(gl.getUniformLocation(program, "keep"), withBackground ? 1 : 0);
+        gl.uniform3f(gl.getUniformLocation(program, "own"), ...own);
+      }
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
   }
@@ -153,21 +162,26 @@ class CanvasView {
   constructor(canvas, data, images) {
     Object.assign(this, { data, ratios: [], context: canvas.getContext("2d") });
     [canvas.width, canvas.height] = data.small;
-    for (const name of ["guide", "plate", "matte"]) this[name] = pixelsOf(images[name], ...data.small);
+    for (const name of PICTURES) this[name] = pixelsOf(images[name], ...data.small);
   }
 
   add(light, pixels) {
     this.ratios[light] = pixels;
   }
 
-  draw(weights, withBackground) {
+  draw(weights, own, withBackground) {
     const [shown, sum] = [this.context.createImageData(...this.data.small), weighed(this.ratios, weights)];
     for (let at = 0; at < sum.length; at += 4) {
       const share = this.matte[at] / 255;
-      const person = [0, 1, 2].map((c) => this.data.white * decoded(this.guide[at + c] / 255) * sum[at + c]);
-      const mixed = person.map((value, c) => decoded(this.plate[at + c] / 255) + value);
-      const soft = softened(withBackground ? mixed : person.map((value) => value / Math.max(share, 0.001)));
-      const pixel = withBackground ? mixed.map((value, c) => value + share * (soft[c] - value)) : soft;
+      const under = withBackground ? 1 : Math.max(share, 0.001);
+      const held = own.map((value, c) => {
+        const background = decoded(this.plate[at + c] / 255);
+        const person = share && (value * (decoded(this.photo[at + c] / 255) - background)) / under;
+        return withBackground ? background + person : person;
+      });
+      const mixed = held.map((value, c) => value + (this.data.white * decoded(this.guide[at + c] / 255) * sum[at + c]) / under);
+      const [soft, bent, part] = [softened(mixed), softened(held), withBackground ? share : 1];
+      const pixel = soft.map((value, c) => own.some(Boolean) ? value + held[c] - bent[c] : mixed[c] + part * (value - mixed[c]));
       shown.data.set([...pixel.map((value) => 255 * encoded(value)), withBackground ? 255 : 255 * share], at);
     }
     this.context.putImageData(shown, 0, 0);

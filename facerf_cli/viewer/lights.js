@@ -4,8 +4,7 @@ const MOST_LIGHTS = 9;
 const WHITE_K = 6504; // of D65
 const [APART_DEG, MOST_A_SIDE] = [6, 6]; // samples of a soft light (light/studio_points.py)
 const XYZ_TO_RGB = [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 0.041556], [0.0556434, -0.2040259, 1.0572252]];
-const WORDS = { front: [0, 0], left: [-90, 0], right: [90, 0], above: [0, 90], below: [0, -90], behind: [180, 0] };
-const ROOM = "room"; // the name of a light that stands for the room
+const [ROOM, OWN] = ["room", "own"]; // names of a light that stands for the room, and of the photo's own light
 // Numbers of the keys of a light, and their limits; those of a page, and others of --light, which it cannot show.
 const KEYS = {
   at: [3, -1e4, 1e4], from: [2, -1e5, 1e5], az: [1, -1e5, 1e5], el: [1, -90, 90], rgb: [3, 0, 1e6],
@@ -13,7 +12,7 @@ const KEYS = {
 };
 const OTHER_KEYS = ["map", "rotate", "spot", "face"];
 
-const newLight = (values) => ({ name: "", azimuth: 0, elevation: 0, around: false, rgb: [1, 1, 1], kelvin: WHITE_K, stops: 0, size: 0, ...values });
+const newLight = (values) => ({ name: "", azimuth: 0, elevation: 0, around: false, own: false, rgb: [1, 1, 1], kelvin: WHITE_K, stops: 0, size: 0, ...values });
 const isName = (text) => /^[A-Za-z][\w-]*$/.test(text) && !Object.hasOwn(KEYS, text) && ![...OTHER_KEYS, "name"].includes(text);
 const numbersIn = (text) => text.split(",").map((part) => (part.trim() ? Number(part) : NaN));
 const rounded = (value, digits) => Number(value.toFixed(digits));
@@ -74,7 +73,7 @@ function samplesOf({ azimuth, elevation, size }) {
 }
 
 // The lights of a --light text: a direction, a word or a preset, each with or without a name, with keys; or keys alone.
-function lightsOf(text, presets) {
+function lightsOf(text, known) {
   const wrong = (what) => new Error(`light ${text}: ${what}`);
   const [given, places] = [{}, []]; // values of keys; a name, if any, and the direction or preset
   for (const part of text.split(";").filter((one) => one.trim())) {
@@ -100,11 +99,11 @@ function lightsOf(text, presets) {
   return places.flatMap(([prefix, where]) => {
     const name = given.name ?? prefix;
     if (name && !isName(name)) throw wrong(`${name} is no name of a light; give letters and digits`);
-    const lights = given.at ? [placed(numbers("at"), numbers("size", [0])[0])] : placesOf(where, presets);
-    if (!lights) throw wrong(`${where} is no direction; give AZ,EL, ${Object.keys(WORDS).join(", ")}, or a preset: ${Object.keys(presets).join(", ")}`);
+    const lights = given.at ? [placed(numbers("at"), numbers("size", [0])[0])] : placesOf(where, known);
+    if (!lights) throw wrong(`${where} is no direction; give AZ,EL, ${Object.keys(known.words).join(", ")}, or a preset: ${Object.keys(known.presets).join(", ")}`);
     return lights.map((light) => newLight({
       ...light,
-      name: [name, light.name].filter(Boolean).join("_"),
+      name: [name, light.name].filter(Boolean).join("_") || (light.own ? OWN : ""),
       rgb: (light.rgb ?? [1, 1, 1]).map((value, c) => value * tint[c]),
       stops: (light.stops ?? 0) + stops,
       kelvin: numbers("kelvin", [light.kelvin ?? WHITE_K])[0],
@@ -114,10 +113,10 @@ function lightsOf(text, presets) {
 }
 
 // Lights of AZ,EL[,STRENGTH], AZ,EL,R,G,B, a word, or a preset; null of anything else.
-function placesOf(where, presets) {
-  if (where === "around") return [{ around: true }];
-  if (Object.hasOwn(presets, where)) return presets[where].map(ofPreset);
-  const values = Object.hasOwn(WORDS, where) ? WORDS[where] : numbersIn(where);
+function placesOf(where, { words, presets }) {
+  if (Object.hasOwn(words, where)) return [ofPacked(words[where])];
+  if (Object.hasOwn(presets, where)) return presets[where].map(ofPacked);
+  const values = numbersIn(where);
   const [azimuth, elevation, ...colour] = values;
   const isOne = [2, 3, 5].includes(values.length) && values.every(Number.isFinite);
   if (!isOne || Math.abs(elevation) > 90 || colour.some((value) => value < 0)) return null;
@@ -129,9 +128,10 @@ function placed(at, side) {
   return { ...azelOf(at), size: (2 * Math.atan2(side / 2, Math.hypot(...at))) / DEGREE, near: true };
 }
 
-// A light of a preset, from the fields that it has in facerf.
-function ofPreset({ name, azel_deg, at_m, size_m, size_deg, rgb, kelvin, stops }) {
-  const place = at_m ? placed(at_m, size_m) : { ...towards(...azel_deg), size: size_deg };
+// A light of a word or a preset, from the fields that it has in facerf.
+function ofPacked({ name, azel_deg, at_m, size_m, size_deg, rgb, kelvin, stops, own }) {
+  const far = azel_deg ? { ...towards(...azel_deg), size: size_deg } : { own, around: !own };
+  const place = at_m ? placed(at_m, size_m) : far;
   return { name, rgb, kelvin: kelvin ?? WHITE_K, stops, ...place };
 }
 
@@ -140,18 +140,22 @@ function textsOf(lights, named) {
   const parts = lights.map(partsOf);
   const areShort = parts.every(({ short }) => short);
   if (named || lights.some(({ name }) => name) || (lights.length > 1 && !areShort)) {
-    return namesOf(lights).map((name, i) => (parts[i].short ? `${name}=${parts[i].short}` : `name=${name};${parts[i].keys}`));
+    return namesOf(lights).map((name, i) => {
+      const { short, keys } = parts[i];
+      if (lights[i].own && name === OWN) return keys.replace("from=", "");
+      return short ? `${name}=${short}` : `name=${name};${keys}`;
+    });
   }
   return lights.length ? [areShort ? parts.map(({ short }) => short).join(";") : parts[0].keys] : [];
 }
 
 // A light by its keys, and by numbers alone where these tell all.
-function partsOf({ azimuth, elevation, around, rgb, kelvin, stops, size }) {
-  const where = around ? "around" : `${rounded(azimuth, 2)},${rounded(elevation, 2)}`;
+function partsOf({ azimuth, elevation, around, own, rgb, kelvin, stops, size }) {
+  const where = own ? OWN : around ? "around" : `${rounded(azimuth, 2)},${rounded(elevation, 2)}`;
   const colour = rgb.every((value) => value === 1) ? "" : rgb.map((value) => Number(value.toPrecision(4))).join(",");
-  const keys = { kelvin: kelvin !== WHITE_K && kelvin, stops: rounded(stops, 2), size_deg: !around && rounded(size, 2) };
+  const keys = { kelvin: kelvin !== WHITE_K && kelvin, stops: rounded(stops, 2), size_deg: !around && !own && rounded(size, 2) };
   const others = Object.keys(keys).filter((key) => keys[key]).map((key) => `${key}=${keys[key]}`);
-  const short = others.length || around ? "" : [where, colour].filter(Boolean).join(",");
+  const short = others.length || around || own ? "" : [where, colour].filter(Boolean).join(",");
   return { short, keys: [`from=${where}`, colour && `rgb=${colour}`, ...others].filter(Boolean).join(";") };
 }
 

@@ -11,6 +11,7 @@ const CONTROLS = {
     kelvin: ["Colour", "K", 1700, 12000, 50, 1667, 25000],
     size: ["Softness", "°", 0, 120, 1],
   },
+  own: { ownStops: ["Own light", "stops", -6, 6, 0.1, -20, 20] },
   room: { room: ["Room", "%", 0, 30, 1, 0, 100] },
   map: { rotate: ["Rotate", "°", -180, 180, 1], mapStops: ["Intensity", "stops", -6, 6, 0.1] },
   image: { exposure: ["Exposure", "EV", -6, 8, 0.05, -20, 20] },
@@ -20,7 +21,7 @@ const MARK_MARGIN = 14; // pixels that a mark keeps from the edge of the picture
 const BEHIND = 1.98; // how far from the head's middle a light can be dragged, where 1 is its outline and 2 behind it
 
 // Read #light=key=40,20;stops=-1&light=rim&room=0.1&env=studio&rotate=30&mapstops=-1&ev=-0.5&background=none&compare=50
-function stateOf(address, maps, presets) {
+function stateOf(address, maps, data) {
   const given = new URLSearchParams(address.hash.length > 1 ? address.hash.slice(1) : address.search);
   const number = (name, low, high) => {
     const value = Number.parseFloat(given.get(name));
@@ -28,10 +29,15 @@ function stateOf(address, maps, presets) {
   };
   const named = (name) => maps.find((map) => map.name === given.get(name));
   const map = named("env") ?? named("room") ?? null; // a map may be the room
-  const found = { lights: map ? [] : [newLight({ azimuth: 40, elevation: 25 })], message: "" };
+  const found = { lights: map ? [] : [newLight({ azimuth: 40, elevation: 25 })], own: [], message: "" };
   try {
-    if (given.has("light")) found.lights = given.getAll("light").flatMap((text) => lightsOf(text, presets));
-    if (found.lights.length > MOST_LIGHTS) found.message = `The first ${MOST_LIGHTS} of ${found.lights.length} lights are shown`;
+    if (given.has("light")) {
+      const lights = given.getAll("light").flatMap((text) => lightsOf(text, data));
+      found.own = lights.filter(({ own }) => own);
+      found.lights = lights.filter(({ own }) => !own);
+    }
+    if (found.own.length > 1) found.message = "The photo's own light is given twice; the first is shown";
+    else if (found.lights.length > MOST_LIGHTS) found.message = `The first ${MOST_LIGHTS} of ${found.lights.length} lights are shown`;
     else if (found.lights.some(({ near }) => near)) found.message = NEAR;
   } catch (error) {
     found.message = error.message;
@@ -39,6 +45,7 @@ function stateOf(address, maps, presets) {
   if (!map && given.has("env")) found.message = `env=${given.get("env")}: give ${maps.map(({ name }) => name).join(", ")}`;
   return {
     lights: found.lights.slice(0, MOST_LIGHTS),
+    own: found.own[0] ?? null, // the photo's own light
     message: found.message,
     selected: 0,
     room: named("room") || given.get("room") === "none" ? 0 : number("room", 0, 1), // null: by the background
@@ -53,8 +60,12 @@ function stateOf(address, maps, presets) {
 
 const NEAR = "A near light is shown as a far one from its side; the command names what is shown";
 
-function addressOf({ lights, room, map, rotate, mapStops, exposure, background, compare }) {
-  const parts = textsOf(lights).map((text) => "light=" + text);
+// All lights, the photo's own one among them.
+const allOf = ({ lights, own }) => (own ? [...lights, own] : lights);
+
+function addressOf(state) {
+  const { room, map, rotate, mapStops, exposure, background, compare } = state;
+  const parts = textsOf(allOf(state)).map((text) => "light=" + text);
   if (room !== null) parts.push("room=" + rounded(room, 4));
   if (map?.command) {
     parts.push("env=" + map.name);
@@ -68,28 +79,32 @@ function addressOf({ lights, room, map, rotate, mapStops, exposure, background, 
 }
 
 // The share that comes from all around, as `facerf relight` has it: of the lights; of a map alone where it is asked for.
-function roomOf({ room, background, lights, map }, data) {
+function roomOf({ room, background, lights, map, own }, data) {
   if (!data.room || hasRoom(lights) || !(lights.length || map)) return 0;
-  return room ?? (!lights.length ? 0 : background && data.background ? data.room.bright : data.room.dark);
+  return room ?? (own || !lights.length ? 0 : background && data.background ? data.room.bright : data.room.dark);
 }
 
 // True where a light stands for the room.
 const hasRoom = (lights) => lights.some(({ around, name }) => around || name === ROOM);
 
 // The command lines that make the same image; a map shines together with lights where all have names.
-function commandOf({ map, lights, room, rotate, mapStops, background }, data, ev, ofRoom) {
-  if (!map && !lights.length) return "# add a light, or choose an environment";
+function commandOf(state, data, ev, ofRoom) {
+  const { map, lights, own, room, rotate, mapStops, background } = state;
+  if (!map && !lights.length && !own) return "# add a light, or choose an environment";
   const quoted = (text) => (/^[\w@%+=:,./-]+$/.test(text) ? text : "'" + text.replaceAll("'", `'"'"'`) + "'");
-  const both = Boolean(map) && (lights.length > 0 || ofRoom.some(Boolean));
+  const roomOfMap = !lights.length && ofRoom.some(Boolean);
+  const both = Boolean(map && (lights.length || own || roomOfMap));
   const keys = [`map=${map?.path}`, rotate && `rotate=${rotate}`, mapStops && `stops=${mapStops}`];
-  const texts = both ? [["name=envmap", ...keys.filter(Boolean)].join(";")] : [];
-  texts.push(...textsOf(lights, both));
-  if (both && !lights.length) texts.push(`name=${ROOM};${partsOf(newLight({ around: true, rgb: ofRoom })).keys}`);
+  const asLight = both && mapStops; // which --envmap has none of
+  const texts = asLight ? [["name=envmap", ...keys.filter(Boolean)].join(";")] : [];
+  texts.push(...textsOf(allOf(state), both));
+  if (roomOfMap) texts.push(`name=${ROOM};${partsOf(newLight({ around: true, rgb: ofRoom })).keys}`);
   let line = `facerf relight ${data.source}`;
-  if (map && !both) line += ` --envmap ${quoted(map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
+  if (map && !asLight) line += ` --envmap ${quoted((both ? "envmap=" : "") + map.path)}` + (rotate ? ` --rotate ${rotate}` : "");
   line += texts.map((text) => ` --light ${quoted(text)}`).join("");
-  if (lights.length && data.room && room !== null && !hasRoom(lights)) line += ` --room ${rounded(room, 4) || "none"}`;
-  line += ` --exposure ${rounded(ev + (map && !both ? mapStops : 0), 2)}`; // stops of a map alone are exposure
+  if (lights.length && data.room && room !== null && !hasRoom(lights) && (room || !own)) line += ` --room ${rounded(room, 4) || "none"}`;
+  const exposure = rounded(ev + (map && !both ? mapStops : 0), 2); // stops of a map alone are exposure
+  if (exposure || !own) line += ` --exposure ${exposure}`;
   if (data.background && !background) line += " --background none";
   return (map?.command ? map.command + "\n" : "") + line + " -o out";
 }
@@ -131,6 +146,8 @@ class Page {
     for (const [section, controls] of Object.entries(CONTROLS)) {
       byId(`${section}Rows`).append(...Object.entries(controls).map(([id, control]) => this.row(id, control)));
     }
+    byId("ownRows").hidden = !data.words.own;
+    byId("ownRows").querySelector("label").htmlFor = "own";
     byId("presets").append(...Object.keys(data.presets).map((name) => new Option(name)));
     this.fillMaps();
     this.connect();
@@ -160,14 +177,16 @@ class Page {
     typed.oninput = () => change(typed.value);
     typed.onblur = () => this.change({});
     row.ondblclick = (event) => event.target !== typed && this.set(id, null);
-    typed.ariaLabel = `${label}, ${unit}`;
+    slider.ariaLabel = typed.ariaLabel = `${label}, ${unit}`;
     row.append(title, slider, typed, Object.assign(document.createElement("span"), { textContent: unit }));
     return row;
   }
 
   // Set a value of the light or the image; null is what it begins with.
   set(id, value) {
+    const { own } = this.state;
     if (id in CONTROLS.light) this.changeLight({ [id]: value ?? newLight()[id] });
+    else if (id in CONTROLS.own) this.change({ own: own && { ...own, stops: value ?? 0 } });
     else this.change({ [id]: value ?? (id in CONTROLS.map ? 0 : null) });
   }
 
@@ -181,7 +200,7 @@ class Page {
 
   // Show the state of an address.
   load(address) {
-    const { message, ...state } = stateOf(address, this.maps, this.data.presets);
+    const { message, ...state } = stateOf(address, this.maps, this.data);
     if (message || this.state) this.say(message);
     this.state ??= state;
     this.change(state);
@@ -223,9 +242,10 @@ class Page {
     this.waiting = null;
     const { state, data } = this;
     const weights = this.weights();
-    this.ev = state.exposure ?? automaticEv(data.exposure, weights);
+    this.ev = state.exposure ?? (state.own ? 0 : automaticEv(data.exposure, weights));
     const exposed = weights.map((value) => value * 2 ** this.ev);
-    this.view.draw(scaled(exposed, data.scales), state.background && data.background);
+    const own = state.own ? rgbOf(state.own).map((value) => value * 2 ** this.ev) : [0, 0, 0];
+    this.view.draw(scaled(exposed, data.scales), own, state.background && data.background);
     drawBall(byId("ballView"), this.rig.lights, exposed);
     this.update();
     document.body.dataset.settled = "true";
@@ -238,6 +258,8 @@ class Page {
     const { state, light, data } = this;
     const around = light?.around;
     this.show(CONTROLS.light, light ?? newLight(), (id) => !light || (around && ["azimuth", "elevation", "size"].includes(id)));
+    this.show(CONTROLS.own, { ownStops: state.own?.stops ?? 0 }, () => !state.own);
+    byId("own").checked = Boolean(state.own);
     this.show(CONTROLS.room, { room: roomOf(state, data) }, () => hasRoom(state.lights) || !(light || state.map));
     this.show(CONTROLS.map, state, () => !state.map);
     this.show(CONTROLS.image, { exposure: this.ev }, () => false);
@@ -323,6 +345,7 @@ class Page {
     on("name", (text) => this.rename(text.trim()));
     byId("name").addEventListener("blur", () => (byId("name").setCustomValidity(""), this.change({})));
     on("tint", (hex) => this.changeLight({ rgb: [1, 3, 5].map((i) => decoded(parseInt(hex.slice(i, i + 2), 16) / 255)) }));
+    on("own", () => this.change({ own: byId("own").checked ? newLight({ name: OWN, own: true }) : null }));
     on("around", () => this.changeLight({ around: byId("around").checked }));
     const actions = {
       add: () => this.add(),
@@ -410,13 +433,13 @@ class Page {
   // Take the lights of a preset in place of all others.
   choose(name) {
     byId("presets").value = "";
-    const lights = lightsOf(name, this.data.presets);
+    const lights = lightsOf(name, this.data);
     this.say(lights.some(({ near }) => near) ? NEAR : "");
-    this.change({ lights, selected: 0 });
+    this.change({ lights, own: null, selected: 0 });
   }
 
   rename(name) {
-    const isTaken = this.state.lights.some((light) => light !== this.light && light.name === name);
+    const isTaken = allOf(this.state).some((light) => light !== this.light && light.name === name);
     const isGood = !name || (isName(name) && !isTaken);
     byId("name").setCustomValidity(isGood ? "" : "letters and digits, not a key of --light, and once");
     byId("name").reportValidity();

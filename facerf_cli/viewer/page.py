@@ -20,13 +20,13 @@ from facerf_cli.image.colour import (
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
-from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK, lit_images, preset_names
+from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK, WORDS, lit_images, preset_names
 from facerf_cli.light.envmap import rig_triangles
 from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
 _HERE = Path(__file__).parent
 SCRIPTS = ("light.js", "lights.js", "readers.js", "image.js", "page.js")
-_RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 92, 82
+_RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 97, 82
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "room": _room(basis),
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
-        "presets": packed_presets(),
+        **packed_lights(plate.background is not None),
         "envmaps": [
             {
                 "name": one.name,
@@ -107,14 +107,18 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
     return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
 
 
-def packed_presets() -> dict[str, list[dict[str, Any]]]:
-    """The lights of each rig that facerf ships, with their names."""
+def packed_lights(of_photo: bool) -> dict[str, Any]:
+    """The light of each word, the photo's own only `of_photo`, and those of each shipped rig, with names."""
     images = {preset: lit_images([preset])[0] for preset in preset_names()}
     return {
-        preset: [
-            {"name": name, **asdict(light)} for name, light in zip(image.names, *image.frames, strict=True)
-        ]
-        for preset, image in images.items()
+        "words": {word: asdict(light) for word, light in WORDS.items() if of_photo or not light.own},
+        "presets": {
+            preset: [
+                {"name": name, **asdict(light)}
+                for name, light in zip(image.names, *image.frames, strict=True)
+            ]
+            for preset, image in images.items()
+        },
     }
 
 

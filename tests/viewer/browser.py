@@ -62,10 +62,10 @@ class Drawn:
 
     @property
     def ev(self) -> float:
-        """The exposure in the command."""
+        """The exposure in the command; in the photo's own light it may have none, for 0 EV."""
         found = re.search(r"--exposure (\S+)", self.command)
-        assert found
-        return float(found[1])
+        assert found or "own" in self.command
+        return float(found[1]) if found else 0.0
 
 
 def chromium() -> str:

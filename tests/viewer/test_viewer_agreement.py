@@ -1,19 +1,29 @@
 """A page agrees with `facerf relight` at lights from all sides; its controls. Skipped without Chromium."""
 
+import base64
+import io
+import json
 import math
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.files.images import read_image
-from facerf_cli.image.colour import MOST_OVER_FRONT_EV, SOFT_VIEW, encode_display, most_exposure_ev
-from facerf_cli.image.strips import resized
+from facerf_cli.image.colour import (
+    MOST_OVER_FRONT_EV,
+    SOFT_VIEW,
+    encode_display,
+    linear_to_srgb,
+    most_exposure_ev,
+)
+from facerf_cli.image.strips import resized, whole
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
@@ -52,8 +62,12 @@ class Shown:
 
     def truth(self, relit: Relit, ev: float) -> np.ndarray:
         """The PNG of `facerf relight` [H, W, 3]."""
-        exposed = self.whole.image(relit, ev).pixels * np.float32(2.0**ev)
-        return np.round(255 * encode_display(exposed, SOFT_VIEW, self.whole.matte))
+        gain = np.float32(2.0**ev)
+        added = None
+        if relit.own is not None:
+            added = gain * whole(self.whole.light_layer(replace(relit, own=None)), *self.whole.size_px)
+        exposed = gain * self.whole.image(relit, ev).pixels
+        return np.round(255 * encode_display(exposed, SOFT_VIEW, self.whole.matte, added))
 
     def errors(self, found: np.ndarray, relit: Relit, ev: float) -> np.ndarray:
         """Of all values of the person."""
@@ -76,6 +90,12 @@ def shown() -> Shown:
     return Shown(whole, page("me.jpg", ["me.jpg"], document, ""))
 
 
+def photo_in(text: str) -> np.ndarray:
+    """The photo [H, W, 3] of a page, in 0..255."""
+    document = json.loads(text.partition('id="data">')[2].partition("</script>")[0])
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(document["photo"])))).astype(np.float64)
+
+
 def towards(*lights: tuple[float, float]) -> torch.Tensor:
     return torch.stack([azel_to_direction(*light) for light in lights]).float()
 
@@ -92,6 +112,7 @@ def text_of(light: torch.Tensor) -> str:
 
 RIG = on_rig((40, 25), (0, 80), (-140, 20), (180, 10))
 BETWEEN = [(40, 25), (-70, 10), (0, -40), (110, 20), (-30, 50)]
+OWN_LIGHT = Lights(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own=torch.ones(1, 3))
 PAIR = on_rig((75, 20), (-150, 10))
 COLOURED = f"light={text_of(PAIR[0])},1,0.5,0.25;{text_of(PAIR[1])}&ev=-0.5"
 ALONE, MAP = COLOURED + "&background=none", "env=sun&rotate=50"
@@ -99,6 +120,9 @@ BOTH = f"{MAP}&mapstops=-2&room=0.2&{COLOURED}"
 SOFT = "light=key=40,25;kelvin=3200;size_deg=40&light=fill=left;stops=-2;rgb=0.5,0.7,1"
 PRESET = "light=key=loop;stops=-1&light=room=around;stops=-4"
 MAP_IN_ROOM = f"{MAP}&room=0.3"
+OWN, DIMMED = "light=own", "light=own;stops=-1&ev=1"  # as bright as the photo, both
+RIM = "light=own&light=rim=-150,15,2"
+OWN_IN_ROOM = f"light=name=day;from=own;stops=-1;kelvin=5000&light=40,25&{MAP}&room=0.2&ev=-0.5"
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +131,8 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawn]:
     chromium()
     addresses = [f"light={text_of(light)}" for light in RIG]
     addresses += [f"light={az},{el}&ev=1" for az, el in BETWEEN]
-    addresses += [COLOURED, ALONE, MAP, BOTH, SOFT, PRESET, MAP_IN_ROOM]
+    addresses += [COLOURED, ALONE, MAP, BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, OWN_IN_ROOM]
+    addresses += [f"{OWN}{more}" for more in ("", "&background=none", "&env=sun")] + [DIMMED]
     found = drawn(shown().text, addresses, tmp_path_factory.mktemp("page"))
     return dict(zip(addresses, found, strict=True))
 
@@ -160,7 +185,7 @@ def test_a_rotated_map_agrees(images: dict[str, Drawn]) -> None:
     assert abs(image.ev - shown().whole.exposure_ev(relit, "auto")) < 0.03
 
 
-@pytest.mark.parametrize("address", [BOTH, SOFT, PRESET, MAP_IN_ROOM])
+@pytest.mark.parametrize("address", [BOTH, SOFT, PRESET, MAP_IN_ROOM, RIM, OWN_IN_ROOM])
 def test_the_command_makes_the_same_image(
     address: str, images: dict[str, Drawn], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,29 +193,54 @@ def test_the_command_makes_the_same_image(
     *draw, line = images[address].command.splitlines()
     assert all(main(shlex.split(one)[1:]) == 0 for one in draw)
     words = shlex.split(line)
-    lights, rooms = (
-        [words[i + 1] for i, word in enumerate(words) if word == name] for name in ("--light", "--room")
+    options = ("--light", "--room", "--envmap", "--rotate")
+    lights, rooms, maps, turns = (
+        [words[i + 1] for i, word in enumerate(words) if word == name] for name in options
     )
-    (setup,) = collect_setups(LightSources(light=lights), tmp_path / "out")
+    sources = LightSources(light=lights, envmap=maps, rotate=next(iter(turns), None))
+    (setup,) = collect_setups(sources, tmp_path / "out")
     setup = with_room(in_room(setup, next(iter(rooms), None), False))
     relit = next(shown().whole.relit(lights_over_rig((setup,), "150", "cell")))
     pixels, ev = images[address].pixels, images[address].ev
     error = shown().errors(pixels, relit, ev)
     assert error.mean() < MEAN_BETWEEN and np.percentile(error, 95) < PERCENTILE_95
-    if "ev=" not in address:
+    if setup.has_own:
+        assert ("--exposure" in line) == ("ev=" in address) and bool(rooms) == ("room=" in address)
+    elif "ev=" not in address:
         (strength,) = lights_over_rig((setup,), "150", "cell").strengths()
         truth = min(shown().whole.exposure_ev(relit, "auto"), most_exposure_ev("auto", strength))
         assert abs(ev - truth) < 0.05
 
 
+def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -> None:
+    photo = 255 * linear_to_srgb(shown().whole.image(next(shown().whole.relit(OWN_LIGHT))).pixels)
+    matte, kept = shown().whole.matte, photo_in(shown().text)
+    assert np.abs(kept - photo).mean() < 1.5  # a JPEG of a grainy film
+    for address in (OWN, DIMMED):
+        pixels = images[address].pixels[..., :3]
+        assert np.abs(pixels - kept)[matte > 0.01].max() <= 1
+        assert np.abs(pixels - photo)[matte == 0].max() <= 1
+    alone = images[f"{OWN}&background=none"].pixels
+    assert np.abs(alone[..., 3] - 255 * matte).max() < 1
+    assert np.abs(alone[..., :3] - kept)[matte == 1].max() <= 1
+    assert "--light own -o out" in images[OWN].command
+    assert "--envmap envmap=maps/00000_sun.exr --light own -o out" in images[f"{OWN}&env=sun"].command
+    assert "--light 'own;stops=-1' --exposure 1 " in images[DIMMED].command
+    assert "--light rim=-150,15,2,2,2 --light own -o out" in images[RIM].command
+
+
 def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path) -> None:
     chromium()
-    (image,) = drawn(shown().text, ["light=40,10&ev=0"], tmp_path, "--disable-3d-apis")
-    size = image.pixels.shape[:2]
-    assert size == (320, 320)
+    addresses = ["light=40,10&ev=0", "light=own;stops=1&light=40,10&room=0.06"]
     relit = shown().relit(towards((40, 10)), torch.ones(1, 3))
-    error = np.abs(resized(shown().truth(relit, 0.0), *size) - image.pixels[..., :3])
-    assert error[resized(shown().whole.matte, *size) > 0.99].mean() < MEAN_BETWEEN
+    for image, own in zip(
+        drawn(shown().text, addresses, tmp_path, "--disable-3d-apis"), (0.0, 2.0), strict=True
+    ):
+        size = image.pixels.shape[:2]
+        assert size == (320, 320)
+        lit = replace(relit, own=torch.full((3,), own)) if own else relit
+        error = np.abs(resized(shown().truth(lit, 0.0), *size) - image.pixels[..., :3])
+        assert error[resized(shown().whole.matte, *size) > 0.99].mean() < MEAN_BETWEEN
 
 
 _ACTIONS = """
@@ -265,6 +315,12 @@ _BY_HAND = (
     seen.roomIsIdle = byId("room").disabled;
     seen.preset = await type("presets", "split");
     seen.exposure = await type("exposureTyped", "0.5");
+    seen.ownIsIdle = byId("ownStops").disabled;
+    await click("auto");
+    seen.own = await click("own");
+    seen.dimmed = await type("ownStopsTyped", "-1.5");
+    seen.lone = [await type("presets", "split"), byId("own").checked];
+    await click("own");
     seen.reset = [await click("reset"), byId("message").textContent];
     const controls = [...document.querySelectorAll("button, input:not([type=file]), select")];
     const hasLabel = (one) => one.ariaLabel || one.labels?.length || one.textContent.trim();
@@ -321,7 +377,11 @@ def test_lights_are_moved_by_hand_and_by_numbers(tmp_path: Path) -> None:
     assert "name=key;from=around;kelvin=3200;stops=-1.25'" in seen["around"] and seen["roomIsIdle"]
     assert "--light 'name=key;from=82.15,9.69;size_deg=11.54'" in seen["preset"]
     assert "--exposure 0.5 " in seen["exposure"]
-    assert "--light 40,25 " in seen["reset"][0] and "--exposure 0.5" not in seen["reset"][0]
+    assert seen["ownIsIdle"] and seen["own"].endswith(" --light own -o out")
+    assert seen["dimmed"].endswith(" --light 'own;stops=-1.5' -o out")
+    assert "own" not in seen["lone"][0] and not seen["lone"][1]
+    assert "--light 40,25 " in seen["reset"][0] and "own" not in seen["reset"][0]
+    assert "--exposure 0.5" not in seen["reset"][0]
     assert seen["reset"][1] == "" and seen["unlabelled"] == []
 
 
@@ -331,8 +391,8 @@ def test_an_address_that_cannot_be_shown_says_so(tmp_path: Path) -> None:
         _ACTIONS
         + """
     const seen = [];
-    const many = "light=" + "1,1;".repeat(12);
-    for (const address of ["light=foo", "light=at=0,0,1", "env=moon", many, "light=key=40,20"]) {
+    const [many, twice] = ["light=" + "1,1;".repeat(12), "light=own&light=from=own"];
+    for (const address of ["light=foo", "light=at=0,0,1", "env=moon", many, twice, "light=key=40,20"]) {
       document.body.dataset.settled = "";
       location.hash = address;
       await settled();
@@ -347,6 +407,7 @@ def test_an_address_that_cannot_be_shown_says_so(tmp_path: Path) -> None:
         ("A near light is shown as a far one", "--light 0,0"),
         ("env=moon: give sun", "--light 40,25"),
         ("The first 9 of 12 lights", "--light '1,1;1,1;1,1;"),
+        ("The photo's own light is given twice", "--light own -o"),
         ("", "--light key=40,20"),
     ]
     for (message, command), (said, line) in zip(found, wanted, strict=True):

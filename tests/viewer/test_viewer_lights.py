@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from facerf_cli import viewer
-from facerf_cli.light.entries import StudioLight, lit_images
+from facerf_cli.light.entries import OWN, WORDS, StudioLight, lit_images
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import far_samples, intensity_of
-from facerf_cli.viewer.page import packed_presets
+from facerf_cli.viewer.page import packed_lights
 from tests.viewer.browser import chromium, driven
 
 SCRIPTS = ("light.js", "lights.js")
 _SCRIPT = """
-  const presets = %s;
+  const known = %s;
   return %s.map((text) => {
     try {
-      const lights = lightsOf(text, presets);
+      const lights = lightsOf(text, known);
       const samples = lights.map((light) => samplesOf(light).map(([at, share]) => [...at, share]));
       return { lights, samples, rgb: lights.map(rgbOf), texts: textsOf(lights) };
     } catch (error) {
@@ -38,6 +38,9 @@ ONE = [
     "el=89.9;size_deg=3",
     "from=-140,40;size_deg=120",
     "from=around;stops=-5;kelvin=4000",
+    "own",
+    "own;stops=-1.5;kelvin=5000",
+    "name=day;from=own;rgb=1,0.9,0.8",
 ]
 MANY = ["40,25;-60,10,1,0.5,0.25", "key=40,20;rim=160,10,0.5", *("beauty", "rembrandt", "rim")]
 FREE = {  # forms that are one with others
@@ -53,7 +56,7 @@ FREE = {  # forms that are one with others
     "at=0,0,-2": "180,0",
 }
 WRONG = {
-    "foo": "light foo: foo is no direction; give AZ,EL, front, left",
+    "foo": "light foo: foo is no direction; give AZ,EL, left, right",
     "40,100": "40,100 is no direction",
     "40,": "40, is no direction",
     "40,20,-1": "is no direction",
@@ -84,7 +87,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     ]
     parts = [(Path(viewer.__file__).parent / name).read_text(encoding="utf-8") for name in SCRIPTS]
     page = f'<html><body data-settled="true"><script>{"".join(parts)}</script></body></html>'
-    script = _SCRIPT % (json.dumps(packed_presets()), json.dumps(texts))
+    script = _SCRIPT % (json.dumps(packed_lights(True)), json.dumps(texts))
     return dict(zip(texts, driven(page, script, tmp_path_factory.mktemp("lights")), strict=True))
 
 
@@ -93,11 +96,11 @@ def assert_is(given: dict[str, Any], lights: tuple[StudioLight, ...]) -> None:
     assert len(given["lights"]) == len(lights)
     for one, samples, rgb, light in zip(given["lights"], given["samples"], given["rgb"], lights, strict=True):
         np.testing.assert_allclose(rgb, intensity_of(light), rtol=2e-4, atol=1e-6)
-        assert one["around"] == light.is_around
+        assert one["around"] == light.is_around and one["own"] == light.own
         if light.at_m is not None:
             toward = np.array(light.at_m) / np.linalg.norm(light.at_m)
             np.testing.assert_allclose(azel_to_direction(one["azimuth"], one["elevation"]), toward, atol=1e-6)
-        elif not light.is_around:
+        elif light.azel_deg is not None:
             directions, shares = far_samples(light)
             truth = np.concatenate([directions, shares[:, None]], 1)
             np.testing.assert_allclose(samples, truth, atol=2e-6)
@@ -117,10 +120,27 @@ def test_the_text_of_lights_gives_them_again(text: str, found: dict[str, Any]) -
     (image,) = lit_images(found[text]["texts"])
     given = found[text]
     for one, rgb, light in zip(given["lights"], given["rgb"], image.frames[0], strict=True):
-        where = None if one["around"] else pytest.approx((one["azimuth"], one["elevation"]), abs=6e-3)
-        assert light.azel_deg == where  # texts have two decimals
+        where = (
+            None
+            if one["around"] or one["own"]
+            else pytest.approx((one["azimuth"], one["elevation"]), abs=6e-3)
+        )
+        assert light.azel_deg == where and light.own == one["own"]  # texts have two decimals
         assert light.size_deg == pytest.approx(one["size"], abs=6e-3)
         np.testing.assert_allclose(intensity_of(light), rgb, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [("own", "own"), ("own;stops=-1.5;kelvin=5000", "own;kelvin=5000;stops=-1.5"), (ONE[-1], ONE[-1])],
+)
+def test_the_photo_s_own_light_is_written_by_its_word(text: str, written: str, found: dict[str, Any]) -> None:
+    assert found[text]["texts"] == [written]
+
+
+def test_every_word_of_light_is_packed_and_own_of_photos_alone() -> None:
+    assert set(packed_lights(True)["words"]) == set(WORDS)
+    assert set(WORDS) - set(packed_lights(False)["words"]) == {OWN}
 
 
 @pytest.mark.parametrize("text", FREE)
