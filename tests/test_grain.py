@@ -14,9 +14,19 @@ SMOOTH = np.linspace(0.2, 1, SIDE, dtype=np.float32)[None, :, None].repeat(SIDE,
 ALL = np.ones((SIDE, SIDE), np.float32)
 
 
-def given(relit: np.ndarray, guided: np.ndarray, coarse: np.ndarray, share: np.ndarray = ALL) -> np.ndarray:
+NOTHING = np.zeros((SIDE, SIDE, 1), np.float32)
+
+
+def given(
+    relit: np.ndarray,
+    guided: np.ndarray,
+    coarse: np.ndarray,
+    share: np.ndarray = ALL,
+    mended: np.ndarray = NOTHING,
+) -> np.ndarray:
     flat = np.stack([guided, coarse], -1)
-    return whole(Grain(flat.__getitem__, share, MAP_PX).given(relit.__getitem__), SIDE, SIDE)
+    grain = Grain(flat.__getitem__, share, MAP_PX, mended.__getitem__)
+    return whole(grain.given(relit.__getitem__), SIDE, SIDE)
 
 
 def test_a_smooth_image_gets_the_photos_pores() -> None:
@@ -32,6 +42,18 @@ def test_edges_of_the_photos_light_are_not_its_detail() -> None:
     assert np.abs(found / SMOOTH - 1).max() < 0.1
 
 
+def test_no_line_is_drawn_where_a_relit_image_is_sharp_itself() -> None:
+    """Skin before cloth of a twentieth of its albedo: of the light that both send back cloth has a fifth."""
+    cloth = (np.arange(SIDE) < SIDE // 2)[None].repeat(SIDE, 0)
+    photo = np.where(cloth, 0.05, 1).astype(np.float32)
+    relit = np.where(cloth, 0.2, 1).astype(np.float32)[..., None].repeat(3, -1)
+    lines, none = (given(relit, photo, photo, mended=part) / relit for part in (NOTHING, 1 + NOTHING))
+    assert np.abs(np.log(lines)).max() > 0.5
+    assert np.abs(np.log(none)).max() < 0.02
+    pores = given(relit, photo * PORES, photo * PORES, mended=1 + NOTHING)[8:-8, 8:30]
+    assert np.log(pores).std() > 0.85 * np.log(PORES).std()  # far from the edge they are
+
+
 def test_hair_and_what_is_nearly_black_stay_as_they_are() -> None:
     half = ALL.copy()
     half[:, : SIDE // 2] = 0
@@ -43,7 +65,7 @@ def test_hair_and_what_is_nearly_black_stay_as_they_are() -> None:
 
 def test_images_add_up_and_strips_show_no_borders() -> None:
     other = np.ascontiguousarray(SMOOTH.transpose(1, 0, 2))
-    grain = Grain(np.stack([ALL, PORES], -1).__getitem__, ALL, MAP_PX)
+    grain = Grain(np.stack([ALL, PORES], -1).__getitem__, ALL, MAP_PX, NOTHING.__getitem__)
     both, one, two = (grain.given(image.__getitem__) for image in (SMOOTH + other, SMOOTH, other))
     rows = slice(0, SIDE)
     np.testing.assert_allclose(both(rows), one(rows) + two(rows), rtol=1e-5)
@@ -70,7 +92,7 @@ def test_only_the_strips_that_show_the_person_are_read(monkeypatch: pytest.Monke
         read.append(rows.start)
         return np.stack([PORES, PORES**2], -1)[rows]
 
-    found = whole(Grain(flat, share, MAP_PX).given(SMOOTH.__getitem__), SIDE, SIDE)
+    found = whole(Grain(flat, share, MAP_PX, NOTHING.__getitem__).given(SMOOTH.__getitem__), SIDE, SIDE)
     assert read == [32, 64]
     np.testing.assert_allclose(found, truth, rtol=1e-6)  # as strips of the same photo differ
     assert np.array_equal(found[:30], SMOOTH[:30])

@@ -7,6 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
@@ -302,7 +303,9 @@ def test_strands_break_up_light_from_behind_and_nothing_else_does(field: Portrai
     )
     relit = enlarged.relit(lit, 0.0, cast(Any, where_they_are))(photo, rows, columns)
     ratio = luminance(relit[..., 3:]) / luminance(relit[..., :3]).clip(1e-6)
-    classes = enlarged._enlarged(view.person.classes, rows, columns).numpy()
+    classes = F.grid_sample(
+        view.person.classes[None], enlarged._grid(rows, columns)[None], align_corners=False
+    )[0].numpy()
     hair, skin = (classes[class_index(name)] for name in ("hair", "skin"))
     assert np.abs(ratio[skin > 0.999] - 1).max() < 0.01
     assert 0.9 < ratio[hair > 0.8].mean() < 1.1 and ratio[hair > 0.8].std() > 0.05

@@ -1,7 +1,7 @@
 """A view of a portrait field at the photo's own resolution.
 
 Its maps are coarse. The gain is enlarged with the photo as a guide, so that the photo without its light keeps
-every pore and hair; shading and highlights of a light are smooth and enlarged as they are.
+every pore and hair; bias, shading and highlights are smooth, but for the photo's edges (`edges.py`).
 """
 
 from collections.abc import Callable
@@ -18,6 +18,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
+from facerf_cli.relighting.edges import Mended, colours_of, places, trust_in
 from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
 from facerf_cli.relighting.rims import Rims
 
@@ -26,6 +27,8 @@ _ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
 _FEATHER = 0.3  # border of the square where a wider one takes over, in halves of its side
 _GLOSS_PX = 0.8  # blur of highlights, which the network draws in pairs of pixels
 _STRAND_RANGE = (0.3, 3.0)  # of an albedo over that of the maps: strands of hair break up its highlights
+_HAIR = ("hair", "beard")
+_SOLID = ("glasses", "headwear", "garment", "hand")  # their edges are kept sharp
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 # Values [h, w, C] for the photo's pixels [h, w, 3], not negative, in some rows and columns.
@@ -40,9 +43,17 @@ class Enlarged:
         self._display_ev = display_ev(photo)
         classes = view.person.classes
         self.own = (1 - classes[0] > _SURE).float()
-        hair = classes[[class_index("hair"), class_index("beard")]].sum(0, keepdim=True)
+        self._colours = colours_of(view.person.image / view.person.exposure)
+        hair, solid = (
+            classes[[class_index(name) for name in names]].sum(0, keepdim=True) for names in (_HAIR, _SOLID)
+        )
+        self._trust = 1 - self.own * (1 - trust_in(self._colours, solid[0], hair[0]))
+        self._mended = Mended.of(self._colours, self._trust, self.own)
         self._hair = torch.cat([self._filled(view.maps.albedo[0].mean(0, keepdim=True)), hair])
-        self._albedo_maps = torch.cat([self._gain_lines(), self._filled(view.maps.bias[0])])
+        self._albedo_maps = torch.cat(
+            [self._gain_lines(), self._filled(self._mended.given(view.maps.bias[0]))]
+        )
+        self._alike = remembered(self._places_alike)
         self._seen = remembered(self._without_light)
 
     @property
@@ -70,17 +81,19 @@ class Enlarged:
         rear = light.behind[0] if rims is None else self._smooth(light.behind[0])
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
+            grid = self._alike((rows, columns), pixels)
             albedo, strands = self._seen((rows, columns), pixels, display_ev)
 
             def radiance(light: Tensor) -> Tensor:
                 shading, highlights = light.chunk(2)
                 return albedo * shading + highlights * strands
 
-            parts = [radiance(self._enlarged(front, rows, columns))]
+            parts = [radiance(_enlarged(front, grid))]
             if rims is not None:
                 offsets_px, brightness = rims.at(rows, columns)
+                offsets = offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
                 # Strands that stand before such a light show one by one.
-                behind = radiance(self._enlarged(rear, rows, columns, offsets_px))
+                behind = radiance(_enlarged(rear, grid + offsets))
                 parts.append(behind * (brightness * strands))
             return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
 
@@ -90,7 +103,7 @@ class Enlarged:
         self, where: tuple[slice, slice], pixels: np.ndarray, display_ev: float
     ) -> tuple[Tensor, Tensor]:
         """The photo without its light [3, h, w] in rows and columns, and what strands do to highlights."""
-        wide = self._enlarged(torch.cat([self._albedo_maps, self._hair]), *where)
+        wide = _enlarged(torch.cat([self._albedo_maps, self._hair]), self._alike(where, pixels))
         albedo, hair = self._albedo(pixels, wide, display_ev), wide[_ALBEDO_MAPS:]
         finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
         return albedo, torch.lerp(torch.ones_like(finer), finer, hair[1])
@@ -100,17 +113,25 @@ class Enlarged:
         maps = torch.cat([self._albedo_maps, self._filled(self._view.maps.gain[0])])
 
         def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-            wide = self._enlarged(maps, rows, columns)
+            wide = _enlarged(maps, self._grid(rows, columns))
             gains = self._gain(pixels, wide, display_ev), wide[_ALBEDO_MAPS:]
             return np.stack([luminance(_by_pixel(gain) * pixels) for gain in gains], -1)
 
         return of
 
+    def mended(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
+        """Share [h, w, 1] of the maps' values at the photo's pixels that are mended."""
+        return _by_pixel(_enlarged(1 - self._trust[None], self._grid(rows, columns)))
+
     def layer(self, name: str, lit: Tensor) -> Shown:
         """A layer of an image under the light of maps [15, S, S]; see `WholePerson.layer`."""
+
+        def read(maps: Tensor, pixels: np.ndarray, rows: slice, columns: slice) -> Tensor:
+            return _enlarged(maps, self._alike((rows, columns), pixels))
+
         if name == "albedo":
-            return lambda pixels, rows, columns: _by_pixel(
-                self._albedo(pixels, self._enlarged(self._albedo_maps, rows, columns), self._display_ev)
+            return lambda pixels, *where: _by_pixel(
+                self._albedo(pixels, read(self._albedo_maps, pixels, *where), self._display_ev)
                 * self._view.exposure
             )
         light = PortraitLight.of(lit[None]).whole
@@ -119,8 +140,8 @@ class Enlarged:
             "shadow": light.reached[0],
             "normal": self._view.maps.normals[0],
         }[name]
-        filled = self._filled(maps)
-        return lambda pixels, rows, columns: _by_pixel(self._enlarged(filled, rows, columns))
+        filled = self._filled(self._mended.given(maps))
+        return lambda pixels, *where: _by_pixel(read(filled, pixels, *where))
 
     def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [15, S, S] and its own [3]."""
@@ -155,24 +176,21 @@ class Enlarged:
     def _smooth(self, light: Tensor) -> Tensor:
         """Shading and highlights [6, S, S], continued over the background; highlights are blurred."""
         shading, highlights = torch.chunk(self._filled(light), 2)
-        return torch.cat([shading, blurred(highlights, _GLOSS_PX)])
+        return self._filled(self._mended.given(torch.cat([shading, blurred(highlights, _GLOSS_PX)])))
 
     def _filled(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] with the person's values continued over the background."""
         return inpaint(maps, self.own)
 
-    def _enlarged(
-        self, maps: Tensor, rows: slice, columns: slice, offsets_px: Tensor | None = None
-    ) -> Tensor:
-        """Maps [C, h, w] over some of the photo's pixels; beyond the square those at its border repeat.
+    def _places_alike(self, where: tuple[slice, slice], pixels: np.ndarray) -> Tensor:
+        """Places [h, w, 2] in the maps where pixels [h, w, 3] in rows and columns find their like."""
+        grid, unit = self._grid(*where), self._view.person.exposure
+        return places(self._colours, self._trust, grid, torch.from_numpy(pixels), unit)
 
-        Each pixel may be read from elsewhere, at an offset of `offsets_px` [2, h, w], x and y.
-        """
+    def _grid(self, rows: slice, columns: slice) -> Tensor:
+        """Places [h, w, 2] in the maps, in -1..1, of some of the photo's pixels."""
         x, y = self._places(rows, columns)
-        grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
-        if offsets_px is not None:
-            grid = grid + offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
-        return F.grid_sample(maps[None], grid, padding_mode="border", align_corners=False)[0]
+        return torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)
 
     def _places(self, rows: slice, columns: slice) -> tuple[Tensor, Tensor]:
         """Places of columns [w] and rows [h] of the photo in the square, in -1..1."""
@@ -181,6 +199,11 @@ class Enlarged:
         x = 2 * (torch.arange(width)[columns] + PIXEL_CENTRE - square.x0_px) / square.side_px - 1
         y = 2 * (torch.arange(height)[rows] + PIXEL_CENTRE - square.y0_px) / square.side_px - 1
         return x.float(), y.float()
+
+
+def _enlarged(maps: Tensor, grid: Tensor) -> Tensor:
+    """Maps [C, h, w] at places [h, w, 2]; beyond the square those at its border repeat."""
+    return F.grid_sample(maps[None], grid[None], padding_mode="border", align_corners=False)[0]
 
 
 def _by_pixel(values: Tensor) -> np.ndarray:

@@ -8,7 +8,8 @@ maps of few pixels. So what of a relit image R is finer than these maps becomes 
 G is a blur inside the person. A is the photo without its light by the guided gain, which knows the edges of
 the photo's shadows and takes some of its grain for them; B by the coarse gain, which knows neither. f is 1
 where the detail of B is faint, as grain is, and 0 where it is strong, as edges are. w is 0 in hair, whose
-strands show the photo's own light, and where the photo is nearly black. R' is linear in R: layers add up.
+strands show the photo's own light, where the photo is nearly black, and at strong edges, where R is sharp
+(`edges.py`) and G, which mixes both sides, would draw lines. R' is linear in R: layers add up.
 """
 
 import math
@@ -21,6 +22,7 @@ from facerf_cli.image.strips import STRIP_PX, Band, box_means, remembered, strip
 _BLUR = 0.5  # reach of G, in pixels of the maps
 _DARK = (0.02, 0.08)  # A at which w is 0, and 1, in units of the person's mean
 _FAINT = 0.1  # strength of detail, root mean square of its logarithm, at which f is 1 / e
+_STRONG = 0.4  # strength of detail at which w is 1 / e where R is mended
 _LARGEST = 8.0  # of A / G(A)
 _TINY, _MOST = 1e-6, 6e4  # of A in units of its mean
 _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
@@ -29,10 +31,12 @@ _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
 class Grain:
     """Gives an image the detail of luminances A and B, `flat` [H, W, 2], where `share` [H, W] is not 0.
 
-    `share` is that of w; `map_px` is the side of the maps' pixels in those of the photo.
+    `share` is that of w; `map_px` is the side of the maps' pixels in those of the photo, `mended` [H, W, 1]
+    the share of R that is sharp at edges.
     """
 
-    def __init__(self, flat: Band, share: np.ndarray, map_px: float) -> None:
+    def __init__(self, flat: Band, share: np.ndarray, map_px: float, mended: Band) -> None:
+        self._mended = mended
         self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
         self._margin = 2 * self._reach
@@ -67,8 +71,10 @@ class Grain:
         seen = (low[..., 0] - _DARK[0]) / (_DARK[1] - _DARK[0])
         logs = np.log((values / low.clip(min=_TINY)).clip(1 / _LARGEST, _LARGEST))
         guided, coarse = logs[..., 0], logs[..., 1]
-        faint = np.exp(-self._blurred(coarse[..., None] ** 2, rows)[..., 0] / _FAINT**2)
-        return (share * seen.clip(0, 1)), np.exp(guided + faint * (coarse - guided))
+        power = self._blurred(coarse[..., None] ** 2, rows)[..., 0]
+        faint, calm = (np.exp(-power / strength**2) for strength in (_FAINT, _STRONG))
+        weight = share * seen.clip(0, 1) * (1 - self._mended(rows)[..., 0] * (1 - calm))
+        return weight, np.exp(guided + faint * (coarse - guided))
 
     def _around(self, rows: slice, margin: int) -> tuple[slice, slice]:
         """Rows with those around them, and where they are among these."""

@@ -1,0 +1,118 @@
+"""Coarse maps at the edges of a photo, where they mix both sides: a finger and the cloth behind it.
+
+Colours tell the sides apart: classes know no finger before a jacket. Pixels of the maps near an edge take the
+values of pixels around them that have their colour and lie farther from any edge (`Mended`). A pixel of the
+photo reads the maps at the centre of those pixels around it that have its colour (`places`); where all of
+them have it, this is its own place.
+"""
+
+import math
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from scipy.sparse import csr_array
+from torch import Tensor
+
+_NEAR_PX = 2  # distance from an edge within which maps are mixed, in their pixels
+_EDGE = 0.12  # difference of colours of an edge
+_REACH_PX, _SPREAD_PX = 4, 2.0  # of the pixels whose values one near an edge takes, and standard deviation
+_ALIKE = 0.06  # difference of colours that count as the same
+_FAR = 0.95  # trust in pixels that keep their values
+_LEAST_TRUST, _LEAST_WEIGHT = 1e-4, 1e-3
+
+
+class Mended(NamedTuple):
+    """Mended pixels [N] of maps [S, S], their trust [N], and weights [N, S * S] of what they take instead."""
+
+    pixels: Tensor
+    trust: Tensor
+    weights: csr_array
+
+    @staticmethod
+    def of(colours: Tensor, trust: Tensor, own: Tensor) -> "Mended":
+        """Pixels of colours [3, S, S] where trust [S, S] is below 1; they take of a person's `own`."""
+        side, flat, trusted = own.shape[-1], colours.flatten(1), (trust * own).flatten()
+        pixels = torch.nonzero(trust.flatten() < _FAR)[:, 0]
+        steps = list(product(range(-_REACH_PX, _REACH_PX + 1), repeat=2))
+        around = np.empty((len(pixels), len(steps)), np.int32)
+        weights = np.empty(around.shape, np.float32)
+        for number, (down, right) in enumerate(steps):
+            y, x = pixels // side + down, pixels % side + right
+            at = y.clamp(0, side - 1) * side + x.clamp(0, side - 1)
+            weight = _likeness(((flat[:, at] - flat[:, pixels]) ** 2).sum(0)) * trusted[at]
+            weight *= (x >= 0) & (x < side) & (y >= 0) & (y < side)
+            around[:, number] = at
+            weights[:, number] = weight * math.exp(-(down**2 + right**2) / (2 * _SPREAD_PX**2))
+        for _ in range(2):  # of what is left
+            weights /= weights.sum(1, keepdims=True).clip(min=1e-12)
+            weights *= weights > _LEAST_WEIGHT
+        used = weights > 0
+        ends = np.concatenate([[0], used.sum(1).cumsum()])
+        taken = csr_array((weights[used], around[used], ends), (len(pixels), side**2))
+        return Mended(pixels, trust.flatten()[pixels], taken)
+
+    def given(self, maps: Tensor) -> Tensor:
+        """Maps [C, S, S] with these pixels mended."""
+        flat = maps.flatten(1).T.clone(memory_format=torch.contiguous_format)
+        taken = torch.from_numpy(self.weights @ flat.numpy())
+        flat[self.pixels] = torch.lerp(taken, flat[self.pixels], self.trust[:, None])
+        return flat.T.reshape(maps.shape)
+
+
+def colours_of(radiance: Tensor) -> Tensor:
+    """Colours of radiance in the units of the Portrait Network, in which differences count alike."""
+    return radiance.clamp(0, 2).sqrt()
+
+
+def trust_in(colours: Tensor, solid: Tensor, loose: Tensor) -> Tensor:
+    """Trust [S, S] in maps: nearly 0 near edges of colours [3, S, S] of what is `solid` [S, S], else 1.
+
+    Elsewhere, as in the face, edges are features, and shade where the surface turns away; and what is `loose`
+    [S, S], as hair, is all edges.
+    """
+    high, low, near = (_highest(part, _NEAR_PX) for part in (colours, -colours, solid[None]))
+    edge = 1 - torch.exp(-(((high + low).amax(0) / _EDGE) ** 4))
+    return (1 - edge * (2 * (near[0] - loose)).clamp(0, 1)).clamp_min(_LEAST_TRUST)
+
+
+def _highest(maps: Tensor, reach: int) -> Tensor:
+    """Largest values of maps [C, S, S] around each pixel."""
+    return F.max_pool2d(maps[None], 2 * reach + 1, 1, reach)[0]
+
+
+def places(colours: Tensor, trust: Tensor, grid: Tensor, radiance: Tensor, unit: float) -> Tensor:
+    """Places [h, w, 2] in -1..1 of maps where pixels of a radiance [h, w, 3] find their like.
+
+    Args:
+        colours: Those of the maps [3, S, S].
+        trust: Trust [S, S] in them.
+        grid: The pixels' own places [h, w, 2].
+        radiance: That of the pixels.
+        unit: Radiance of 1 in the units of the Portrait Network.
+    """
+    side, near = colours.shape[-1], (trust < _FAR).float()[None, None]
+    beside = F.grid_sample(near, grid[None], "nearest", "border", align_corners=False)[0, 0] > 0
+    x, y = ((grid[beside] + 1) * (side / 2) - 0.5).clamp(0, side - 1).T
+    own = colours_of(radiance[beside] / unit).T.contiguous()
+    around = F.pad(colours[None], (1, 2, 1, 2), mode="replicate")[0].flatten(1)
+    corner = (y.long() * (side + 3) + x.long())[None]  # of the 4 x 4 pixels of the maps around each
+    across, down = ([step - 1 + at.floor() - at for step in range(4)] for at in (x, y))
+    total, right, below = torch.zeros(3, len(x))
+    for row, column in product(range(4), repeat=2):
+        place = corner + (row * (side + 3) + column)
+        weight = _likeness((around.gather(1, place.expand(3, -1)) - own).square_().sum(0))
+        weight *= (1 - across[column].abs() / 2) * (1 - down[row].abs() / 2)
+        total += weight
+        right.addcmul_(weight, across[column])
+        below.addcmul_(weight, down[row])
+    found = grid.clone()
+    found[beside] += torch.stack([right, below], -1) / total[:, None] * (2 / side)
+    return found
+
+
+def _likeness(difference2: Tensor) -> Tensor:
+    """Likeness of colours; it falls slowly, so that a mixed pixel takes from both sides."""
+    return 1 / (1 + (difference2 / _ALIKE**2) ** 2)

@@ -1,0 +1,112 @@
+"""Coarse maps at the edges of a photo: nothing of the one side is seen on the other."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from facerf_cli.face.crop import Crop
+from facerf_cli.image.colour import luminance
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.raster.texture import blurred
+from facerf_cli.relighting.edges import Mended, colours_of, places, trust_in
+from facerf_cli.relighting.enlarged import Enlarged
+from tests import astronaut
+
+SIDE, SCALE = 48, 5  # pixels of the maps, and of the photo along each of them
+HEIGHT, WIDTH = 180, 240
+DARK, BRIGHT = 0.02, 0.4  # radiance of cloth and of skin
+BESIDE, FAR = 1.0, 14.0  # pixels of the photo between the edge and what is sure, and pixels of the maps
+ONES = torch.ones(SIDE, SIDE)
+
+
+def skin(side: int, scale: float) -> Tensor:
+    """Share of the bright half [side, side], whose edge is slanted and ends in no pixel's corner."""
+    fine = (torch.arange(side * 8) + 0.5) / 8 * scale
+    bright = (fine[None] > 101.3 + 0.3 * fine[:, None]).float()
+    return F.avg_pool2d(bright[None], 8)[0]
+
+
+def distance(side: int, scale: float) -> Tensor:
+    """Distance from the edge [side, side] in pixels of the photo, above 0 in the bright half."""
+    at = (torch.arange(side) + 0.5) * scale
+    return (at[None] - 101.3 - 0.3 * at[:, None]) / 1.09**0.5
+
+
+def mixed(share: Tensor, dark: float, bright: float) -> Tensor:
+    return dark + share * (bright - dark)
+
+
+def grid() -> Tensor:
+    x, y = ((torch.arange(length) + 0.5) / (SIDE * SCALE) * 2 - 1 for length in (WIDTH, HEIGHT))
+    return torch.stack([x.expand(HEIGHT, -1), y[:, None].expand(-1, WIDTH)], -1)
+
+
+def test_two_sides_of_an_edge_keep_their_own_values() -> None:
+    """Maps of 1 and 3, blurred by a pixel as those of a network are: at the photo's pixels they are sharp."""
+    colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
+    maps = blurred(mixed(skin(SIDE, SCALE), 1, 3)[None], 1.0)
+    trust = trust_in(colours, ONES, 0 * ONES)
+    photo = mixed(skin(SIDE * SCALE, 1), DARK, BRIGHT)[:HEIGHT, :WIDTH, None].expand(-1, -1, 3)
+    read = places(colours, trust, grid(), photo, 1.0)
+    found, bled = (
+        F.grid_sample(values[None], at[None], padding_mode="border", align_corners=False)[0, 0]
+        for values, at in ((Mended.of(colours, trust, ONES).given(maps), read), (maps, grid()))
+    )
+    away = distance(SIDE * SCALE, 1)[:HEIGHT, :WIDTH]
+    sure = away.abs() > BESIDE
+    wanted = torch.where(away > 0, 3.0, 1.0)
+    assert (bled - wanted)[sure].abs().max() > 0.5
+    assert (found - wanted)[sure].abs().max() < 0.1
+
+
+def test_maps_of_any_layout_stay_as_they_are() -> None:
+    colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
+    by_pixel = torch.rand(SIDE, SIDE, 2, generator=torch.Generator().manual_seed(0))
+    before = by_pixel.clone()
+    found = Mended.of(colours, trust_in(colours, ONES, 0 * ONES), ONES).given(by_pixel.permute(2, 0, 1))
+    assert torch.equal(by_pixel, before) and (found.permute(1, 2, 0) != before).any()
+
+
+def test_where_there_is_no_edge_nothing_changes() -> None:
+    """Nor at edges of what is not solid, as of features of a face, or of what is hair."""
+    shades = torch.linspace(0.3, 0.6, SIDE).expand(3, SIDE, -1)
+    edges = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
+    maps = torch.rand(2, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
+    photo = torch.full((HEIGHT, WIDTH, 3), 0.2)
+    for colours, solid, loose in ((shades, 1, 0), (edges, 0, 0), (edges, 1, 1)):
+        trust = trust_in(colours, solid * ONES, loose * ONES)
+        assert torch.equal(Mended.of(colours, trust, ONES).given(maps), maps)
+        assert torch.equal(places(colours, trust, grid(), photo, 1.0), grid())
+
+
+@pytest.mark.parametrize("glossy", [False, True])
+def test_no_light_of_a_hand_is_on_the_cloth_behind_it(glossy: bool) -> None:
+    """The hand is cloth to the segmentation, and light on it is four times as bright."""
+    view = astronaut.field().views[0]
+    size = view.person.image.shape[-1]
+    side_px = 2 * size  # of the square, which the photo is a little wider than
+    share = skin(size, 2)
+    classes = torch.zeros(len(CLASSES), size, size)
+    classes[class_index("garment"), :, :-20] = 1
+    classes[class_index("skin"), :, -20:] = 1
+    person = replace(
+        view.person,
+        square=Crop(0.0, 0.0, float(side_px), size),
+        image=mixed(share, DARK, BRIGHT).expand(3, -1, -1),
+        classes=classes,
+    )
+    flat = torch.ones(1, 3, size, size)
+    maps = view.maps._replace(gain=flat, bias=0 * flat)
+    lit = torch.zeros(15, size, size)
+    rows = slice(3 if glossy else 0, 6 if glossy else 3)
+    lit[rows] = blurred(mixed(share, 0.5, 2)[None], 1.0)
+    both = skin(side_px + 20, 1)[:side_px], distance(side_px + 20, 1)[:side_px].numpy()
+    photo = mixed(both[0], DARK, BRIGHT)[..., None].expand(-1, -1, 3).numpy().copy()
+    enlarged = Enlarged(replace(view, person=person, maps=maps), photo)
+    relit = luminance(enlarged.relit(lit, 0.0, None)(photo, slice(0, side_px), slice(0, side_px + 20)))
+    cloth, far = (both[1] < -BESIDE) & (both[1] > -FAR), both[1] < -FAR
+    assert np.abs(relit[cloth] / relit[far].mean() - 1).max() < 0.15
