@@ -38,7 +38,7 @@ from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
 _LIGHTS_AT_ONCE = 16
-_EVEN_LIGHTS = 32  # that shine as even light does
+_EVEN_LIGHTS = 16  # that shine as even light does
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
 _CLOTH = ("garment", "headwear")
