@@ -329,7 +329,7 @@ def write_display(
     metadata: Attributes | None = None,
     view: View = PLAIN_VIEW,
     share: np.ndarray | None = None,
-    added: np.ndarray | None = None,
+    added: Band | None = None,
     bits: Literal[8, 16] = 8,
     quality: int = JPEG_QUALITY,
 ) -> float:
@@ -349,7 +349,7 @@ def write_display(
             seen = seen * opaque[..., None]
         gain = np.float32(2.0**chosen_ev)
         exposed = np.nan_to_num(seen * gain)
-        more = None if added is None else rows_of(added, rows) * gain
+        more = None if added is None else added(rows) * gain
         data = encode_display(exposed, view, None if share is None else rows_of(share, rows), more)
         return data if opaque is None or jpeg else np.dstack([data, opaque.astype(np.float32)])
 

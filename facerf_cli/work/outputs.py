@@ -12,6 +12,7 @@ import numpy as np
 from facerf_cli.errors import UsageError
 from facerf_cli.files.images import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
+from facerf_cli.image.strips import Band
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.output_options import Format, OutputOptions
 
@@ -23,16 +24,16 @@ log = logging.getLogger(LOGGER_NAME)
 class OutputImage:
     """An image to write: linear Rec.709 [H, W, 3], not multiplied by alpha [H, W], and its layers.
 
-    `share` [H, W] is how far a soft view applies to each pixel, or `added` [H, W, 3] what was not
-    photographed (`colour.encode_display`); without both it applies to all. `header` is further metadata of
-    the EXR alone.
+    `share` [H, W] is how far a soft view applies to each pixel, or `added` [H, W, 3], by rows, what was
+    not photographed (`colour.encode_display`); without both it applies to all. `header` is further metadata
+    of the EXR alone.
     """
 
     pixels: np.ndarray
     alpha: np.ndarray | None = None
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
     share: np.ndarray | None = None
-    added: np.ndarray | None = None
+    added: Band | None = None
     header: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -15,7 +15,7 @@ from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import most_exposure_ev
-from facerf_cli.image.strips import Band, filled
+from facerf_cli.image.strips import Band, filled, rows_of
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import with_room
@@ -146,7 +146,7 @@ def _rendered(
     added = None
     if setup.has_own:
         others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
-        added = filled({"added": _sum_of(others, size_px[1], arrays.get("A"))}, *size_px, empty)["added"]
+        added = _sum_of(others, size_px[1], arrays.get("A"))
     return OutputImage(arrays["rgb"], arrays.get("A", scene.alpha), layers, share, added)
 
 
@@ -156,7 +156,7 @@ def _sum_of(layers: Sequence[np.ndarray], width: int, alpha: np.ndarray | None) 
     def of(rows: slice) -> np.ndarray:
         total = np.zeros((rows.stop - rows.start, width, 3), np.float32)
         for layer in layers:
-            total += layer[rows]
+            total += rows_of(layer, rows)
         return total if alpha is None else total / np.maximum(alpha[rows], 1e-3)[..., None]
 
     return of
