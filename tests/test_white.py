@@ -153,6 +153,7 @@ def test_the_faces_own_field_has_the_same_white_in_every_light() -> None:
         assert ratio.std(1).max() < 1e-3 and (ratio.mean(1) - 1).abs().max() > 0.01
 
 
+@pytest.mark.slow
 def test_the_light_of_a_balanced_photo_is_white_and_that_of_a_party_is_not() -> None:
     head, models = astronaut.head(), astronaut.models()
     white = estimate_light(models, head, white="scene").light.weights.sum(0)

@@ -185,6 +185,7 @@ def test_a_sequence_with_a_hole_is_said(
     assert "plate.2.exr: no such file; a shot needs all of its frames" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """As a photo's: in frames, and in a film of frames that can have it; the other is said."""
     clear = np.zeros((192, 224), np.uint8)
@@ -231,6 +232,7 @@ def test_alpha_that_is_0_in_every_frame_is_none(
         caplog.clear()
 
 
+@pytest.mark.slow
 def test_a_frame_whose_matte_is_black_is_left_as_it_is(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
