@@ -174,11 +174,10 @@ def reflectance_of(
         found = None if network_alone else source_light(models, head.face, steady.light if steady else None)
         quotient = found.quotient if found else None
         field = Field(models, head.face, quotient, memory_bytes, even_shade=found is not None)
-        if white is None:
-            return found, field
+        if steady or white is None:
+            return found, replace(field, balance=steady.balance if steady else None)
         even = found.even if found else field.small_under_even_light()
-        balance = steady.balance if steady else balance_of(white, [(head.face, even)])
-        return found, replace(field, balance=balance)
+        return found, replace(field, balance=balance_of(white, [(head.face, even)]))
 
     def of_person() -> list[SeenPerson]:
         assert photo is not None

@@ -12,7 +12,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.image.colour import luminance
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.raster.texture import blurred
-from facerf_cli.relighting.edges import Mended, colours_of, places, trust_in
+from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
 from facerf_cli.relighting.enlarged import Enlarged
 from tests import astronaut
 
@@ -54,7 +54,7 @@ def test_two_sides_of_an_edge_keep_their_own_values() -> None:
     read = places(colours, trust, grid(), photo, 1.0)
     found, bled = (
         F.grid_sample(values[None], at[None], padding_mode="border", align_corners=False)[0, 0]
-        for values, at in ((Mended.of(colours, trust, ONES).given(maps), read), (maps, grid()))
+        for values, at in ((EdgeFill.of(colours, trust, ONES).filled(maps), read), (maps, grid()))
     )
     away = distance(SIDE * SCALE, 1)[:HEIGHT, :WIDTH]
     sure = away.abs() > BESIDE
@@ -67,7 +67,7 @@ def test_maps_of_any_layout_stay_as_they_are() -> None:
     colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
     by_pixel = torch.rand(SIDE, SIDE, 2, generator=torch.Generator().manual_seed(0))
     before = by_pixel.clone()
-    found = Mended.of(colours, trust_in(colours, ONES, 0 * ONES), ONES).given(by_pixel.permute(2, 0, 1))
+    found = EdgeFill.of(colours, trust_in(colours, ONES, 0 * ONES), ONES).filled(by_pixel.permute(2, 0, 1))
     assert torch.equal(by_pixel, before) and (found.permute(1, 2, 0) != before).any()
 
 
@@ -79,7 +79,7 @@ def test_where_there_is_no_edge_nothing_changes() -> None:
     photo = torch.full((HEIGHT, WIDTH, 3), 0.2)
     for colours, solid, loose in ((shades, 1, 0), (edges, 0, 0), (edges, 1, 1)):
         trust = trust_in(colours, solid * ONES, loose * ONES)
-        assert torch.equal(Mended.of(colours, trust, ONES).given(maps), maps)
+        assert torch.equal(EdgeFill.of(colours, trust, ONES).filled(maps), maps)
         assert torch.equal(places(colours, trust, grid(), photo, 1.0), grid())
 
 

@@ -22,10 +22,10 @@ def given(
     guided: np.ndarray,
     coarse: np.ndarray,
     share: np.ndarray = ALL,
-    mended: np.ndarray = NOTHING,
+    sharpened: np.ndarray = NOTHING,
 ) -> np.ndarray:
     flat = np.stack([guided, coarse], -1)
-    grain = Grain(flat.__getitem__, share, MAP_PX, mended.__getitem__)
+    grain = Grain(flat.__getitem__, share, MAP_PX, sharpened.__getitem__)
     return whole(grain.given(relit.__getitem__), SIDE, SIDE)
 
 
@@ -47,10 +47,10 @@ def test_no_line_is_drawn_where_a_relit_image_is_sharp_itself() -> None:
     cloth = (np.arange(SIDE) < SIDE // 2)[None].repeat(SIDE, 0)
     photo = np.where(cloth, 0.05, 1).astype(np.float32)
     relit = np.where(cloth, 0.2, 1).astype(np.float32)[..., None].repeat(3, -1)
-    lines, none = (given(relit, photo, photo, mended=part) / relit for part in (NOTHING, 1 + NOTHING))
+    lines, none = (given(relit, photo, photo, sharpened=part) / relit for part in (NOTHING, 1 + NOTHING))
     assert np.abs(np.log(lines)).max() > 0.5
     assert np.abs(np.log(none)).max() < 0.02
-    pores = given(relit, photo * PORES, photo * PORES, mended=1 + NOTHING)[8:-8, 8:30]
+    pores = given(relit, photo * PORES, photo * PORES, sharpened=1 + NOTHING)[8:-8, 8:30]
     assert np.log(pores).std() > 0.85 * np.log(PORES).std()  # far from the edge they are
 
 

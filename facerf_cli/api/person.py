@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import repeat
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -287,8 +286,7 @@ class Person(pipeline.FittedPerson):
                 raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
             with torch.no_grad():
                 relit = list(composition.relit(some))
-            owns = repeat(None) if some.own is None else some.own
-            for weights, own, one in zip(some.weights, owns, relit, strict=False):
+            for weights, own, one in zip(some.weights, some.owns, relit, strict=True):
                 bands = {"rgb": layer_of(one)} if cut_out else composition.bands(one, behind=behind)
                 arrays = self._with_layers(composition, one, layers, bands)
                 image = torch.from_numpy(arrays.pop("rgb"))

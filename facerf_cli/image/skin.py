@@ -78,7 +78,7 @@ def observer_weights() -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _skin_table() -> Tensor:
+def skin_table() -> Tensor:
     """Table [1, 3, steps of blood, steps of melanin] of linear Rec.709; steps are even in the square root."""
     step = np.linspace(0, 1, _STEPS) ** 2
     blood, melanin = np.meshgrid(step * BLOOD_MOST, step * MELANIN_MOST, indexing="ij")
@@ -91,4 +91,4 @@ def skin_albedo(melanin: Tensor, blood: Tensor) -> Tensor:
     """Colour [B, 3, H, W] of skin, linear Rec.709, from melanin and blood fractions [B, 1, H, W]."""
     at = torch.stack([melanin[:, 0] / MELANIN_MOST, blood[:, 0] / BLOOD_MOST], -1)
     at = 2 * at.clamp(0, 1).sqrt() - 1
-    return F.grid_sample(_skin_table().expand(len(at), -1, -1, -1), at, align_corners=True)
+    return F.grid_sample(skin_table().expand(len(at), -1, -1, -1), at, align_corners=True)

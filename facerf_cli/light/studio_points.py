@@ -1,6 +1,7 @@
 """Studio lights as points: the squares of soft lights are sampled by a regular grid."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,6 +145,11 @@ class Lights:
         used = (some != 0).any(0).any(1)
         near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
         return Lights(self.directions, self.weights[sums], near, some[:, used], own)
+
+    @property
+    def owns(self) -> Sequence[Tensor | None]:
+        """The share [3] of the photo's own light in each sum; None where it shines in none."""
+        return [None] * len(self) if self.own is None else list(self.own)
 
     def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
         """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""

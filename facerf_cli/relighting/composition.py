@@ -18,7 +18,6 @@ negative weights, such as the paper's plain least squares gives, can make pixels
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import repeat
 from typing import Literal
 
 import numpy as np
@@ -191,8 +190,8 @@ class Composition:
 
     def relit(self, lights: Lights) -> Iterator[Relit]:
         """Relight the head under each sum of lights, the photo's own light among them; see `_by_lights`."""
-        own = repeat(None) if lights.own is None else lights.own
-        return (replace(one, own=share) for one, share in zip(self._by_lights(lights), own, strict=False))
+        pairs = zip(self._by_lights(lights), lights.owns, strict=True)
+        return (replace(one, own=own) for one, own in pairs)
 
     def _by_lights(self, lights: Lights) -> Iterator[Relit]:
         """Relight the head under each sum of lights (paper, 'Relighting'); one prediction serves all sums.

@@ -1,7 +1,7 @@
 """Coarse maps at the edges of a photo, where they mix both sides: a finger and the cloth behind it.
 
 Colours tell the sides apart: classes know no finger before a jacket. Pixels of the maps near an edge take the
-values of pixels around them that have their colour and lie farther from any edge (`Mended`). A pixel of the
+values of pixels around them that have their colour and lie farther from any edge (`EdgeFill`). A pixel of the
 photo reads the maps at the centre of those pixels around it that have its colour (`places`); where all of
 them have it, this is its own place.
 """
@@ -24,15 +24,15 @@ _FAR = 0.95  # trust in pixels that keep their values
 _LEAST_TRUST, _LEAST_WEIGHT = 1e-4, 1e-3
 
 
-class Mended(NamedTuple):
-    """Mended pixels [N] of maps [S, S], their trust [N], and weights [N, S * S] of what they take instead."""
+class EdgeFill(NamedTuple):
+    """Pixels [N] of maps [S, S] near edges, their trust [N], and weights [N, S * S] of what they take."""
 
     pixels: Tensor
     trust: Tensor
     weights: csr_array
 
     @staticmethod
-    def of(colours: Tensor, trust: Tensor, own: Tensor) -> "Mended":
+    def of(colours: Tensor, trust: Tensor, own: Tensor) -> "EdgeFill":
         """Pixels of colours [3, S, S] where trust [S, S] is below 1; they take of a person's `own`."""
         side, flat, trusted = own.shape[-1], colours.flatten(1), (trust * own).flatten()
         pixels = torch.nonzero(trust.flatten() < _FAR)[:, 0]
@@ -52,10 +52,10 @@ class Mended(NamedTuple):
         used = weights > 0
         ends = np.concatenate([[0], used.sum(1).cumsum()])
         taken = csr_array((weights[used], around[used], ends), (len(pixels), side**2))
-        return Mended(pixels, trust.flatten()[pixels], taken)
+        return EdgeFill(pixels, trust.flatten()[pixels], taken)
 
-    def given(self, maps: Tensor) -> Tensor:
-        """Maps [C, S, S] with these pixels mended."""
+    def filled(self, maps: Tensor) -> Tensor:
+        """Maps [C, S, S] with these pixels filled."""
         flat = maps.flatten(1).T.clone(memory_format=torch.contiguous_format)
         taken = torch.from_numpy(self.weights @ flat.numpy())
         flat[self.pixels] = torch.lerp(taken, flat[self.pixels], self.trust[:, None])
@@ -94,9 +94,9 @@ def places(colours: Tensor, trust: Tensor, grid: Tensor, radiance: Tensor, unit:
         unit: Radiance of 1 in the units of the Portrait Network.
     """
     side, near = colours.shape[-1], (trust < _FAR).float()[None, None]
-    beside = F.grid_sample(near, grid[None], "nearest", "border", align_corners=False)[0, 0] > 0
-    x, y = ((grid[beside] + 1) * (side / 2) - 0.5).clamp(0, side - 1).T
-    own = colours_of(radiance[beside] / unit).T.contiguous()
+    near_edge = F.grid_sample(near, grid[None], "nearest", "border", align_corners=False)[0, 0] > 0
+    x, y = ((grid[near_edge] + 1) * (side / 2) - 0.5).clamp(0, side - 1).T
+    own = colours_of(radiance[near_edge] / unit).T.contiguous()
     around = F.pad(colours[None], (1, 2, 1, 2), mode="replicate")[0].flatten(1)
     corner = (y.long() * (side + 3) + x.long())[None]  # of the 4 x 4 pixels of the maps around each
     across, down = ([step - 1 + at.floor() - at for step in range(4)] for at in (x, y))
@@ -109,7 +109,7 @@ def places(colours: Tensor, trust: Tensor, grid: Tensor, radiance: Tensor, unit:
         right.addcmul_(weight, across[column])
         below.addcmul_(weight, down[row])
     found = grid.clone()
-    found[beside] += torch.stack([right, below], -1) / total[:, None] * (2 / side)
+    found[near_edge] += torch.stack([right, below], -1) / total[:, None] * (2 / side)
     return found
 
 

@@ -18,7 +18,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
-from facerf_cli.relighting.edges import Mended, colours_of, places, trust_in
+from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
 from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
 from facerf_cli.relighting.rims import Rims
 
@@ -48,10 +48,10 @@ class Enlarged:
             classes[[class_index(name) for name in names]].sum(0, keepdim=True) for names in (_HAIR, _SOLID)
         )
         self._trust = 1 - self.own * (1 - trust_in(self._colours, solid[0], hair[0]))
-        self._mended = Mended.of(self._colours, self._trust, self.own)
+        self._edges = EdgeFill.of(self._colours, self._trust, self.own)
         self._hair = torch.cat([self._filled(view.maps.albedo[0].mean(0, keepdim=True)), hair])
         self._albedo_maps = torch.cat(
-            [self._gain_lines(), self._filled(self._mended.given(view.maps.bias[0]))]
+            [self._gain_lines(), self._filled(self._edges.filled(view.maps.bias[0]))]
         )
         self._alike = remembered(self._places_alike)
         self._seen = remembered(self._without_light)
@@ -119,8 +119,8 @@ class Enlarged:
 
         return of
 
-    def mended(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-        """Share [h, w, 1] of the maps' values at the photo's pixels that are mended."""
+    def sharpened(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
+        """Share [h, w, 1] of the maps' values at the photo's pixels that are sharpened."""
         return _by_pixel(_enlarged(1 - self._trust[None], self._grid(rows, columns)))
 
     def layer(self, name: str, lit: Tensor) -> Shown:
@@ -140,7 +140,7 @@ class Enlarged:
             "shadow": light.reached[0],
             "normal": self._view.maps.normals[0],
         }[name]
-        filled = self._filled(self._mended.given(maps))
+        filled = self._filled(self._edges.filled(maps))
         return lambda pixels, *where: _by_pixel(read(filled, pixels, *where))
 
     def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
@@ -176,7 +176,7 @@ class Enlarged:
     def _smooth(self, light: Tensor) -> Tensor:
         """Shading and highlights [6, S, S], continued over the background; highlights are blurred."""
         shading, highlights = torch.chunk(self._filled(light), 2)
-        return self._filled(self._mended.given(torch.cat([shading, blurred(highlights, _GLOSS_PX)])))
+        return self._filled(self._edges.filled(torch.cat([shading, blurred(highlights, _GLOSS_PX)])))
 
     def _filled(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] with the person's values continued over the background."""

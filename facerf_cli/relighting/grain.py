@@ -22,7 +22,7 @@ from facerf_cli.image.strips import STRIP_PX, Band, box_means, remembered, strip
 _BLUR = 0.5  # reach of G, in pixels of the maps
 _DARK = (0.02, 0.08)  # A at which w is 0, and 1, in units of the person's mean
 _FAINT = 0.1  # strength of detail, root mean square of its logarithm, at which f is 1 / e
-_STRONG = 0.4  # strength of detail at which w is 1 / e where R is mended
+_STRONG = 0.4  # strength of detail at which w is 1 / e where R is sharpened
 _LARGEST = 8.0  # of A / G(A)
 _TINY, _MOST = 1e-6, 6e4  # of A in units of its mean
 _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
@@ -31,12 +31,12 @@ _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
 class Grain:
     """Gives an image the detail of luminances A and B, `flat` [H, W, 2], where `share` [H, W] is not 0.
 
-    `share` is that of w; `map_px` is the side of the maps' pixels in those of the photo, `mended` [H, W, 1]
-    the share of R that is sharp at edges.
+    `share` is that of w; `map_px` is the side of the maps' pixels in those of the photo, `sharpened`
+    [H, W, 1] the share of R that is sharp at edges.
     """
 
-    def __init__(self, flat: Band, share: np.ndarray, map_px: float, mended: Band) -> None:
-        self._mended = mended
+    def __init__(self, flat: Band, share: np.ndarray, map_px: float, sharpened: Band) -> None:
+        self._sharpened = sharpened
         self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
         self._margin = 2 * self._reach
@@ -73,7 +73,7 @@ class Grain:
         guided, coarse = logs[..., 0], logs[..., 1]
         power = self._blurred(coarse[..., None] ** 2, rows)[..., 0]
         faint, calm = (np.exp(-power / strength**2) for strength in (_FAINT, _STRONG))
-        weight = share * seen.clip(0, 1) * (1 - self._mended(rows)[..., 0] * (1 - calm))
+        weight = share * seen.clip(0, 1) * (1 - self._sharpened(rows)[..., 0] * (1 - calm))
         return weight, np.exp(guided + faint * (coarse - guided))
 
     def _around(self, rows: slice, margin: int) -> tuple[slice, slice]:

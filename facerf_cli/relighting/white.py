@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.skin import BLOOD_MOST, MELANIN_MOST, skin_albedo
+from facerf_cli.image.skin import skin_table
 from facerf_cli.light.estimate import clipped
 from facerf_cli.network.inputs import is_grey
 from facerf_cli.portrait.classes import CLASSES, class_index
@@ -25,7 +25,6 @@ from facerf_cli.relighting import White
 SURE = 0.9  # share of a class
 _BLACK = 0.15  # of the median brightness of a class: what is darker has no colour of its own
 _LEAST = 500  # pixels or texels that have a colour
-_STEPS = 64  # of melanin and of blood, among all skins
 _BALANCED, _FAR = 0.3, 0.8  # difference of log chromaticities of a photo's skin from all colours of skin
 BARE = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
 _GROUPS = [BARE, *([number] for number in range(1, len(CLASSES)) if number not in BARE)]
@@ -115,7 +114,5 @@ def _nearest_skin(chroma: Tensor) -> Tensor:
 @lru_cache(maxsize=1)
 def _skin_chromas() -> Tensor:
     """Log red / green and blue / green [N, 2] of all skins."""
-    step = torch.linspace(0, 1, _STEPS).square()
-    melanin, blood = torch.meshgrid(step * MELANIN_MOST, step * BLOOD_MOST, indexing="ij")
-    red, green, blue = skin_albedo(melanin[None, None], blood[None, None])[0].flatten(1).log()
+    red, green, blue = skin_table()[0].flatten(1).log()
     return torch.stack([red - green, blue - green], 1)

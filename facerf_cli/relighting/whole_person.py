@@ -60,8 +60,8 @@ class WholePerson:
         """The detail of the photo [H, W, 3] without its light, for a person's matte [H, W]; and the eyes."""
         flat = self._joined(photo, [view.without_light(display_ev) for view in self._views])
         hair = self._segmentation.layer("hair")
-        mended = self._joined(photo, [view.mended for view in self._views])
-        grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px, mended)
+        sharpened = self._joined(photo, [view.sharpened for view in self._views])
+        grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px, sharpened)
         return grain, Eyes(photo.__getitem__, self._person.eyes, self._size_px)
 
     def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:

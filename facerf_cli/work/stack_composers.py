@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import repeat
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +65,7 @@ class StackImages:
     def relit(self, lights: Lights) -> Iterator[Relit]:
         """Sums of the stack's lights."""
         textures = weighted_sum(stream_olats(self.path), lights.weights)
-        own = repeat(None) if lights.own is None else lights.own
-        return (Relit(texture, own=share) for texture, share in zip(textures, own, strict=False))
+        return (Relit(texture, own=own) for texture, own in zip(textures, lights.owns, strict=True))
 
     def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
         """The person before the photo's background at `ev`, before another, or with alpha."""
