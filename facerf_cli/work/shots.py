@@ -215,7 +215,7 @@ class FilmOutput:
         if batch.dry_run:
             print(f"{items[0].input_path} -> {self.path}")
             return ""
-        from facerf_cli.files.film import check_writable
+        from facerf_cli.files.film_writer import check_writable
 
         digest_of = cache(file_sha256)
         made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
@@ -229,7 +229,7 @@ class FilmOutput:
 
     def _is_finished(self, key: str, overwrite: Overwrite) -> bool:
         """True if the film is there and need not be made again: its metadata say what it was made from."""
-        from facerf_cli.files.film import comment_of
+        from facerf_cli.files.film_writer import comment_of
 
         if overwrite == "always" or not self.path.is_file():
             return False
@@ -240,7 +240,8 @@ class FilmOutput:
         if code or not all(path.exists() for path in images):
             log.error("%s: not written, since frames failed; the others stay in %s", self.path, self.folder)
             return 1
-        from facerf_cli.files.film import Timing, film_timing, write_film
+        from facerf_cli.files.film import Timing, film_timing
+        from facerf_cli.files.film_writer import write_film
         from facerf_cli.run.logs import Provenance
 
         source = shots[0].film if shots else None
