@@ -57,7 +57,7 @@ def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
     assert page["images"].shape == (12, *photo.shape) and page["textures"].shape == (12, 256, 256, 3)
     assert page["cut_out"].shape == page["turned"].shape == page["face"].shape == (*size, 4)
     assert set(page["layers"]) == {"image", "person.A", "albedo", "specular", "shadow"}
-    assert page["own_map"].shape == (128, 256, 3)
+    assert page["estimated_map"].shape == (128, 256, 3)
     assert sorted(path.name for path in page["folder"].glob("relit.*")) == ["relit.exr", "relit.png"]
     one = page["person"]
     assert one.albedo.shape == one.normals.shape == photo.shape
