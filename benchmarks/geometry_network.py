@@ -3,8 +3,8 @@
     python benchmarks/geometry_network.py [PHOTO|DIR ...] [--crops RUN/bank/pictures] [--dataset DATASET]
 
 - `--crops`: held-out heads of a bank (`facerf train --stage geometry`), true landmarks with added noise.
-- `--dataset`: its people under every tenth light together, against the landmarks of its fits (dlib).
-- Photos: against dlib's landmarks.
+- `--dataset`: its people under every tenth light together, against the landmarks of its fits.
+- Photos: against the landmarks that are found in them.
 
 Errors are means in percent of the distance of the outer eye corners; the contour slides along the estimated
 outline, as in the fit. Steps of the fit are counted until its cost is within 1 % of the least. Naive twin:
@@ -114,7 +114,7 @@ def steps_needed(problem: Problem, starts: dict[str, FitState]) -> dict[str, Ten
 
 
 def of_photos(paths: list[Path]) -> tuple[Tensor, Tensor]:
-    """Crops and dlib's landmarks of photos."""
+    """Crops and landmarks of photos."""
     crops, landmarks = [], []
     for path in paths:
         photo = read_image(path).pixels

@@ -36,7 +36,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.find import Face, FaceBox, LandmarksFrom, find_faces
+from facerf_cli.portrait.find import Face, FaceBox, find_faces
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
 from facerf_cli.portrait.segment import Segmentation, segment
@@ -97,13 +97,12 @@ def find_for(
     photo: np.ndarray,
     name: str,
     which: str = "largest",
-    landmarks_from: LandmarksFrom = "facerf",
 ) -> Sequence[FaceBox]:
     """Find faces in a photo [H, W, 3] with what a geometry needs: landmarks, or boxes alone.
 
     `which` is largest, all or an index. Raises InputError, with the photo's name, where no face is found.
     """
-    faces = find_faces(people, photo, name, which, landmarks_from)
+    faces = find_faces(people, photo, name, which)
     return [face.box for face in faces] if geometry == "network" else faces
 
 

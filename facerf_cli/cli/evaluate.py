@@ -53,7 +53,7 @@ def olat(
     dataset: DatasetArgument,
     *,
     data: SplitOptions,
-    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "landmarks_from")],
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry")],
     field: FieldOptions,
     options: Annotated[EvaluateOptions, Without("name")],
 ) -> None:
@@ -164,7 +164,7 @@ def yale_b(
     ],
     *,
     yale: YaleOptions,
-    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "landmarks_from")],
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry")],
     field: FieldOptions,
     options: Annotated[EvaluateOptions, Only("reflectance", "against", "compare", "pictures", *_BATCH)],
 ) -> None:

@@ -13,7 +13,7 @@ import torch
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.options import Measures, Space
-from facerf_cli.face.dlib_landmarks import face_descriptor
+from facerf_cli.face.descriptor import face_descriptor
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.image.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
 from facerf_cli.network.checkpoint import load_vgg, read_tensors

@@ -34,7 +34,7 @@ from facerf_cli.pipeline import (
     head_of,
     reflectance_of,
 )
-from facerf_cli.portrait.find import FaceBox, LandmarksFrom
+from facerf_cli.portrait.find import FaceBox
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.relighting.composition import Target
@@ -91,12 +91,11 @@ class Reading:
     sides: Sides
     geometry: Geometry | None = None
     keep_eyes: bool = False
-    landmarks_from: LandmarksFrom = "facerf"
 
     def find(self, image: np.ndarray, name: str) -> FaceBox:
         """The largest face in an image; InputError where none is found."""
         assert self.geometry is not None
-        return find_for(self.people, self.geometry, image, name, landmarks_from=self.landmarks_from)[0]
+        return find_for(self.people, self.geometry, image, name)[0]
 
 
 @dataclass(frozen=True, eq=False)

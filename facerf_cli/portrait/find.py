@@ -8,13 +8,11 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
-from facerf_cli.face.dlib_landmarks import detect_landmarks
 from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
@@ -32,7 +30,6 @@ from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, 
 from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
-LandmarksFrom = Literal["facerf", "dlib"]
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
@@ -45,8 +42,7 @@ _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels i
 class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
-    There is no view of a face that was given, or found by dlib. The photo's other heads are there where they
-    were looked for.
+    There is no view of a face that was given. The photo's other heads are there where they were looked for.
     """
 
     box_px: Box
@@ -104,13 +100,12 @@ def find_faces(
     pixels_linear: np.ndarray,
     name: str,
     which: str = "largest",
-    landmarks_from: LandmarksFrom = "facerf",
 ) -> list[Face]:
     """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
 
     Raises InputError, with the image's name, where no face is found.
     """
-    faces = detect_faces(people, to_display(pixels_linear), landmarks_from, everyone=which != "largest")
+    faces = detect_faces(people, to_display(pixels_linear), everyone=which != "largest")
     if not faces:
         raise InputError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
     return choose_face(faces, which, name)
@@ -119,17 +114,13 @@ def find_faces(
 def detect_faces(
     people: PeopleNetworks,
     image_srgb: np.ndarray,
-    landmarks_from: LandmarksFrom = "facerf",
     everyone: bool = False,
 ) -> list[Face]:
     """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
 
-    Turned and small faces are looked for where no other is found, or for `everyone`; dlib's detector always
-    looks for all.
+    Turned and small faces are looked for where no other is found, or for `everyone`.
     """
     check_display(image_srgb)
-    if landmarks_from == "dlib":
-        return [Face(*found) for found in detect_landmarks(image_srgb)]
     image_srgb = _brightened(image_srgb)
     meshes: list[FaceMesh] = []
     for squares in _attempts(image_srgb):

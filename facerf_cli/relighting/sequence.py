@@ -26,7 +26,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.portrait import PortraitMaps
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.find import Face, LandmarksFrom, choose_face, detect_faces, face_near
+from facerf_cli.portrait.find import Face, choose_face, detect_faces, face_near
 from facerf_cli.portrait.parse import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person, portrait_square, wider_square
 from facerf_cli.portrait.segment import (
@@ -161,11 +161,10 @@ class Follower:
         self,
         people: PeopleNetworks,
         which: str,
-        landmarks_from: LandmarksFrom = "facerf",
         last: np.ndarray | None = None,
     ) -> None:
         self._people = people
-        self._which, self._from, self._last = which, landmarks_from, last
+        self._which, self._last = which, last
 
     def see(self, image_srgb: np.ndarray) -> Sighting | None:
         """Find the face in the next frame, sRGB uint8 [H, W, 3]; None where it is not seen.
@@ -174,7 +173,7 @@ class Follower:
         its size. The first face is the one that `which` chooses: largest, or an index from the left.
         """
         face: Face | None = None
-        if self._last is not None and self._from == "facerf":
+        if self._last is not None:
             face = face_near(self._people, image_srgb, self._last)
             if face is not None and not _may_be(face, self._last):
                 face = None
@@ -189,7 +188,7 @@ class Follower:
     def _searched(self, image_srgb: np.ndarray) -> Face | None:
         last = self._last
         everyone = last is not None or self._which != "largest"
-        faces = detect_faces(self._people, image_srgb, self._from, everyone)
+        faces = detect_faces(self._people, image_srgb, everyone)
         if last is None:
             few = self._which.isdecimal() and int(self._which) >= len(faces)
             return None if few or not faces else choose_face(faces, self._which, "frame")[0]

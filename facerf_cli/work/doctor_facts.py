@@ -12,7 +12,8 @@ import torch
 
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.errors import FacerfError
-from facerf_cli.face.dlib_landmarks import PREDICTOR_LICENCE, RECOGNITION_LICENCE, predictor_path
+from facerf_cli.face.descriptor import LICENCE as DESCRIPTOR_LICENCE
+from facerf_cli.face.descriptor import descriptor_path
 from facerf_cli.face.morphable import BUILTIN_PATH
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.files import SHIPPED, serving_files
@@ -35,7 +36,7 @@ def examine(settings: Settings) -> dict[str, dict[str, Any]]:
             "face model": _face_model(BUILTIN_PATH),
             **_checkpoints(serving),
             "mediapipe": {"licence": MEDIAPIPE_LICENCE, "size": _size(ASSET)},
-            "dlib": _extra_models(),
+            "dlib": _extra_model(),
         },
         "networks": networks,
         "colour": _colour_configuration(),
@@ -84,14 +85,10 @@ def _checkpoint(path: Path) -> dict[str, Any]:
     return {"name": path.stem, "licence": metadata.get("licence"), "size": _size(path), **provenance}
 
 
-def _extra_models() -> dict[str, str]:
-    """The models of the extra `dlib`, which may not be used commercially."""
+def _extra_model() -> dict[str, str]:
+    """The model of the extra `dlib`."""
     try:
-        return {
-            "licence": PREDICTOR_LICENCE,
-            "size": _size(predictor_path()),
-            "recognition": RECOGNITION_LICENCE,
-        }
+        return {"licence": DESCRIPTOR_LICENCE, "size": _size(descriptor_path())}
     except FacerfError:
         return {"name": "not installed (an extra, see above)"}
 

@@ -116,7 +116,7 @@ def reading_of(settings: FaceSettings) -> Reading:
     models, photo = methods_of(settings)[0].models, settings.photo
     geometry = None if settings.data.joint_fit else photo.geometry or models.default_geometry
     sides, keep_eyes = models.sides(photo.texture_side), settings.options.keep_eyes
-    return Reading(models.networks.people, sides, geometry, keep_eyes, photo.landmarks_from)
+    return Reading(models.networks.people, sides, geometry, keep_eyes)
 
 
 def _comparison(settings: FaceSettings) -> Compare:

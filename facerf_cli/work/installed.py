@@ -16,7 +16,7 @@ EXTRAS = {
     "heic": "HEIC photos of phones",
     "video": "films in and out; its wheel holds GPL codecs",
     "rembg": "`--matte-from rembg:NAME`; its models have licences of their own",
-    "dlib": "`--landmarks-from dlib`, not for commercial use",
+    "dlib": "`--identity`, and Face dis of `evaluate`",
 }
 Facts = dict[str, Any]
 

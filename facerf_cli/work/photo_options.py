@@ -26,7 +26,6 @@ NETWORKS = {
     "portrait": frozenset({"reflectance", "portrait"}),
     "diffuse-sh": frozenset({"diffuse_sh"}),
 }
-LandmarksFrom = Literal["facerf", "dlib"]
 Geometry = Literal["landmarks", "network"]
 Refine = Literal["none", "features"]
 PoseDeg = tuple[float, float, float]
@@ -74,8 +73,6 @@ class PhotoOptions:
         geometry: Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.
         texture_side: Side of the UV texture; a multiple of 256.
         form: Class of a Reflectance Network of your own.
-        landmarks_from: Find landmarks by facerf's own network, or by dlib's predictor (an extra; its licence
-            excludes commercial use).
         person: Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies
             it.
         matte_from: Replace it by that of a model in rembg's folder (an extra); the model's licence is
@@ -99,7 +96,6 @@ class PhotoOptions:
         panel=METHOD,
     )
     form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
-    landmarks_from: LandmarksFrom = option("facerf", panel=FACE)
     person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
     matte_from: MatteModel | None = option(
         None, metavar="rembg:NAME", shown_default=False, parse=parse_matte_from, panel=FACE

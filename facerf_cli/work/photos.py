@@ -62,8 +62,7 @@ log = logging.getLogger(LOGGER_NAME)
 class PhotoFace:
     """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'.
 
-    `name` is for messages. `facts` say how far it can be relied on; there are none of a face that was given,
-    or found by dlib.
+    `name` is for messages. `facts` say how far it can be relied on; there are none of a face that was given.
     """
 
     tag: str
@@ -216,7 +215,7 @@ def find_people(
         faces = [_given(item, image, options.landmarks)]
     else:
         networks, path = load_models_once(options).networks.people, str(item.input_path)
-        faces = find_for(networks, geometry, image.pixels, path, options.face, options.landmarks_from)
+        faces = find_for(networks, geometry, image.pixels, path, options.face)
     found = []
     for number, face in enumerate(faces):
         name, (left, top, right, bottom) = str(item.input_path), face.box_px

@@ -11,7 +11,7 @@ import torch
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
-from facerf_cli.face.dlib_landmarks import face_descriptor
+from facerf_cli.face.descriptor import face_descriptor
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata

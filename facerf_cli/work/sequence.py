@@ -117,14 +117,14 @@ def _followed(shot: Shot, rows: Sequence[dict[str, Any]], options: PhotoOptions)
     take = rows[[0, *_cuts(rows)][-1] :]
     last = next((seen.landmarks_px for seen in map(_sighting, reversed(take)) if seen), None)
     networks = load_models_once(options).networks.people
-    follower = Follower(networks, options.face, options.landmarks_from, last)
+    follower = Follower(networks, options.face, last)
     frames = ShotFrames(shot, options)
     show = lru_cache(_AHEAD)(lambda number: to_display(frames.read(number).pixels))
     finder = CutFinder(len(shot.frames), show)
     for number in _with_progress(range(len(rows), len(shot.frames)), shot, options.settings):
         cut = shot.cuts and finder.is_cut(number)
         if cut:
-            follower = Follower(networks, options.face, options.landmarks_from)
+            follower = Follower(networks, options.face)
         yield _row(number, _sight(shot, number, show, follower, options), cut)
 
 
@@ -145,7 +145,6 @@ def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
         "files": [[state.st_size, state.st_mtime_ns] for state in states],
         "cuts": shot.cuts,
         "face": options.face,
-        "landmarks_from": options.landmarks_from,
         "landmarks": options.landmarks,
         "colourspace": options.colourspace,
         "layer": options.layer,

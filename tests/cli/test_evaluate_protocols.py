@@ -270,7 +270,7 @@ def test_people_of_a_dataset_by_every_protocol(
     dataset = read_dataset(folder)
     cameras = {f"{p.subject}/{p.index:05d}": (p.subject, p.source_camera) for p in read_pairs(dataset)}
 
-    def find(_: object, geometry: str, image: np.ndarray, name: str, landmarks_from: str) -> list[Face]:
+    def find(_: object, geometry: str, image: np.ndarray, name: str) -> list[Face]:
         return [face_at(load_fit(dataset.fit_path(*cameras[name])).landmarks_px.double().numpy())]
 
     monkeypatch.setattr(people, "find_for", find)

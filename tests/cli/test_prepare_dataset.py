@@ -111,7 +111,7 @@ def test_the_fit_lies_on_the_true_face_in_every_camera(given: Given, prepared: D
             scale = fit.camera.focal_px / -fitted[:, 2].mean()
             fitted_px = fit.camera.focal_px * fitted[:, :2] / -fitted[:, 2:] * torch.tensor([1, -1]) + 48
             off_px = fitted_px - torch.from_numpy(fit.crop.to_crop(posed.project(true_landmarks).numpy()))
-            assert off_px[17:].norm(dim=-1).mean() < 0.09 * 0.089 * scale  # dlib is off by 5 % on these masks
+            assert off_px[17:].norm(dim=-1).mean() < 0.09 * 0.089 * scale
 
 
 def test_light_normals_and_skin_agree(given: Given, prepared: Dataset) -> None:

@@ -87,9 +87,8 @@ def test_the_command_of_a_page_has_the_options_that_it_was_made_with() -> None:
         colourspace="ACEScg",
         face="all",
         landmarks=Path("points"),
-        landmarks_from="dlib",
     )
-    line = "--input-colourspace ACEScg --face 2 --landmarks points --landmarks-from dlib --checkpoint"
+    line = "--input-colourspace ACEScg --face 2 --landmarks points --checkpoint"
     assert photo_words(options, 2) == [*line.split(), "my net.safetensors"]
     rembg = MatteModel("rembg:u2net", Path("models/u2net.onnx"))
     alone = PhotoOptions(Settings(), face="1", person=Path("mattes"), matte_from=rembg)

@@ -190,7 +190,7 @@ def found_by_truth(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, blind: str
     joint = person_of(dataset)
     cameras = {camera: joint.lit(camera).face for camera in ("C0", "C1")}
 
-    def find(_: object, geometry: Geometry, image: np.ndarray, name: str, landmarks_from: str) -> list[Face]:
+    def find(_: object, geometry: Geometry, image: np.ndarray, name: str) -> list[Face]:
         assert geometry == "landmarks"
         camera = name.rpartition("/")[2]
         if camera not in cameras:  # a source, of C0 if its index is even

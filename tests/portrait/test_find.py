@@ -1,4 +1,4 @@
-"""Faces are found in small, dark, turned and large images and in tight crops; by facerf and by dlib."""
+"""Faces are found in small, dark, turned and large images and in tight crops."""
 
 import io
 
@@ -8,8 +8,7 @@ import skimage.data
 import skimage.transform
 from PIL import Image
 
-from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.face import dlib_landmarks
+from facerf_cli.errors import InputError
 from facerf_cli.face.topology import CONTOUR, MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.portrait.find import detect_faces, find_faces
@@ -17,19 +16,15 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS
 
 PHOTO = skimage.data.astronaut()[:400, 40:400]  # not square
 INNER = slice(len(CONTOUR), None)
-
-
-BOTH = pytest.mark.parametrize("source", ["facerf", "dlib"], indirect=True, scope="module")
-
-
-@pytest.fixture(scope="module")
-def source(request):
-    return getattr(request, "param", "facerf")
+MARKED_PX = {  # where a person sees them: corners of eyes and mouth, tip of the nose, chin
+    36: (154, 101), 39: (171, 103), 42: (198, 105), 45: (218, 105),
+    30: (184, 125), 48: (164, 140), 54: (203, 141), 8: (183, 178),
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def landmarks_px(source):
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO, source)
+def landmarks_px():
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO)
     return face.landmarks_px
 
 
@@ -47,71 +42,70 @@ def resized(image, scale):
     return np.round(255 * skimage.transform.resize(image, size, anti_aliasing=True)).astype(np.uint8)
 
 
-@BOTH
-def test_a_mirrored_photo_has_mirrored_landmarks(source, landmarks_px):
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[:, ::-1], source)
+def test_landmarks_lie_where_a_person_marks_them(landmarks_px):
+    off_px = np.linalg.norm(landmarks_px[list(MARKED_PX)] - list(MARKED_PX.values()), axis=1)
+    assert off_px.max() < 0.06 * iod_px(landmarks_px)
+
+
+def test_a_mirrored_photo_has_mirrored_landmarks(landmarks_px):
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[:, ::-1])
     back = face.landmarks_px[MIRROR_68] * [-1, 1] + [PHOTO.shape[1], 0]
     assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.25)
     assert error_iod(back, landmarks_px) < 0.02
 
 
-@BOTH
 @pytest.mark.parametrize("turns", [1, 2])
-def test_turned_photos(source, landmarks_px, turns):
+def test_turned_photos(landmarks_px, turns):
     height, width = PHOTO.shape[:2]
     x, y = landmarks_px.T
     expected = {1: (y, width - x), 2: (width - x, height - y)}[turns]
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.rot90(PHOTO, turns), source)
-    # dlib looks at the photo turned back; facerf's network finds an upright square of its own
-    assert error_iod(face.landmarks_px, np.stack(expected, -1)) < (0.02 if source == "dlib" else 0.05)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.rot90(PHOTO, turns))
+    assert error_iod(face.landmarks_px, np.stack(expected, -1)) < 0.05
     left, top, right, bottom = face.box_px
     assert left < face.landmarks_px[30, 0] < right and top < face.landmarks_px[30, 1] < bottom
 
 
-def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(source, landmarks_px):
+def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(landmarks_px):
     buffer = io.BytesIO()
     Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.array(Image.open(buffer)), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.array(Image.open(buffer)))
     assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
 
 
-def test_a_small_face(source, landmarks_px):
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, resized(PHOTO, 0.4), source)
+def test_a_small_face(landmarks_px):
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, resized(PHOTO, 0.4))
     assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
 
 
-def test_a_large_image(source, landmarks_px):
+def test_a_large_image(landmarks_px):
     large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, large, source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, large)
     assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
 
 
-@BOTH
-def test_a_tight_crop(source, landmarks_px):
+def test_a_tight_crop(landmarks_px):
     low, high = landmarks_px[17:].min(0).astype(int) - 8, landmarks_px[17:].max(0).astype(int) + 10
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[low[1] : high[1], low[0] : high[0]], source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[low[1] : high[1], low[0] : high[0]])
     assert error_iod(face.landmarks_px[17:] + low, landmarks_px[17:]) < 0.06
 
 
-@BOTH
-def test_a_dark_photo(source, landmarks_px):
+def test_a_dark_photo(landmarks_px):
     linear = srgb_to_linear(PHOTO.astype(np.float32) / 255)
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.round(PHOTO * 0.03).astype(np.uint8), source)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.round(PHOTO * 0.03).astype(np.uint8))
     assert error_iod(face.landmarks_px, landmarks_px) < 0.08
-    (face,) = find_faces(SHIPPED_NETWORKS.people, linear * 1e-3, "dark.exr", landmarks_from=source)
+    (face,) = find_faces(SHIPPED_NETWORKS.people, linear * 1e-3, "dark.exr")
     assert error_iod(face.landmarks_px, landmarks_px) < 0.02
 
 
-def test_several_faces_from_left_to_right(source, landmarks_px):
+def test_several_faces_from_left_to_right(landmarks_px):
     small = np.zeros_like(PHOTO)
     small[100:300, 90:270] = resized(PHOTO, 0.5)
     pair = np.concatenate([small, PHOTO], 1)
-    faces = detect_faces(SHIPPED_NETWORKS.people, pair, source)
+    faces = detect_faces(SHIPPED_NETWORKS.people, pair)
     assert len(faces) == 2 and faces[0].area_px < faces[1].area_px
-    assert len(detect_faces(SHIPPED_NETWORKS.people, pair, source, everyone=True)) == 2
-    if source == "facerf":
-        for a, b in (faces, faces[::-1]):
-            assert [one.landmarks_px is b.landmarks_px for one in a.others] == [True]
+    assert len(detect_faces(SHIPPED_NETWORKS.people, pair, everyone=True)) == 2
+    for a, b in (faces, faces[::-1]):
+        assert [one.landmarks_px is b.landmarks_px for one in a.others] == [True]
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5000, 3), (200, 300, 3)])
@@ -123,22 +117,6 @@ def test_no_face_names_the_image_and_a_way_out(shape):
 def test_only_display_images_are_searched():
     with pytest.raises(ValueError, match="uint8"):
         detect_faces(SHIPPED_NETWORKS.people, np.zeros((5, 5, 3), np.float32))
-
-
-def test_both_find_the_same_landmarks():
-    own, other = (
-        detect_faces(SHIPPED_NETWORKS.people, PHOTO, source)[0].landmarks_px for source in ("facerf", "dlib")
-    )
-    off = np.linalg.norm(own - other, axis=1) / iod_px(other)
-    assert off[INNER].mean() < 0.06 and off.mean() < 0.08
-
-
-def test_without_the_extra_only_its_option_fails(monkeypatch):
-    monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
-    dlib_landmarks._predictor.cache_clear()
-    assert detect_faces(SHIPPED_NETWORKS.people, PHOTO)
-    with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
-        detect_faces(SHIPPED_NETWORKS.people, PHOTO, "dlib")
 
 
 def test_a_face_that_is_larger_than_the_photo():

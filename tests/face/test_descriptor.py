@@ -8,8 +8,8 @@ import pytest
 import skimage.data
 
 from facerf_cli.errors import FacerfError
-from facerf_cli.face import dlib_landmarks
-from facerf_cli.face.dlib_landmarks import face_descriptor
+from facerf_cli.face import descriptor as module
+from facerf_cli.face.descriptor import face_descriptor
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.files.images import read_image
 from facerf_cli.portrait.find import find_faces
@@ -51,7 +51,8 @@ def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
             return [0.0] * 128
 
     recorder = Recorder()
-    monkeypatch.setattr(dlib_landmarks, "_recognition", lambda: recorder)
+    dlib, _ = module._recognition()
+    monkeypatch.setattr(module, "_recognition", lambda: (dlib, recorder))
     places = np.stack([np.arange(68), 2 * np.arange(68)], -1)
     face_descriptor(np.full((9, 7, 3), [0.2, 0.5, 1.3]), places + PIXEL_CENTRE + 0.2)
     assert recorder.points == [tuple(place) for place in places.tolist()]  # a pixel's centre is whole there
@@ -80,7 +81,7 @@ def test_other_shapes_are_refused(landmarks_px: np.ndarray) -> None:
 def test_a_missing_model_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, landmarks_px: np.ndarray
 ) -> None:
-    monkeypatch.setattr(dlib_landmarks, "find_spec", lambda name: None)
-    dlib_landmarks._recognition.cache_clear()
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    module._recognition.cache_clear()
     with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
         face_descriptor(PHOTO, landmarks_px)

