@@ -6,7 +6,7 @@ import numpy as np
 from skimage.transform import SimilarityTransform, warp
 
 from facerf_cli.batch.inputs import FILM_SUFFIXES
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.image.strips import fitted, resized
 

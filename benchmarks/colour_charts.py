@@ -32,8 +32,9 @@ from facerf_cli.capture.chart import (
 )
 from facerf_cli.capture.chart_photo import outline_patches
 from facerf_cli.capture.chart_search import find_chart
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
 from facerf_cli.files.sheets import contact_sheet
+from facerf_cli.files.write import write_display
 
 sys.path.insert(0, str(ROOT))  # the renderer of charts is the tests'
 from tests.capture.chart_image import background, chart_image

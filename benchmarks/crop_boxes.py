@@ -20,8 +20,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_box, from_landmarks
 from facerf_cli.face.fit import regressed_fit
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
-from facerf_cli.files.images import read_image
 from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.files.read import read_image
 from facerf_cli.pipeline import regress_head
 from facerf_cli.portrait.find import Face, find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models

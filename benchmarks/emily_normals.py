@@ -15,7 +15,7 @@ import torch
 from _common import SHARED, arguments, print_header, print_row, required
 from PIL import Image
 
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.pipeline import find_for, fit
 from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.portrait_field import PortraitField

@@ -19,7 +19,8 @@ from _common import ASTRONAUT, arguments, best_s, print_header, print_row
 from skimage.transform import resize
 
 import facerf_cli as facerf
-from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import auto_exposure_ev, encode_display, linear_to_srgb, named_view
 
 _ROUNDS = 3

@@ -18,7 +18,7 @@ import torch
 from _common import arguments, photos, print_header, print_row
 from torch import Tensor
 
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.light import estimate
 from facerf_cli.light.estimate import LightEvidence, estimate_signed_weights, estimate_smooth_weights
 from facerf_cli.pipeline import estimate_light, fit_photo

@@ -17,7 +17,7 @@ import torch
 from _common import ASTRONAUT, ROOT, arguments
 
 from facerf_cli.face.head import shrunk_photo
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import direction_to_azel, golden_spiral, rig_directions

@@ -19,7 +19,8 @@ from _common import ASTRONAUT, arguments, best_s, required
 from skimage.metrics import structural_similarity
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE

@@ -20,7 +20,7 @@ from _common import ROOT, arguments, photos
 from scipy.ndimage import gaussian_filter
 from typer.testing import CliRunner
 
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import luminance
 from facerf_cli.main import app
 

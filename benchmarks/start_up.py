@@ -24,7 +24,7 @@ import torch
 from _common import ASTRONAUT, arguments, best_s, print_header, print_row
 from large_photos import enlarged
 
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.pipeline import find_for, head_of

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import grid_triangles
-from facerf_cli.files.images import write_display
+from facerf_cli.files.write import write_display
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.transport import BakeSettings

@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.main import main
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS

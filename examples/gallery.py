@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
 from facerf_cli.main import main
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, latlong_solid_angles
 
 HEIGHT_PX, SAMPLES = 128, 4  # samples x samples in a pixel

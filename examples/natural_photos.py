@@ -19,8 +19,9 @@ from scipy.ndimage import gaussian_filter
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import Pair, image_path, read_pairs
 from facerf_cli.dataset.weights import read_envmap
-from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.light.sphere import direction_to_uv
 
 VIEW_DEG = 40.0  # angle that the background spans

@@ -11,7 +11,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from facerf_cli.face.crop import Crop, from_landmarks
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.main import main
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS

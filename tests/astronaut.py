@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.face.head import Head
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.pipeline import FittedPerson, fit
 from facerf_cli.portrait.find import Face, find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models

@@ -15,7 +15,6 @@ from facerf_cli.batch.settings import Shard
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.icc import space_of_profile
 from facerf_cli.files.light_files import (
     Harmonics,
     LightRecord,
@@ -24,6 +23,7 @@ from facerf_cli.files.light_files import (
     write_light,
     write_numbers,
 )
+from facerf_cli.files.spaces import space_of_profile
 from facerf_cli.files.texts import read_rig
 from facerf_cli.light.entries import lit_images, parse_lights
 from facerf_cli.run.logs import escaped, json_line, printable_line

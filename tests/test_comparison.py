@@ -7,7 +7,7 @@ import pytest
 import typer.main
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
-from facerf_cli.files.images import PHOTO_LIMIT_PX
+from facerf_cli.files.read import PHOTO_LIMIT_PX
 from facerf_cli.main import app
 
 PAGE = (Path(__file__).parents[1] / "docs/comparison.md").read_text()

@@ -19,7 +19,7 @@ import torch
 from safetensors.torch import save_file
 
 from facerf_cli.face.morphable import load_face_model, save_face_model
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from facerf_cli.network.features import VggFeatures
 from tests.dataset.dataset_fixture import write_small_dataset

@@ -11,7 +11,7 @@ import pytest
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
-from facerf_cli.files.images import LinearImage
+from facerf_cli.files.read import LinearImage
 from facerf_cli.image.strips import Band, Layer, filled, whole
 from facerf_cli.portrait.find import FaceBox
 from facerf_cli.relighting.group import GroupComposition

@@ -14,7 +14,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face import morphable
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import MAX_ARRAYS, load_face_model
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
 from facerf_cli.run import memory
 

@@ -13,7 +13,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_box, from_landmarks
 from facerf_cli.face.fit import fit_landmarks
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.pipeline import find_for, fit_photo, regress_head, regress_photo
 from facerf_cli.portrait.find import Face, find_faces

@@ -9,7 +9,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
 from facerf_cli.image.strips import block_means, box_means, enlarged, filled, strips, whole
 from facerf_cli.portrait.matte import PersonColours, lifted, shrunk

@@ -31,8 +31,8 @@ class Door:
 
 def _image(path: Path) -> None:
     from facerf_cli.files.image_metadata import read_header
-    from facerf_cli.files.images import read_image
     from facerf_cli.files.olat_stack import is_olat_stack
+    from facerf_cli.files.read import read_image
 
     read_header(path)
     is_olat_stack(path)

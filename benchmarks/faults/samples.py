@@ -23,11 +23,10 @@ from facerf_cli.evaluation.report import FORMAT
 from facerf_cli.face.fit import fit_from_arrays, save_fit
 from facerf_cli.face.importers.ict import VERTICES
 from facerf_cli.face.morphable import BUILTIN_PATH
-from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import embed_xmp
-from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.write import linear_profile, write_display, write_exr
 from facerf_cli.image.colour import LINEAR_P3
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import rig_directions

@@ -19,7 +19,7 @@ from facerf_cli.baselines import RelightKind
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import check_in_photo, check_landmarks
 from facerf_cli.face.fit import Geometry
-from facerf_cli.files import images
+from facerf_cli.files import read, write
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.portrait.find import FaceBox, face_at
 from facerf_cli.relighting import White
@@ -31,7 +31,7 @@ __all__ = ["Light", "Person", "PhotoCamera", "fit", "load_models", "read_image",
 
 def read_image(path: str | Path, colourspace: str | None = None) -> np.ndarray:
     """Read an image or a map as scene-linear Rec.709 [H, W, 3]; `colourspace` overrides the file's."""
-    return images.read_image(Path(path), colourspace).pixels
+    return read.read_image(Path(path), colourspace).pixels
 
 
 def write_image(path: str | Path, pixels: Array, exposure: float | Literal["auto"] = 0.0) -> None:
@@ -42,9 +42,9 @@ def write_image(path: str | Path, pixels: Array, exposure: float | Literal["auto
     path, colour = Path(path), np.ascontiguousarray(values[..., :3], np.float32)
     alpha = values[..., 3] if values.shape[-1] == 4 else None
     if path.suffix.lower() == ".exr":
-        images.write_exr(path, colour, alpha)
+        write.write_exr(path, colour, alpha)
     else:
-        images.write_display(path, colour, exposure, alpha)
+        write.write_display(path, colour, exposure, alpha)
 
 
 def load_models(

@@ -29,7 +29,7 @@ from facerf_cli.capture.chart import (
 from facerf_cli.capture.chart_search import block_means, find_chart
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import write_display
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import luminance
 
 CAMERA_FIELD = "{camera}"

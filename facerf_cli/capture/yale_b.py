@@ -27,7 +27,7 @@ import torch
 from facerf_cli.capture.capture import Capture, shift_image
 from facerf_cli.errors import InputError
 from facerf_cli.face.joint_fit import PosedCamera
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import read_text
 from facerf_cli.light.sphere import azel_to_direction
 

@@ -34,8 +34,9 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import load_fit
 from facerf_cli.files.documents import Document, Points68, read_document, write_document
-from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.olat_stack import StackHeader, read_olats
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.network.inputs import MEAN_RADIANCE, Batch, concatenate, resize
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Networks

@@ -35,9 +35,9 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import checked, digest
 from facerf_cli.files.image_metadata import Attributes
-from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.texts import parse_json, text_of
+from facerf_cli.files.write import write_exr
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line
 
 RELIT, PAIRS_NAME = "relit", "pairs.jsonl"

@@ -27,8 +27,8 @@ from facerf_cli.dataset.unwrapped import stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.files.write import HALF_MAX
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import Networks

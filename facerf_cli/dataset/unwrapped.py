@@ -28,8 +28,9 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import digest
-from facerf_cli.files.images import HALF_MAX, read_image
 from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import HALF_MAX
 from facerf_cli.raster.texture import normal_map, unwrap
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.workers import in_shards, one_thread

@@ -26,9 +26,9 @@ from torch import Tensor
 
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import HALF_MAX
 from facerf_cli.files.light_files import read_map_file
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
+from facerf_cli.files.write import HALF_MAX
 from facerf_cli.light.envmap import rotated_weights, texel_integrals
 from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.sky.skies import ProceduralMaps, draw_sky

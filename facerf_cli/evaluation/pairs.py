@@ -18,7 +18,7 @@ import numpy as np
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import folder_name
-from facerf_cli.files.images import PHOTO_LIMIT_PX, LinearImage, read_image
+from facerf_cli.files.read import PHOTO_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.texts import read_text, require_regular
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces

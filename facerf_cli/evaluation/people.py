@@ -18,8 +18,8 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, region_mask
-from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
+from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.metrics import tone_of
 from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.sphere import RigLight

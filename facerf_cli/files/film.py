@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.image.cicp import HDR_CURVES, space_of_codes
+from facerf_cli.files.spaces import HDR_CURVES, space_of_codes
 from facerf_cli.image.colour import SRGB, ColourSpace
 from facerf_cli.run.logs import LOGGER_NAME
 

@@ -14,9 +14,8 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.decoding import decode
 from facerf_cli.files.film import BT709, Film, Timing, exact, reason, require_av, start_s
-from facerf_cli.files.images import PHOTO_LIMIT_PX
+from facerf_cli.files.read import PHOTO_LIMIT_PX, decode
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, unit_floats
 from facerf_cli.run.logs import LOGGER_NAME
 

@@ -4,7 +4,6 @@ Provenance is written as an XMP packet into PNG, JPEG and TIFF files, where view
 source type.
 """
 
-import logging
 import os
 import re
 import shutil
@@ -20,12 +19,10 @@ from xml.sax.saxutils import quoteattr
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.avif import is_avif, open_avif
-from facerf_cli.files.heif import decode_heif, is_heif
-from facerf_cli.files.image_parts import is_floating, open_image, shown_size, utf8_path
-from facerf_cli.files.stated_space import default_space, stated_space
+from facerf_cli.files import isobmff
+from facerf_cli.files.read import metadata_of, open_image, shown_size, utf8_path
+from facerf_cli.files.spaces import default_space, is_floating, stated_space
 from facerf_cli.image.colour import ColourSpace
-from facerf_cli.run.logs import LOGGER_NAME
 
 Attributes = Mapping[str, str | int | float]
 
@@ -47,7 +44,6 @@ _OF_PLATE = re.compile(
     r"|(camera|lens)\w*|(nominal|effective|entrancePupil|pinhole)\w*|focus|aperture|expTime|isoSpeed|shutterAngle)"
 )
 _TUPLES = {"smpte:TimeCode": "timecode", "FramesPerSecond": "rational"}
-log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
@@ -65,45 +61,24 @@ class Header:
 def read_header(path: Path) -> Header | None:
     """Read the header of the layer that is read; return None if the file is not a readable image."""
     utf8_path(path)
-    try:
-        spec = _spec_of(path) if path.is_file() else None
-    except InputError:  # no image, damaged, or pi-heif is not there
-        spec = None
-    if spec is None:
+    if not path.is_file():
         return None
-    height, width = shown_size(spec)
-    return Header(
-        width, height, is_floating(spec), 8 * spec.format.size(), _space(path, spec), metadata_of(spec)
-    )
-
-
-def _spec_of(path: Path) -> oiio.ImageSpec:
-    if is_avif(path):
-        return open_avif(path)[1]
-    if is_heif(path):
-        return decode_heif(path, _HEIF_LIMIT_PX)[1]  # upright
-    opened = open_image(path)
-    opened.stream.close()
-    return opened.spec
-
-
-def _space(path: Path, spec: oiio.ImageSpec) -> ColourSpace:
     try:
-        return stated_space(path, spec) or default_space(spec)
-    except InputError:  # an HDR image, whose pixels are not read
-        return default_space(spec)
-
-
-def metadata_of(spec: oiio.ImageSpec) -> dict[str, Any]:
-    """Return the attributes that are text, numbers or tuples, without the orientation."""
-    plain = (str, int, float, tuple)
-    attributes = {}
-    for entry in spec.extra_attribs:
-        with suppress(UnicodeDecodeError):  # of a text in another encoding
-            if isinstance(entry.value, plain):
-                attributes[entry.name] = entry.value
-    attributes.pop("Orientation", None)  # `read_image` turns the image upright
-    return attributes
+        kind = isobmff.kind_of(path)
+        if kind == "avif":
+            _, spec = isobmff.open_avif(path)
+        elif kind == "heif":
+            _, spec = isobmff.decode_heif(path, _HEIF_LIMIT_PX)
+        else:
+            with open_image(path) as opened:
+                spec = opened.spec
+    except InputError:  # no image, damaged, or pi-heif is not there
+        return None
+    space = default_space(spec)
+    with suppress(InputError):  # an HDR image, whose pixels are not read
+        space = stated_space(path, spec) or space
+    height, width = shown_size(spec)
+    return Header(width, height, is_floating(spec), 8 * spec.format.size(), space, metadata_of(spec))
 
 
 def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,26 +92,6 @@ def set_attribute(spec: oiio.ImageSpec, name: str, value: Any) -> None:
         spec.attribute(name, oiio.TypeDesc(_TUPLES.get(name, "rational")), value)
     else:
         spec.attribute(name, value)
-
-
-def require_whole_png(path: Path) -> None:
-    """Check the chunks and checksums of a PNG file to its end; a file of another kind passes.
-
-    OpenImageIO does not report such damage reliably.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
-            return
-        kind = b""
-        while kind != b"IEND":
-            head = stream.read(8)
-            length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
-            body, checksum = stream.read(min(length, size)), stream.read(4)  # a length may be 4 GiB
-            if len(body) != length or len(checksum) != 4:
-                raise InputError(f"{path}: damaged or cut short: the PNG file ends too early; copy it again")
-            if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
-                raise InputError(f"{path}: damaged: a checksum of the PNG file is wrong; copy it again")
 
 
 def embed_xmp(path: Path, metadata: Attributes) -> None:

@@ -20,10 +20,9 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.decoding import LINEAR_BYTES
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import ENVMAP_LIMIT_PX, LinearImage, read_image
+from facerf_cli.files.read import ENVMAP_LIMIT_PX, LINEAR_BYTES, LinearImage, read_image
 from facerf_cli.files.texts import read_bytes, text_of
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms

@@ -8,8 +8,8 @@ import numpy as np
 from torch import Tensor
 
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import half_floats, warn_of_clamped
 from facerf_cli.files.olat_stack import StackHeader
+from facerf_cli.files.write import half_floats, warn_of_clamped
 
 _OF_STACK = ("kind", "directions", "rotation", "source", "seen", "normals", "layout_version")
 

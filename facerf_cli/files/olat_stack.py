@@ -23,9 +23,9 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.image_metadata import Attributes
-from facerf_cli.files.image_parts import oiio_error, utf8_path
-from facerf_cli.files.images import half_floats, warn_of_clamped, write_parts
+from facerf_cli.files.read import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
+from facerf_cli.files.write import half_floats, warn_of_clamped, write_parts
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.image.strips import Band
 from facerf_cli.run import memory

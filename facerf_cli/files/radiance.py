@@ -5,8 +5,8 @@ COLORCORR, of which there may be several, have multiplied the values.
 """
 
 from collections import defaultdict
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -25,27 +25,19 @@ _RUNS_BYTES = 60  # of a pixel while runs are decoded
 _REPEAT = (1, 1, 1)  # a pixel that says how often the one before it is repeated
 
 
-@dataclass(frozen=True)
-class RadianceHeader:
-    """The contents of a header: where pixels begin, and `scale` [3], by which they are divided."""
+class RadianceHeader(NamedTuple):
+    """The place where pixels begin, rows in the file and pixels in each, and their divisor [3]."""
 
     values_from: int
-    size: tuple[int, int]  # rows in the file and pixels in each
+    size: tuple[int, int]
     scale: np.ndarray
-    orientation: int
-    aspect: float  # width of a pixel by its height
-    primaries: tuple[float, ...] | None
-
-    def describe(self, spec: oiio.ImageSpec) -> None:
-        """Set the attributes that OpenImageIO leaves out, or has otherwise."""
-        spec.attribute("Orientation", self.orientation)
-        spec.attribute("PixelAspectRatio", self.aspect)
-        if self.primaries is not None:
-            spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), self.primaries)
 
 
-def read_radiance_header(path: Path) -> RadianceHeader:
-    """Parse the header of a Radiance file; an InputError for what is damaged in it."""
+def read_radiance_header(path: Path, spec: oiio.ImageSpec) -> RadianceHeader:
+    """Parse the header of a Radiance file, and set the attributes that OpenImageIO has otherwise.
+
+    Raises InputError for what is damaged in it.
+    """
     with path.open("rb") as stream:
         start = stream.read(_LIMIT_BYTES)
     lines, _, rest = start.partition(b"\n\n")
@@ -68,8 +60,11 @@ def read_radiance_header(path: Path) -> RadianceHeader:
             raise ValueError("a number in it is out of range")
     except (ValueError, KeyError, ZeroDivisionError) as error:
         raise InputError(f"{path}: damaged: the header of a Radiance file is wrong ({error})") from None
-    values_from = len(lines) + len("\n\n") + len(resolution) + len("\n")
-    return RadianceHeader(values_from, size, scale, orientation, aspect, primaries or None)
+    spec.attribute("Orientation", orientation)
+    spec.attribute("PixelAspectRatio", aspect)
+    if primaries:
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), primaries)
+    return RadianceHeader(len(lines) + len("\n\n") + len(resolution) + len("\n"), size, scale)
 
 
 def require_rgb(path: Path) -> None:

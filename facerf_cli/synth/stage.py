@@ -17,8 +17,8 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.topology import GRID
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
-from facerf_cli.files.images import write_exr
 from facerf_cli.files.texts import read_json
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings

@@ -24,8 +24,8 @@ from torch import Tensor, nn
 from facerf_cli.batch.made_from import Recipe, recipe_of, require_same
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import write_display
 from facerf_cli.files.texts import file_sha256, parse_json
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.stopping import unhurried

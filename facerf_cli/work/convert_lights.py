@@ -8,7 +8,6 @@ import torch
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
-from facerf_cli.files.images import write_exr
 from facerf_cli.files.light_files import (
     Harmonics,
     LightRecord,
@@ -18,6 +17,7 @@ from facerf_cli.files.light_files import (
     write_light,
     write_numbers,
 )
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.forms import (
     LightForms,
     MapAxes,

@@ -13,9 +13,9 @@ from facerf_cli.batch.settings import Overwrite
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import sweep_leftovers
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import write_display, write_exr
 from facerf_cli.files.light_files import read_map_file
 from facerf_cli.files.sheets import contact_sheet, labels
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.light.envmap import ball, mean_radiance
 from facerf_cli.run.logs import LOGGER_NAME

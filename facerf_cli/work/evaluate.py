@@ -39,7 +39,7 @@ from facerf_cli.evaluation.summary import Layout, print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
 from facerf_cli.files.image_metadata import embed_xmp
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.network.files import serving_files
 from facerf_cli.relighting.models import described_file
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line

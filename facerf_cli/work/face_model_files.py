@@ -18,7 +18,7 @@ from facerf_cli.face.morphable import (
 from facerf_cli.face.topology import GRID, OUTER_EYE_CORNERS, grid_triangles
 from facerf_cli.face.view import draw_turntable
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.images import write_display
+from facerf_cli.files.write import write_display
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, LOGGER_NAME, Provenance
 
 _NAMES_SHOWN = 12

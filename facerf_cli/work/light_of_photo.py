@@ -18,9 +18,10 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import render_face, see_face
-from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import labels
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.light.envmap import ball
 from facerf_cli.light.forms import rig_to_latlong

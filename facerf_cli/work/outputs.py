@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import write_display, write_exr, write_tiff
+from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.image.strips import Band
 from facerf_cli.run.logs import LOGGER_NAME

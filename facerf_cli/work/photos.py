@@ -20,7 +20,7 @@ from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.files.images import LinearImage, read_image
+from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import parse_lights

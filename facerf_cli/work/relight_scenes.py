@@ -15,8 +15,8 @@ from facerf_cli.face.descriptor import face_descriptor
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
-from facerf_cli.files.images import LinearImage, read_image
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
+from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.image.strips import Band, covering
 from facerf_cli.light.envmap import backdrop

@@ -14,8 +14,9 @@ from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
-from facerf_cli.files.images import LinearImage, write_display, write_exr
 from facerf_cli.files.meshes import TexturedMesh, write_glb, write_obj
+from facerf_cli.files.read import LinearImage
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import filled
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS

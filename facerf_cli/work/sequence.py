@@ -15,7 +15,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.film import Film
-from facerf_cli.files.images import LinearImage
+from facerf_cli.files.read import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709, unit_floats
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.portrait.segment import Segmentation

@@ -17,11 +17,12 @@ from facerf_cli.face.fit import fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
-from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_npz import write_olat_npz
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.read import LinearImage
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
 from facerf_cli.image.strips import filled, resized
 from facerf_cli.light.studio_points import Lights

@@ -19,7 +19,8 @@ from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.chart_search import find_chart
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import linear_to_srgb
 from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, background, chart_image
 from tests.capture.test_chart import kept_luminance

@@ -20,7 +20,7 @@ from facerf_cli.capture.draft import (
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import ACESCG
 
 SUFFIXES = frozenset({".exr", ".png", ".pgm"})

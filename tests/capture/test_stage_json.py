@@ -11,7 +11,7 @@ import torch
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.image.colour import matrix_to_rec709, named_space
 
 K = [[500.0, 0, 33], [0, 500.0, 30], [0, 0, 1]]

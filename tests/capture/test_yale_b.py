@@ -11,7 +11,7 @@ from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, Flash, YaleB, guess_camera, read_shifts, read_yale_b
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.main import main
 from tests.capture.test_stage_json import capture_at

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests import astronaut
 from tests.cli.toy_checkpoint import save_toy_checkpoint

@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import LightRecord, read_light, read_numbers, write_light
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_uv, rig_directions

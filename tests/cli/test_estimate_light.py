@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.files.images import read_image, write_display
 from facerf_cli.files.light_files import read_light
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, rig_directions

@@ -8,7 +8,7 @@ import pytest
 
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.options import EvaluateOptions, NamedCheckpoint
-from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
 from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
 

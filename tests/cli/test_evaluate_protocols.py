@@ -22,7 +22,7 @@ from facerf_cli.evaluation import people
 from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_checkpoint
 from facerf_cli.network.features import LightNetwork

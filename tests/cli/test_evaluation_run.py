@@ -12,7 +12,8 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.options import EvaluateOptions, Measures, NamedCheckpoint
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, configure_logging
 from facerf_cli.work.photo_options import PhotoOptions
 from tests.evaluation.toy_protocol import (

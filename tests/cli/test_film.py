@@ -14,7 +14,8 @@ from skimage.data import astronaut
 
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Settings
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from facerf_cli.work import relight_scenes
 from facerf_cli.work.photo_options import PhotoOptions

@@ -11,7 +11,8 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from facerf_cli.face.fit import FaceFit, load_fit
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.main import main
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import render_texture

@@ -10,7 +10,7 @@ import torch
 
 from facerf_cli.face.crop import from_box
 from facerf_cli.face.fit import load_fit
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
 from facerf_cli.network.files import SHIPPED

@@ -15,9 +15,9 @@ from facerf_cli.errors import InputError
 from facerf_cli.evaluation.pairs import read_array
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.decoding import decode
 from facerf_cli.files.light_files import read_numbers
 from facerf_cli.files.olat_stack import is_olat_stack
+from facerf_cli.files.read import decode
 from facerf_cli.files.texts import is_regular, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
 from tests.cli.toy_batch import run

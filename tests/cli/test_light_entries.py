@@ -7,7 +7,7 @@ import pytest
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, preset_names
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.work.light_setups import LightSources, collect_setups

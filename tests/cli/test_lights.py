@@ -10,8 +10,9 @@ import torch
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import parse_lights
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions

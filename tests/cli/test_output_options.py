@@ -12,8 +12,9 @@ import pytest
 from PIL import Image
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import file_sha256
+from facerf_cli.files.write import write_exr
 from facerf_cli.image import colour
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas

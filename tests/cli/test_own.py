@@ -9,7 +9,7 @@ import torch
 
 import facerf_cli as facerf
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb
 from facerf_cli.light.entries import OWN, LitImage, lit_images
 from facerf_cli.light.studio_points import Lights

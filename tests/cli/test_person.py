@@ -16,8 +16,9 @@ from skimage.data import astronaut as photograph
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.images import LinearImage, write_display
 from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.files.read import LinearImage
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import resized
 from facerf_cli.main import main

@@ -10,7 +10,8 @@ import torch
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.main import main

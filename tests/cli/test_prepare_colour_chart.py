@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.stage_json import read_capture
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
 from tests.capture.test_chart import kept_luminance

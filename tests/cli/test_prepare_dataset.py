@@ -23,7 +23,8 @@ from facerf_cli.dataset.prepare import Preparation, _Subject
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.files import SHIPPED

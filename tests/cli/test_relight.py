@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import read_image, write_display, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, write_olat_stack
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.option import attributes_of

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.processes import wait_until

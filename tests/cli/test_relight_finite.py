@@ -7,7 +7,8 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import all_or_none
-from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.main import main
 from tests.astronaut import PATH as PHOTO
 

@@ -10,7 +10,7 @@ import torch
 from facerf_cli.baselines import prt
 from facerf_cli.baselines.prt import TransferSettings
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.images import read_image, write_display, write_exr
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.studio_points import Lights

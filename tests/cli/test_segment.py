@@ -8,7 +8,8 @@ import OpenImageIO as oiio
 import pytest
 
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.main import main
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.confidence import SCALES

@@ -14,7 +14,7 @@ import torch
 from safetensors.numpy import load_file
 
 from facerf_cli.capture.stage_json import read_capture
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.main import main
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.network import checkpoint

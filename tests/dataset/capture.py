@@ -11,7 +11,7 @@ from torch import Tensor
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import interpolate, rasterize

@@ -28,7 +28,7 @@ from facerf_cli.dataset.weights import envmap_names, relit_images
 from facerf_cli.errors import InputError
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.files.images import write_display
+from facerf_cli.files.write import write_display
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks

@@ -22,8 +22,8 @@ from facerf_cli.dataset.pairs import (
 )
 from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.dataset.weights import envmap_names, map_directions, read_envmap
-from facerf_cli.files.images import write_exr
 from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset

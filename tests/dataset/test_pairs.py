@@ -31,8 +31,9 @@ from facerf_cli.dataset.weights import (
     world_to_map,
 )
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import read_olat_header, read_olats, write_olat_stack
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset

@@ -11,7 +11,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import measure
 from facerf_cli.evaluation.options import Measures
 from facerf_cli.evaluation.pairs import Facts, case_of, collect_pairs, compare_pair, read_predictions
-from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import srgb_to_linear
 
 NAMES = ("anna/one", "anna/two", "bert/one")

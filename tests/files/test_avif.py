@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.avif import open_avif
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import read_image
+from facerf_cli.files.isobmff import open_avif
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.run import memory
 from tests import icc_profiles

@@ -13,7 +13,8 @@ import pytest
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.film import Film, Timing, film_timing
 from facerf_cli.files.film_writer import check_writable, comment_of, write_film
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
 from tests.files.test_stated_by_files import bt2020_of, write_png
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 
-from facerf_cli.files.icc import linear_profile, space_of_profile
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
+from facerf_cli.files.spaces import space_of_profile
+from facerf_cli.files.write import linear_profile
 from facerf_cli.image import colour
 from tests import icc_profiles
 

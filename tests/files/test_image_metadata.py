@@ -14,8 +14,9 @@ from PIL import Image
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import embed_xmp, plate_metadata, read_header, xmp_packet
-from facerf_cli.files.images import read_image, write_display, write_exr, write_tiff
 from facerf_cli.files.olat_stack import is_olat_stack
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 

@@ -12,9 +12,10 @@ from PIL import Image
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import HALF_MAX, PHOTO_LIMIT_PX, read_image, write_display, write_exr, write_tiff
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.files.stated_space import stated_space
+from facerf_cli.files.read import PHOTO_LIMIT_PX, read_image
+from facerf_cli.files.spaces import stated_space
+from facerf_cli.files.write import HALF_MAX, write_display, write_exr, write_tiff
 from facerf_cli.image import colour
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers

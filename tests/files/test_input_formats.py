@@ -15,7 +15,8 @@ from PIL import Image
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import read_image, write_display
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.run import memory
 from tests import icc_profiles

@@ -9,7 +9,6 @@ import torch
 from PIL import Image
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.images import read_image
 from facerf_cli.files.light_files import (
     FORMAT,
     Harmonics,
@@ -20,6 +19,7 @@ from facerf_cli.files.light_files import (
     write_light,
     write_numbers,
 )
+from facerf_cli.files.read import read_image
 
 
 def random_rows(rows: int) -> torch.Tensor:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from facerf_cli.files.images import write_display
 from facerf_cli.files.meshes import TexturedMesh, write_glb, write_obj
+from facerf_cli.files.write import write_display
 
 # A quad of two triangles; the texture is red in the top left, green in the top right, black below.
 UV = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], np.float32)

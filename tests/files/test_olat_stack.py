@@ -14,8 +14,7 @@ import pytest
 import torch
 
 from facerf_cli.errors import FacerfError, InputError
-from facerf_cli.files import images, olat_stack
-from facerf_cli.files.images import read_image, write_exr
+from facerf_cli.files import olat_stack, write
 from facerf_cli.files.olat_stack import (
     StackHeader,
     is_olat_stack,
@@ -24,6 +23,8 @@ from facerf_cli.files.olat_stack import (
     stream_olats,
     write_olat_stack,
 )
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.run import memory
 from tests.stacks import read_olat_stack
 
@@ -107,7 +108,7 @@ def test_oiiotool_opens_it(path: Path) -> None:
 def test_values_beyond_half_are_held_and_nan_is_our_bug(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(images.log, "propagate", True)
+    monkeypatch.setattr(write.log, "propagate", True)
     write_olat_stack(tmp_path / "a.exr", header(), iter([OLATS * 1e6]))
     assert "beyond the range of half floats" in caplog.text
     assert read_olat_stack(tmp_path / "a.exr").olats.isfinite().all()

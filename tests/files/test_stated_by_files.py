@@ -13,10 +13,11 @@ import tifffile
 from PIL import Image
 
 from facerf_cli.errors import InputError
-from facerf_cli.files import heif
+from facerf_cli.files import isobmff
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.light_files import read_map_file
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from tests.icc_profiles import press_profile
 
@@ -173,10 +174,10 @@ def test_alpha_and_codes_of_a_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     """As pi-heif reports them: alpha that is multiplied in, and HLG, which is refused."""
     (path := tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic")
     values = np.dstack([QUADS // 2, np.full((H, W), 128, np.uint8)])
-    found = {heif.PIXELS: values, heif.ASSOCIATED: np.array(True), heif.CODES: np.array([1, 13])}
-    monkeypatch.setattr(heif, "arrays_apart", lambda *_: found)
+    found = {"pixels": values, "is_associated": np.array(True), "codes": np.array([1, 13])}
+    monkeypatch.setattr(isobmff, "arrays_apart", lambda *_: found)
     np.testing.assert_allclose(levels_of(path), QUADS, atol=2)
-    found[heif.CODES] = np.array([9, 18])
+    found["codes"] = np.array([9, 18])
     with pytest.raises(InputError, match=r"a\.heic: is an HDR image \(HLG\)"):
         read_image(path)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.light.sphere import azel_to_direction
 
 ROOT = Path(__file__).parents[2]

@@ -13,8 +13,9 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from facerf_cli.files.images import read_image, write_exr
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.read import read_image
+from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import azel_to_direction, direction_to_uv, rig_directions
 
 ROOT = Path(__file__).parents[2]

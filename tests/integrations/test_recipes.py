@@ -12,7 +12,7 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from facerf_cli.files.images import write_display, write_exr
+from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import rig_directions
 from tests.integrations.test_nuke_and_blender import ROOT, stack

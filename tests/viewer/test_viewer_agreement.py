@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from facerf_cli.face.head import shrunk_photo
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import (
     MOST_OVER_FRONT_EV,
     SOFT_VIEW,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from facerf_cli.files.images import write_exr
+from facerf_cli.files.write import write_exr
 
 HEIGHT, WIDTH, LIGHTS = 120, 96, 40
 SUBJECT, CAMERA = "egg", "C0"

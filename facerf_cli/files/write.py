@@ -1,15 +1,16 @@
-"""Image files: read from any encoding as scene-linear float32 Rec.709; written as EXR, TIFF, PNG or JPEG.
+"""Image files written from scene-linear Rec.709: EXR, TIFF, PNG and JPEG, whole or not at all.
 
 An EXR with layers has several parts: the image, which any program opens, and then a part for each layer, so
 that tools which want four channels find four.
 """
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import OpenImageIO as oiio
@@ -17,11 +18,9 @@ import torch
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.decoding import decode, full_frame, upright
-from facerf_cli.files.icc import linear_profile
-from facerf_cli.files.image_metadata import Attributes, embed_xmp, metadata_of, set_attribute
-from facerf_cli.files.image_parts import is_floating, oiio_error, shown_size, utf8_path
-from facerf_cli.files.stated_space import OCIO_SPACE, default_space, stated_space
+from facerf_cli.files.image_metadata import Attributes, embed_xmp, set_attribute
+from facerf_cli.files.read import oiio_error, utf8_path
+from facerf_cli.files.spaces import OCIO_SPACE
 from facerf_cli.image.colour import (
     ACES,
     ACESCG,
@@ -31,23 +30,22 @@ from facerf_cli.image.colour import (
     PLAIN_VIEW,
     ColourSpace,
     View,
+    adaptation,
     auto_exposure_ev,
     encode_display,
     from_linear_rec709,
-    named_space,
-    to_linear_rec709,
-    unit_floats,
+    rgb_to_xyz,
 )
-from facerf_cli.image.strips import Band, resized, rows_of, strips
+from facerf_cli.image.strips import Band, rows_of, strips
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
 
 
-PHOTO_LIMIT_PX = 64_000_000
-ENVMAP_LIMIT_PX = 134_300_000  # 16k x 8k
 HALF_MAX = 65504.0  # the largest finite half float
 JPEG_QUALITY = 95
+_D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the connection space of ICC profiles
+_FIXED = 65536  # s15Fixed16Number
 _PNG_LEVEL = 4  # of zlib: half the time of 6 for two hundredths more bytes
 _OIIO_NAMES = {
     LINEAR: "lin_rec709_scene",
@@ -64,94 +62,6 @@ _LAYER_CHANNELS = {
     "depth": ("Z", "float"),
     "uv": ("UV", "float"),
 }
-
-
-@dataclass(frozen=True)
-class LinearImage:
-    """An upright image in scene-linear Rec.709; the colour is not premultiplied by alpha."""
-
-    pixels: np.ndarray  # [H, W, 3] float32
-    alpha: np.ndarray | None = None  # [H, W] float32
-    colourspace_name: str = LINEAR.name  # the colour space from which the file was decoded
-    metadata: dict[str, Any] = field(default_factory=dict)
-
-
-def read_image(
-    path: Path | str,
-    colourspace: str | ColourSpace | None = None,
-    limit_px: int = PHOTO_LIMIT_PX,
-    non_finite: Literal["error", "zero"] = "error",
-    kept_px: int = 0,
-    layer: str | None = None,
-    with_alpha: bool = True,
-) -> LinearImage:
-    """Read an image of any supported format; `colourspace` overrides the colour space that the file states.
-
-    `layer` names one of an EXR. Without alpha the colour is as it is stored: of a map it is light, and covers
-    nothing.
-
-    Before pixels are decoded the size is checked, and the budget of memory asked, for `kept_px` bytes a pixel
-    that the caller makes of it, too. NaN and infinite values raise an InputError, or are set to 0 with a
-    warning if `non_finite` is "zero".
-    """
-    path = Path(path)
-    found = decode(path, limit_px, kept_px, layer, with_alpha)
-    spec = found.spec
-    values = upright(full_frame(found.values, spec), spec.get_int_attribute("Orientation", 1))
-    space = _space(path, colourspace, spec)
-    if colourspace and space.decode is not None and is_floating(spec):
-        log.warning("%s: floating-point values decoded by the curve of %s", path, space.name)
-    pixels = np.empty((*values.shape[:2], 3), np.float32)
-    alpha = None if found.alpha is None else np.empty(values.shape[:2], np.float32)
-    bad = 0
-    for rows in strips(values.shape):
-        colour = np.broadcast_to(values[rows][..., found.colour], pixels[rows].shape)
-        opaque = None if found.alpha is None else unit_floats(values[rows][..., found.alpha])
-        colour, opaque, wrong = _finite(colour, opaque)
-        bad += wrong
-        if alpha is not None and opaque is not None:
-            alpha[rows] = opaque.clip(0, 1)
-            if found.is_associated:
-                # rounding exceeds 1 where alpha is small
-                most = np.inf if values.dtype.kind == "f" else 1.0
-                colour = unit_floats(colour) / np.where(alpha[rows] > 0, alpha[rows], 1)[..., None]
-                colour = colour.clip(None, most)
-        pixels[rows] = to_linear_rec709(colour, space)
-    if bad:
-        _say_non_finite(path, bad, pixels.shape[0] * pixels.shape[1], non_finite)
-    if (size := shown_size(spec)) != pixels.shape[:2]:
-        log.info("%s: its pixels are not square; read at %d x %d", path, size[1], size[0])
-        pixels = resized(pixels, *size)
-        alpha = None if alpha is None else resized(alpha, *size)
-    return LinearImage(pixels, alpha, space.name, metadata_of(spec))
-
-
-def _space(path: Path, colourspace: str | ColourSpace | None, spec: oiio.ImageSpec) -> ColourSpace:
-    """Return the space in which the caller wants a file read, or that the file states."""
-    if colourspace:
-        return named_space(colourspace) if isinstance(colourspace, str) else colourspace
-    found, default = stated_space(path, spec), default_space(spec)
-    if found is None and is_floating(spec):
-        log.info("%s: does not say its colour space; read as %s", path, default.name)
-    return found or default
-
-
-def _finite(colour: np.ndarray, alpha: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, int]:
-    """Colour [h, W, 3] and alpha [h, W] with 0 for what is not finite, and the number of such pixels."""
-    bad = ~np.isfinite(colour)
-    bad_alpha = np.zeros(bad.shape[:2], bool) if alpha is None else ~np.isfinite(alpha)
-    pixels = int((bad.any(-1) | bad_alpha).sum())
-    if not pixels:
-        return colour, alpha, 0
-    alpha = None if alpha is None else np.where(bad_alpha, np.float32(0), alpha)
-    return np.where(bad, np.float32(0), colour), alpha, pixels
-
-
-def _say_non_finite(path: Path, count: int, total: int, non_finite: str) -> None:
-    """Apply the policy `non_finite` of `read_image`."""
-    if non_finite == "error":
-        raise InputError(f"{path}: {count} of {total} pixels are NaN or infinite; replace them first")
-    log.warning("%s: %d pixels are NaN or infinite; their values are set to 0", path, count)
 
 
 def write_exr(
@@ -171,11 +81,12 @@ def write_exr(
     G, B in half. Each name before the dot is a part, or with `single` all are channels of one. Values beyond
     the range of half floats (65504) are clamped with a warning.
     """
-    parts, specs = [_exr_image(pixels, alpha, space), *_exr_layers(layers or {}, space)], []
+    parts = _exr_parts(pixels, alpha, layers or {})
+    specs, beyond = [], []
     for part in parts:
         spec = _spec((*pixels.shape[:2], len(part.channels)), part.kind)
         spec.channelnames = tuple(part.channels)
-        spec.alpha_channel = part.alpha_channel
+        spec.alpha_channel = 3 if part is parts[0] and alpha is not None else -1
         if len(parts) > 1:
             spec.attribute("name", part.name)
         spec.attribute("compression", compression)
@@ -186,10 +97,18 @@ def write_exr(
         else:  # the same in all parts, as OpenEXR requires
             spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
         specs.append(spec)
-    beyond: list[int] = []
 
     def band(part: _ExrPart, rows: slice) -> np.ndarray:
-        values = np.dstack([of(rows) for of in part.of])
+        values = np.dstack(
+            [
+                from_linear_rec709(rows_of(image, rows).astype(np.float32, copy=False), space)
+                if is_colour
+                else rows_of(image, rows)
+                for image, is_colour in part.images
+            ]
+        )
+        if part is parts[0] and alpha is not None:
+            values[..., :3] *= values[..., 3:]
         if part.kind == "float" and np.isfinite(values).all():
             return values.astype(np.float32, copy=False)
         data, count = half_floats(path, values)
@@ -198,74 +117,48 @@ def write_exr(
 
     bands: list[Band] = [partial(band, part) for part in parts]
     if single:
-        specs, bands = [_one_spec(specs)], [_one_band(bands)]
+        one = oiio.ImageSpec(specs[0])
+        one.nchannels = sum(spec.nchannels for spec in specs)
+        one.channelnames = tuple(name for spec in specs for name in spec.channelnames)
+        one.channelformats = tuple(spec.format for spec in specs for _ in range(spec.nchannels))
+        one.format = oiio.TypeDesc(oiio.FLOAT)
+        one.erase_attribute("name")
+        specs = [one]
+        bands = [lambda rows: np.dstack([band(part, rows).astype(np.float32, copy=False) for part in parts])]
     write_parts(path, specs, bands, metadata)
     warn_of_clamped(path, sum(beyond))
     return sum(beyond)
 
 
-def _one_spec(specs: Sequence[oiio.ImageSpec]) -> oiio.ImageSpec:
-    """The specification of one part with the channels of all, each in its own number format."""
-    one = oiio.ImageSpec(specs[0])
-    one.nchannels = sum(spec.nchannels for spec in specs)
-    one.channelnames = tuple(name for spec in specs for name in spec.channelnames)
-    one.channelformats = tuple(spec.format for spec in specs for _ in range(spec.nchannels))
-    one.format = oiio.TypeDesc(oiio.FLOAT)
-    one.erase_attribute("name")
-    return one
-
-
-def _one_band(bands: Sequence[Band]) -> Band:
-    return lambda rows: np.dstack([band(rows).astype(np.float32, copy=False) for band in bands])
-
-
 @dataclass(frozen=True, eq=False)
 class _ExrPart:
-    """A part of an EXR: its channels by name, all of one number format.
-
-    `of` are images [H, W] or [H, W, C] of its rows, which together have a value for each channel.
-    """
+    """A part of an EXR: channels of one number format, which images [H, W] or [H, W, C] have together."""
 
     name: str
     kind: str
+    is_data: bool  # no colours: it has no colour space
     channels: list[str]
-    of: list[Band]
-    alpha_channel: int = -1
-    is_data: bool = False  # no colours: it has no colour space
+    images: list[tuple[np.ndarray, bool]]  # and whether they are colours, to convert
 
 
-def _exr_image(pixels: np.ndarray, alpha: np.ndarray | None, space: ColourSpace) -> _ExrPart:
-    """Return the image itself, R, G, B and A, premultiplied."""
-    if alpha is None:
-        return _ExrPart("rgba", "half", list("RGB"), [_in_space(pixels, space)])
-
-    straight = _in_space(pixels, space)
-
-    def colour(rows: slice) -> np.ndarray:
-        return straight(rows) * rows_of(alpha, rows)[..., None]
-
-    return _ExrPart("rgba", "half", list("RGBA"), [colour, _in_space(alpha, None)], alpha_channel=3)
-
-
-def _exr_layers(layers: Mapping[str, np.ndarray], space: ColourSpace) -> Iterator[_ExrPart]:
-    """Yield a part for the layers of each name before the dot; colours are converted to the space."""
+def _exr_parts(
+    pixels: np.ndarray, alpha: np.ndarray | None, layers: Mapping[str, np.ndarray]
+) -> list[_ExrPart]:
+    """Return the image itself, and a part for the layers of each name before the dot."""
+    rgba = _ExrPart("rgba", "half", False, list("RGB"), [(pixels, True)])
+    if alpha is not None:
+        rgba.channels.append("A")
+        rgba.images.append((alpha, False))
     grouped: dict[str, _ExrPart] = {}
     for layer, values in layers.items():
         letters, kind = _LAYER_CHANNELS.get(layer, ("RGB", "half"))
         name = layer.split(".")[0]
         single = len(values.shape) == 2
         is_data = single or letters != "RGB"
-        group = grouped.setdefault(name, _ExrPart(name, kind, [], [], is_data=is_data))
-        group.channels.extend([layer] if single else [f"{layer}.{x}" for x in letters[: values.shape[-1]]])
-        group.of.append(_in_space(values, None if is_data else space))
-    yield from grouped.values()
-
-
-def _in_space(values: np.ndarray, space: ColourSpace | None) -> Band:
-    """Rows of colours in a space, or as they are."""
-    if space is None:
-        return lambda rows: rows_of(values, rows)
-    return lambda rows: from_linear_rec709(rows_of(values, rows).astype(np.float32, copy=False), space)
+        part = grouped.setdefault(name, _ExrPart(name, kind, is_data, [], []))
+        part.channels.extend([layer] if single else [f"{layer}.{x}" for x in letters[: values.shape[-1]]])
+        part.images.append((values, not is_data))
+    return [rgba, *grouped.values()]
 
 
 def half_floats(path: Path, values: np.ndarray) -> tuple[np.ndarray, int]:
@@ -319,6 +212,34 @@ def write_tiff(
         profile = np.frombuffer(linear_profile(space), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
     write_parts(path, [spec], [values], metadata)
+
+
+def linear_profile(space: ColourSpace) -> bytes:
+    """Return an ICC profile (version 2.4) of a linear space, for files that have no other way to state it."""
+    assert space.chromaticities is not None and space.decode is None
+    matrix = rgb_to_xyz(space.chromaticities)
+    colorants = adaptation(matrix.sum(1), _D50_XYZ) @ matrix
+    text = space.name.encode("ascii") + b"\0"
+    description = b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(4 + 4 + 2 + 1 + 67)
+    line = b"curv\0\0\0\0" + bytes(4)  # without entries: the identity
+    tags = {b"desc": description, b"cprt": b"text\0\0\0\0No copyright\0", b"wtpt": _xyz(_D50_XYZ)}
+    for letter, column in zip((b"r", b"g", b"b"), colorants.T, strict=True):
+        tags[letter + b"XYZ"], tags[letter + b"TRC"] = _xyz(column), line
+    table, body, start = b"", b"", 132 + 12 * len(tags)
+    for signature, content in tags.items():
+        table += signature + struct.pack(">II", start + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    header = bytearray(128)
+    header[8:12], header[12:24], header[36:40] = b"\x02\x40\0\0", b"mntrRGB XYZ ", b"acsp"
+    struct.pack_into(">6H", header, 24, 2026, 1, 1, 0, 0, 0)  # fixed, so that files are reproducible
+    header[68:80] = _xyz(_D50_XYZ)[8:]
+    whole = bytes(header) + struct.pack(">I", len(tags)) + table + body
+    return struct.pack(">I", len(whole)) + whole[4:]
+
+
+def _xyz(values: np.ndarray) -> bytes:
+    """Return an XYZType."""
+    return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(float(value) * _FIXED) for value in values))
 
 
 def write_display(

@@ -1,0 +1,283 @@
+"""Images in ISO boxes (ISO 14496-12): HEIC and AVIF, which OpenImageIO does not read, and JPEG XL's alpha.
+
+HEIC and HEIF, as phones store them, are decoded by pi-heif, an extra (`facerf[heic]`); some damaged files
+crash it, so it runs in a process of its own (`apart.py`). AVIF is decoded by Pillow in 8 bits; 10 and 12 bits
+keep their depth by PyAV, an extra (`facerf[video]`). Values are integers [H, W, C] as they are stored.
+"""
+
+import importlib.util
+import io
+import logging
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.apart import arrays_apart
+from facerf_cli.run import memory
+from facerf_cli.run.logs import LOGGER_NAME, one_line
+
+HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
+AVIF_BYTES = 24  # of a pixel while it is decoded: 16 bits in planes, in one array, and scaled
+_HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
+_AVIF_BRANDS = (b"avif", b"avis")
+_START_BYTES = 64  # in which a file names its brands
+_DEEP, _TWELVE = 0x40, 0x20  # bits of an av1C box
+_ORIENTATION = 0x0112  # of Exif
+_UNKNOWN, _BT601 = 2, 5  # matrices (ITU-T H.273), and
+_MATRICES = (1, 4, _BT601, 6, 7, 9)  # those that FFmpeg converts
+_FULL = 1  # range, to which pi-heif and Pillow decode
+_MOST = np.iinfo(np.uint16).max
+_JXL_HEADER_BYTES, _JXL_ALPHA = 4096, 0  # more than a header has; the kind of an extra channel
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+def kind_of(path: Path) -> str:
+    """Return "avif" or "heif" for a file that begins as one, whatever its suffix; else an empty text."""
+    with path.open("rb") as stream:
+        start = stream.read(_START_BYTES)
+    brands = start[8 : int.from_bytes(start[:4], "big")]
+    if start[4:8] != b"ftyp":
+        return ""
+    if any(brands[at : at + 4] in _AVIF_BRANDS for at in range(0, len(brands), 4)):
+        return "avif"
+    return "heif" if start[8:12] in _HEIF_BRANDS else ""
+
+
+def _state(spec: oiio.ImageSpec, is_associated: bool, profile: Any, codes: Any) -> None:
+    """Set what OpenImageIO would: alpha, and a profile, or without one the codes of primaries and curve."""
+    spec.attribute("oiio:UnassociatedAlpha", int(not is_associated))
+    if profile is not None:
+        spec.attribute(
+            "ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), np.frombuffer(profile, np.uint8)
+        )
+    elif codes is not None:
+        spec.attribute("CICP", oiio.TypeDesc("int[4]"), (*map(int, codes), 0, _FULL))
+
+
+def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray]:
+    """The main image, upright, `pixels` [H, W, C], and its ICC `profile`, or `codes` of its colour space.
+
+    Of an image of more than `most_px` pixels only the `size` (W, H); over `limit_px` is a ValueError.
+    """
+    import pi_heif
+
+    image = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
+    width, height = image.size
+    if width * height > limit_px:
+        most = f"at most {limit_px / 1e6:.0f} megapixels are read"
+        raise ValueError(f"{width} x {height} pixels; {most}, so make it smaller")
+    if width * height > most_px:
+        return {"size": np.array([width, height])}
+    pixels = np.array(image)  # a copy: the memory of pi-heif ends with its image
+    is_associated = np.array(bool(image.premultiplied_alpha))
+    arrays = {"pixels": pixels.reshape(height, width, -1), "is_associated": is_associated}
+    if profile := image.info.get("icc_profile"):
+        arrays["profile"] = np.frombuffer(profile, np.uint8)
+    elif code := image.info.get("nclx_profile"):
+        arrays["codes"] = np.array([code["color_primaries"], code["transfer_characteristics"]])
+    return arrays
+
+
+def decode_heif(path: Path, limit_px: int, bytes_px: int = HEIF_BYTES) -> tuple[np.ndarray, oiio.ImageSpec]:
+    """Decode the main image, upright, and describe it.
+
+    The size is checked, and the budget of memory asked for `bytes_px` bytes a pixel, before it is decoded.
+    """
+    if importlib.util.find_spec("pi_heif") is None:
+        raise InputError(
+            f"{path}: HEIC and HEIF need the package pi-heif; pip install 'facerf[heic]', or save it as JPEG"
+        )
+    try:
+        arrays = arrays_apart(heif_arrays, path, limit_px, memory.left_bytes() // bytes_px)
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
+    if "size" in arrays:
+        width, height = arrays["size"].tolist()
+        memory.require(f"{path}: {width} x {height} pixels", width * height * bytes_px, "make it smaller")
+    values = arrays["pixels"]
+    height, width, channels = values.shape
+    spec = oiio.ImageSpec(width, height, channels, str(values.dtype))
+    _state(spec, bool(arrays["is_associated"]), arrays.get("profile"), arrays.get("codes"))
+    return values, spec
+
+
+def open_avif(path: Path) -> tuple[Any, oiio.ImageSpec]:
+    """Open the main image by Pillow without decoding it, and describe it; it need not be upright."""
+    try:
+        from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
+    except ImportError:
+        SUPPORTED = False
+    if not SUPPORTED:
+        raise InputError(f"{path}: AVIF needs Pillow 11.3 or later; pip install -U pillow, or save it as PNG")
+    content = path.read_bytes()
+    try:
+        image = AvifImageFile(io.BytesIO(content))  # Image.open limits the size
+        orientation = image.getexif().get(_ORIENTATION, 1)
+    except Exception as error:  # whatever damage makes Pillow raise
+        raise _damaged(path, error) from None
+    bits, codes, is_associated = _stated(content)
+    spec = oiio.ImageSpec(*image.size, len(image.mode), "uint8" if bits == 8 else "uint16")
+    _state(spec, is_associated, image.info.get("icc_profile") or None, codes)
+    spec.attribute("oiio:BitsPerSample", bits)
+    spec.attribute("Orientation", orientation if orientation in range(1, 9) else 1)
+    return image, spec
+
+
+def decode_avif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
+    """Decode an opened image, in 16 bits where it is deeper than 8."""
+    shape, bits = (spec.height, spec.width, -1), spec.get_int_attribute("oiio:BitsPerSample")
+    if bits > 8 and (values := _deep_values(image)) is not None:
+        return values.reshape(shape)
+    try:
+        values = np.asarray(image)
+    except Exception as error:
+        raise _damaged(path, error) from None
+    spec.attribute("oiio:UnassociatedAlpha", 1)  # Pillow divides by alpha
+    if bits > 8:
+        advice = "" if importlib.util.find_spec("av") else "; pip install 'facerf[video]' to keep them"
+        log.warning("%s: has %d bits, read as 8 bits%s", path, bits, advice)
+    return values.reshape(shape)
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: damaged or cut short; copy it again ({one_line(str(error))})")
+
+
+def _deep_values(image: Any) -> np.ndarray | None:
+    """Colour and alpha [H, W, C] uint16; None without PyAV, and for what it does not read whole."""
+    try:
+        import av
+    except ImportError:
+        return None
+
+    def frame_of(number: int) -> Any:
+        with av.open(io.BytesIO(image.fp.getvalue()), "r") as container:
+            frame = next(container.decode(container.streams.video[number]))
+        if (frame.width, frame.height) != image.size:
+            raise ValueError("a tile")
+        return frame
+
+    try:
+        frame = frame_of(0)
+        name, bits, is_limited = frame.format.name, frame.format.components[0].bits, frame.color_range == 1
+        matrix = _BT601 if frame.colorspace == _UNKNOWN else int(frame.colorspace)
+        if name.startswith("gbr"):
+            values, white = frame.to_ndarray(format="rgb48le"), _MOST
+        elif matrix in _MATRICES and not (name.startswith("gray") and is_limited):
+            values = frame.to_ndarray(format="rgb48le", src_colorspace=matrix)
+            white = 255 << 8 if is_limited else ((1 << bits) - 1) << (16 - bits)  # as it comes from FFmpeg
+        else:
+            return None
+        values = (values * np.float32(_MOST / white)).round().clip(max=_MOST).astype(np.uint16)
+        alpha = [frame_of(1).to_ndarray(format="gray16le")] if image.mode == "RGBA" else []
+        return np.dstack([values[..., : min(len(image.mode), 3)], *alpha])
+    except (av.error.FFmpegError, OSError, ValueError, IndexError, StopIteration):
+        return None
+
+
+def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the kind and the content of each box in order."""
+    at = 0
+    while at + 8 <= len(content):
+        size, kind = struct.unpack_from(">I4s", content, at)
+        head = 8
+        if size == 1:
+            (size,), head = struct.unpack_from(">Q", content, at + head), 16
+        end = at + size if size else len(content)
+        if end < at + head:
+            return
+        yield kind, content[at + head : end]
+        at = end
+
+
+def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
+    """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12."""
+    try:
+        meta = dict(_boxes(dict(_boxes(content))[b"meta"][4:]))
+        properties = dict(_properties(meta[b"pitm"], dict(_boxes(meta[b"iprp"]))))
+        flags = properties.get(b"av1C", bytes(4))[2]
+        bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
+        bits = max([bits, *properties.get(b"pixi", b"")[5:]])
+        colours = properties.get(b"colr", b"")
+        codes = struct.unpack_from(">HH", colours, 4) if colours[:4] == b"nclx" else None
+        return bits, codes, b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
+    except (KeyError, IndexError, struct.error):
+        return 8, None, False
+
+
+def _properties(primary: bytes, inside: dict[bytes, bytes]) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the properties of the primary item, by the boxes `ipco` and `ipma`."""
+    every, table = list(_boxes(inside[b"ipco"])), inside[b"ipma"]
+    main = int.from_bytes(primary[4 : 8 if primary[0] else 6], "big")
+    of_item, of_index = (4 if table[0] else 2), 1 + (table[3] & 1)
+    at = 8
+    while at < len(table):
+        item, count = int.from_bytes(table[at : at + of_item], "big"), table[at + of_item]
+        at += of_item + 1
+        for place in range(at, at + of_index * count, of_index) if item == main else ():
+            index = int.from_bytes(table[place : place + of_index], "big") & ((1 << 8 * of_index - 1) - 1)
+            yield every[index - 1]
+        at += of_index * count
+
+
+def multiplies_alpha(path: Path) -> bool:
+    """Return whether the colour is multiplied by alpha; False for the header of an animation or a preview."""
+    content = path.read_bytes()
+    if not content.startswith(b"\xff\x0a"):  # in a container, whole or in numbered parts
+        parts = [
+            body[4 * (kind == b"jxlp") :] for kind, body in _boxes(content) if kind in (b"jxlc", b"jxlp")
+        ]
+        content = b"".join(parts)
+    rest = int.from_bytes(content[2:_JXL_HEADER_BYTES], "little")  # zeros follow it
+
+    def read(count: int) -> int:
+        nonlocal rest
+        value, rest = rest & ((1 << count) - 1), rest >> count
+        return value
+
+    def choose(*choices: tuple[int, int]) -> int:
+        """Read a number of so many bits above an offset; two bits say which."""
+        count, offset = choices[read(2)]
+        return offset + read(count)
+
+    def skip_size() -> None:
+        is_small = read(1)
+        for skips_ratio in (True, False):
+            if is_small:
+                read(5)
+            else:
+                choose((9, 1), (13, 1), (18, 1), (30, 1))
+            if skips_ratio and read(3):  # by which the width follows
+                return
+
+    def skip_depth() -> None:
+        if read(1):  # floats
+            choose((0, 32), (0, 16), (0, 24), (6, 1))
+            read(4)
+        else:
+            choose((0, 8), (0, 10), (0, 12), (6, 1))
+
+    skip_size()
+    if read(1):  # all is as by default, without alpha
+        return False
+    if read(1):  # extra fields
+        read(3)  # orientation
+        if read(1):
+            skip_size()
+        if read(2):  # a preview, an animation
+            return False
+    skip_depth()
+    read(1)
+    if not choose((0, 0), (0, 1), (4, 2), (12, 1)) or read(1):  # no extra channel, or alpha as by default
+        return False
+    kind = choose((0, 0), (0, 1), (4, 2), (6, 18))
+    skip_depth()
+    choose((0, 0), (0, 3), (0, 4), (3, 1))
+    read(8 * choose((0, 0), (4, 0), (5, 16), (10, 48)))  # its name
+    return kind == _JXL_ALPHA and read(1) == 1
