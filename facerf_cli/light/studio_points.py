@@ -56,9 +56,9 @@ def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     return directions, torch.ones(len(directions)) / (directions @ middle).sum()
 
 
-def is_around(directions: Tensor) -> Tensor:
-    """Which of lights [N, 3] are samples of light from all around, or of a rig of as many lights."""
-    return (directions[:, None] == rig_directions(_AROUND)).all(-1).any(-1)
+def is_of_rig(directions: Tensor, lights: int = _AROUND) -> Tensor:
+    """Which of directions [N, 3] are of a rig of so many lights; by default of light from all around."""
+    return (directions[:, None] == rig_directions(lights)).all(-1).any(-1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +156,13 @@ class Lights:
         weights = () if self.near_weights is None else self.near_weights.unbind(1)
         return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
 
-    def arriving(self, place_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light that arrives at a place [3]."""
+    def arriving(self, place_m: Tensor, centre_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light at a place [3] of a face.
+
+        Near lights are about the face's centre [3].
+        """
         directions, weights = [self.directions], [self.weights]
-        for points, rgb in self.around(place_m):
+        for points, rgb in self.around(centre_m):
             toward, irradiance = points.arriving(place_m[:, None, None])
             directions.append(toward[:, 0, 0])
             weights.append(rgb[:, None] * irradiance[:, 0, 0, None])

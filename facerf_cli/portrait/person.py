@@ -36,6 +36,7 @@ SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrai
 SEEN_PX = 224  # and in which it sees a photo: face and hair come out better, ears and neck a little worse
 SIDES = 3.0  # its side in extents of the landmarks: the larger side of their bounds
 _WIDEST = 7.0  # and the largest side of the square around the whole person
+_NEAR_IRIS = 1.5  # reach of the pixels whose light an iris mirrors, in its radii
 _OVERHANG = 0.03  # of a person over the square, in sides, that needs no wider one; and its margin
 
 
@@ -65,16 +66,18 @@ class SeenPerson:
         """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
         return self.shadows.toward(places_m)
 
-    def reaching_irises(self, directions: Tensor) -> Tensor:
-        """Share [N, L] of lights [L, 3] that reaches each of N irises."""
-        irises_px = self.eyes.irises_px
-        found = torch.zeros(len(irises_px), len(directions))
-        places = self.square.to_crop(irises_px[:, :2]).clip(0, self.square.size_px - 1).astype(int)
-        for share, (column, row) in zip(found, places, strict=True):
-            fields = (self.maps.normals, self.maps.positions_m, self.maps.covered)
-            maps = ProxyMaps(*(field[..., row, column, None, None] for field in fields))
-            share[:] = Shadows(self.proxy, maps).along(directions)[:, 0, 0]
-        return found
+    def around_iris(self, number: int) -> tuple[Shadows, Tensor]:
+        """The lights that reach the pixels around an iris, and the places [h, w, 2] of these in -1..1."""
+        x_px, y_px, radius_px = self.eyes.irises_px[number]
+        reach, last = max(1, round(_NEAR_IRIS * radius_px * self.square.scale)), self.square.size_px - 1
+        at = self.square.to_crop(np.array([[x_px, y_px]]))[0].clip(0, last).astype(int)
+        columns, rows = (slice(max(0, middle - reach), middle + reach + 1) for middle in at)
+        fields = (self.maps.normals, self.maps.positions_m, self.maps.covered)
+        maps = ProxyMaps(*(field[..., rows, columns] for field in fields))
+        at_pixels = 2 * (torch.arange(last + 1) + PIXEL_CENTRE) / (last + 1) - 1
+        y, x = torch.meshgrid(at_pixels[rows], at_pixels[columns], indexing="ij")
+        shadows = Shadows(self.proxy, replace(maps, covered=torch.ones_like(maps.covered)))
+        return shadows, torch.stack([x, y], -1)
 
     @property
     def sides(self) -> float:

@@ -41,7 +41,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
-from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
+from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
 from facerf_cli.relighting.grain import Grain
 from facerf_cli.relighting.portrait_field import PortraitField
@@ -212,8 +212,7 @@ class Composition:
                 texture = texture * (1 - from_behind(-points.toward))
                 textures = textures + rgb[..., None, None] * texture
             stacked = torch.stack([view.stacked for view in lit], 1)
-            toward, arriving = lights.arriving(self.vertices_m.mean(0))
-            mirrored = mirrored_in_cornea(toward, arriving, reflectance.person.reaching_irises(toward))
+            mirrored = reflectance.views[0].mirrored(lights, self.vertices_m.mean(0))
             yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored)
             return
         changes = self.surround.changes if isinstance(self.surround, Surround) else None

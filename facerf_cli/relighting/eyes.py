@@ -1,7 +1,7 @@
 """Eyes: the photo's catchlights give way to the mirror image of the new light in the cornea.
 
-The cornea is a ball before the iris that reflects a fixed share of the light; lights are seen in it as discs.
-What is far brighter than the rest of an iris in the photo is a catchlight. All is linear in light.
+The cornea is a ball before the iris that reflects a fixed share of the light; lights are seen in it as discs,
+as blurred as the photo is, and fade toward the lids, whose lashes shade them. All is linear in light.
 """
 
 import math
@@ -10,31 +10,33 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from skimage.draw import polygon2mask
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import Band, block_means
+from facerf_cli.image.strips import Band
 from facerf_cli.light.sphere import RIG_LIGHTS
-from facerf_cli.light.studio_points import is_around
+from facerf_cli.light.studio_points import is_of_rig
 from facerf_cli.portrait.mesh import SeenEyes
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import smoothstep
+from facerf_cli.relighting.iris import blur_px, opening, outlined, without_catchlights
 
 _IRIS_OF_CORNEA = 5.9 / 7.8  # their radii, mm
 _REFLECTED = 0.025  # by Fresnel's law, of light that arrives at a right angle
 _SIDE = 64  # of the mirror image
-_LIGHT_RAD = math.acos(1 - 2 / RIG_LIGHTS)  # radius of a light's disc, which fills a cell of the rig
+_RIG_RAD = math.acos(1 - 2 / RIG_LIGHTS)  # radius of a disc that fills a cell of the rig of a map
+_LIGHT_RAD = math.radians(7.0)  # and of any other light: two discs of it fill the grid of a soft light
+_SOFT = 0.9  # share of a disc, in solid angle, in which it fades on both sides of its border
 _LEAST_PX = 2.0  # radius of an iris in which something can be seen
-_RIM = 0.85  # of the radius: beyond it what is bright is the white of the eye
-_FINE = 4  # parts of a pixel at the lids, along each side
-_CATCHLIGHT = 1.5  # radiance from which on a pixel is a catchlight, over the median of the iris
+_AROUND = 2.0  # reach of the window around an iris, in radii
+_LASHES = 0.08  # standard deviation of the shade of the lids, in radii
 
 
 def mirrored_in_cornea(directions: Tensor, weights: Tensor, arrives: Tensor) -> Tensor:
-    """Radiance [M, N, 3, s, s] that N irises mirror under M sums, rgb weights [M, L, 3], of lights [L, 3].
+    """Radiance [M, 3, s, s] that an iris mirrors under M sums, rgb weights [M, L, 3], of lights [L, 3].
 
-    `arrives` [N, L] is the share of each light that reaches each iris, past nose and brows. The square lies
+    `arrives` [L] is the share of each light that reaches the iris, past nose, brows and lids. The square lies
     around the iris, as the camera sees it; the eye looks at the camera. The same light from all around, as a
     room's, is not mirrored: it has nothing to show, and would lie before dark irises as a grey disc.
     """
@@ -43,56 +45,42 @@ def mirrored_in_cornea(directions: Tensor, weights: Tensor, arrives: Tensor) -> 
     x, y = right * _IRIS_OF_CORNEA, -down * _IRIS_OF_CORNEA
     normals = torch.stack([x, y, (1 - x * x - y * y).clamp_min(0).sqrt()])
     seen = 2 * normals[2] * normals - normals.new_tensor([0.0, 0.0, 1.0]).view(3, 1, 1)
-    outer, inner = math.cos(1.2 * _LIGHT_RAD), math.cos(0.8 * _LIGHT_RAD)
     inside = (right.square() + down.square()) < 1
-    discs = inside * smoothstep((torch.einsum("lc,cij->lij", directions, seen) - outer) / (inner - outer))
+    radii = torch.where(is_of_rig(directions, RIG_LIGHTS), _RIG_RAD, _LIGHT_RAD)[:, None, None]
+    away = (1 - torch.einsum("lc,cij->lij", directions, seen)) / (1 - radii.cos())
+    discs = inside * smoothstep((1 + _SOFT - away) / (2 * _SOFT))
     # a disc that gives a white surface radiance 1 has itself the radiance 1 / sin^2
-    shown = discs * (_REFLECTED / math.sin(_LIGHT_RAD) ** 2)
-    return torch.einsum("mlc,nl,lij->mncij", weights, arrives * ~is_around(directions), shown)
+    shown = discs * (_REFLECTED / radii.sin().square())
+    return torch.einsum("mlc,l,lij->mcij", weights, arrives * ~is_of_rig(directions), shown)
 
 
 @dataclass(frozen=True, eq=False)
 class _Iris:
-    """A window of the photo: share of the iris [h, w], what stays without catchlights [h, w], its grid."""
+    """A window of the photo: what stays without catchlights [h, w, 3], the share that mirrors lights [h, w].
+
+    `grid` [1, h, w, 2] are places in the mirror image; `blur` is that of the photo in pixels.
+    """
 
     number: int  # among the person's irises
     rows: slice
     columns: slice
-    share: np.ndarray
     kept: np.ndarray
-    grid: Tensor  # [1, h, w, 2], in the mirror image
+    mirrors: np.ndarray
+    grid: Tensor
+    radius_px: float
+    blur: float
 
 
 class Eyes:
     """The irises of a person's eyes, as far as they show between the lids in a photo [H, W, 3]."""
 
     def __init__(self, photo: Band, eyes: SeenEyes, size_px: tuple[int, ...]) -> None:
-        self._irises = []
-        for number, (x_px, y_px, radius_px) in enumerate(eyes.irises_px.tolist()):
-            rows, columns = (
-                slice(max(0, math.floor(middle - radius_px)), min(length, math.ceil(middle + radius_px)))
-                for middle, length in zip((y_px, x_px), size_px, strict=True)
-            )
-            if radius_px < _LEAST_PX or rows.start >= rows.stop or columns.start >= columns.stop:
-                continue
-            y, x = (
-                (torch.arange(at.start, at.stop) + PIXEL_CENTRE - middle) / radius_px
-                for at, middle in ((rows, y_px), (columns, x_px))
-            )
-            away = (x[None].square() + y[:, None].square()).sqrt().numpy()
-            inner, disc = (((end - away) * radius_px + 0.5).clip(0, 1) for end in (_RIM, 1))
-            share = disc * _between(eyes.lids_px[number], rows, columns)
-            light = luminance(photo(rows)[:, columns])
-            if (share > 0.5).any():
-                most = _CATCHLIGHT * np.median(light[share > 0.5])
-                darker = (1 - most / np.maximum(light, 1e-9)).clip(min=0)
-                kept = (1 - inner * darker).astype(np.float32)
-                grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
-                self._irises.append(_Iris(number, rows, columns, share.astype(np.float32), kept, grid))
+        found = (_iris(photo, eyes, number, size_px) for number in range(len(eyes.irises_px)))
+        self._irises = [iris for iris in found if iris is not None]
 
     def lit(self, relit: Band, mirrored: Tensor) -> Band:
         """A relit image [H, W, 3], by rows, with the mirror images [N, 3, s, s] in its eyes."""
-        images = [self._placed(iris, mirrored[iris.number]) for iris in self._irises]
+        images = [_placed(iris, mirrored[iris.number]) for iris in self._irises]
 
         def of(rows: slice) -> np.ndarray:
             pixels = relit(rows)
@@ -101,24 +89,49 @@ class Eyes:
                 if first < last:
                     part = pixels[first - rows.start : last - rows.start, iris.columns]
                     own = slice(first - iris.rows.start, last - iris.rows.start)
-                    share, kept = iris.share[own, :, None], iris.kept[own, :, None]
-                    part += share * (part * (kept - 1) + image[own])
+                    part *= iris.kept[own]
+                    part += image[own]
             return pixels
 
         return of
 
-    @staticmethod
-    def _placed(iris: _Iris, mirrored: Tensor) -> np.ndarray:
-        """The mirror image [h, w, 3] in the window of an iris, without what is finer than its pixels."""
-        side = max(2, min(_SIDE, len(iris.share)))
-        small = F.interpolate(mirrored[None], (side, side), mode="area")
-        found = F.grid_sample(small, iris.grid, padding_mode="border", align_corners=False)
-        return np.asarray(found[0].permute(1, 2, 0).numpy())
+
+def _iris(photo: Band, eyes: SeenEyes, number: int, size_px: tuple[int, ...]) -> _Iris | None:
+    """An iris of a photo [H, W, 3]; None where too little of it shows."""
+    x_px, y_px, radius_px = eyes.irises_px[number].tolist()
+    rows, columns = (
+        slice(max(0, math.floor(middle - reach)), min(length, math.ceil(middle + reach)))
+        for middle, length in zip((y_px, x_px), size_px, strict=True)
+        for reach in (_AROUND * radius_px,)
+    )
+    if radius_px < _LEAST_PX or rows.start >= rows.stop or columns.start >= columns.stop:
+        return None
+    pixels = photo(rows)[:, columns]
+    light, between = luminance(pixels), opening(eyes.lids_px[number], rows, columns)
+    corner = np.array([columns.start, rows.start, 0])
+    x_px, y_px, radius_px = outlined(light, eyes.irises_px[number] - corner, between)
+    y, x = (
+        (torch.arange(length) + PIXEL_CENTRE - middle) / radius_px
+        for length, middle in zip(light.shape, (y_px, x_px), strict=True)
+    )
+    away = (x[None].square() + y[:, None].square()).sqrt().numpy()
+    share = (((1 - away) * radius_px + 0.5).clip(0, 1) * between).astype(np.float32)
+    if not (share > 0.5).any():
+        return None
+    blur = blur_px(light, radius_px)
+    kept = (without_catchlights(pixels, away, share, radius_px, blur) / pixels.clip(1e-6)).clip(0, 1)
+    shade = gaussian_filter(share, _LASHES * radius_px, mode="constant")
+    grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
+    mirrors = share * (2 * shade - 1).clip(0)
+    return _Iris(
+        number, rows, columns, 1 + share[..., None] * (kept - 1), mirrors, grid.float(), radius_px, blur
+    )
 
 
-def _between(lids_px: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    """Share [h, w] of the opening between lids, an outline [N, 2], in a window of the photo."""
-    size = rows.stop - rows.start, columns.stop - columns.start
-    corners = (lids_px - (columns.start, rows.start)) * _FINE - PIXEL_CENTRE
-    inside = polygon2mask((size[0] * _FINE, size[1] * _FINE), corners[:, ::-1])
-    return block_means(inside[..., None], _FINE)[..., 0]
+def _placed(iris: _Iris, mirrored: Tensor) -> np.ndarray:
+    """The mirror image [h, w, 3] in the window of an iris, without what is finer than the photo shows."""
+    side = max(2, min(_SIDE, round(2 * iris.radius_px)))
+    small = F.interpolate(mirrored[None], (side, side), mode="area")
+    found = F.grid_sample(small, iris.grid, padding_mode="zeros", align_corners=False)
+    image = gaussian_filter(found[0].permute(1, 2, 0).numpy(), (iris.blur, iris.blur, 0), mode="constant")
+    return np.asarray(iris.mirrors[..., None] * image)

@@ -19,7 +19,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_uv
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import PointLights
+from facerf_cli.light.studio_points import Lights, PointLights
 from facerf_cli.network.inputs import is_grey
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
@@ -29,6 +29,7 @@ from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes
+from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
@@ -205,6 +206,25 @@ class PortraitView:
             reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
         return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6), behind)
+
+    def mirrored(self, lights: Lights, centre_m: Tensor) -> Tensor:
+        """Radiance [M, N, 3, s, s] that N irises mirror under M sums of lights that reach them.
+
+        The face's centre [3] is what near lights are about.
+        """
+        found = []
+        for number in range(len(self.person.eyes.irises_px)):
+            shadows, places = self.person.around_iris(number)
+            maps = PortraitMaps(
+                *(
+                    F.grid_sample(part, places[None], "bilinear", "border", align_corners=False)
+                    for part in self.maps
+                )
+            )
+            toward, weights = lights.arriving(torch.from_numpy(shadows.origins.mean(0)), centre_m)
+            *_, arrives = maps.shaded(toward[None], shadows.along(toward)[None])
+            found.append(mirrored_in_cornea(toward, weights, arrives[0].mean((1, 2))))
+        return torch.stack(found, 1) if found else torch.zeros(len(lights), 0)
 
     def relit(self, lit: PortraitLight) -> Tensor:
         """Radiance [M, 3, S, S] of the person in the square, at the resolution of the maps."""

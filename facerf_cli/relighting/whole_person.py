@@ -21,6 +21,8 @@ from facerf_cli.relighting.rims import Rims
 from facerf_cli.relighting.surface import Surface
 
 COLOURS = ("albedo", "specular")  # layers that are radiance
+_NO_GRAIN = ("hair", "eyes", "lips", "mouth")  # its blur would mix their colours with the skin's
+_LEAST_MOUTH = 0.12  # share of lips and mouth in a pixel from which on it has none
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
 
 
@@ -59,9 +61,10 @@ class WholePerson:
     ) -> tuple[Grain, Eyes]:
         """The detail of the photo [H, W, 3] without its light, for a person's matte [H, W]; and the eyes."""
         flat = self._joined(photo, [view.without_light(display_ev) for view in self._views])
-        hair = self._segmentation.layer("hair")
+        hair, eyes, lips, mouth = (self._segmentation.layer(name) for name in _NO_GRAIN)
+        plain = (1 - hair - eyes).clip(0) * (1 - (lips + mouth) / _LEAST_MOUTH).clip(0)
         sharpened = self._joined(photo, [view.sharpened for view in self._views])
-        grain = Grain(flat, (matte > 0) * (1 - hair), self._views[0].pixel_px, sharpened)
+        grain = Grain(flat, (matte > 0) * plain, self._views[0].pixel_px, sharpened)
         return grain, Eyes(photo.__getitem__, self._person.eyes, self._size_px)
 
     def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
