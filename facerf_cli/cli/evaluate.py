@@ -9,19 +9,8 @@ import typer
 
 from facerf_cli.cli.options import HELP_NAMES, is_default, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.options import (
-    EvaluateOptions,
-    FactsOptions,
-    GeometryOptions,
-    PairsOptions,
-    SplitOptions,
-    TransferOptions,
-    YaleOptions,
-    folder_name,
-    has_own_field_alone,
-)
+from facerf_cli.evaluation.options import EvaluateOptions, has_own_field_alone
 from facerf_cli.option import Only, Without
-from facerf_cli.work.evaluation_settings import FaceSettings
 from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptions
 
 app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
@@ -29,6 +18,8 @@ app = typer.Typer(help="Measure the paper's tables on prepared data and photos, 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
 _BATCH = ("output", "measures", "overwrite", "dry_run", "jobs", "shard", "ray")
 _MADE_BY_FIELD = ("network_alone", "held_to_photo", "mean_checkpoint")
+_PAIRS = ("split", "every", "pairs", "joint_fit")
+_METHODS = ("reflectance", "against", "compare", "pictures", "keep_eyes", "preset")
 
 DatasetArgument = Annotated[
     Path,
@@ -52,10 +43,9 @@ def olat(
     context: typer.Context,
     dataset: DatasetArgument,
     *,
-    data: SplitOptions,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry")],
     field: FieldOptions,
-    options: Annotated[EvaluateOptions, Without("name")],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS)],
 ) -> None:
     """Predict single lights of held-out people from images in natural light (the paper's Table 1).
 
@@ -68,22 +58,17 @@ def olat(
     checkpoint, --against without_normals.safetensors, gives the paper's Table 3. DIR/pairs.json lists the
     pairs, for --pairs.
     """
-    settings = FaceSettings("olat", options, photo, data, field.network_alone)
-    _check(context, settings, photos=False)
-    from facerf_cli.work.evaluate_items import run_on_people
-
-    raise typer.Exit(run_on_people(settings, dataset))
+    options = replace(options, dataset=dataset, network_alone=field.network_alone)
+    _evaluate(context, "olat", options, photo)
 
 
 def reconstruction(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
     *,
-    data: SplitOptions,
-    people: FactsOptions,
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
     solve: SolveOptions,
-    options: Annotated[EvaluateOptions, Without("name")],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS, "facts")],
 ) -> None:
     """Explain photos by reflectance and light, and render them again (the paper's Table 2).
 
@@ -92,8 +77,8 @@ def reconstruction(
     makes: that would be exact by construction. Of a DATASET the sources of its pairs are measured; its true
     light is known, so light_error_deg is the angle between the brightest single lights.
     """
-    settings = FaceSettings("reconstruction", options, photo, data, solve=solve, facts=people.facts)
-    _run(context, settings, inputs)
+    options = replace(options, dataset=_only_dataset(inputs), **vars(solve))
+    _evaluate(context, "reconstruction", options, photo, inputs)
 
 
 def transfer(
@@ -108,11 +93,9 @@ def transfer(
         ),
     ],
     *,
-    exchange: TransferOptions,
-    data: SplitOptions,
     photo: Annotated[PhotoOptions, Without("texture_side", "face", "person", "matte_from")],
     solve: SolveOptions,
-    options: Annotated[EvaluateOptions, Without("name")],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS, "photos", "held_to_photo")],
 ) -> None:
     """Exchange the reflectances of two images of a person (the paper's Table 2).
 
@@ -120,25 +103,19 @@ def transfer(
     from A's. The same method estimates that light in the image with its own reflectance. Of a DATASET,
     couples are sources of one person with different cameras and different maps.
     """
-    alone = not exchange.held_to_photo
-    settings = FaceSettings("transfer", options, photo, data, alone, solve)
-    if not exchange.photos:
-        _run(context, settings, inputs)
-    _check(context, settings, photos=True)
-    from facerf_cli.work.evaluate_items import run_on_couples
-
-    raise typer.Exit(run_on_couples(settings, inputs))
+    dataset = None if options.photos else _only_dataset(inputs)
+    if dataset is None and not options.photos:
+        raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
+    options = replace(options, dataset=dataset, network_alone=not options.held_to_photo, **vars(solve))
+    _evaluate(context, "transfer", options, photo, inputs)
 
 
 def geometry(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
     *,
-    mean: GeometryOptions,
-    data: Annotated[SplitOptions, Only("split", "every", "pairs")],
-    people: FactsOptions,
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
-    options: Annotated[EvaluateOptions, Without("name")],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS[:3], *_METHODS, "facts", "mean_checkpoint")],
 ) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
@@ -146,10 +123,9 @@ def geometry(
     crop, and compared where both show the face. The paper trained networks with the mean face: give them as
     --mean-checkpoint. --against does not apply.
     """
-    settings = FaceSettings(
-        "geometry", options, photo, data, mean_checkpoint=mean.mean_checkpoint, facts=people.facts
-    )
-    _run(context, settings, inputs)
+    if options.against:
+        raise UsageError("--against: does not apply to geometry; give --checkpoint and --mean-checkpoint")
+    _evaluate(context, "geometry", replace(options, dataset=_only_dataset(inputs)), photo, inputs)
 
 
 def yale_b(
@@ -163,10 +139,9 @@ def yale_b(
         ),
     ],
     *,
-    yale: YaleOptions,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry")],
     field: FieldOptions,
-    options: Annotated[EvaluateOptions, Only("reflectance", "against", "compare", "pictures", *_BATCH)],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_METHODS[:4], "shifts", "subjects", "room")],
 ) -> None:
     """Relight real people to real point lights and compare with their photos under these.
 
@@ -180,11 +155,8 @@ def yale_b(
     """
     if is_default(context, "reflectance") and not has_own_field_alone(photo.settings.checkpoints):
         options = replace(options, reflectance=("portrait",))
-    settings = FaceSettings("yale-b", options, photo, network_alone=field.network_alone)
-    _check(context, settings, photos=False)
-    from facerf_cli.work.evaluate_items import run_yale_b
-
-    raise typer.Exit(run_yale_b(settings, yale, folder))
+    options = replace(options, network_alone=field.network_alone)
+    _evaluate(context, "yale-b", options, photo, [str(folder)])
 
 
 def pairs(
@@ -198,37 +170,42 @@ def pairs(
             show_default=False,
         ),
     ],
-    compared: PairsOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH)],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, "truth", "masks", "facts")],
 ) -> None:
     """Measure folders of predictions against a folder of truths, image by image.
 
     Trees are mirrored; names must match, suffixes may differ. A missing, an additional or a differently sized
     prediction is an error: no table is made of what is left.
     """
-    options = replace(options, reflectance=())
-    options.check()
-    options.require_output_apart([*predictions, *filter(None, (compared.truth, compared.masks))])
-    names = tuple(map(folder_name, predictions))
-    compared = replace(compared, predictions=tuple(predictions), names=names)
-    from facerf_cli.work.evaluate_items import run_pairs
-
-    raise typer.Exit(run_pairs(compared, options, settings_of(context)))
+    options = replace(options, reflectance=(), predictions=tuple(predictions))
+    _evaluate(context, "pairs", options, PhotoOptions(settings_of(context)))
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
     app.command(context_settings=HELP_NAMES)(with_groups(_protocol))
 
 
-def _run(context: typer.Context, settings: FaceSettings, inputs: Sequence[str]) -> None:
-    """Run a protocol on the dataset of the inputs, or on photos, and exit."""
-    folder = _only_dataset(inputs)
-    if folder is None and settings.protocol == "transfer":
-        raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
-    _check(context, settings, photos=folder is None)
-    from facerf_cli.work.evaluate_items import run_on_people, run_on_photos
+def _evaluate(
+    context: typer.Context,
+    protocol: str,
+    options: EvaluateOptions,
+    photo: PhotoOptions,
+    inputs: Sequence[str] = (),
+) -> None:
+    """Run a protocol and exit; raises UsageError for options that would fail every item, or do nothing."""
+    options.check()
+    photo.check()
+    if options.dataset is None:
+        refuse_given(context, _PAIRS, "is for a prepared dataset; leave it out here")
+    else:
+        of_photos = ("face", "landmarks", "colourspace", "layer", "facts")
+        refuse_given(context, of_photos, "is for photos; leave it out here")
+    if not options.has_field:
+        why = "is for the field; give --reflectance field too, or leave it out"
+        refuse_given(context, _MADE_BY_FIELD, why)
+    from facerf_cli.work.evaluate import evaluate
 
-    raise typer.Exit(run_on_photos(settings, inputs) if folder is None else run_on_people(settings, folder))
+    raise typer.Exit(evaluate(protocol, options, photo, inputs))
 
 
 def _only_dataset(inputs: Sequence[str]) -> Path | None:
@@ -242,21 +219,3 @@ def _only_dataset(inputs: Sequence[str]) -> Path | None:
     if datasets and len(inputs) > 1:
         raise UsageError(f"{datasets[0]}: one dataset among several inputs; give it alone, or give photos")
     return datasets[0] if datasets else None
-
-
-def _check(context: typer.Context, settings: FaceSettings, photos: bool) -> None:
-    """Raise UsageError for options that would fail every item, or that would do nothing."""
-    settings.check()
-    if photos:
-        refuse_given(
-            context, ("split", "every", "pairs", "joint_fit"), "is for a prepared dataset; leave it out here"
-        )
-    else:
-        refuse_given(
-            context,
-            ("face", "landmarks", "colourspace", "layer", "facts"),
-            "is for photos; leave it out here",
-        )
-    if not settings.options.has_field:
-        why = "is for the field; give --reflectance field too, or leave it out"
-        refuse_given(context, _MADE_BY_FIELD, why)

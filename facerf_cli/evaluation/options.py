@@ -1,13 +1,15 @@
-"""The options of `facerf evaluate`: groups of the command line, light to import."""
+"""The options of `facerf evaluate`, of which each protocol has some; light to import."""
 
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from facerf_cli.baselines import RelightKind
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.network.files import SHIPPED, serving_files
 from facerf_cli.option import DATA, MEASURES, METHODS, option
@@ -46,103 +48,6 @@ def has_own_field_alone(checkpoints: Sequence[Path]) -> bool:
 
 
 @dataclass(frozen=True)
-class SplitOptions:
-    """The images of a prepared dataset that are measured.
-
-    Attributes:
-        split: Measure this split of DATASET; all if no network was trained on it.
-        every: Measure every Nth pair of DATASET's split only.
-        pairs: Measure the pairs of a list, the pairs.json of another run.
-        joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
-            instead of each image alone.
-    """
-
-    split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA)
-    every: int = option(1, metavar="N", least=1, panel=DATA)
-    pairs: Path | None = option(None, metavar="FILE", shown_default="those of the split", panel=DATA)
-    joint_fit: bool = option(False, panel=DATA)
-
-
-@dataclass(frozen=True)
-class YaleOptions:
-    """The images of Extended Yale B that are measured.
-
-    Attributes:
-        shifts: Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its
-            subject's frontal one.
-        subjects: Measure these subjects only, such as yaleB05,yaleB15. Repeatable.
-        room: Light from all around that comes with each flash, as a room sends it back: a share of it.
-    """
-
-    shifts: Path | None = option(None, metavar="CSV", shown_default="no alignment", panel=DATA)
-    subjects: list[str] | None = option(
-        None, metavar="NAME,...", in_recipe=False, shown_default="all", panel=DATA
-    )
-    room: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
-
-
-@dataclass(frozen=True)
-class PairsOptions:
-    """The images that predictions are compared with.
-
-    Attributes:
-        truth: Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...
-        masks: Compare inside masks: images with the truths' names, white inside.
-        facts: Read a row for each image: name, person, and columns for the tables (text) or for the list of
-            images (numbers).
-    """
-
-    truth: Path = option(..., metavar="DIR", in_recipe=False, shown_default=False)
-    masks: Path | None = option(
-        None, metavar="DIR", shown_default="the truths' alpha, else everything", panel=DATA
-    )
-    facts: Path | None = option(
-        None, metavar="CSV", shown_default="a person is a truth's topmost folder", panel=DATA
-    )
-    predictions: tuple[Path, ...] = ()
-    names: tuple[str, ...] = ()  # of the predictions' methods
-
-
-@dataclass(frozen=True)
-class FactsOptions:
-    """The people of photos.
-
-    Attributes:
-        facts: Read a row for each photo: name, person, and columns for the list of images.
-    """
-
-    facts: Path | None = option(
-        None, metavar="CSV", shown_default="a person is a photo's topmost folder", panel=DATA
-    )
-
-
-@dataclass(frozen=True)
-class GeometryOptions:
-    """The mean face of Table 4.
-
-    Attributes:
-        mean_checkpoint: Use a checkpoint of `facerf train --mean-face` for the mean face.
-    """
-
-    mean_checkpoint: Path | None = option(
-        None, metavar="FILE", shown_default="that of the fitted face", panel=METHODS
-    )
-
-
-@dataclass(frozen=True)
-class TransferOptions:
-    """The images of a person whose reflectances are exchanged, and how these are read.
-
-    Attributes:
-        photos: Read photos, two of each person or in folders.
-        held_to_photo: Correct the field by the quotient of its photo, as `relight` does.
-    """
-
-    photos: bool = option(False, in_recipe=False, flags=("--photos",), panel=DATA)
-    held_to_photo: bool = option(False, flags=("--held-to-photo",), panel=METHODS)
-
-
-@dataclass(frozen=True)
 class Measures:
     """The values and metrics of images; LPIPS is measured if VGG-16's weights are given.
 
@@ -158,11 +63,6 @@ class Measures:
     lpips: Path | None = option(None, metavar="FILE", shown_default="where installed", panel=MEASURES)
     vgg_weights: str | None = option(None, metavar="imagenet|PATH", shown_default="no LPIPS", panel=MEASURES)
     face_distance: bool = option(False, panel=MEASURES)
-
-    def check(self) -> None:
-        """Raise UsageError for heads without the network that they belong to."""
-        if self.lpips is not None and self.vgg_weights is None:
-            raise UsageError("--lpips: needs VGG-16; add --vgg-weights imagenet, or a file of its weights")
 
 
 def _parse_kinds(names: Sequence[str]) -> tuple[RelightKind, ...]:
@@ -189,12 +89,28 @@ class NamedCheckpoint:
 
 @dataclass(frozen=True)
 class EvaluateOptions(BatchOptions):
-    """Settings of what is measured, by which methods, and where it goes, for other processes too.
+    """Options of all protocols: the images, the methods, the measures; those that one lacks are as here.
 
     Attributes:
+        split: Measure this split of DATASET; all if no network was trained on it.
+        every: Measure every Nth pair of DATASET's split only.
+        pairs: Measure the pairs of a list, the pairs.json of another run.
+        joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
+            instead of each image alone.
+        photos: Read photos, two of each person or in folders.
+        shifts: Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its
+            subject's frontal one.
+        subjects: Measure these subjects only, such as yaleB05,yaleB15. Repeatable.
+        room: Light from all around that comes with each flash, as a room sends it back: a share of it.
+        truth: Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...
+        masks: Compare inside masks: images with the truths' names, white inside.
+        facts: Read a row for each image: name, person, and columns for the list of images; of `pairs` those
+            that are text break the tables down.
         reflectance: Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait;
             repeatable, and the others are compared with the first.
         against: Measure another checkpoint of the field, under its name or that of its run. Repeatable.
+        mean_checkpoint: Use a checkpoint of `facerf train --mean-face` for the mean face.
+        held_to_photo: Correct the field by the quotient of its photo, as `relight` does.
         compare: Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name.
             Repeatable.
         pictures: Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.
@@ -202,6 +118,29 @@ class EvaluateOptions(BatchOptions):
         preset: Measure as many images as the paper did.
     """
 
+    split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA)
+    every: int = option(1, metavar="N", least=1, panel=DATA)
+    pairs: Path | None = option(None, metavar="FILE", shown_default="those of the split", panel=DATA)
+    joint_fit: bool = option(False, panel=DATA)
+    photos: bool = option(False, in_recipe=False, flags=("--photos",), panel=DATA)
+    shifts: Path | None = option(None, metavar="CSV", shown_default="no alignment", panel=DATA)
+    subjects: tuple[str, ...] = option(
+        (),
+        metavar="NAME,...",
+        in_recipe=False,
+        shown_default="all",
+        typed=list[str] | None,
+        parse=lambda given: tuple(name.strip() for text in given for name in text.split(",") if name.strip()),
+        panel=DATA,
+    )
+    room: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
+    truth: Path | None = option(None, metavar="DIR", in_recipe=False, shown_default=False, required=True)
+    masks: Path | None = option(
+        None, metavar="DIR", shown_default="the truths' alpha, else everything", panel=DATA
+    )
+    facts: Path | None = option(
+        None, metavar="CSV", shown_default="a person is an image's topmost folder", panel=DATA
+    )
     reflectance: tuple[RelightKind, ...] = option(
         ("field",),
         metavar="KIND",
@@ -218,6 +157,10 @@ class EvaluateOptions(BatchOptions):
         parse=lambda given: tuple(map(NamedCheckpoint.parse, given)),
         panel=METHODS,
     )
+    mean_checkpoint: Path | None = option(
+        None, metavar="FILE", shown_default="that of the fitted face", panel=METHODS
+    )
+    held_to_photo: bool = option(False, flags=("--held-to-photo",), panel=METHODS)
     compare: tuple[Path, ...] = option(
         (), metavar="DIR", shown_default="none", typed=list[Path] | None, parse=tuple, panel=METHODS
     )
@@ -225,19 +168,30 @@ class EvaluateOptions(BatchOptions):
     keep_eyes: bool = option(False, panel=MEASURES)
     measures: Measures = Measures()
     preset: Literal["paper"] | None = option(None, shown_default="none", panel=MEASURES)
+    # What the command line fills in.
+    network_alone: bool = True  # the photo does not correct the field
+    non_negative: bool = True  # the light's least squares
+    refine: str = "none"
+    predictions: tuple[Path, ...] = ()  # folders of `pairs`
+    dataset: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: photos
 
     @property
     def methods(self) -> tuple[str, ...]:
         """The names of all methods: reflectance models, checkpoints, and folders of predictions."""
-        return (*self.reflectance, *(one.name for one in self.against), *map(folder_name, self.compare))
+        folders = map(folder_name, (*self.predictions, *self.compare))
+        return (*self.reflectance, *(one.name for one in self.against), *folders)
 
     @property
     def has_field(self) -> bool:
         """True if the neural field is among the methods."""
         return bool({"field", "portrait"} & set(self.reflectance) or self.against)
 
+    def item(self, path: Path, name: str) -> Item:
+        """An item of this run."""
+        return Item(path, self.output / name, name)
+
     def check(self) -> None:
-        """Raise UsageError for an option that would fail every item."""
+        """Raise UsageError for options that would fail every item, or that exclude each other."""
         twice = sorted({name for name in self.methods if self.methods.count(name) > 1})
         if twice:
             raise UsageError(f"two methods have the name {twice[0]!r}; rename one, or give NAME=FILE")
@@ -247,11 +201,27 @@ class EvaluateOptions(BatchOptions):
         for folder in self.compare:
             if not folder.is_dir():
                 raise UsageError(f"--compare {folder}: no such folder; give one that exists")
-        self.require_output_apart(self.compare)
-        self.measures.check()
+        for read in (*self.compare, *self.predictions, self.truth, self.masks):
+            if read and Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(read)):
+                raise UsageError(f"-o {self.output}: lies in {read}, which is read; give another folder")
+        if self.measures.lpips is not None and self.measures.vgg_weights is None:
+            raise UsageError("--lpips: needs VGG-16; add --vgg-weights imagenet, or a file of its weights")
+        if self.preset and self.every > 1:
+            raise UsageError(
+                "--preset and --every exclude each other: a preset has a fixed number of images; leave one "
+                "out"
+            )
+        if self.pairs and (self.preset or self.every > 1):
+            raise UsageError("--pairs: is a list of its own; leave --preset and --every out")
 
-    def require_output_apart(self, folders: Iterable[Path]) -> None:
-        """Raise UsageError for an output folder inside one that is read: the next run would read it, too."""
-        for folder in folders:
-            if Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(folder)):
-                raise UsageError(f"-o {self.output}: lies in {folder}, which is read; give another folder")
+
+@dataclass(frozen=True)
+class Chosen:
+    """The content of a run: what each item holds, and files that shape the figures beside the items' own.
+
+    `groups` counts the sources or couples of a dataset; those without a face are missing in the tables.
+    """
+
+    items: Mapping[Item, Any] = field(metadata=NOT_IN_RECIPE)
+    files: tuple[Path, ...] = ()
+    groups: int | None = field(default=None, metadata=NOT_IN_RECIPE)

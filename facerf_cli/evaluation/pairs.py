@@ -8,8 +8,8 @@ import csv
 import io
 import math
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tokenize import TokenError
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.options import folder_name
+from facerf_cli.evaluation.options import Chosen, EvaluateOptions, folder_name
 from facerf_cli.files.read import PHOTO_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.texts import read_text, require_regular
 from facerf_cli.network.stored_graph import PeopleNetworks
@@ -26,19 +26,12 @@ from facerf_cli.portrait.find import find_faces
 SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif", ".pgm", ".ppm", ".npy"}
 )
+_PARTS = 64  # most items
 _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file
 _CSV_ADVICE = "begin with a header such as name,person,..."
 PREDICTION_SUFFIXES = (".exr", ".png", ".npy")  # of `--compare`
 _LARGEST_NUMBER_BYTES, _HEADER_BYTES = 8, 1 << 16  # limits of a .npy file
-
-
-@dataclass(frozen=True)
-class Facts:
-    """An image's person ('' if not given), and its other facts by column."""
-
-    person: str = ""
-    values: Mapping[str, str | float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -51,43 +44,56 @@ class ImagePair:
     mask: Path | None
 
 
+def choose_images(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+    """Choose all images of folders of predictions, with their truths, in parts."""
+    assert options.truth is not None
+    pairs = collect_pairs(options.predictions, options.truth, options.masks, options.facts)
+    size = math.ceil(len(pairs) / _PARTS)
+    parts = [pairs[start : start + size] for start in range(0, len(pairs), size)]
+    return Chosen({options.item(options.truth, f"part-{n:02d}"): part for n, part in enumerate(parts)})
+
+
 def collect_pairs(
     predictions: Sequence[Path], truths: Path, masks: Path | None = None, facts: Path | None = None
 ) -> list[ImagePair]:
     """Match the images of folders, sorted by name; a folder of predictions is a method with its name.
 
-    `masks` mirrors the truths; `facts` is a CSV file (`read_facts`). If it names no person, that is the
-    truth's topmost folder; in a flat tree nobody knows, for an image is no person. Raises UsageError for
-    folders that cannot be used, InputError for names that do not match: it names the first few and counts
-    all.
+    `masks` mirrors the truths; `facts` is a CSV file (`read_facts`). Raises UsageError for folders that
+    cannot be used, InputError for names that do not match: it names the first few and counts all.
     """
-    others = [*predictions, *([] if masks is None else [masks])]
-    _check_folders(predictions, [truths, *others])
-    found = _images_in(truths, others)
-    by_method = {folder_name(folder): _images_in(folder, [truths, *others]) for folder in predictions}
-    mask_files = {} if masks is None else _images_in(masks, [truths, *predictions])
+    folders = [truths, *predictions, *([] if masks is None else [masks])]
+    if not predictions:
+        raise UsageError("pairs: no folder of predictions; give at least one")
+    for folder in folders:
+        if not folder.is_dir():
+            raise UsageError(f"{folder}: no such folder; check the path")
+    resolved = [folder.resolve() for folder in folders]
+    if again := [folder for folder in folders if resolved.count(folder.resolve()) > 1]:
+        raise UsageError(f"{again[0]}: given twice; give separate folders of predictions, truths and masks")
+    images = {folder: _images_in(folder, resolved) for folder in folders}
     described = {} if facts is None else read_facts(facts)
-    named: list[tuple[Path | None, Mapping[str, object]]] = list(
-        zip(predictions, by_method.values(), strict=True)
-    )
-    named += [(masks, mask_files), (facts, described)]
-    complaints = [_mismatch(found, names, str(place)) for place, names in named if place is not None]
-    if said := [complaint for complaint in complaints if complaint]:
+    found = images.pop(truths)
+    others: dict[Path, Mapping[str, object]] = {**images, **({} if facts is None else {facts: described})}
+    if wrong := [words for place, names in others.items() if (words := _mismatch(found, names, place))]:
         raise InputError(
-            f"{'; '.join(said)}; give the names of {truths}, with its subfolders; suffixes may differ"
+            f"{'; '.join(wrong)}; give the names of {truths}, with its subfolders; suffixes may differ"
         )
-    pairs = []
-    for name in sorted(found):
-        files = {method: images[name] for method, images in by_method.items()}
-        pairs.append(ImagePair(case_of(name, described), found[name], files, mask_files.get(name)))
-    return pairs
+    return [
+        ImagePair(
+            case_of(name, described),
+            found[name],
+            {folder_name(folder): images[folder][name] for folder in predictions},
+            images[masks][name] if masks else None,
+        )
+        for name in sorted(found)
+    ]
 
 
-def case_of(name: str, described: Mapping[str, Facts]) -> Case:
+def case_of(name: str, described: Mapping[str, Case]) -> Case:
     """The case of an image; its person is the described one, else its topmost folder, else '': not known."""
-    known = described.get(name, Facts())
+    known = described.get(name, Case(name, ""))
     folder, slash, _ = name.partition("/")
-    return Case(name, known.person or (folder if slash else ""), known.values)
+    return replace(known, person=known.person or (folder if slash else ""))
 
 
 def compare_pair(pair: ImagePair, finder: PeopleNetworks | None = None) -> Comparison:
@@ -108,25 +114,8 @@ def compare_pair(pair: ImagePair, finder: PeopleNetworks | None = None) -> Compa
     return Comparison(pair.case, truth.pixels, mask, predictions, landmarks_px=landmarks_px)
 
 
-def _check_folders(predictions: Sequence[Path], folders: Sequence[Path]) -> None:
-    if not predictions:
-        raise UsageError("pairs: no folder of predictions; give at least one")
-    for folder in folders:
-        if not folder.is_dir():
-            raise UsageError(f"{folder}: no such folder; check the path")
-    names = [folder_name(folder) for folder in predictions]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise UsageError(
-            f"two folders of predictions have the name {twice[0]!r}, which names the method; rename one"
-        )
-    resolved = [folder.resolve() for folder in folders]
-    if again := [folder for folder in folders if resolved.count(folder.resolve()) > 1]:
-        raise UsageError(f"{again[0]}: given twice; give separate folders of predictions, truths and masks")
-
-
-def _images_in(folder: Path, leave_out: Sequence[Path]) -> dict[str, Path]:
-    """The images of a folder by name, without hidden ones and without those of the folders `leave_out`."""
-    elsewhere = {other.resolve() for other in leave_out}
+def _images_in(folder: Path, elsewhere: Collection[Path]) -> dict[str, Path]:
+    """The images of a folder by name, without hidden ones and without those of the folders `elsewhere`."""
     found: dict[str, Path] = {}
     for here, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f[0] != "." and (Path(here) / f).resolve() not in elsewhere]
@@ -143,12 +132,12 @@ def _images_in(folder: Path, leave_out: Sequence[Path]) -> dict[str, Path]:
     return found
 
 
-def _mismatch(truths: Mapping[str, Path], others: Mapping[str, object], where: str) -> str | None:
-    """Describe names that do not match the truths'; None if all do."""
+def _mismatch(truths: Mapping[str, Path], others: Mapping[str, object], where: Path) -> str:
+    """Describe names that do not match the truths'; empty if all do."""
     missing, strangers = sorted(truths.keys() - others.keys()), sorted(others.keys() - truths.keys())
     parts = [f"{len(missing)} of {len(truths)} missing ({_few(missing)})"] if missing else []
     parts += [f"{len(strangers)} without a truth ({_few(strangers)})"] if strangers else []
-    return f"{where}: {', '.join(parts)}" if parts else None
+    return f"{where}: {', '.join(parts)}" if parts else ""
 
 
 def _few(names: Sequence[str]) -> str:
@@ -161,8 +150,8 @@ def _read(path: Path, colourspace: str | None = None) -> LinearImage:
     return read_image(path, colourspace)
 
 
-def read_facts(path: Path) -> dict[str, Facts]:
-    """Read facts by the image's name from a CSV with a header: `name`, optionally `person`, other columns.
+def read_facts(path: Path) -> dict[str, Case]:
+    """Read cases by the image's name from a CSV with a header: `name`, optionally `person`, other columns.
 
     A column whose cells are all numbers holds numbers; an empty cell is no fact.
     """
@@ -181,7 +170,7 @@ def read_facts(path: Path) -> dict[str, Facts]:
     rows = [dict(zip(header, line, strict=True)) for line in lines[1:]]
     others = [column for column in header if column not in ("name", "person")]
     numbers = {column for column in others if all(_is_number(row[column]) for row in rows if row[column])}
-    found: dict[str, Facts] = {}
+    found: dict[str, Case] = {}
     for row in rows:
         if row["name"] in found:
             raise InputError(f"{path}: {row['name']} has two lines; remove one")
@@ -190,7 +179,7 @@ def read_facts(path: Path) -> dict[str, Facts]:
             for column in others
             if row[column]
         }
-        found[row["name"]] = Facts(row.get("person", ""), values)
+        found[row["name"]] = Case(row["name"], row.get("person", ""), values)
     return found
 
 

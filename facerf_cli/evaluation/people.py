@@ -10,6 +10,7 @@ from torch import Tensor
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Explained, Reflectance
+from facerf_cli.batch.inputs import Item
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, pair_weights, render_source, weights_path
 from facerf_cli.errors import InputError, UsageError
@@ -126,19 +127,26 @@ class Portrait:
     """One face of a photo; every method's models fit or regress its head, in one crop.
 
     `face` is the face as it was found, or a fit that was made beforehand. The photo's alpha tells what is
-    neither compared nor used. `name` is the photo's in errors.
+    neither compared nor used. `name` is the photo's in errors. Of a dataset there are its person and the pair
+    whose source it is, too.
     """
 
     name: str
+    case: Case
     photo: LinearImage
     face: FaceBox | FaceFit
     reading: Reading
+    origin: "tuple[DatasetPerson, Pair] | None" = None
     _views: dict[int, tuple[Models, HeadView]] = field(default_factory=dict)
 
     def by(self, models: Models) -> HeadView:
         """The portrait by a method's models; InputError where nothing of the face is visible."""
         if id(models) not in self._views:
-            head = self._head(models)
+            image, face, sides = self.photo.pixels, self.face, self.reading.sides
+            if isinstance(face, FaceFit):
+                head = Head(image, face, unwrap_face(models.face, face, image, sides.texture, image.shape))
+            else:
+                head = head_of(models, image, face, sides)
             view = self._view(models, head, head.fit)
             masked = head.without(models.face, self._inside(head.fit.crop))
             self._views[id(models)] = models, replace(view, head=masked)
@@ -170,12 +178,6 @@ class Portrait:
         inside = crop.valid(*self.photo.pixels.shape[:2]).astype(np.float32)
         return inside if alpha is None else inside * crop.apply(alpha[..., None])[..., 0]
 
-    def _head(self, models: Models) -> Head:
-        image, sides = self.photo.pixels, self.reading.sides
-        if not isinstance(self.face, FaceFit):
-            return head_of(models, image, self.face, sides)
-        return Head(image, self.face, unwrap_face(models.face, self.face, image, sides.texture, image.shape))
-
 
 def common_mask(views: Iterable[HeadView]) -> np.ndarray:
     """The mask [S, S] inside those of all views."""
@@ -197,14 +199,11 @@ class DatasetPerson:
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
-    def face_of(self, pair: Pair) -> "SourceFace":
-        """The source of a pair; NoFaceError where no face is found in it."""
-        case = Case(_name(pair), self.name, self.facts | {"map": pair.envmap})
-        return SourceFace(case, self.portrait(pair), (self, pair))
-
     def portrait(self, pair: Pair) -> Portrait:
         """The face in the source of a pair; NoFaceError where none is found in it."""
-        return self._portrait(self.source(pair), pair.source_camera, _name(pair))
+        portrait = self._portrait(self.source(pair), pair.source_camera, _name(pair))
+        case = replace(portrait.case, facts=self.facts | {"map": pair.envmap})
+        return replace(portrait, case=case, origin=(self, pair))
 
     def lit(self, camera: str) -> Portrait:
         """The person in a camera under all lights: under one light no detector finds a face."""
@@ -229,7 +228,7 @@ class DatasetPerson:
                 face = self.reading.find(image, name)
             except InputError as error:
                 raise NoFaceError(str(error)) from None
-        return Portrait(name, LinearImage(image, header.seen), face, self.reading)
+        return Portrait(name, Case(name, self.name), LinearImage(image, header.seen), face, self.reading)
 
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
@@ -272,32 +271,78 @@ class DatasetPerson:
 
 
 @dataclass(frozen=True, eq=False)
-class SourceFace:
-    """A face that is measured; of a dataset its person and the pair whose source it is, too."""
+class Bench:
+    """The means of a run: its methods, these over the mean face, and the reading of faces and of photos."""
 
-    case: Case
-    portrait: Portrait
-    origin: tuple[DatasetPerson, Pair] | None = None
+    methods: tuple[Method, ...]
+    mean: tuple[Method, ...]
+    reading: Reading
+    faces_of: Callable[[Item], Iterator[Portrait]]
 
 
-Compare = Callable[[Sequence[SourceFace]], Iterable[Comparison]]
+Compare = Callable[[Sequence[Portrait], Sequence[Method]], Iterable[Comparison]]
 
 
 def compare_people(
-    person: DatasetPerson, groups: Iterable[Sequence[Pair]], compare: Compare
+    person: DatasetPerson, groups: Iterable[Sequence[Pair]], compare: Compare, methods: Sequence[Method]
 ) -> Iterator[Comparison]:
-    """Compare the sources of each group of a person's pairs; the loop of every protocol over a dataset.
+    """Compare the sources of each group of a person's pairs.
 
     A group in one of whose images no face is found is named and left out; any other error is raised.
     """
     for pairs in groups:
         try:
-            found = list(compare([person.face_of(pair) for pair in pairs]))
+            found = list(compare([person.portrait(pair) for pair in pairs], methods))
         except NoFaceError as error:
-            names = " and ".join(map(_name, pairs))
-            log.warning("%s: left out (%s)", names, error)
+            log.warning("%s: left out (%s)", " and ".join(map(_name, pairs)), error)
         else:
             yield from found
+
+
+@dataclass(frozen=True)
+class PersonPairs:
+    """Pairs of a person of a dataset, whose sources are compared group by group."""
+
+    dataset: Dataset
+    name: str
+    groups: Sequence[Sequence[Pair]]
+    strangers: frozenset[Pair] = frozenset()
+
+    def compared(self, compare: Compare, bench: Bench) -> Iterator[Comparison]:
+        """Compare each group; raises UsageError where the joint fits are of another face model."""
+        face_model = self.dataset.face_model
+        if bench.reading.geometry is None and bench.methods[0].models.face.name != face_model:
+            raise UsageError(
+                f"--joint-fit: {self.dataset.folder} has fits of {face_model}; give it as --face-model"
+            )
+        person = DatasetPerson(self.dataset, self.name, bench.reading, self.strangers)
+        return compare_people(person, self.groups, compare, bench.methods)
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo whose faces are compared one by one."""
+
+    item: Item
+
+    def compared(self, compare: Compare, bench: Bench) -> Iterator[Comparison]:
+        """Compare each face."""
+        for face in bench.faces_of(self.item):
+            yield from compare([face], bench.methods)
+
+
+@dataclass(frozen=True)
+class Couple:
+    """Two photos of a person, whose first faces are compared together."""
+
+    person: str
+    photos: tuple[Item, Item]
+
+    def compared(self, compare: Compare, bench: Bench) -> Iterable[Comparison]:
+        """Compare the faces of both."""
+        faces = [next(bench.faces_of(photo)) for photo in self.photos]
+        of_person = [replace(face, case=replace(face.case, person=self.person)) for face in faces]
+        return compare(of_person, bench.methods)
 
 
 def _name(pair: Pair) -> str:

@@ -1,158 +1,34 @@
-"""Figures of finished items as files, strips of images, and the report of a run: a page without scripts."""
+"""Figures of finished items as files, and the report of a run: a CSV, and a page without scripts."""
 
 import base64
 import csv
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from PIL import Image
 from pydantic import BeforeValidator
 
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.measure import Comparison, Row
+from facerf_cli.evaluation.measure import Row
+from facerf_cli.evaluation.strips import ERROR_COLOURS, ERROR_HIGHEST, Strip
 from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, cell_words, metric_named, published_for
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document
 from facerf_cli.files.sheets import filled_page
-from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.image.metrics import best_scale
 from facerf_cli.run.logs import json_line
 
 Format = Literal["facerf-evaluation-3"]
 FORMAT: Format = "facerf-evaluation-3"
 
-# Strips.
-ERROR_HIGHEST = 0.2  # of display values 0..1: the end of the false colours
-# Dark to bright by violet and orange; the lightness only rises, so that the error also reads in grey.
-ERROR_COLOURS = ((8, 6, 20), (87, 22, 110), (187, 55, 84), (249, 142, 9), (252, 250, 176))
-_TILE_PX = 192  # the longer side
-_GAP_PX = 4  # between tiles
-_GAP = 128  # grey of the gap, that glares neither on a light page nor on a dark one
-_OUTSIDE = 0.16  # display value of what is not compared
-_KEPT_WORST, _KEPT_WORST_OF_OTHERS, _KEPT_BEST, _KEPT_TYPICAL = 8, 2, 2, 2  # of an item
-# The page.
-WORST, TYPICAL, BEST = 40, 4, 4
+WORST, FEW = 40, 4  # cases on the page; `few` are typical ones, and as many the best
 # Okabe and Ito's colours (2008), which colour-blind readers can tell apart; for methods in their order.
 METHOD_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#3a9fd8", "#8a8a8a")
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)  # of the plots: line, box, bar, box, line
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Facts on a case's strip: source over truth, then the methods' images over their errors.
-
-    Images are at the truth's exposure `ev`, the methods' multiplied by `scales`, which are 1 if no scale was
-    sought. A source has its own exposure; without a source, the mask is there. `file` is the path of the JPEG
-    below the evaluation's folder, once it is written.
-    """
-
-    case: str
-    file: str
-    methods: tuple[str, ...]
-    ev: float
-    scales: tuple[float, ...]
-    has_source: bool
-    size_px: tuple[int, int]  # width, height
-
-
-def draw_strip(comparison: Comparison, scaled: bool) -> tuple[Strip, np.ndarray]:
-    """Draw a case's strip; `scaled` multiplies predictions by the scale that Si-MSE finds.
-
-    The image is [2 h, (1 + methods) w, 3], bytes for display.
-    """
-    truth, mask = comparison.truth, comparison.mask
-    ev = auto_exposure_ev(truth, mask)
-    tile = _tile_size(truth.shape)
-    true = _display(truth, ev)
-    source = comparison.source
-    given = mask if source is None else _display(source, auto_exposure_ev(source))
-    columns, scales = [_column(_fitted(given, tile), _fitted(true, tile))], []
-    for prediction in comparison.predictions.values():
-        scale = best_scale(prediction, truth, mask) if scaled else 1.0
-        ours = _display(scale * prediction, ev)
-        columns.append(_column(_fitted(_inside(ours, mask), tile), _fitted(_error(ours, true, mask), tile)))
-        scales.append(scale)
-    pixels = np.concatenate(columns, 1)[:-_GAP_PX, :-_GAP_PX]
-    size_px = (pixels.shape[1], pixels.shape[0])
-    methods = tuple(comparison.predictions)
-    return Strip(comparison.case.name, "", methods, ev, tuple(scales), source is not None, size_px), pixels
-
-
-def _tile_size(shape: tuple[int, ...]) -> tuple[int, int]:
-    """Width and height of a tile for images [H, W, ...]."""
-    longer = max(shape[:2])
-    return round(_TILE_PX * shape[1] / longer) or 1, round(_TILE_PX * shape[0] / longer) or 1
-
-
-def _display(linear: np.ndarray, ev: float) -> np.ndarray:
-    """Encode linear light of any shape as display values 0..1."""
-    return linear_to_srgb(np.clip(linear * np.float32(2.0**ev), 0, 1))
-
-
-def _inside(display: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """A prediction [H, W, 3] where it is compared, grey elsewhere."""
-    weight = mask[..., None].astype(np.float32)
-    return weight * display + (1 - weight) * np.float32(_OUTSIDE)
-
-
-def _error(ours: np.ndarray, true: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """The channels' mean absolute difference of display values [H, W, 3], in false colours [H, W, 3]."""
-    apart = np.abs(ours - true).mean(-1) * (mask > 0) / ERROR_HIGHEST
-    stops = np.linspace(0, 1, len(ERROR_COLOURS))
-    channels = [np.interp(apart, stops, np.array(ERROR_COLOURS)[:, channel] / 255) for channel in range(3)]
-    return np.stack(channels, -1)
-
-
-def _fitted(display: np.ndarray, tile: tuple[int, int]) -> np.ndarray:
-    """An image [h, w, 3] or [h, w] in 0..1, resized to fit into a tile and centred on it, as bytes."""
-    data = (np.clip(np.nan_to_num(display), 0, 1) * 255 + 0.5).astype(np.uint8)
-    image = Image.fromarray(data).convert("RGB")
-    ratio = min(tile[0] / image.width, tile[1] / image.height)
-    size = max(1, round(image.width * ratio)), max(1, round(image.height * ratio))
-    canvas = Image.new("RGB", tile, (round(255 * _OUTSIDE),) * 3)
-    resized = image.resize(size, Image.Resampling.LANCZOS if ratio < 1 else Image.Resampling.BICUBIC)
-    canvas.paste(resized, ((tile[0] - size[0]) // 2, (tile[1] - size[1]) // 2))
-    return np.asarray(canvas)
-
-
-def _column(above: np.ndarray, below: np.ndarray) -> np.ndarray:
-    """Two tiles in a column, each with a gap below and on its right."""
-    frame = ((0, _GAP_PX), (0, _GAP_PX), (0, 0))
-    return np.concatenate([np.pad(tile, frame, constant_values=_GAP) for tile in (above, below)])
-
-
-def cases_to_keep(rows: Sequence[Row], metric: str) -> list[str]:
-    """Choose the cases of an item whose strips are kept, by name.
-
-    They are the worst of the first method, fewer of each other one, the first one's best, and those in the
-    middle.
-    """
-    chosen: set[str] = set()
-    for number, method in enumerate(dict.fromkeys(row.method for row in rows)):
-        ranked = _worst_first([row for row in rows if row.method == method], metric)
-        chosen.update(ranked[: _KEPT_WORST_OF_OTHERS if number else _KEPT_WORST])
-        if number == 0:
-            middle = max(len(ranked) - _KEPT_TYPICAL, 0) // 2
-            chosen.update(ranked[middle : middle + _KEPT_TYPICAL] + ranked[-_KEPT_BEST:])
-    return sorted(chosen)
-
-
-def _badness(row: Row, metric: str) -> float:
-    """A row's figure, larger for a worse image; minus infinity if there is none."""
-    value = row.values.get(metric, math.nan)
-    sign = 1 if metric_named(metric).lower_is_better else -1
-    return sign * value if math.isfinite(value) else -math.inf
-
-
-def _worst_first(rows: Iterable[Row], metric: str) -> list[str]:
-    """Cases of one method's rows whose figure is finite, the worst first; of equals by name."""
-    figures = sorted((-_badness(row, metric), row.case) for row in rows)
-    return [case for figure, case in figures if math.isfinite(figure)]
 
 
 def _with_nan(row: Any) -> Any:
@@ -210,120 +86,77 @@ def images_csv(rows: Sequence[Row]) -> str:
 
 
 @dataclass(frozen=True)
-class CaseImage:
-    """A case with its strip and its rows, one a method."""
+class ChosenCases:
+    """Names of cases to look at, each once; where there are few, all are in `worst`."""
 
-    strip: Strip
-    rows: tuple[Row, ...]
+    worst: list[str]
+    typical: list[str]
+    best: list[str]
 
-
-@dataclass(frozen=True)
-class Chosen:
-    """The cases on the page, each once; if they are few, all are in `worst`."""
-
-    worst: tuple[CaseImage, ...]
-    typical: tuple[CaseImage, ...]
-    best: tuple[CaseImage, ...]
-
-    def all(self) -> tuple[CaseImage, ...]:
-        """All cases on the page."""
+    def all(self) -> list[str]:
+        """All of them."""
         return self.worst + self.typical + self.best
 
 
-def choose(summary: Summary, rows: Sequence[Row], strips: Iterable[Strip], worst: int = WORST) -> Chosen:
-    """Choose among the cases whose strips were kept, by the layout's first metric of the first method."""
-    metric, first = summary.metrics[0], summary.methods[0]
-    of_case: dict[str, list[Row]] = {}
-    for row in rows:
-        of_case.setdefault(row.case, []).append(row)
+def choose_cases(
+    rows: Sequence[Row], metric: str, among: Collection[str], worst: int = WORST, few: int = FEW
+) -> ChosenCases:
+    """Choose cases by a metric of the first method, the worst first: `worst` of those beyond the median.
 
-    def badness(case: CaseImage) -> float:
-        return next((_badness(row, metric) for row in case.rows if row.method == first), -math.inf)
-
-    cases = [CaseImage(strip, tuple(of_case[strip.case])) for strip in strips if strip.case in of_case]
-    cases = sorted(cases, key=lambda case: (-badness(case), case.strip.case))
-    if len(cases) == summary.images <= worst:
-        return Chosen(tuple(cases), (), ())
-    rest, best = cases[:-BEST], cases[-BEST:][::-1]
-    cell = summary.groups[0].cells[metric].get(first)
+    With them go a `few` near the median of all rows, and a `few` of the best. Only cases `among` some are
+    chosen, and none without a finite figure.
+    """
     sign = 1 if metric_named(metric).lower_is_better else -1
-    median = sign * cell.interval.median if cell else 0.0
-    typical = sorted(rest, key=lambda case: abs(badness(case) - median))[:TYPICAL]
-    bad = [case for case in rest if case not in typical and badness(case) > median][:worst]
-    return Chosen(tuple(bad), tuple(typical), tuple(best))
-
-
-def _axis(groups: list[Group], metric: str) -> tuple[float, float]:
-    """The lowest and highest value of the plots; an error's axis begins at 0 if no value is negative."""
-    cells = [cell for group in groups for cell in group.cells.get(metric, {}).values()]
-    lows = [float(np.quantile(cell.values, _QUANTILES[0])) for cell in cells]
-    highs = [max(float(np.quantile(cell.values, _QUANTILES[-1])), cell.interval.mean) for cell in cells]
-    if not cells:
-        return 0.0, 1.0
-    low, high = min(lows), max(highs)
-    low = 0.0 if low >= 0 and metric_named(metric).lower_is_better else low
-    return (low, high) if high > low else (low, low + 1)
-
-
-def _spread(cell: Cell, axis: tuple[float, float]) -> dict[str, str]:
-    """Places of a method's values on the axis, in percent: a line, a box and its width, a bar and a dot."""
-    low, high = axis
-
-    def place(value: float) -> str:
-        return f"{100 * min(max((value - low) / (high - low), 0), 1):.2f}%"
-
-    least, lower, middle, upper, most = (float(v) for v in np.quantile(cell.values, _QUANTILES))
-    values = {"least": least, "lower": lower, "middle": middle, "most": most, "mean": cell.interval.mean}
-    box = max(100 * (min(upper, high) - max(lower, low)) / (high - low), 0.4)
-    return {name: place(value) for name, value in values.items()} | {"box": f"{box:.2f}%"}
-
-
-def _fact(value: str | float) -> str:
-    return value if isinstance(value, str) else f"{value:.4g}"
-
-
-def _alt(strip: Strip) -> str:
-    """The text in place of a strip's image."""
-    first = "The source" if strip.has_source else "The mask"
-    return f"{strip.case}. {first} above the truth; then, above their errors: {', '.join(strip.methods)}."
-
-
-def _figure(values: Mapping[str, float], metric: str) -> str:
-    """A figure with its metric's digits; empty where it is missing."""
-    if metric not in values:
-        return ""
-    return f"{values[metric]:.{metric_named(metric).digits}f}" if math.isfinite(values[metric]) else "none"
-
-
-@dataclass(frozen=True)
-class About:
-    """The run: its command line, facerf's version, and facts; file and SHA-256 of each network, by title."""
-
-    command: str
-    version: str
-    networks: Mapping[str, Mapping[str, str]]
-    facts: Mapping[str, str]
-
-
-def page(summary: Summary, about: About, chosen: Chosen, jpegs: Mapping[str, bytes]) -> str:
-    """Write the report; `jpegs` are the chosen cases' strips by case. Equal figures give equal bytes."""
-    colours = {
-        method: METHOD_COLOURS[number % len(METHOD_COLOURS)] for number, method in enumerate(summary.methods)
+    figures = {
+        row.case: sign * row.values.get(metric, math.nan) for row in rows if row.method == rows[0].method
     }
+    badness = {case: figure for case, figure in figures.items() if math.isfinite(figure)}
+    ranked = sorted(badness.keys() & set(among), key=lambda case: (-badness[case], case))
+    if len(ranked) == len(badness) <= worst:
+        return ChosenCases(ranked, [], [])
+    median = float(np.median(list(badness.values())))
+    rest, best = ranked[:-few], ranked[-few:][::-1]
+    typical = sorted(rest, key=lambda case: abs(badness[case] - median))[:few]
+    bad = [case for case in rest if case not in typical and badness[case] > median]
+    return ChosenCases(bad[:worst], typical, best)
+
+
+def page(
+    summary: Summary, run: Mapping[str, Any], rows: Sequence[Row], strips: Sequence[Strip], folder: Path
+) -> str:
+    """Write the report. Equal figures give equal bytes.
+
+    Args:
+        summary: The tables.
+        run: `facerf`, the version; `command`; `networks`, file and SHA-256 of each by title; and other facts.
+        rows: The figures of every image and method.
+        strips: Those that were kept, whose files lie below the folder.
+        folder: The evaluation's folder.
+    """
+    chosen = choose_cases(rows, summary.metrics[0], [strip.case for strip in strips])
+    strip_of = {strip.case: strip for strip in strips}
+    rows_of: dict[str, list[Row]] = {case: [] for case in chosen.all()}
+    for row in rows:
+        if row.case in rows_of:
+            rows_of[row.case].append(row)
+    worst = "All cases, the worst first" if len(chosen.worst) == summary.images else "Worst cases"
+    sections = {"Typical cases": chosen.typical, "Best cases": chosen.best}
     return filled_page(
         Path(__file__).with_name("report.html"),
         summary=summary,
-        about=about,
-        chosen=chosen,
-        jpegs={case: base64.b64encode(jpeg).decode("ascii") for case, jpeg in jpegs.items()},
-        facts=[fact for fact in summary.layout.by if any(group.fact == fact for group in summary.groups)],
+        run=run,
+        sections={worst: chosen.worst} | {title: cases for title, cases in sections.items() if cases},
+        strip_of=strip_of,
+        rows_of=rows_of,
+        jpegs={
+            case: base64.b64encode((folder / strip_of[case].file).read_bytes()).decode() for case in rows_of
+        },
+        facts=list(dict.fromkeys(group.fact for group in summary.groups if group.fact)),
         metrics=[name for name in summary.layout.metrics if name in summary.metrics],
+        colours=dict(zip(summary.methods, cycle(METHOD_COLOURS))),
         gradient=", ".join(f"rgb({r} {g} {b})" for r, g, b in ERROR_COLOURS),
         highest=ERROR_HIGHEST,
         everywhere=ALL,
-        colours=colours,
-        alt=_alt,
-        fact_words=_fact,
         figure=_figure,
         metric_named=metric_named,
         axis_of=_axis,
@@ -331,3 +164,28 @@ def page(summary: Summary, about: About, chosen: Chosen, jpegs: Mapping[str, byt
         spread_of=_spread,
         published_for=published_for,
     )
+
+
+def _axis(groups: Sequence[Group], metric: str) -> tuple[float, float]:
+    """The lowest and highest value of the plots; an error's axis begins at 0 if no value is negative."""
+    cells = [cell for group in groups for cell in group.cells.get(metric, {}).values()]
+    ends = [end for cell in cells for end in (*np.quantile(cell.values, _QUANTILES), cell.interval.mean)]
+    low, high = float(min(ends, default=0)), float(max(ends, default=1))
+    low = 0.0 if low >= 0 and metric_named(metric).lower_is_better else low
+    return (low, high) if high > low else (low, low + 1)
+
+
+def _spread(cell: Cell, axis: tuple[float, float]) -> dict[str, str]:
+    """Places of a method's values on the axis, in percent: a line, a box and its width, a bar and a dot."""
+    low, high = axis
+    at = 100 * (np.array([*np.quantile(cell.values, _QUANTILES), cell.interval.mean]) - low) / (high - low)
+    names = ("least", "lower", "middle", "upper", "most", "mean")
+    width = max(at[3] - at[1], 0.4)
+    return {name: f"{place:.2f}%" for name, place in zip(names, at, strict=True)} | {"box": f"{width:.2f}%"}
+
+
+def _figure(values: Mapping[str, float], metric: str) -> str:
+    """A figure with its metric's digits; empty where it is missing."""
+    if metric not in values:
+        return ""
+    return f"{values[metric]:.{metric_named(metric).digits}f}" if math.isfinite(values[metric]) else "none"

@@ -1,35 +1,99 @@
-"""The images that are measured: pairs of a dataset, and couples of photos.
+"""The images that are measured: pairs of a dataset, photos, and couples of both.
 
 All, every Nth, as many as the paper measured, or a frozen list, which each run leaves as DIR/pairs.json.
 """
 
 import logging
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
-from facerf_cli.dataset.dataset import Dataset
-from facerf_cli.dataset.pairs import Pair, check_pair, read_pairs
+from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.pairs import Pair, check_pair, pairs_path, read_pairs
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.options import Chosen, EvaluateOptions
+from facerf_cli.evaluation.pairs import read_facts
+from facerf_cli.evaluation.people import Couple, PersonPairs, Photo
 from facerf_cli.files.documents import Document, checked, read_document, write_document
 from facerf_cli.run.logs import LOGGER_NAME
 
+PairsByPerson = Mapping[str, Sequence[Pair]]
 Groups = Mapping[str, Sequence[Sequence[Pair]]]  # by person: pairs whose sources are compared together
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
 
 # The paper's numbers of images ('Quantitative Evaluations', Tables 1, 2 and 4).
-PAPER_PHOTOS = 130
-_PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT, _PAPER_COUPLES = 160, 3900, 8100, 43
+_PAPER_PHOTOS, _PAPER_COUPLES, _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT = 130, 43, 160, 3900, 8100
 
 ListFormat = Literal["facerf-pairs-1"]
 LIST_FORMAT: ListFormat = "facerf-pairs-1"
 PAIRS_LIST = "pairs.json"
+
+
+def choose_people(
+    choose: Callable[[PairsByPerson, EvaluateOptions], Groups],
+    size: int,
+    options: EvaluateOptions,
+    inputs: Sequence[str],
+) -> Chosen:
+    """Choose groups of `size` pairs of the people of a dataset; those of a list, if one is given."""
+    assert options.dataset is not None
+    dataset = read_dataset(options.dataset)
+    strangers: frozenset[Pair] = frozenset()
+    if options.pairs:
+        groups = read_list(options.pairs, dataset, size)
+        listed = {pair for members in groups.values() for group in members for pair in group}
+        strangers = frozenset(listed.difference(read_pairs(dataset)))
+    else:
+        groups = choose(pairs_of_split(dataset, options.split), options)
+    if not options.dry_run:
+        write_list(options.output / PAIRS_LIST, groups)
+    items = {
+        options.item(options.dataset / "olat" / name, name): PersonPairs(
+            dataset, name, groups[name], strangers
+        )
+        for name in sorted(groups)
+    }
+    files = options.dataset / "dataset.json", options.pairs or pairs_path(dataset)
+    return Chosen(items, files, sum(map(len, groups.values())))
+
+
+def choose_sources(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+    """Choose sources of a dataset, or photos: all, or up to the paper's number."""
+    if options.dataset:
+        return choose_people(source_pairs, 1, options, inputs)
+    photos = collect_items(inputs, options.output, PHOTO_SUFFIXES)
+    names = {photo.name for photo in photos}
+    described = {} if options.facts is None else read_facts(options.facts)
+    if unknown := sorted({re.sub(r"_face\d+$", "", name) for name in described} - names):
+        raise InputError(
+            f"{options.facts}: {unknown[0]} is no photo of this run; give names such as {min(names)}"
+        )
+    most = _up_to(_PAPER_PHOTOS, len(photos), "photos") if options.preset else len(photos)
+    return Chosen({photo: Photo(photo) for photo in photos[:most]})
+
+
+def choose_couples(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+    """Choose couples of sources of a dataset, or of photos: all, or up to the paper's number."""
+    if options.dataset:
+        return choose_people(couple_pairs, 2, options, inputs)
+    by_person: dict[str, list[tuple[Item, Item]]] = {}
+    for person, couple in couples_of_photos(inputs, options.output):
+        by_person.setdefault(person, []).append(couple)
+    if options.preset:
+        by_person = evenly(by_person, _PAPER_COUPLES, "couples of photos")
+    items = {}
+    for person, couples in by_person.items():
+        for first, second in couples:
+            item = options.item(first.input_path, f"{first.name}--{Path(second.name).name}")
+            items[item] = Couple(person, (first, second))
+    return Chosen(items, tuple(couple.photos[1].input_path for couple in items.values()))
 
 
 def pairs_of_split(dataset: Dataset, split: str) -> dict[str, list[Pair]]:
@@ -46,42 +110,79 @@ def pairs_of_split(dataset: Dataset, split: str) -> dict[str, list[Pair]]:
     return pairs
 
 
-def choose_sources(pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
+def source_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
     """Choose every Nth pair of a dataset, or as many sources as the paper measured, evenly over people."""
-    if preset:
-        return _alone(evenly(pairs, _up_to(PAPER_PHOTOS, _count(pairs), "sources")))
-    numbered = [pair for members in pairs.values() for pair in members][::every]
-    return _alone({name: [pair for pair in numbered if pair.subject == name] for name in pairs})
+    if options.preset:
+        chosen = evenly(pairs, _PAPER_PHOTOS, "sources")
+    else:
+        numbered = [pair for members in pairs.values() for pair in members][:: options.every]
+        chosen = {name: [pair for pair in numbered if pair.subject == name] for name in pairs}
+    return {name: [(pair,) for pair in members] for name, members in chosen.items() if members}
 
 
-def choose_olats(pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
+def olat_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
     """Choose every Nth pair, or up to the paper's number of pairs and of maps, evenly over people."""
-    if not preset:
-        return choose_sources(pairs, every, preset)
+    if not options.preset:
+        return source_pairs(pairs, options)
     maps = list(dict.fromkeys(pair.envmap for members in pairs.values() for pair in members))
     kept = set(maps[: _up_to(_PAPER_MAPS, len(maps), "maps")])
     chosen: dict[str, list[Pair]] = {name: [] for name in pairs}
-    for same, most in ((True, _PAPER_SAME), (False, _PAPER_DIFFERENT)):
+    for same, most, kind in (
+        (True, _PAPER_SAME, "pairs of the same pose"),
+        (False, _PAPER_DIFFERENT, "pairs of different poses"),
+    ):
         groups = {
             name: [p for p in members if p.envmap in kept and (p.source_camera == p.target_camera) is same]
             for name, members in pairs.items()
         }
-        kind = "pairs of the same pose" if same else "pairs of different poses"
-        for name, members in evenly(groups, _up_to(most, _count(groups), kind)).items():
+        for name, members in evenly(groups, most, kind).items():
             chosen[name] += members
-    return _alone({name: sorted(members, key=lambda pair: pair.index) for name, members in chosen.items()})
+    in_order = {name: sorted(members, key=lambda pair: pair.index) for name, members in chosen.items()}
+    return {name: [(pair,) for pair in members] for name, members in in_order.items() if members}
 
 
-def choose_couples(pairs: Mapping[str, Sequence[Pair]], every: int, preset: bool) -> Groups:
+def couple_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
     """Choose every Nth couple of each person, or up to the paper's number evenly over people."""
     couples = {name: members for name, own in pairs.items() if (members := couples_of(own))}
     if not couples:
         raise UsageError(
             "no two sources of one person with different cameras and maps; run relight-dataset with more"
         )
-    if preset:
-        return evenly(couples, _up_to(_PAPER_COUPLES, _count(couples), "couples of images"))
-    return {name: members[::every] for name, members in couples.items()}
+    if options.preset:
+        return evenly(couples, _PAPER_COUPLES, "couples of images")
+    return {name: members[:: options.every] for name, members in couples.items()}
+
+
+def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
+    """Pair up a person's pairs, each once, in order: sources of different cameras and different maps."""
+    couples: list[tuple[Pair, Pair]] = []
+    waiting: list[Pair] = []
+    for pair in pairs:
+        fits = (p for p in waiting if p.source_camera != pair.source_camera and p.envmap != pair.envmap)
+        first = next(fits, None)
+        if first is None:
+            waiting.append(pair)
+        else:
+            waiting.remove(first)
+            couples.append((first, pair))
+    return couples
+
+
+def evenly(groups: Mapping[str, Sequence[T]], paper: int, what: str) -> dict[str, list[T]]:
+    """Choose the first of each group, then the second of each, and so on, up to the paper's number in all."""
+    most = _up_to(paper, sum(map(len, groups.values())), what)
+    rounds = sorted((place, name) for name, members in groups.items() for place in range(len(members)))
+    chosen: dict[str, list[T]] = {name: [] for name in groups}
+    for place, name in rounds[:most]:
+        chosen[name].append(groups[name][place])
+    return {name: members for name, members in chosen.items() if members}
+
+
+def _up_to(paper: int, found: int, what: str) -> int:
+    """The paper's number, or what there is; a line says where that is less."""
+    if found < paper:
+        log.warning("%d %s are measured, all there are; the paper measured %d", found, what, paper)
+    return min(paper, found)
 
 
 class _PairList(Document):
@@ -104,7 +205,7 @@ def read_list(path: Path, dataset: Dataset, size: int) -> Groups:
     """
     content = read_document(path, _PairList, "give the pairs.json of another run of facerf evaluate")
     listed = [
-        [checked(Pair, row, f"{path}: groups[{number}]") for row in group]
+        tuple(checked(Pair, row, f"{path}: groups[{number}]") for row in group)
         for number, group in enumerate(content.groups)
     ]
     keys = [pair.key for group in listed for pair in group]
@@ -131,82 +232,11 @@ def _with_map(pair: Pair, folder: Path) -> Pair:
     return replace(pair, envmap=str(near)) if near.is_file() and not Path(pair.envmap).is_file() else pair
 
 
-def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
-    """Pair up a person's pairs, each once, in order: sources of different cameras and different maps."""
-    couples: list[tuple[Pair, Pair]] = []
-    waiting: list[Pair] = []
-    for pair in pairs:
-        fits = (p for p in waiting if p.source_camera != pair.source_camera and p.envmap != pair.envmap)
-        first = next(fits, None)
-        if first is None:
-            waiting.append(pair)
-        else:
-            waiting.remove(first)
-            couples.append((first, pair))
-    return couples
+def couples_of_photos(inputs: Sequence[str], output: Path) -> Iterator[tuple[str, tuple[Item, Item]]]:
+    """Yield couples of photos with the name of their person.
 
-
-def evenly(groups: Mapping[str, Sequence[T]], most: int) -> dict[str, list[T]]:
-    """Choose the first of each group, then the second of each, and so on, up to `most` in all."""
-    rounds = sorted((place, name) for name, members in groups.items() for place in range(len(members)))
-    chosen: dict[str, list[T]] = {name: [] for name in groups}
-    for place, name in rounds[:most]:
-        chosen[name].append(groups[name][place])
-    return {name: members for name, members in chosen.items() if members}
-
-
-def _alone(pairs: Mapping[str, Sequence[Pair]]) -> Groups:
-    """Each pair as a group of its own; people without any are left out."""
-    return {name: [(pair,) for pair in members] for name, members in pairs.items() if members}
-
-
-def _count(groups: Mapping[str, Sequence[object]]) -> int:
-    return sum(map(len, groups.values()))
-
-
-def _up_to(paper: int, found: int, what: str) -> int:
-    """The paper's number, or what there is; a line says where that is less."""
-    if found < paper:
-        log.warning("%d %s are measured, all there are; the paper measured %d", found, what, paper)
-    return min(paper, found)
-
-
-def choose_photos(items: list[Item], preset: bool) -> list[Item]:
-    """Choose all photos, or up to the paper's number of them."""
-    return items[: _up_to(PAPER_PHOTOS, len(items), "photos")] if preset else items
-
-
-@dataclass(frozen=True)
-class Couple:
-    """Two photos of a person."""
-
-    person: str
-    photos: tuple[Item, Item]
-
-    @property
-    def item(self) -> Item:
-        """The couple as an item at the first one's place, with both names."""
-        first, second = self.photos
-        tail = f"--{Path(second.name).name}"
-        return Item(first.input_path, Path(f"{first.output_base}{tail}"), f"{first.name}{tail}")
-
-
-def couples_of_photos(inputs: Sequence[str], output: Path, preset: bool) -> list[Couple]:
-    """Pair up photos: two files each as they are named, and two each of a folder in its order.
-
-    A preset takes up to the paper's number of couples, evenly over people.
+    They are two files each as they are named, and two each of a folder in its order.
     """
-    couples = list(_couples(inputs, output))
-    if not preset:
-        return couples
-    most = _up_to(_PAPER_COUPLES, len(couples), "couples of photos")
-    of_person: dict[str, list[Couple]] = {}
-    for couple in couples:
-        of_person.setdefault(couple.person, []).append(couple)
-    return [couple for members in evenly(of_person, most).values() for couple in members]
-
-
-def _couples(inputs: Sequence[str], output: Path) -> Iterable[Couple]:
     inputs = list(expand_inputs(inputs))
     items = collect_items(inputs, output, PHOTO_SUFFIXES)
     by_path = {os.path.abspath(item.input_path): item for item in items}
@@ -229,4 +259,4 @@ def _couples(inputs: Sequence[str], output: Path) -> Iterable[Couple]:
             given.add(files)
             place = Path(first.name).parent.as_posix()
             of_folder = folder.resolve().name if folder and place == "." else place
-            yield Couple(of_folder if folder else first.name, (first, second))
+            yield (of_folder if folder else first.name), (first, second)

@@ -4,7 +4,7 @@ import csv
 import math
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,10 @@ from rich.text import Text
 from facerf_cli.evaluation.measure import METRICS, NEAR_BLACK, Metric, Row
 from facerf_cli.image.metrics import Interval, mean_interval
 from facerf_cli.run.logs import counted
+
+ALL = "all images"
+_DIGITS = 12  # of a digest
+_PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 
 
 @dataclass(frozen=True)
@@ -45,37 +49,30 @@ class PublishedFigure:
 def published(*protocols: str) -> tuple[PublishedFigure, ...]:
     """Read the figures that are shown with those of protocols, from published.csv."""
     with Path(__file__).with_name("published.csv").open(encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["protocol"] in protocols]
-    return tuple(
-        PublishedFigure(
-            row["method"],
-            row["metric"],
-            float(row["mean"]),
-            float(row["sd"]) if row["sd"] else None,
-            (row["fact"], row["value"]) if row["fact"] else None,
-            row["source"],
-            row["data"],
-            int(row["digits"]) if row["digits"] else None,
+        return tuple(
+            PublishedFigure(
+                row["method"],
+                row["metric"],
+                float(row["mean"]),
+                float(row["sd"]) if row["sd"] else None,
+                (row["fact"], row["value"]) if row["fact"] else None,
+                row["source"],
+                row["data"],
+                int(row["digits"]) if row["digits"] else None,
+            )
+            for row in csv.DictReader(stream)
+            if row["protocol"] in protocols
         )
-        for row in rows
-    )
-
-
-ALL = "all images"
-_DIGITS = 12  # of a digest
-_PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 
 
 @dataclass(frozen=True)
 class Layout:
     """The contents of a protocol's tables.
 
-    `name` is the protocol's on the command line, `title` the heading. The first of `metrics` decides which
-    images are the best and the worst. `by` names the facts, as text, that break the tables down. `notes` are
-    printed below the figures.
+    `title` is the heading. The first of `metrics` decides which images are the best and the worst. `by` names
+    the facts, as text, that break the tables down; where it is empty, all do. `notes` are printed below.
     """
 
-    name: str
     title: str
     metrics: tuple[str, ...] = ("si_mse",)
     by: tuple[str, ...] = ()
@@ -84,27 +81,25 @@ class Layout:
 
 
 @dataclass(frozen=True)
-class Paired:
-    """A method against the first one, on the images that both have."""
-
-    difference: Interval  # this method's value less the first one's
-    won: float  # share of images on which this method is better; a tie counts half
-
-
-@dataclass(frozen=True)
 class Cell:
-    """One metric of one method over a group of images."""
+    """One metric of one method over a group of images, and against the first method.
 
-    values: tuple[float, ...]  # sorted
+    `values` are sorted; those that are not finite are counted in `left_out`. `difference` is this method's
+    value less the first one's, on the images that both have, and `won` the share of these on which this
+    method is better; a tie counts half. The first method has none, nor one without such images.
+    """
+
+    values: tuple[float, ...]
     interval: Interval
-    left_out: int  # images whose value is not finite
-    paired: Paired | None  # None for the first method, and where no image has both
+    left_out: int
+    difference: Interval | None = None
+    won: float = math.nan
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON."""
         entry: dict[str, Any] = self.interval.as_dict() | {"left_out": self.left_out}
-        if self.paired is not None:
-            entry["less_the_first"] = self.paired.difference.as_dict() | {"won": self.paired.won}
+        if self.difference is not None:
+            entry["less_the_first"] = self.difference.as_dict() | {"won": self.won}
         return entry
 
 
@@ -115,19 +110,6 @@ class Group:
     fact: str
     value: str
     cells: Mapping[str, Mapping[str, Cell]]  # by metric, then by method
-
-    @property
-    def title(self) -> str:
-        """The group's name in a table."""
-        return f"{self.fact}: {self.value}" if self.fact else ALL
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the group's tables for JSON."""
-        metrics = {
-            metric: {method: cell.as_dict() for method, cell in by_method.items()}
-            for metric, by_method in self.cells.items()
-        }
-        return {"fact": self.fact or None, "value": self.value or None, "metrics": metrics}
 
 
 @dataclass(frozen=True)
@@ -149,15 +131,25 @@ class Summary:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all tables for JSON."""
+        groups = [
+            {
+                "fact": group.fact or None,
+                "value": group.value or None,
+                "metrics": {
+                    metric: {method: cell.as_dict() for method, cell in by_method.items()}
+                    for metric, by_method in group.cells.items()
+                },
+            }
+            for group in self.groups
+        ]
         return {
-            "protocol": self.layout.name,
             "title": self.layout.title,
             "notes": self.layout.notes,
             "pictures": self.images,
             "persons": self.persons,
             "methods": self.methods,
             "metrics": self.metrics,
-            "groups": [group.as_dict() for group in self.groups],
+            "groups": groups,
             "published": [vars(figure) for figure in self.layout.published],
         }
 
@@ -175,7 +167,8 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     metrics = tuple(dict.fromkeys([*narrow, *measured]))
     methods = tuple(dict.fromkeys(row.method for row in rows))
     groups = [Group("", "", _cells(rows, methods, metrics))]
-    for fact in layout.by:
+    text = dict.fromkeys(name for row in rows for name, value in row.facts.items() if isinstance(value, str))
+    for fact in layout.by or text:
         by_value: dict[str, list[Row]] = {}
         for row in rows:
             if fact in row.facts:
@@ -183,14 +176,13 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for value in sorted(by_value, key=natural):
             groups.append(Group(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
-    persons = set() if "" in persons else persons
     if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
         note = (
             f"Of {counted(len(dark), 'image')} the truth is near black (root mean square below "
             f"{NEAR_BLACK}): left out of Si-MSE."
         )
         layout = replace(layout, notes=(*layout.notes, note))
-    return Summary(layout, methods, metrics, tuple(groups), len(cases), len(persons))
+    return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
 
 
 def metric_named(name: str) -> Metric:
@@ -200,11 +192,8 @@ def metric_named(name: str) -> Metric:
 
 def published_for(summary: Summary, group: Group, metric: str) -> list[PublishedFigure]:
     """The published figures of a group and a metric."""
-    return [
-        figure
-        for figure in summary.layout.published
-        if figure.metric == metric and (figure.group or ("", "")) == (group.fact, group.value)
-    ]
+    key = (group.fact, group.value) if group.fact else None
+    return [one for one in summary.layout.published if one.metric == metric and one.group == key]
 
 
 def natural(text: str) -> list[tuple[int, float, str]]:
@@ -214,26 +203,28 @@ def natural(text: str) -> list[tuple[int, float, str]]:
 
 
 def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) -> dict[str, dict[str, Cell]]:
-    """The cells that have values, by metric and method."""
-    found: dict[str, dict[str, Cell]] = {}
+    """The cells that have finite values, by metric and method."""
+    found: dict[str, dict[str, Cell]] = {metric: {} for metric in metrics}
     for metric in metrics:
-        by_method: dict[str, dict[str, Row]] = {method: {} for method in methods}
-        for row in rows:
-            if metric in row.values:
-                by_method[row.method][row.case] = row
-        cells = {method: _cell(metric, own, by_method[methods[0]]) for method, own in by_method.items()}
-        found[metric] = {method: cell for method, cell in cells.items() if cell is not None}
+        measured = [row for row in rows if metric in row.values]
+        finite = [row for row in measured if math.isfinite(row.values[metric])]
+        firsts = {row.case: row.values[metric] for row in finite if row.method == methods[0]}
+        for method in methods:
+            ours = [row for row in finite if row.method == method]
+            interval = _interval([(row.person, row.values[metric]) for row in ours])
+            if interval is None:
+                continue
+            values = tuple(sorted(row.values[metric] for row in ours))
+            cell = Cell(values, interval, sum(row.method == method for row in measured) - len(ours))
+            if method != methods[0]:
+                both = [
+                    (row.person, row.values[metric] - firsts[row.case]) for row in ours if row.case in firsts
+                ]
+                cell = replace(
+                    cell, difference=_interval(both), won=_won(metric, [apart for _, apart in both])
+                )
+            found[metric][method] = cell
     return found
-
-
-def _cell(metric: str, ours: Mapping[str, Row], firsts: Mapping[str, Row]) -> Cell | None:
-    """The figures of one method's rows by case; None if no value is finite."""
-    finite = {case: row.values[metric] for case, row in ours.items() if math.isfinite(row.values[metric])}
-    interval = _interval([(ours[case].person, value) for case, value in finite.items()])
-    if interval is None:
-        return None
-    paired = None if ours is firsts else _paired(metric, finite, firsts)
-    return Cell(tuple(sorted(finite.values())), interval, len(ours) - len(finite), paired)
 
 
 def _interval(values: Sequence[tuple[str, float]]) -> Interval | None:
@@ -242,18 +233,10 @@ def _interval(values: Sequence[tuple[str, float]]) -> Interval | None:
     return mean_interval(values if known else [("", value) for _, value in values])
 
 
-def _paired(metric: str, ours: Mapping[str, float], firsts: Mapping[str, Row]) -> Paired | None:
+def _won(metric: str, differences: Sequence[float]) -> float:
     better = -1.0 if metric_named(metric).lower_is_better else 1.0
-    differences = {
-        case: (firsts[case].person, value - firsts[case].values[metric])
-        for case, value in ours.items()
-        if case in firsts and math.isfinite(firsts[case].values[metric])
-    }
-    interval = _interval(list(differences.values()))
-    if interval is None:
-        return None
-    won = [0.5 if apart == 0 else float(better * apart > 0) for _, apart in differences.values()]
-    return Paired(interval, sum(won) / len(won))
+    won = [0.5 if apart == 0 else float(better * apart > 0) for apart in differences]
+    return sum(won) / len(won) if won else math.nan
 
 
 def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) -> None:
@@ -266,10 +249,10 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
     plain = not terminal or console.width <= _PIPED_WIDTH  # rules take columns that a narrow terminal lacks
     layout = summary.layout
     console.print(Text(f"{layout.title}: {summary.size}", style="bold"))
-    first, *others = [metric for metric in layout.metrics if metric in summary.metrics]
-    console.print(_table(summary, first, summary.groups, plain=plain))
-    for metric in others:
-        console.print(_table(summary, metric, summary.groups[:1], plain=plain))
+    shown = [metric for metric in layout.metrics if metric in summary.metrics]
+    for metric in shown:
+        groups = summary.groups if metric == shown[0] else summary.groups[:1]
+        console.print(_table(summary, metric, groups, plain))
     measured_on = dict.fromkeys(f"{figure.source}: {figure.data}" for figure in layout.published)
     if measured_on:
         console.print(Text("Published figures. " + ". ".join(measured_on) + "."))
@@ -281,6 +264,7 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
 
 
 def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) -> Table:
+    """The groups' rows: one for each method, then the published figures."""
     how = metric_named(metric)
     better = "less" if how.lower_is_better else "more"
     table = Table(
@@ -293,26 +277,20 @@ def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) 
     )
     table.add_column("images", overflow="fold", min_width=10, max_width=26)
     table.add_column("method", overflow="fold", max_width=20)
-    for name in ("n", "mean", "sd", "median", "95 % interval", "vs first", "won"):
+    columns = ["n", "mean", "sd", "median", "95 % interval", "vs first", "won"]
+    for name in columns[: None if len(summary.methods) > 1 else 5]:
         table.add_column(name, justify="right", no_wrap=name not in ("95 % interval", "vs first"))
+    rows: list[list[str]] = []
     for group in groups:
-        for row in _table_rows(summary, group, metric):
-            table.add_row(*(Text(entry) for entry in row))
-    if len(summary.methods) == 1:  # nothing to compare with
-        for _ in range(2):
-            table.columns.pop()
+        title = f"{group.fact}: {group.value}" if group.fact else ALL
+        for method, cell in group.cells.get(metric, {}).items():
+            rows.append([title, method, str(cell.interval.images), *cell_words(cell, how.digits)])
+            title = ""
+        for figure in published_for(summary, group, metric):
+            rows.append([f"published, {figure.source}", figure.method, "", *figure.words(how.digits)])
+    for row in rows:
+        table.add_row(*map(Text, row[: len(table.columns)]))
     return table
-
-
-def _table_rows(summary: Summary, group: Group, metric: str) -> Iterator[list[str]]:
-    """A group's rows: one for each method, then the published figures."""
-    digits = metric_named(metric).digits
-    title = group.title
-    for method, cell in group.cells.get(metric, {}).items():
-        yield [title, method, str(cell.interval.images), *cell_words(cell, digits)]
-        title = ""
-    for figure in published_for(summary, group, metric):
-        yield [f"published, {figure.source}", figure.method, "", *figure.words(digits), *[""] * 4]
 
 
 def cell_words(cell: Cell, digits: int) -> list[str]:
@@ -321,19 +299,16 @@ def cell_words(cell: Cell, digits: int) -> list[str]:
     The difference is followed by its interval. Both have as many digits after the point as show two of their
     uncertainty, and at most `digits`. The last two are empty for the first method.
     """
-    interval, paired = cell.interval, cell.paired
+    interval, apart = cell.interval, cell.difference
     most = _decimals(interval, digits)
     words = [f"{value:.{most}f}" for value in (interval.mean, interval.sd, interval.median)]
     known = not math.isnan(interval.low)  # NaN with one person, or where nobody is named
     words.append(f"{interval.low:.{most}f} to {interval.high:.{most}f}" if known else "one person?")
-    if paired is None:
+    if apart is None:
         return [*words, "", ""]
-    apart = paired.difference
     most = _decimals(apart, digits)
-    difference = f"{apart.mean:+.{most}f}"
-    if known:
-        difference += f" ({apart.low:+.{most}f} to {apart.high:+.{most}f})"
-    return [*words, difference, f"{100 * paired.won:.0f} %"]
+    between = f" ({apart.low:+.{most}f} to {apart.high:+.{most}f})" if known else ""
+    return [*words, f"{apart.mean:+.{most}f}{between}", f"{100 * cell.won:.0f} %"]
 
 
 def _decimals(interval: Interval, most: int) -> int:

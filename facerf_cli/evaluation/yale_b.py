@@ -10,15 +10,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB
-from facerf_cli.errors import InputError
+from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB, read_shifts, read_yale_b
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.options import Chosen, EvaluateOptions
 from facerf_cli.evaluation.people import Method, Reading
-from facerf_cli.evaluation.summary import Layout, published
 from facerf_cli.face.head import Head
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
@@ -172,43 +173,14 @@ def face_mask() -> np.ndarray:
     return ((x - 84) / 70) ** 2 + ((y - 98) / 88) ** 2 <= 1
 
 
-PUBLISHED_SUBJECTS = 21
-
-
-def layout(
-    database: YaleB, subjects: Sequence[str], network_alone: bool = False, room: float = 0.0
-) -> Layout:
-    """The contents of the tables, and the notes below them."""
-    return Layout(
-        name="yale-b",
-        title="Extended Yale B: real people relit to real point lights",
-        metrics=("si_mse", "ssim"),
-        by=("column", "angle", "subjects"),
-        published=published("yale-b"),
-        notes=tuple(_notes(database, subjects, network_alone, room)),
-    )
-
-
-def _notes(database: YaleB, subjects: Sequence[str], network_alone: bool, room: float) -> Iterator[str]:
-    """Notes below the figures."""
-    yield f"The field is {'the network alone' if network_alone else 'corrected by its source image'}."
-    yield "Grey images, values as given, which are close to linear in light; the mask is one ellipse."
-    yield "The flashes' strength is not known: metrics that do not fit a scale (MSE, PSNR) say little."
-    if room:
-        yield f"Each flash comes with {room:.3g} of its light from all around, as of a room (--room)."
-    if database.shifts:
-        yield "Images are aligned to their subject's frontal one by the given shifts."
-    else:
-        yield "Images are not aligned (no --shifts); the published figures are of aligned ones."
-    marked, known = sum(map(len, database.marked.values())), len(database.left_out)
-    yield f"Left out of all subjects there: {marked} images marked as damaged, {known} known to be."
-    yield (
-        f"Published rows are of the same images, aligned, of {PUBLISHED_SUBJECTS} subjects, by the benchmark "
-        f"that they come from; here are {len(subjects)}. The quotient image knows more than one photo: other "
-        "subjects under the same flashes."
-    )
-    if chosen := sorted(set(subjects) & set(SETTINGS_SUBJECTS)):
-        yield f"Settings were chosen on {', '.join(chosen)}."
+def choose_subjects(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+    """Choose subjects of a folder of the database, all if none are named."""
+    database = read_yale_b(Path(inputs[0]), None if options.shifts is None else read_shifts(options.shifts))
+    if unknown := sorted(set(options.subjects) - set(database.subjects)):
+        there = ", ".join(database.subjects)
+        raise UsageError(f"--subjects {', '.join(unknown)}: not in {database.folder}; give some of {there}")
+    chosen = [name for name in database.subjects if not options.subjects or name in options.subjects]
+    return Chosen({options.item(database.folder / name, name): (database, name) for name in chosen})
 
 
 def compare_subject(

@@ -1,4 +1,4 @@
-"""`facerf evaluate pairs` from the command line, and the options that protocols share."""
+"""`facerf evaluate pairs` from the command line."""
 
 import json
 from pathlib import Path
@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.options import EvaluateOptions, NamedCheckpoint
+from facerf_cli.evaluation.options import NamedCheckpoint
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
 from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
@@ -90,39 +89,6 @@ def test_a_link_is_a_method_of_its_own_name(folders: Path) -> None:
     assert main([*line, "--overwrite", "never"]) == 2
     assert main(line) == 0
     assert json.loads((folders / "out/summary.json").read_text())["groups"] != before
-
-
-def test_bad_lines(folders: Path, capsys: Said) -> None:
-    good, truth, out = (str(folders / name) for name in ("good", "truth", "out"))
-    for line, words in (
-        (["pairs", good, "-o", out], "--truth"),
-        (["pairs", str(folders / "none"), "--truth", truth, "-o", out], "no such folder"),
-        (["pairs", good, "--truth", truth, "-o", truth], "give another folder"),
-        (["pairs", good, "--truth", truth, "-o", f"{truth}/here"], f"lies in {truth}, which is read"),
-        (["pairs", good, "--truth", truth, "-o", f"{good}/here"], f"lies in {good}, which is read"),
-        (["olat", "x", "-o", f"{good}/here", "--compare", good], f"lies in {good}, which is read"),
-        (["pairs", good, "--truth", truth, "-o", out, "--lpips", "y"], "--vgg-weights"),
-        (["pairs", good, "--truth", truth, "-o", out, "--preset", "paper"], "--preset"),
-        (["olat", "x", "-o", out, "--reflectance", "phong"], "give portrait, field, diffuse-sh"),
-    ):
-        assert main(["evaluate", *line]) == 2
-        said = capsys.readouterr().err
-        assert words in said and len(said.splitlines()) == 1, said
-
-
-@pytest.mark.parametrize("name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "pairs"])
-def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said) -> None:
-    assert main(["evaluate", name, "--help"]) == 0
-    out = capsys.readouterr().out
-    assert "--output" in out and "--space" in out and "{options}" not in out
-    assert ("--reflectance" in out) == (name != "pairs") and ("--keep-eyes" in out) == (name[0] not in "yp")
-
-
-def test_reflectance_models_are_named_and_files_are_there() -> None:
-    assert EvaluateOptions(Path("out"), reflectance=("prt", "field")).has_field
-    assert not EvaluateOptions(Path("out"), reflectance=("prt",)).has_field
-    with pytest.raises(UsageError, match="no such file"):
-        EvaluateOptions(Path("out"), against=(NamedCheckpoint.parse("none.safetensors"),)).check()
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,23 @@ import pytest
 from facerf_cli.capture.yale_b import Flash
 from facerf_cli.evaluation import people, yale_b
 from facerf_cli.evaluation.measure import SOURCE
+from facerf_cli.evaluation.people import Bench, Reading
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.network.files import BEST, SHIPPED
-from facerf_cli.work import evaluate_items
-from facerf_cli.work.evaluation_settings import FaceSettings
+from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
+from facerf_cli.work import evaluate
 from tests.capture.yale_fixture import write_pgm, write_yale_b
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
 
 Said = pytest.CaptureFixture[str]
 FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
+
+
+def bench(*methods: Any) -> Bench:
+    return Bench(methods, (), Reading(SHIPPED_NETWORKS.people, Sides(256, 512), "landmarks"), iter)
 
 
 @pytest.fixture
@@ -34,7 +39,7 @@ def folder(tmp_path: Path) -> Path:
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    monkeypatch.setattr(evaluate_items, "methods_of", lambda _: (Lambert("field", models),))
+    monkeypatch.setattr(evaluate, "bench_of", lambda *_: bench(Lambert("field", models)))
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("overhead",))
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
@@ -77,17 +82,17 @@ def test_an_own_field_is_measured_alone_or_its_row_names_both(
     run.mkdir()
     save_toy_checkpoint(run / "best.safetensors")
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    named = evaluate_items.methods_of
+    named = evaluate.methods_of
 
-    def toys(settings: FaceSettings) -> tuple[Lambert, ...]:
-        asked.append([method.name for method in named(settings)])
-        return tuple(Lambert(name, models) for name in asked[-1])
+    def toys(*options: Any) -> Bench:
+        asked.append([method.name for method in named(*options)])
+        return bench(*(Lambert(name, models) for name in asked[-1]))
 
-    monkeypatch.setattr(evaluate_items, "methods_of", toys)
+    monkeypatch.setattr(evaluate, "bench_of", toys)
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ())
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ())
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
-    evaluate = ["evaluate", "yale-b", str(folder), "-o", str(out), "--subjects", "yaleB07"]
+    line = ["evaluate", "yale-b", str(folder), "-o", str(out), "--subjects", "yaleB07"]
     lines: list[tuple[list[str], list[str], dict[str, Path]]] = [
         ([], ["portrait"], {"Reflectance Network": SHIPPED["reflectance"]}),
         (["--checkpoint", str(run)], ["field"], {"Reflectance Network": run / BEST}),
@@ -103,7 +108,7 @@ def test_an_own_field_is_measured_alone_or_its_row_names_both(
         ),
     ]
     for options, names, files in lines:
-        assert main([*evaluate, *options]) == 0
+        assert main([*line, *options]) == 0
         summary = json.loads((out / "summary.json").read_text())
         networks = {title: one["sha256"] for title, one in summary["networks"].items()}
         assert asked[-1] == summary["methods"] == names
@@ -135,33 +140,6 @@ def test_no_table_without_a_subject(folder: Path, tmp_path: Path, capsys: Said) 
     said = capsys.readouterr()
     assert "84 x 96 pixels, not 168 x 192" in said.err and "Traceback" not in said.err
     assert (out / "cases" / "yaleB07.json").is_file() and not (out / "summary.json").exists()
-
-
-@pytest.mark.parametrize(
-    ("line", "code", "complaint"),
-    [
-        (["nowhere"], 1, "no such folder"),
-        (["."], 1, "no folders yaleB01"),
-        (["yale", "--subjects", "yaleB07,yaleB99"], 2, "--subjects yaleB99: not in"),
-        (["yale", "--shifts", "shifts.csv"], 1, "shifts.csv: no such file"),
-        (["yale", "--compare", "nowhere"], 2, "no such folder"),
-        (["yale", "--keep-eyes"], 2, "no such option"),
-        (["yale", "--preset", "paper"], 2, "no such option"),
-    ],
-)
-def test_bad_lines(
-    folder: Path,
-    tmp_path: Path,
-    capsys: Said,
-    monkeypatch: pytest.MonkeyPatch,
-    line: list[str],
-    code: int,
-    complaint: str,
-) -> None:
-    monkeypatch.chdir(folder.parent)
-    assert main(["evaluate", "yale-b", *line, "-o", str(tmp_path / "out")]) == code
-    said = capsys.readouterr().err
-    assert complaint in said.lower().replace("yaleb", "yaleB") and len(said.splitlines()) == 1
 
 
 def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) -> None:

@@ -3,19 +3,18 @@
 import csv
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.options import EvaluateOptions, Measures, NamedCheckpoint
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, configure_logging
-from facerf_cli.work.photo_options import PhotoOptions
 from tests.evaluation.toy_protocol import (
     HEIGHT,
     NOISE,
@@ -95,7 +94,7 @@ def test_an_item_whose_input_changed_is_measured_again(tmp_path: Path) -> None:
     def asked() -> list[str]:
         for note in notes.iterdir():
             note.unlink()
-        assert evaluation(out, Toy(notes=notes), compare=(theirs,)).run(inputs) == 0
+        assert evaluation(out, Toy(notes=notes), inputs, compare=(theirs,)).run() == 0
         return sorted(note.stem for note in notes.iterdir())
 
     inputs = items(out)
@@ -150,7 +149,7 @@ def test_images_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path) -
 
 
 def test_images_and_summary_name_the_face_model(tmp_path: Path) -> None:
-    assert evaluate(tmp_path, photo=PhotoOptions(Settings()), pictures=True) == 0
+    assert replace(evaluation(tmp_path, pictures=True), face_model=load_face_model).run() == 0
     licence = load_face_model().licence
     guess = read_image(tmp_path / "pictures/good/bea/02.exr").metadata
     assert (guess["facerf:face_model"], guess["facerf:face_model_licence"]) == ("builtin", licence)
@@ -189,9 +188,9 @@ def test_two_methods_of_one_name(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="two methods have the name 'field'"):
         options.check()
     with pytest.raises(UsageError, match="nothing to evaluate"):
-        evaluation(tmp_path).run([])
+        evaluation(tmp_path, inputs=[]).run()
 
 
-def test_the_work_goes_to_other_processes() -> None:
-    work = evaluation(Path("out"))
+def test_the_work_goes_to_other_processes(tmp_path: Path) -> None:
+    work = evaluation(tmp_path / "out")
     assert pickle.loads(pickle.dumps(work)) == work

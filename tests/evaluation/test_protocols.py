@@ -4,7 +4,6 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,9 +16,7 @@ from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people
-from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.people import DatasetPerson, Reading, SourceFace, compare_people
-from facerf_cli.evaluation.protocols import (
+from facerf_cli.evaluation.comparisons import (
     COMPOSITE,
     FULL,
     LAMBERT,
@@ -33,7 +30,10 @@ from facerf_cli.evaluation.protocols import (
     transfer,
     turn_class,
 )
-from facerf_cli.evaluation.selection import choose_olats, couples_of, evenly
+from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.people import DatasetPerson, Reading, compare_people
+from facerf_cli.evaluation.selection import couples_of, evenly, olat_pairs
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.morphable import load_face_model
@@ -69,6 +69,7 @@ def pair(index: int, source: str, target: str, light: int, envmap: str = "a") ->
     return Pair("0000", index, "test", source, envmap, 0.0, 0, target, light)
 
 
+PAPER = EvaluateOptions(Path("out"), preset="paper")
 FACE_ONLY = FaceModelOnly(load_face_model())
 
 
@@ -77,7 +78,7 @@ def unlit(gain: float = 1.0, models: FaceModelOnly = FACE_ONLY) -> Double:
 
 
 def olats(person: DatasetPerson, pairs: list[Pair], methods: list[Double]) -> Iterator[Comparison]:
-    return compare_people(person, [(pair,) for pair in pairs], partial(compare_olats, methods=methods))
+    return compare_people(person, [(pair,) for pair in pairs], compare_olats, methods)
 
 
 def side_light(person: DatasetPerson, camera: str) -> int:
@@ -125,16 +126,15 @@ def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: DatasetP
     asked = pair(0, "C0", "C0", 0)
     image = person.source(asked)
     truth = np.eye(3), np.array([[0.0, 0, 0], [5, 5, 5], [1, 1, 1]])
-    face = person.face_of(asked)
+    face = person.portrait(asked)
     assert face.origin is not None
     lit: Any = SimpleNamespace(light=lambda _: truth)
     (found,) = reconstruct([replace(face, origin=(lit, asked))], [unlit(0.5)])
-    portrait = face.portrait
     error = si_mse(found.predictions["unlit"], image, found.mask)
     assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
     assert np.array_equal(brightest(*truth), [0, 1, 0]) and BRIGHTEST.tolist() == [0, 0, 1]
-    np.testing.assert_allclose(found.landmarks_px, portrait.by(FACE_ONLY).fit.landmarks_px)
+    np.testing.assert_allclose(found.landmarks_px, face.by(FACE_ONLY).fit.landmarks_px)
 
 
 def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> None:
@@ -142,13 +142,13 @@ def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> No
     sides = []
     for camera in ("C0", "C1"):
         asked = pair(0, camera, camera, 0)
-        sides.append(SourceFace(Case(f"by {camera}", "0000"), person.portrait(asked)))
+        sides.append(replace(person.portrait(asked), case=Case(f"by {camera}", "0000")))
     first, second = transfer(sides, [method])
     assert first.case.name == "by C0_by_by C1"
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
     assert torch.equal(light_of_a[0], a.light.weights)
-    heads = [side.portrait.by(FACE_ONLY).head for side in sides]
+    heads = [side.by(FACE_ONLY).head for side in sides]
     fits = [head.fit for head in heads]
     torch.testing.assert_close(turn @ fits[1].rotation, fits[0].rotation)
     assert first.truth is heads[0].cropped and first.source is heads[1].cropped
@@ -172,9 +172,8 @@ def test_the_mean_face_is_compared_where_both_see_the_face(
 ) -> None:
     person = found_by_truth(dataset, monkeypatch)
     mean = FaceModelOnly(FACE_ONLY.face.pose_only())
-    face = person.face_of(pair(0, "C1", "C1", 0))
-    portrait = face.portrait
-    views = [portrait.by(models) for models in (FACE_ONLY, mean)]
+    face = person.portrait(pair(0, "C1", "C1", 0))
+    views = [face.by(models) for models in (FACE_ONLY, mean)]
     assert views[0].fit.alpha.any() and not views[1].fit.alpha.any()
     forms = [unlit()], [unlit(models=mean)]
     (found,) = reconstruct([face], fitted_and_mean(*forms), with_light=False)
@@ -280,11 +279,11 @@ def test_images_without_a_face_are_left_out_and_named(
 
 
 def test_any_other_trouble_with_a_source_is_an_error(person: DatasetPerson) -> None:
-    def compare(_: object) -> list[Comparison]:
+    def compare(*_: object) -> list[Comparison]:
         raise InputError("damaged")
 
     with pytest.raises(InputError, match="damaged"):
-        list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare))
+        list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare, []))
 
 
 def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
@@ -312,8 +311,8 @@ def test_couples_are_of_two_cameras_and_two_maps_and_each_image_is_in_one() -> N
 
 def test_a_preset_takes_the_first_of_each_before_the_second_of_any() -> None:
     groups = {"a": [1, 2, 3, 4], "b": [5], "c": [6, 7]}
-    assert evenly(groups, 4) == {"a": [1, 2], "b": [5], "c": [6]}
-    assert evenly(groups, 99) == groups and evenly(groups, 1) == {"a": [1]}
+    assert evenly(groups, 4, "") == {"a": [1, 2], "b": [5], "c": [6]}
+    assert evenly(groups, 99, "") == groups and evenly(groups, 1, "") == {"a": [1]}
 
 
 def test_the_papers_pairs_are_of_its_maps_and_as_many_as_there_are(caplog: pytest.LogCaptureFixture) -> None:
@@ -322,12 +321,12 @@ def test_the_papers_pairs_are_of_its_maps_and_as_many_as_there_are(caplog: pytes
         name: [replace(pair(i, "C0", cameras[i % 3], 0, f"m{i % 200}"), subject=name) for i in range(12_000)]
         for name in ("a", "b")
     }
-    chosen = [one for groups in choose_olats(many, 1, preset=True).values() for (one,) in groups]
+    chosen = [one for groups in olat_pairs(many, PAPER).values() for (one,) in groups]
     same = sum(one.source_camera == one.target_camera for one in chosen)
     assert (same, len(chosen) - same) == (3900, 8100) and not caplog.messages
     assert {one.envmap for one in chosen} == {f"m{n}" for n in range(160)}
     few = {name: members[:30] for name, members in many.items()}
-    assert sum(map(len, choose_olats(few, 1, preset=True).values())) == 60
+    assert sum(map(len, olat_pairs(few, PAPER).values())) == 60
     assert any("60" not in line and "20 pairs of the same pose" in line for line in caplog.messages)
 
 

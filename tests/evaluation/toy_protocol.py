@@ -10,19 +10,14 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.options import Chosen, EvaluateOptions
+from facerf_cli.evaluation.protocols import Protocol
+from facerf_cli.evaluation.run import Evaluation
 from facerf_cli.evaluation.summary import Layout, published
-from facerf_cli.work.evaluate import Evaluation
-from facerf_cli.work.photo_options import PhotoOptions
 
 PEOPLE = ("anna", "bea", "carl")
 LAYOUT = Layout(
-    "toy",
-    "Toy <images> & more",
-    ("si_mse", "psnr", "light_error_deg"),
-    ("pose", "angle"),
-    published("olat"),
-    ("A note with a <b>tag</b>.",),
+    "Toy <images> & more", ("si_mse", "psnr", "light_error_deg"), ("pose", "angle"), published("olat")
 )
 HEIGHT, WIDTH = 36, 48
 NOISE = {"good": 0.02, "bad <i>": 0.1}
@@ -38,13 +33,27 @@ class Toy:
     cases: int = 4
     notes: Path | None = field(default=None, metadata=NOT_IN_RECIPE)
 
-    def __call__(self, item: Item) -> Iterator[Comparison]:
-        if self.notes is not None:
-            (self.notes / f"{item.name}.asked").touch()
-            if (self.notes / f"{item.name}.broken").exists():
-                raise InputError(f"{item.input_path}: is broken")
-        for number in range(self.cases):
-            yield comparison(item.name, number)
+
+def compare(options: EvaluateOptions, bench: object, content: tuple[Toy, Item]) -> Iterator[Comparison]:
+    toy, item = content
+    if toy.notes is not None:
+        (toy.notes / f"{item.name}.asked").touch()
+        if (toy.notes / f"{item.name}.broken").exists():
+            raise InputError(f"{item.input_path}: is broken")
+    for number in range(toy.cases):
+        yield comparison(item.name, number)
+
+
+def notes(options: EvaluateOptions, chosen: Chosen) -> list[str]:
+    return ["A note with a <b>tag</b>."]
+
+
+def choose(options: EvaluateOptions, inputs: object) -> Chosen:
+    return Chosen({})
+
+
+# Its name is that of a protocol with published figures.
+PROTOCOL = Protocol("olat", choose, compare, LAYOUT, notes)
 
 
 def comparison(person: str, number: int) -> Comparison:
@@ -75,23 +84,14 @@ def items(output: Path, people: tuple[str, ...] = PEOPLE) -> list[Item]:
     return [Item(folder / person, output / person, person) for person in people]
 
 
-def evaluate(
-    output: Path,
-    toy: Toy | None = None,
-    layout: Layout = LAYOUT,
-    photo: PhotoOptions | None = None,
-    **options: object,
-) -> int:
-    return evaluation(output, toy, layout, photo, **options).run(items(output))
+def evaluate(output: Path, toy: Toy | None = None, **options: object) -> int:
+    return evaluation(output, toy, **options).run()
 
 
 def evaluation(
-    output: Path,
-    toy: Toy | None = None,
-    layout: Layout = LAYOUT,
-    photo: PhotoOptions | None = None,
-    **options: object,
+    output: Path, toy: Toy | None = None, inputs: list[Item] | None = None, **options: object
 ) -> Evaluation:
     given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
     toy = toy or Toy()
-    return Evaluation(layout, toy, (toy,), given, Settings(), photo=photo)
+    chosen = Chosen({item: (toy, item) for item in (items(output) if inputs is None else inputs)})
+    return Evaluation(PROTOCOL, chosen, given, Settings(), dict, toy)  # type: ignore[arg-type]

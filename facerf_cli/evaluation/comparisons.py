@@ -1,0 +1,203 @@
+"""The comparisons of the paper's tables: images that methods predict of faces, and the truths.
+
+- `compare_olats` (Tables 1 and 3): single lights of held-out people. The source of each pair of a dataset is
+  a user's photo: the face is found in it, fitted or regressed, and relit by one light of the target camera's
+  stack. The image is the rendered face alone; in the same pose the photo with its face relit by the first
+  method, the image of `facerf relight`, has a row of its own.
+- `reconstruct` (Table 2, and 4 with the fitted and the mean face): photos explained by a method's reflectance
+  and light, and rendered again, the face alone.
+- `transfer` (Table 2): two images of one person with their reflectances exchanged, so that a reflectance is
+  measured where it was not read.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import PurePosixPath
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.evaluation.measure import Comparison
+from facerf_cli.evaluation.people import HeadView, Method, Portrait, common_mask
+from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.image.colour import luminance
+from facerf_cli.image.metrics import light_error_deg, tone_drift_deg
+from facerf_cli.light.sphere import direction_to_azel
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.relighting.composition import Composition, Relit, Target
+from facerf_cli.relighting.models import Models
+
+LAMBERT = "lambert"  # the source's texture under the cosine of the light: the least a method must beat
+COMPOSITE = "composite"  # the first method's face back in its photo, with its detail
+FULL, MEAN = "all components", "mean face"  # the forms of Table 4
+LIGHTS_DEG = (0, 30, 60, 90, 180)  # between a light and the camera's axis
+TURNS_DEG = (0, 30, 60, 180)  # of the head, from the source's pose to the target's
+_NO_TURN_DEG = 0.5
+_NEAR_AXIS_DEG = 25.0  # lights that show the skin's colour rather than its shape
+
+
+@torch.no_grad()
+def compare_olats(faces: Sequence[Portrait], methods: Sequence[Method]) -> Iterator[Comparison]:
+    """A source: each method's image under the target's light next to the stack's own, unclipped."""
+    (face,) = faces
+    assert face.origin is not None
+    person, pair = face.origin
+    light = torch.from_numpy(person.header(pair.target_camera).directions[pair.target_light]).float()
+    lights = Lights.each(light[None])
+    same = pair.source_camera == pair.target_camera
+    target = face if same else person.lit(pair.target_camera)
+    predictions, views = {}, []
+    for method in methods:
+        view = target.pose_of(face.by(method.models), method.models)
+        predictions[method.name] = next(method.images(None, view.head, lights, Target(view.fit, "face")))
+        views.append(view)
+    first = views[0]
+    predictions[LAMBERT] = _lambert(methods[0].models, light, first)
+    if same:  # the image of `facerf relight`, cropped as the truth is
+        whole = next(methods[0].images(face.photo.pixels, first.head, lights, Target()))
+        predictions[COMPOSITE] = first.fit.crop.apply(whole)
+    stack = person.dataset.stack_path(pair.subject, pair.target_camera)
+    truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
+    pose = "same pose" if same else "different pose"
+    comparison = Comparison(
+        replace(face.case, facts={"pose": pose, **_angles(light, first), **face.case.facts}),
+        first.fit.crop.apply(truth.permute(1, 2, 0).numpy()),
+        common_mask(views),
+        predictions,
+        source=first.head.cropped,
+        landmarks_px=target.by(methods[0].models).head.landmarks_px,
+        source_face=face.by(methods[0].models).face,
+    )
+    yield _with_drift(comparison, person.albedo, first.region("skin"))
+
+
+def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:
+    """The source's texture under the cosine of a light [3], rendered in the target's crop."""
+    head = view.head
+    turn = head.fit.turn_to(view.fit.rotation)
+    cosine = torch.einsum("c,cd,dij->ij", light, turn, head.face.normals).clamp_min(0)
+    composition = Composition(models.face, None, head, Target(view.fit, "face"))
+    return composition.image(Relit(head.face.texture * cosine)).pixels
+
+
+def _angles(light: Tensor, view: HeadView) -> dict[str, str | float]:
+    """Facts on the direction of the light and the turn of the head from the source's pose."""
+    turn_deg = angle_of(view.head.fit.turn_to(view.fit.rotation))
+    angle_deg = float(torch.rad2deg(light[2].clamp(-1, 1).acos()))
+    azimuth_deg, elevation_deg = direction_to_azel(light)
+    return {
+        "angle": angle_class(angle_deg),
+        "turn": turn_class(turn_deg),
+        "turn_deg": turn_deg,
+        "angle_deg": angle_deg,
+        "azimuth_deg": float(azimuth_deg),
+        "elevation_deg": float(elevation_deg),
+    }
+
+
+def _with_drift(comparison: Comparison, albedo: np.ndarray | None, skin: np.ndarray) -> Comparison:
+    """Add the drift of the skin tone (ITA on true albedo) if the light is near the camera's axis."""
+    near = float(comparison.case.facts["angle_deg"]) <= _NEAR_AXIS_DEG
+    if albedo is None or not near:
+        return comparison
+    extra = {}
+    for name, image in comparison.predictions.items():
+        drift = tone_drift_deg(image, comparison.truth, skin * comparison.mask, albedo)
+        if drift is not None:
+            extra[name] = {"tone_drift_deg": abs(drift), "tone_shift_deg": drift}
+    return replace(comparison, extra=extra)
+
+
+@torch.no_grad()
+def reconstruct(
+    faces: Sequence[Portrait], methods: Sequence[Method], with_light: bool = True
+) -> Iterator[Comparison]:
+    """A portrait's crop next to each method's reconstruction, where all of them show the face.
+
+    Where the true light is known, each has the error of its brightest direction, `with_light`. The methods
+    of Table 4 are fitted to the same landmarks, or regressed from the same crop.
+    """
+    (face,) = faces
+    truth = face.origin[0].light(face.origin[1]) if face.origin and with_light else None
+    predictions, views, extra = {}, [], {}
+    for method in methods:
+        view = face.by(method.models)
+        explained = method.explained(view.head)
+        light, target = explained.light, Target(composite="face")
+        predictions[method.name] = method.image(view.head, explained.reflectance, light, target)
+        views.append(view)
+        if truth is not None:
+            estimated = brightest(light.directions.numpy(), light.weights.numpy())
+            extra[method.name] = {"light_error_deg": light_error_deg(estimated, brightest(*truth))}
+    head = views[0].head
+    yield Comparison(
+        face.case, head.cropped, common_mask(views), predictions, head.cropped, head.landmarks_px, extra=extra
+    )
+
+
+def brightest(directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The direction [3] of the light of the largest luminance, of directions [L, 3] and weights [L, 3]."""
+    return np.asarray(directions[luminance(weights).argmax()])
+
+
+def fitted_and_mean(fitted: Sequence[Method], mean: Sequence[Method]) -> tuple[Method, ...]:
+    """The methods of Table 4; a row has the name of the form, and its method's if there are many."""
+    return tuple(
+        replace(method, name=form if len(methods) == 1 else f"{form}, {method.name}")
+        for form, methods in ((FULL, fitted), (MEAN, mean))
+        for method in methods
+    )
+
+
+@torch.no_grad()
+def transfer(faces: Sequence[Portrait], methods: Sequence[Method]) -> Iterator[Comparison]:
+    """Both images, each rendered from its own light and the other's reflectance.
+
+    The same method estimates that light with the image's own reflectance.
+    """
+    views = [[face.by(method.models) for method in methods] for face in faces]
+    explained = [
+        [method.explained(view.head) for method, view in zip(methods, of_face, strict=True)]
+        for of_face in views
+    ]
+    for own, other in ((0, 1), (1, 0)):
+        predictions = {}
+        for number, method in enumerate(methods):
+            head, reflectance = views[other][number].head, explained[other][number].reflectance
+            light, target = explained[own][number].light, Target(views[own][number].fit, "face")
+            predictions[method.name] = method.image(head, reflectance, light, target)
+        first, source = views[own][0].head, views[other][0].head
+        turn_deg = angle_of(source.fit.turn_to(first.fit.rotation))
+        case = faces[own].case
+        name = f"{case.name}_by_{PurePosixPath(faces[other].case.name).name}"
+        facts = {**case.facts, "turn": turn_class(turn_deg), "turn_deg": turn_deg}
+        yield Comparison(
+            replace(case, name=name, facts=facts),
+            first.cropped,
+            common_mask(views[own]),
+            predictions,
+            source.cropped,
+            first.landmarks_px,
+            views[other][0].face,
+        )
+
+
+def angle_of(rotation: Tensor) -> float:
+    """The angle in degrees of a rotation [3, 3]."""
+    return float((((rotation.trace() - 1) / 2).clamp(-1, 1).acos()).rad2deg())
+
+
+def angle_class(angle_deg: float) -> str:
+    """'0 to 30 deg' and so on, of the angle between a light and the camera's axis."""
+    return _class(angle_deg, LIGHTS_DEG)
+
+
+def turn_class(angle_deg: float) -> str:
+    """'none', '0 to 30 deg' and so on, of the angle by which a head is turned."""
+    return "none" if angle_deg < _NO_TURN_DEG else _class(angle_deg, TURNS_DEG)
+
+
+def _class(angle_deg: float, edges_deg: tuple[int, ...]) -> str:
+    return next(f"{low} to {high} deg" for low, high in pairwise(edges_deg) if angle_deg <= high)
