@@ -84,5 +84,6 @@ def _error(ours: np.ndarray, true: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def _fitted(display: np.ndarray, size_px: tuple[int, int]) -> Image.Image:
     """An image [h, w, 3] or [h, w] in 0..1, resized to fit into a tile and centred on it."""
     data = (np.clip(np.nan_to_num(display), 0, 1) * 255 + 0.5).astype(np.uint8)
-    grey = (round(255 * _OUTSIDE),) * 3
-    return ImageOps.pad(Image.fromarray(data).convert("RGB"), size_px, Image.Resampling.LANCZOS, grey)
+    image, grey = Image.fromarray(data).convert("RGB"), (round(255 * _OUTSIDE),) * 3
+    method = Image.Resampling.LANCZOS if image.width > size_px[0] else Image.Resampling.BICUBIC
+    return ImageOps.pad(image, size_px, method, grey)
