@@ -14,10 +14,10 @@ _REACH_PX = 2  # of the linear functions of colour by which a matte is enlarged
 _SMOOTHNESS = 1e-5  # variance of colours, sRGB in 0..1, below which the matte is smoothed
 _COLOURS_PX = 512  # longest side at which they are found
 _COLOUR_REACH = (0.03, 0.006)  # of the means of colours, one after the other, in longest sides
-# Depths inside the outline from which a person begins to hide all, and hides all; in pixels of the classes.
-_SOLID_PX = (1.0, 3.0)
-_CLEAR_PX = (1.0, 4.0)  # distances outside it from which a person begins to be absent, and is
-_LOOSE_PX = 7  # side of the square around a pixel in which hair leaves its matte as it is
+_SURE = (0.05, 0.93)  # alpha up to which a person is absent, and from which on it hides all
+_OUTLINE_PX = 768  # longest side at which distances from the outline are measured
+_SOLID_PX = (1.0, 3.0)  # distances from it over which a person comes to hide all, and to be absent
+_LOOSE_PX = 7  # side of the square around a pixel of the classes in which hair leaves its matte as it is
 _LEFT = 0.7  # of the background nearby, that a mixture holds at least
 _TINY = 1e-5
 
@@ -63,18 +63,20 @@ def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
     """A matte [H, W] that is 1 inside its outline and 0 outside, but for a share [h, w] of loose hair.
 
     Skin and cloth hide what is behind them, and end at their outline. But a jaw that shines in the light of
-    the background has a colour between both, and of a dark background a matte holds a haze.
+    the background has a colour between both, and of a dark background a matte holds a haze. In hair, too,
+    what is nearly sure is sure: a hundredth of a bright wall shows as speckles on a dark suit.
     """
-    inside = shrunk(matte, (loose.shape[0], loose.shape[1])) > 0.5
-    tight = 1 - maximum_filter(loose, _LOOSE_PX)
-    full, none = (
-        ((distance_transform_edt(part) - first) / (last - first)).clip(0, 1) * tight
-        for part, (first, last) in ((inside, _SOLID_PX), (~inside, _CLEAR_PX))
-    )
+    size, (first, last) = fitted(matte.shape[0], matte.shape[1], _OUTLINE_PX), _SOLID_PX
+    inside = shrunk(matte, size) > 0.5
+    tight = 1 - enlarged(maximum_filter(loose, _LOOSE_PX)[None], size)[0]
+    deep = [
+        ((distance_transform_edt(part) - first) / (last - first)).clip(0, 1) for part in (inside, ~inside)
+    ]
     found = np.empty_like(matte)
     for rows in strips(matte.shape):
-        filled, cleared = enlarged(np.stack([full, none]), matte.shape, rows)
-        found[rows] = (matte[rows] + filled * (1 - matte[rows])) * (1 - cleared)
+        filled, cleared = enlarged(np.stack(deep) * tight, matte.shape, rows)
+        sure = ((matte[rows] - _SURE[0]) / (_SURE[1] - _SURE[0])).clip(0, 1)
+        found[rows] = (sure + filled * (1 - sure)) * (1 - cleared)
     return found
 
 
