@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import (
+    binary_propagation,
     distance_transform_edt,
     gaussian_filter,
     gaussian_gradient_magnitude,
@@ -36,6 +37,8 @@ _SIDES, _BELOW, _FILLED, _WEIGHT = (2.2, 3.5, 6.0), 0.06, 0.3, 8.0
 _RIM = 0.12  # of a square, in its sides, over which its weight rises
 _VETO = 0.8  # of the Parsing Network, where it sees less of a person below the eyes
 _HAIR_BAND, _BODY_BAND = 0.05, 0.014  # half widths of the outline that is solved, in heights of the head
+_MAYBE, _DIM = 0.15, 0.3  # least share of a flat part, and its least brightness
+_FLAT = 0.015  # its largest change over a pixel, as a share of the brightness
 _HOLE = 0.12  # side of holes that are filled, in heights of the head
 _BODY_SIDES, _BODY_BELOW = 5.5, 1.6  # square of the first look at a body, in heights of the head
 _CLAIM, _LEAD = 0.6, 0.5  # a body claims a pixel from here on, where the next one's is below this part of it
@@ -118,7 +121,8 @@ def matte_of(share: np.ndarray, image_srgb: np.ndarray, landmarks_px: np.ndarray
     size = fitted(height, width, most_px)
     image = shrunk(image_srgb, size) / np.float32(255)
     scaled = head.scaled(max(size) / longest_px)
-    expected, unknown = outline(np.asarray(enlarged(share[None], size)[0]).clip(0, 1), scaled)
+    whole = with_flat_parts(np.asarray(enlarged(share[None], size)[0]).clip(0, 1), image, scaled)
+    expected, unknown = outline(whole, scaled)
     alpha = solve_matte(image, expected, unknown)
     alpha = solved_before_plain_background(alpha, srgb_to_linear(image))
     return alpha if size == (height, width) else lifted(alpha, image, image_srgb)
@@ -194,6 +198,20 @@ def part_of_first(
     owner = watershed_ift(cost, seeds.astype(np.int16))
     soft = max(1.0, 0.01 * float(np.mean([head.height_px for head in heads])))
     return np.asarray(gaussian_filter((owner == 1).astype(np.float32), soft))
+
+
+def with_flat_parts(share: np.ndarray, image: np.ndarray, head: HeadPlace) -> np.ndarray:
+    """A share [h, w] that is 1 where a part of the person above the eyes goes on in an image [h, w, 3].
+
+    Networks take a tall hat's crown for the background, but no outline crosses a plain surface; in the dark
+    none is seen. What the outline's band reaches is solved there.
+    """
+    person, light = share > 0.5, image.mean(2)
+    above = (np.arange(len(share))[:, None] < head.y_px) & (head.distance(share.shape) < 2)
+    flat = (light > _DIM) & (gaussian_gradient_magnitude(light, 1.0) < _FLAT * light)
+    more = binary_propagation(person, mask=person | (flat & above & (share > _MAYBE))) & ~person
+    deep = more & (distance_transform_edt(~person) > _HAIR_BAND * head.height_px)
+    return np.where(binary_propagation(deep, mask=more), np.float32(1), share)
 
 
 def outline(share: np.ndarray, head: HeadPlace) -> tuple[np.ndarray, np.ndarray]:

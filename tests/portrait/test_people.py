@@ -12,6 +12,7 @@ from facerf_cli.portrait.people import (
     outline,
     part_of_first,
     person_among,
+    with_flat_parts,
 )
 from tests.portrait.seen import white_people
 
@@ -98,6 +99,19 @@ def test_the_parsing_network_takes_away_below_the_eyes_alone() -> None:
     image = np.where(disc(160, 70, 55)[..., None], 1.0, 0.3).repeat(3, -1).astype(np.float32)
     share = person_among(white_people(), image, HEAD, [], np.zeros(image.shape[:2])).person
     assert share[30, 160] > 0.9 and share[100, 160] < 0.3
+
+
+def test_a_plain_hat_goes_on_to_its_edge_and_what_lies_below_the_eyes_or_in_the_dark_does_not() -> None:
+    """Networks are sure of the lower half of a white hat and unsure of all around the head."""
+    hat, wall = disc(160, 40, 30), np.full((240, 320), 0.3)
+    share = np.where(disc(160, 70, 20) | (hat & (np.arange(240)[:, None] > 35)), 0.9, wall)
+    image = np.where(hat[..., None], 0.9, np.array([0.1, 0.2, 0.3]))
+    found = with_flat_parts(share, image, HEAD)
+    deep = disc(160, 40, 27)
+    assert (found[deep] > 0.8).all() and (found[~disc(160, 40, 33)] == share[~disc(160, 40, 33)]).all()
+    for other in (HeadPlace(160, -40, 60, 0), HEAD):
+        darker = image if other is not HEAD else image * 0.2
+        assert np.array_equal(with_flat_parts(share, darker, other), share)
 
 
 def test_what_is_not_joined_to_the_face_is_nobody_and_small_holes_are_filled() -> None:
