@@ -31,7 +31,7 @@ class Finding:
     """
 
     severity: Severity
-    check: str  # name of the check, such as 'missing' or 'unlit'
+    check: str  # name of the check, such as 'missing' or 'order'
     subject: str
     words: str
     camera: str = ""

@@ -20,7 +20,7 @@ def capture(tmp_path: Path) -> Capture:
 
 
 def broken(light: str, severity: Severity = "error") -> Finding:
-    return Finding(severity, "unlit", "yaleB05", "is dark", "P00", light)
+    return Finding(severity, "fields", "yaleB05", "is dark", "P00", light)
 
 
 def test_everything_is_there(capture: Capture) -> None:
@@ -30,22 +30,22 @@ def test_everything_is_there(capture: Capture) -> None:
 
 
 def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None:
-    missing, marked, unlit, sound, another = capture.light_ids[1:6]
+    missing, marked, woven, sound, another = capture.light_ids[1:6]
     gone, bad = (capture.frame_path("yaleB05", "P00", light) for light in (missing, marked))
     content = gone.read_bytes()
     gone.unlink()
     bad.rename(bad.with_name(bad.name + ".bad"))
     capture = read_yale_capture(capture.folder)
     assert capture.marked == {"yaleB05": frozenset({marked})} and len(capture.light_ids) == 13
-    findings = [broken(unlit), broken(sound, "warning")]
+    findings = [broken(woven), broken(sound, "warning")]
     chosen = select_frames(capture, "yaleB05", findings)
     assert chosen.lights == (0, *range(4, 13))
     assert chosen.left_out == {
         missing: "P00: missing",
         marked: "P00: marked as damaged",
-        unlit: "P00: unlit",
+        woven: "P00: fields",
     }
-    assert chosen.in_words() == f"2 lights left out ({missing}: P00: missing; {unlit}: P00: unlit)"
+    assert chosen.in_words() == f"2 lights left out ({missing}: P00: missing; {woven}: P00: fields)"
     assert chosen.missing == (f"P00/{missing}", f"P00/{marked}")
     with pytest.raises(InputError, match=r"yaleB05: 9 of 13 lights .* too few"):
         select_frames(capture, "yaleB05", [*findings, broken(another)])

@@ -42,8 +42,8 @@ def prepare(capture: Path, output: Path, *line: str) -> int:
 
 
 def frame(light: int, subject: str = "0000", camera: str = "C1") -> Finding:
-    words = "is far darker than its neighbours"
-    return Finding("error", "unlit", subject, words, camera, f"L{light:03d}", {"share": 0.1})
+    words = "has rows of two fields"
+    return Finding("error", "fields", subject, words, camera, f"L{light:03d}", {"share": 0.1})
 
 
 ORDER = Finding("error", "order", "0001", "the lamps are in another order", "C0")
@@ -56,7 +56,7 @@ def test_broken_frames_are_left_out_and_errors_stop_their_subject(
     plant(frame(4), ORDER, CLIPPED)
     assert prepare(capture, tmp_path) == 1
     said = capsys.readouterr().err
-    assert "0000: 1 light left out (L004: C1: unlit)" in said
+    assert "0000: 1 light left out (L004: C1: fields)" in said
     assert "0001/C0: order: the lamps are in another order" in said and "subject stopped" in said
     dataset = read_dataset(tmp_path)
     assert dataset.subjects == ("0000",) and 4 not in dataset.lights_of("0000")

@@ -32,7 +32,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.frames import CameraFrames, read_frames
-from facerf_cli.capture.checks.shading import Stereo, fit_stereo, lit_pixels, parabola_vertex
+from facerf_cli.capture.checks.shading import Stereo, fit_stereo, lit_pixels
 from facerf_cli.capture.findings import Finding
 
 # Pixels here are those of the small frames.
@@ -128,9 +128,17 @@ def register(moved: np.ndarray, still: np.ndarray) -> tuple[np.ndarray, float, f
     near = np.roll(correlation, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
     norm = np.sqrt((np.abs(a) ** 2).sum() * (np.abs(b) ** 2).sum()) + 1e-12
     row, column = (int(index) for index in np.unravel_index(near.argmax(), near.shape))
-    px = np.arange(-reach, reach + 1.0)
-    shift = np.array([parabola_vertex(px, near[:, column], row), parabola_vertex(px, near[row], column)])
+    shift = np.array([peak(near[:, column], row), peak(near[row], column)]) - reach
     return shift, float(near[row, column] / norm), float((near[row, column] - near[reach, reach]) / norm)
+
+
+def peak(values: np.ndarray, place: int) -> float:
+    """Refine the place of a maximum of values [N] by a parabola through its neighbours; an end stays."""
+    if not 0 < place < len(values) - 1:
+        return float(place)
+    before, here, after = values[place - 1 : place + 2].tolist()
+    bend = before - 2 * here + after
+    return place + (before - after) / (2 * bend) if bend else float(place)
 
 
 def with_alignment(capture: Capture, subject: str, broken: Mapping[str, set[str]]) -> Capture:

@@ -13,10 +13,6 @@ face; others reach only edges and hair.
 but turn the fitted normals. The visible side of any object faces the camera: normals lean to the right on its
 right side, and slopes from outline to outline cancel, so that the mean normal points to the camera (upward by
 some 30 degrees, because what faces down is dark).
-
-**Display curve.** To find the exponent e for which values^e are linear, photometric stereo is fitted to
-values^e, raised to 1/e and compared with the values. That comparison uses the same values for every e; on
-values^e a low exponent would win by flattening everything.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from facerf_cli.capture.checks.frames import CameraFrames, reaches_face, same_frames
+from facerf_cli.capture.checks.frames import CameraFrames, same_frames
 from facerf_cli.capture.findings import Finding
 
 # Photometric stereo.
@@ -35,15 +31,6 @@ _RIDGE = 1e-3  # keeps the equations of pixels with few weighted frames solvable
 _LEAST_COSINE = 0.15  # of light and normal: at grazing angles a matte surface is a poor model
 _BRIGHT_SHARE = 0.2  # of a pixel's brightest frames: darker ones start as shadow
 _LIT_SHARE = 0.1  # of the brightest pixels: pixels that never get as bright are background
-# Display curve.
-EXPONENTS = np.array([0.35, 0.4, 0.45, 0.55, 0.7, 0.85, 1.0, 1.2, 1.45, 1.8, 2.2, 2.6, 3.0])
-# Linear frames of Extended Yale B's subjects 05, 15 and 22 give 0.85 to 1, synthetic ones 1; encoded by 1/2.2
-# they give 1.7 to 2.4.
-_LINEAR = (0.6, 1.5)
-_CLEAR = 1.25  # least ratio of the error at exponent 1 to the smallest error
-_PIXELS = 600
-_FACING = 0.3  # cosine of light and normal
-_LIT = 0.25  # of a pixel's brightest frame, values as they are
 # Order of lights in front. On Extended Yale B's subjects 05, 15 and 22 and synthetic faces the light of a
 # frame is found to 14 degrees at worst.
 _OFF_DEG = 30.0
@@ -55,12 +42,6 @@ _LIGHT_ITERATIONS = 4
 # subjects of Extended Yale B they point left or right by 5 at most, up by -18 to 14, and lean by 0.9.
 _TURN_DEG, _UP_DEG = 20.0, (-45.0, 75.0)
 _LEAN = 0.3  # correlation of a normal's x with the pixel's x, negative for mirrored lights
-# Lights that did not fire. Sound frames of Extended Yale B's subjects 05, 15 and 22 have 0.77 of their
-# neighbours' gain or more, those of synthetic faces 0.41; a light that did not fire leaves some hundredths.
-_LEAST_GAIN = 0.3
-_REACH = 0.3  # of the best placed lights' radiance: below it, cast shadows and the room dominate
-_NEIGHBOURS = 6
-_BRIGHT_PERCENTILE = 98  # of the pixels, above which gains are measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +52,9 @@ class Stereo:
     room: np.ndarray  # [P] constant light of the room, not negative
     lit: np.ndarray  # [h, w] bool
 
-    def lit_by(self, directions: np.ndarray) -> np.ndarray:
-        """Radiance [L, P] under lights from directions [L, 3], without the room's light and cast shadows."""
-        return np.maximum(directions @ self.g.T, 0)
-
     def predicted(self, directions: np.ndarray) -> np.ndarray:
-        """Predicted frames [L, P] under lights from directions [L, 3]."""
-        return self.lit_by(directions) + self.room
+        """Predicted frames [L, P] under lights from directions [L, 3], without cast shadows."""
+        return np.maximum(directions @ self.g.T, 0) + self.room
 
     @property
     def normals(self) -> np.ndarray:
@@ -121,18 +98,6 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
 
 
-def parabola_vertex(x: np.ndarray, y: np.ndarray, place: int) -> float:
-    """Refine the place of an extremum of samples y [N] at x [N] by a parabola through it and its neighbours.
-
-    Returns x[place] for a sample at an end, or where the three values are equal.
-    """
-    if not 0 < place < len(x) - 1:
-        return float(x[place])
-    slopes = np.diff(y[place - 1 : place + 2]) / np.diff(x[place - 1 : place + 2])
-    bend = (slopes[1] - slopes[0]) / (x[place + 1] - x[place - 1])
-    return float((x[place - 1] + x[place]) / 2 - slopes[0] / (2 * bend)) if bend else float(x[place])
-
-
 def check_duplicates(frames: CameraFrames, stereo: Stereo | None) -> Iterator[Finding]:
     """Report identical frames, except the one of each group whose light predicts the image best.
 
@@ -170,7 +135,7 @@ def check_frames_order(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding
         like = frames.light_ids[int(np.argmax(frames.directions @ found[place]))]
         words = (
             f"is lit from {off_deg[place]:.0f} degrees off its light's direction, as under {like}; correct "
-            "the file's name"
+            "the file's name, or check whether the light fired"
         )
         yield frames.error("order", words, int(rows[place]), off_deg=round(float(off_deg[place]), 1))
 
@@ -188,89 +153,6 @@ def solve_light(image: np.ndarray, stereo: Stereo) -> np.ndarray:
         facing = stereo.normals @ light > 0.15 * np.linalg.norm(light)
         weights = facing / (1 + (residual / (2 * spread + 1e-9)) ** 2)
     return light / max(np.linalg.norm(light), 1e-12)
-
-
-def check_unlit(frames: CameraFrames, stereo: Stereo) -> Iterator[Finding]:
-    """Report each frame with far less of its predicted light than the frames of neighbouring lights have."""
-    expected, gains = measure_gains(frames, stereo)
-    judged = expected > _REACH * np.percentile(expected, 95)
-    judged &= reaches_face(frames.directions)
-    if judged.sum() <= _NEIGHBOURS:
-        return
-    rows = np.flatnonzero(judged)
-    cosines = frames.directions[rows] @ frames.directions[rows].T
-    np.fill_diagonal(cosines, -2)
-    neighbours = rows[np.argsort(-cosines, axis=1)[:, :_NEIGHBOURS]]
-    for row, usual in zip(rows.tolist(), np.median(gains[neighbours], axis=1), strict=True):
-        if gains[row] < _LEAST_GAIN * usual:
-            share = max(float(gains[row] / usual), 0.0)
-            words = f"has {share:.0%} of the light that its neighbours predict; check whether the light fired"
-            mean = float(frames.grey[row].mean())
-            yield frames.error("unlit", words, row, share=round(share, 3), mean=mean)
-
-
-def measure_gains(frames: CameraFrames, stereo: Stereo) -> tuple[np.ndarray, np.ndarray]:
-    """Expected radiance [L] of the brightest pixels under each light, and the measured share of it [L].
-
-    Hair or a hand may hide a light from most of the face, but some pixel, such as the nose's tip, nearly
-    always stays lit.
-    """
-    predicted = stereo.lit_by(frames.directions)
-    seen = frames.grey[:, stereo.lit] - stereo.room
-    bright, expected = (np.percentile(values, _BRIGHT_PERCENTILE, axis=1) for values in (seen, predicted))
-    return expected, bright / np.maximum(expected, 1e-12)
-
-
-def check_gamma(subject: str, curves: Sequence[tuple[float, float]]) -> Iterator[Finding]:
-    """Report one error for a subject whose cameras agree, in the median, that values are not linear.
-
-    `curves` are those of `fit_exponent`.
-    """
-    exponent, worse = np.median(curves, axis=0).tolist() if curves else (1.0, 1.0)
-    if _LINEAR[0] < exponent < _LINEAR[1] or worse < _CLEAR:
-        return
-    words = (
-        f"frames are declared linear, but values to the power {exponent:.1f} explain them {worse:.1f} "
-        "times better; give their colour space"
-    )
-    figures = {"exponent": round(exponent, 2), "times_better": round(worse, 2), "cameras": len(curves)}
-    yield Finding("error", "gamma", subject, words, figures=figures)
-
-
-def fit_exponent(frames: CameraFrames, lit: np.ndarray) -> tuple[float, float] | None:
-    """Fit the exponent that linearises a camera's lit pixels [h, w]; None where too little is lit.
-
-    Returns it, and the ratio of the error at exponent 1 to the smallest error.
-    """
-    values = np.maximum(frames.grey[:, lit].astype(float), 0)
-    step = max(values.shape[1] // _PIXELS, 1)
-    values = values[:, ::step]
-    top = np.percentile(values, 98, axis=0)
-    values = values[:, top > 0] / top[top > 0]
-    used = values > _LIT
-    if len(values) < _LEAST_FRAMES or used.sum() < _PIXELS:
-        return None
-    errors = np.array([_shading_error(values, used, frames.directions, exponent) for exponent in EXPONENTS])
-    place = int(errors.argmin())
-    exponent = parabola_vertex(np.log(EXPONENTS), errors, place)
-    at_one = float(errors[np.argmin(np.abs(EXPONENTS - 1))])
-    return float(np.exp(exponent)), at_one / max(float(errors[place]), 1e-9)
-
-
-def _shading_error(values: np.ndarray, used: np.ndarray, directions: np.ndarray, exponent: float) -> float:
-    """Median error of matte shading on values [L, P] that are scaled to 1."""
-    linear = values**exponent
-    outer = (directions[:, :, None] * directions[:, None]).reshape(len(directions), -1)
-    weights = used.astype(float)
-    for _ in range(_ITERATIONS):
-        matrices = (weights.T @ outer).reshape(-1, 3, 3) + 1e-3 * np.eye(3)
-        g = np.linalg.solve(matrices, ((weights * linear).T @ directions)[..., None])[..., 0]
-        shaded = directions @ g.T
-        residual = np.abs(linear - shaded)
-        spread = 1.48 * np.median(residual, axis=0) + 1e-3
-        weights = (shaded > _FACING * np.linalg.norm(g, axis=1)) / (1 + (residual / (2 * spread)) ** 2)
-    back = np.maximum(shaded, 0) ** (1 / exponent)
-    return float(np.median(np.abs(values - back)[used]))
 
 
 @dataclass(frozen=True)

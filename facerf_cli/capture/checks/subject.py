@@ -19,10 +19,7 @@ from facerf_cli.capture.checks.shading import (
     RigFit,
     check_duplicates,
     check_frames_order,
-    check_gamma,
     check_rigs,
-    check_unlit,
-    fit_exponent,
     fit_stereo,
     measure_rig,
 )
@@ -33,7 +30,6 @@ from facerf_cli.capture.findings import Finding
 class _Cameras:
     """Results of a subject's cameras, which are judged together at the end."""
 
-    curves: list[tuple[float, float]] = field(default_factory=list)
     rigs: list[RigFit] = field(default_factory=list)
     frame_of: dict[str, str] = field(default_factory=dict)  # camera/light by the digest of its pixels
 
@@ -49,7 +45,7 @@ def check_subject(capture: Capture, subject: str, side_px: int = 96) -> list[Fin
     found = [
         one for camera in plain.cameras for one in _check_camera(plain, subject, camera, side_px, cameras)
     ]
-    found += [*check_gamma(subject, cameras.curves), *check_rigs(subject, cameras.rigs)]
+    found += check_rigs(subject, cameras.rigs)
     return sorted(found, key=lambda finding: (finding.severity != "error", finding.leaves_out))
 
 
@@ -70,20 +66,17 @@ def _check_camera(
     found += check_duplicates(frames, stereo)
     if stereo is None:
         return found
-    unlit = list(check_unlit(frames.without(_left_out(found)), stereo))
-    sound = frames.without(_left_out([*found, *unlit]))
+    sound = frames.without(_left_out(found))
     if sound.light_ids != fitted.light_ids:
         stereo = fit_stereo(sound)
     if stereo is None:
-        return [*found, *unlit]
+        return found
     disorder = list(check_frames_order(sound, stereo))
     if any(not one.leaves_out for one in disorder):  # then neither normals nor expected brightness are known
         return [*found, *disorder]
     cameras.rigs.append(measure_rig(camera, stereo))
     ordered = sound.without(_left_out(disorder))
-    if curve := fit_exponent(ordered, stereo.lit):
-        cameras.curves.append(curve)
-    return [*found, *unlit, *disorder, *check_motion(ordered, stereo)]
+    return [*found, *disorder, *check_motion(ordered, stereo)]
 
 
 def _left_out(findings: Iterable[Finding]) -> set[str]:

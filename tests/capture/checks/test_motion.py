@@ -8,8 +8,7 @@ import pytest
 from scipy import ndimage
 
 from facerf_cli.capture.capture import shift_image
-from facerf_cli.capture.checks.motion import align_shifts, head_path, with_alignment
-from facerf_cli.capture.checks.shading import parabola_vertex
+from facerf_cli.capture.checks.motion import align_shifts, head_path, peak, with_alignment
 from facerf_cli.capture.stage_json import read_capture
 from tests.capture.checks.egg_stage import CAMERA, IDS, SUBJECT, directions, images, write_stage
 
@@ -79,13 +78,10 @@ def test_a_camera_that_sees_no_lamp_in_front_is_left_alone(tmp_path: Path) -> No
     assert not align_shifts(behind, SUBJECT, CAMERA, set(IDS[35:]))
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-def test_the_vertex_of_a_parabola_that_is_sampled_unevenly(sign: int) -> None:
-    x = np.array([0.0, 1.0, 1.5, 3.0])
-    y = sign * (x - 1.3) ** 2
-    assert parabola_vertex(x, y, 2) == pytest.approx(1.3)
-    assert parabola_vertex(x, y, 0) == 0.0 and parabola_vertex(x, y, 3) == 3.0
-    assert parabola_vertex(x, np.ones(4), 2) == 1.5
+def test_the_peak_of_a_sampled_parabola() -> None:
+    values = 3 - (np.arange(5.0) - 1.8) ** 2
+    assert peak(values, 2) == pytest.approx(1.8)
+    assert peak(values, 0) == 0.0 and peak(values, 4) == 4.0 and peak(np.ones(4), 2) == 2.0
 
 
 def test_a_path_is_told_from_errors_of_shading_and_from_jumps() -> None:

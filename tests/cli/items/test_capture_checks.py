@@ -9,7 +9,7 @@ from facerf_cli.work.capture_findings import show_findings, summary
 
 STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
 WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")
-UNLIT = [Finding("error", "unlit", "0000", f"has {k} % of the light", "C0", f"L{k:03d}") for k in range(9)]
+FIELDS = [Finding("error", "fields", "0000", f"has {k} fields", "C0", f"L{k:03d}") for k in range(9)]
 
 
 def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:
@@ -23,7 +23,7 @@ def test_no_findings_print_nothing() -> None:
 
 
 def test_what_stops_a_subject_comes_first_and_warnings_last() -> None:
-    text = shown([WARNS, *UNLIT, STOPS])
+    text = shown([WARNS, *FIELDS, STOPS])
     assert text.index("subject stopped", text.index("0001/C0")) < text.index("0000/C0/L000")
     assert text.index("0000/C0/L002") < text.index("the head moves")
     assert "are mirrored [left] to right" in text  # brackets are no markup
@@ -34,17 +34,17 @@ def test_a_log_file_is_no_narrow_terminal() -> None:
 
 
 def test_strict_stops_subjects_whatever_it_is() -> None:
-    assert "warning" not in shown([WARNS, *UNLIT, STOPS], strict=True)
-    assert "left out" not in shown(UNLIT, strict=True)
+    assert "warning" not in shown([WARNS, *FIELDS, STOPS], strict=True)
+    assert "left out" not in shown(FIELDS, strict=True)
 
 
 def test_many_alike_are_counted() -> None:
-    text = shown(UNLIT)
+    text = shown(FIELDS)
     assert "0000/C0/L002" in text and "L003" not in text and "(and 6 more like it)" in text
 
 
 def test_the_summary_counts_what_follows() -> None:
     assert (
-        summary([WARNS, *UNLIT, STOPS])
+        summary([WARNS, *FIELDS, STOPS])
         == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"
     )
