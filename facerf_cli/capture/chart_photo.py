@@ -6,7 +6,8 @@ by the lights' rgb. The light on the chart counts as that of all lights, so it h
 """
 
 import hashlib
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,11 +27,12 @@ from facerf_cli.capture.chart import (
     sample,
     squares_px,
 )
-from facerf_cli.capture.chart_search import block_means, find_chart
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import luminance
+from facerf_cli.image.strips import block_means
+from facerf_cli.run.logs import counted
 
 CAMERA_FIELD = "{camera}"
 # Thresholds beyond which a chart's image is refused.
@@ -45,25 +47,24 @@ _SIDE_PX = 1024  # fits a screen
 _SQUARES = (MIDDLE_SIDE + 0.08, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # sides of outline, sample and published colour
 
 
-def read_charts(capture: Capture, image: str, corners_px: np.ndarray | None) -> Iterator[ChartCorrection]:
+def read_charts(capture: Capture, image: str, corners_px: Sequence[np.ndarray]) -> Iterator[ChartCorrection]:
     """Yield the corrections from one image for all cameras, or from one per camera with {camera} in its name.
 
-    corners_px [4, 2] are those of the patches' area, in order around it; None searches for the chart.
-    Without an image there are no corrections. InputError for an image without a usable chart, UsageError for
-    corners with several images.
+    corners_px has, for each image, the corners [4, 2] of the patches' area, in order around it. InputError
+    for an image without a usable chart, UsageError for corners of another number of images.
     """
-    if not image:
-        return
-    if CAMERA_FIELD not in image:
-        yield _read_chart(capture, Path(image), list(capture.cameras), corners_px, "colour_chart.png")
-        return
-    if corners_px is not None:
+    each = CAMERA_FIELD in image
+    if len(corners_px) != (wanted := len(capture.cameras) if each else 1):
         raise UsageError(
-            f"--chart-corners: --colour-chart {image} names an image per camera; omit --chart-corners"
+            f"--chart-corners: has corners of {counted(len(corners_px), 'image')}, and --colour-chart names "
+            f"{wanted}; give 'x,y x,y x,y x,y' for each, separated by ;"
         )
-    for camera in capture.cameras:
+    if not each:
+        yield _read_chart(capture, Path(image), list(capture.cameras), corners_px[0], "colour_chart.png")
+        return
+    for camera, corners in zip(capture.cameras, corners_px, strict=True):
         named = Path(image.replace(CAMERA_FIELD, camera))
-        yield _read_chart(capture, named, [camera], None, f"colour_chart_{camera}.png")
+        yield _read_chart(capture, named, [camera], corners, f"colour_chart_{camera}.png")
 
 
 def _normalise(capture: Capture, decoded: np.ndarray) -> np.ndarray:
@@ -73,13 +74,10 @@ def _normalise(capture: Capture, decoded: np.ndarray) -> np.ndarray:
 
 
 def _read_chart(
-    capture: Capture, image: Path, cameras: list[str], corners_px: np.ndarray | None, overlay: str
+    capture: Capture, image: Path, cameras: list[str], corners_px: np.ndarray, overlay: str
 ) -> ChartCorrection:
     raw = read_frame(image, capture.colour_space)
-    if corners_px is None:
-        corners_px = find_chart(_normalise(capture, raw))
     _refuse(image, _faults_of_corners(corners_px, *raw.shape[:2]))
-    assert corners_px is not None
     tries = []
     for turned in four_turns(corners_px):
         patches = sample(raw, turned)
@@ -109,13 +107,8 @@ def _refuse(image: Path, faults: Iterator[str]) -> None:
         raise InputError(f"{image}: {fault}")
 
 
-def _faults_of_corners(corners_px: np.ndarray | None, height: int, width: int) -> Iterator[str]:
-    if corners_px is None:
-        yield (
-            "no ColorChecker Classic found; give the corners of its 24 patches with "
-            "--chart-corners 'x,y x,y x,y x,y'"
-        )
-    elif not ((corners_px >= 0) & (corners_px <= [width, height])).all():
+def _faults_of_corners(corners_px: np.ndarray, height: int, width: int) -> Iterator[str]:
+    if not ((corners_px >= 0) & (corners_px <= [width, height])).all():
         yield f"--chart-corners lie outside its {width} x {height} pixels; correct them"
     elif not is_convex(corners_px):
         yield "--chart-corners make no convex quadrilateral; give them in order around the chart"
@@ -166,7 +159,8 @@ def write_chart_overlays(capture: Capture, folder: Path) -> None:
     for chart in capture.charts:
         linear = _normalise(capture, read_frame(chart.image, capture.colour_space))
         corrected = correct_colours([chart], chart.record["cameras"][0], linear)
-        small, scale = block_means(corrected, _SIDE_PX)
+        scale = min(math.ceil(max(corrected.shape[:2]) / _SIDE_PX), *corrected.shape[:2])
+        small = block_means(corrected, scale)
         outlined = outline_patches(small, np.array(chart.record["corners_px"]) / scale)
         write_display(folder / chart.record["overlay"], outlined)
 

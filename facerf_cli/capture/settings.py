@@ -31,13 +31,12 @@ class ChartSettings:
     Attributes:
         colour_chart: Correct the colours by this image of a ColorChecker Classic under the stage's lights;
             with {camera} in its name, by an image per camera.
-        chart_corners: Corners of the chart's 24 patches in pixels, in order around them.
+        chart_corners: Corners of the chart's 24 patches in pixels, in order around them; those of several
+            images in the order of the cameras, separated by ;.
     """
 
     colour_chart: str = option("", metavar="IMAGE", shown_default=False, panel=CORRECTION)
-    chart_corners: str = option(
-        "", metavar="'X,Y X,Y X,Y X,Y'", shown_default="search for the chart", panel=CORRECTION
-    )
+    chart_corners: str = option("", metavar="'X,Y X,Y X,Y X,Y'", shown_default=False, panel=CORRECTION)
 
 
 @dataclass(frozen=True)

@@ -197,14 +197,16 @@ def _not_checked(item: Item, error: Exception) -> list[Finding]:
 def _open_capture(folder: Path, reading: ReadSettings, chart: ChartSettings) -> Capture:
     """Read a capture's description and --colour-chart, and log the corrections; UsageError for wrong ones."""
     image, corners = chart.colour_chart, chart.chart_corners
-    if corners and not image:
-        raise UsageError("--chart-corners: no image is given; give --colour-chart too")
+    if bool(corners) != bool(image):
+        raise UsageError(
+            "--colour-chart, --chart-corners: one is missing; give the image and its chart's corners"
+        )
     try:
         capture = read_capture(folder, reading)
     except InputError as error:
         raise UsageError(str(error)) from None
     try:
-        charts = tuple(read_charts(capture, image, _parse_corners(corners) if corners else None))
+        charts = tuple(read_charts(capture, image, list(_parse_corners(corners)))) if image else ()
     except InputError as error:
         raise UsageError(f"--colour-chart: {error}") from None
     for correction in charts:
@@ -213,12 +215,17 @@ def _open_capture(folder: Path, reading: ReadSettings, chart: ChartSettings) -> 
 
 
 def _parse_corners(text: str) -> np.ndarray:
-    """Parse four corners [4, 2] in pixels, `x,y x,y x,y x,y`."""
+    """Parse four corners [N, 4, 2] in pixels for each of N images, `x,y x,y x,y x,y; x,y ...`."""
     try:
-        corners_px = np.array([[float(number) for number in pair.split(",")] for pair in text.split()])
+        corners_px = np.array(
+            [
+                [[float(number) for number in pair.split(",")] for pair in of_image.split()]
+                for of_image in text.split(";")
+            ]
+        )
     except ValueError:
         corners_px = np.empty(0)
-    if corners_px.shape != (4, 2) or not np.isfinite(corners_px).all():
+    if corners_px.shape[1:] != (4, 2) or not np.isfinite(corners_px).all():
         raise UsageError(f"--chart-corners '{text}': give four corners in pixels, as 'x,y x,y x,y x,y'")
     return corners_px
 

@@ -16,13 +16,12 @@ from facerf_cli.capture.chart import (
     squares_px,
 )
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
-from facerf_cli.capture.chart_search import find_chart
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import linear_to_srgb
-from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, background, chart_image
+from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, chart_image
 from tests.capture.test_chart import kept_luminance
 from tests.capture.test_stage_json import GOOD, capture_at
 
@@ -36,10 +35,10 @@ def capture(folder: Path, **changes: Any) -> Capture:
     return read_capture(capture_at(folder, **{"lights": WHITE, "cameras": CAMERAS, **changes}))
 
 
-def correction(folder: Path, image: np.ndarray, corners_px: np.ndarray | None = CORNERS) -> ChartCorrection:
+def correction(folder: Path, image: np.ndarray, corners_px: np.ndarray = CORNERS) -> ChartCorrection:
     """By a chart's picture [H, W, 3] above black, of a capture with white lamps."""
     write_exr(folder / "chart.exr", image + LEVEL)
-    return next(read_charts(capture(folder), str(folder / "chart.exr"), corners_px))
+    return next(read_charts(capture(folder), str(folder / "chart.exr"), [corners_px]))
 
 
 def delta_e(chart: ChartCorrection) -> float:
@@ -47,10 +46,9 @@ def delta_e(chart: ChartCorrection) -> float:
     return float(chart.record["delta_e_2000"]["after"]["mean"])
 
 
-@pytest.mark.parametrize("found", [False, True])
-def test_a_camera_with_noise_and_uneven_light_is_undone(tmp_path: Path, found: bool) -> None:
+def test_a_camera_with_noise_and_uneven_light_is_undone(tmp_path: Path) -> None:
     image = chart_image(matrix=CAMERA, light=(1.2, 0.8), noise=0.01)
-    chart = correction(tmp_path, image, None if found else CORNERS)
+    chart = correction(tmp_path, image)
     before, after = (chart.record["delta_e_2000"][when] for when in ("before", "after"))
     np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.02)
     assert after["mean"] < 0.5 and after["max"] < 1.5 < 5 < before["mean"]
@@ -71,7 +69,7 @@ def test_lamps_of_one_colour_change_nothing(tmp_path: Path) -> None:
     for name, lights, tint in (("white", WHITE, [1, 1, 1]), ("tinted", tinted, [3, 2, 1])):
         stage = capture(tmp_path / name, lights=lights)
         write_exr(tmp_path / f"{name}.exr", chart_image(matrix=CAMERA, noise=0.0) * np.float32(tint) + LEVEL)
-        chart = next(read_charts(stage, str(tmp_path / f"{name}.exr"), CORNERS))
+        chart = next(read_charts(stage, str(tmp_path / f"{name}.exr"), [CORNERS]))
         np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=5e-3)
 
 
@@ -80,7 +78,7 @@ def test_a_chart_for_each_camera(tmp_path: Path) -> None:
     for number, matrix in enumerate((CAMERA, np.eye(3))):
         write_exr(tmp_path / f"chart_C{number}.exr", chart_image(matrix=matrix) + LEVEL)
     name = str(tmp_path / "chart_{camera}.exr")
-    charts = tuple(read_charts(stage, name, None))
+    charts = tuple(read_charts(stage, name, [CORNERS, CORNERS]))
     assert [chart.record["cameras"] for chart in charts] == [["C0"], ["C1"]]
     np.testing.assert_allclose(charts[1].record["matrix"], np.eye(3), atol=0.01)
     seen = (np.array([[[0.3, 0.5, 0.2]]]) @ CAMERA.T).astype(np.float32)
@@ -90,8 +88,8 @@ def test_a_chart_for_each_camera(tmp_path: Path) -> None:
         < 1e-6
     )
     assert correct_colours((), "C0", seen) is seen
-    with pytest.raises(UsageError, match="names an image per camera"):
-        next(read_charts(stage, name, CORNERS))
+    with pytest.raises(UsageError, match="corners of 1 image, and --colour-chart names 2"):
+        next(read_charts(stage, name, [CORNERS]))
     write_chart_overlays(replace(stage, charts=charts), tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         "colour_chart_C0.png",
@@ -112,12 +110,11 @@ def test_the_overlay_shows_published_colours_in_corrected_ones(tmp_path: Path) -
 
 
 DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
-REFUSED: dict[str, tuple[np.ndarray, np.ndarray | None, str]] = {
+REFUSED: dict[str, tuple[np.ndarray, np.ndarray, str]] = {
     "clipped at 1": (chart_image(exposure=1.5).clip(max=1 - LEVEL), CORNERS, "white patch is clipped"),
     "clipped below 1": (chart_image().clip(max=0.5), CORNERS, "white patch is clipped"),
     "grey": (chart_image().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "is grey"),
     "a face": (FACE, CORNERS, "delta E"),
-    "a face, no corners": (FACE, None, "no ColorChecker Classic found; give the corners"),
     "too dark": (chart_image(exposure=DIM), CORNERS, "too dark"),
     "encoded": (linear_to_srgb(chart_image().clip(0, 1)), CORNERS, "lin_rec709"),
     "small": (chart_image(CORNERS / 8, (60, 80), noise=0.0), CORNERS / 8, "pixels in its middle"),
@@ -138,9 +135,9 @@ def test_a_white_of_eight_bits_is_clipped(tmp_path: Path) -> None:
     write_display(tmp_path / "chart.png", chart_image(exposure=1.3))
     stage = capture(tmp_path, colour_space="sRGB", black_level=0.0)
     with pytest.raises(InputError, match="of the chart's patches are clipped"):
-        next(read_charts(stage, str(tmp_path / "chart.png"), CORNERS))
+        next(read_charts(stage, str(tmp_path / "chart.png"), [CORNERS]))
     write_display(tmp_path / "chart.png", chart_image(matrix=CAMERA, exposure=0.8))
-    chart = next(read_charts(stage, str(tmp_path / "chart.png"), CORNERS))
+    chart = next(read_charts(stage, str(tmp_path / "chart.png"), [CORNERS]))
     np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.03)
 
 
@@ -152,32 +149,3 @@ def test_a_white_of_floats_that_is_one_is_not_clipped(tmp_path: Path) -> None:
         ]
         < 0.5
     )
-
-
-@pytest.mark.parametrize("turn", [0, 3])
-def test_a_chart_is_found_whichever_way_it_lies(turn: int) -> None:
-    upright = CORNERS if turn % 2 == 0 else np.array([[120.0, 10], [250, 20], [240, 215], [110, 200]])
-    corners = four_turns(upright)[turn]
-    image = chart_image(corners, matrix=CAMERA, light=(0.8, 1.2), noise=0.01, clutter=0.5, seed=turn)
-    found = find_chart(image)
-    assert found is not None and np.abs(found - corners).max() < 2
-
-
-@pytest.mark.parametrize("kind", ["clutter", "face", "black", "tiles", "thin"])
-def test_what_is_no_chart_is_not_taken_for_one(kind: str) -> None:
-    draw = np.random.default_rng(5)
-    image = {
-        "clutter": lambda: background(draw, (240, 320), 1.0),
-        "face": lambda: data.astronaut() / 255,
-        "black": lambda: np.zeros((240, 320, 3)),
-        "tiles": lambda: tiles(draw),
-        "thin": lambda: draw.uniform(0, 1, (2, 3000, 3)),
-    }[kind]()
-    assert find_chart(image.astype(np.float32)) is None
-
-
-def tiles(draw: np.random.Generator) -> np.ndarray:
-    """A wall of tiles in other colours: a grid, but no chart."""
-    wall = np.kron(draw.uniform(0, 1, (6, 8, 3)), np.ones((40, 40, 1)))
-    wall[::40] = wall[1::40] = wall[:, ::40] = wall[:, 1::40] = 0.03
-    return wall

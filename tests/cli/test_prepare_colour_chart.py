@@ -19,6 +19,7 @@ from tests.dataset.capture import BLACK_LEVEL, write_capture
 from tests.stacks import read_olat_stack
 
 LIGHTS = 10
+PLACE = ("--chart-corners", " ".join(f"{x:g},{y:g}" for x, y in CORNERS))
 SPLIT = ("--split", "1/0/0")
 Said = pytest.CaptureFixture[str]
 
@@ -50,7 +51,7 @@ def wrong(right: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def corrected(wrong: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("corrected") / "dataset"
-    assert prepare(wrong, output, *SPLIT, "--colour-chart", str(wrong / "chart.exr")) == 0
+    assert prepare(wrong, output, *SPLIT, "--colour-chart", str(wrong / "chart.exr"), *PLACE) == 0
     return output
 
 
@@ -81,21 +82,21 @@ def test_what_was_done_is_told(wrong: Path, corrected: Path, tmp_path: Path, cap
     assert chart["delta_e_2000"]["after"]["mean"] < 0.5 < 5 < chart["delta_e_2000"]["before"]["mean"]
     assert read_image(corrected / chart["overlay"]).pixels.max() > 0.5
     assert f'src="{chart["overlay"]}"' in (corrected / "index.html").read_text()
-    line = ["--colour-chart", str(wrong / "chart.exr"), "--dry-run"]
+    line = ["--colour-chart", str(wrong / "chart.exr"), *PLACE, "--dry-run"]
     assert prepare(wrong, tmp_path / "out", *SPLIT, *line) == 0
     said = capsys.readouterr().err
     assert "delta E 2000 mean 0." in said and said.count("\n") == 2 and not (tmp_path / "out").exists()
 
 
-def test_jobs_corners_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, capsys: Said) -> None:
-    """Jobs change no byte; corners that are given lead to the same; another chart is another dataset."""
-    before, chart = tree(corrected), ["--colour-chart", str(wrong / "chart.exr")]
+def test_jobs_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, capsys: Said) -> None:
+    """Jobs change no byte; another chart, or another place of it, is another dataset."""
+    before, chart = tree(corrected), ["--colour-chart", str(wrong / "chart.exr"), *PLACE]
     assert prepare(wrong, tmp_path / "jobs", *SPLIT, *chart, "--jobs", "2") == 0
     assert tree(tmp_path / "jobs") == before
     assert prepare(wrong, corrected, *SPLIT, *chart) == 0 and tree(corrected) == before
     capsys.readouterr()
-    corners = " ".join(f"{x:g},{y:g}" for x, y in CORNERS)
-    for line in ([], [*chart, "--chart-corners", corners]):
+    corners = " ".join(f"{x + 1:g},{y:g}" for x, y in CORNERS)
+    for line in ([], [*chart[:2], "--chart-corners", corners]):
         assert prepare(wrong, corrected, *SPLIT, *line) == 2
         assert (
             "or --colour-chart of the capture changed; give --overwrite" in capsys.readouterr().err
@@ -114,24 +115,21 @@ def test_an_older_charts_image_does_not_outlive_its_dataset(
 
 def test_a_file_is_no_dataset(wrong: Path, tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "file").touch()
-    assert prepare(wrong, tmp_path / "file", *SPLIT, "--colour-chart", str(wrong / "chart.exr")) == 2
+    assert prepare(wrong, tmp_path / "file", *SPLIT, "--colour-chart", str(wrong / "chart.exr"), *PLACE) == 2
     assert "file: cannot be written to" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        (["--colour-chart", "none.exr"], "none.exr: no such file"),
+        (["--colour-chart", "none.exr", *PLACE], "none.exr: no such file"),
         (["--colour-chart", "chart.exr", "--chart-corners", "1,2 3,4 5,6"], "give four corners"),
         (["--colour-chart", "chart.exr", "--chart-corners", "a,b c,d e,f g,h"], "give four corners"),
         (["--colour-chart", "chart.exr", "--chart-corners", "1,2 3,4 5,6 nan,8"], "give four corners"),
         (["--colour-chart", "chart.exr", "--chart-corners", "0,0 900,0 900,9 0,9"], "outside its 330 x 240"),
-        (["--colour-chart", "0000/C0/L000.exr"], "no ColorChecker Classic found"),
-        (["--chart-corners", "1,2 3,4 5,6 7,8"], "give --colour-chart too"),
-        (
-            ["--colour-chart", "{camera}.exr", "--chart-corners", "1,2 3,4 5,6 7,8"],
-            "names an image per camera",
-        ),
+        (["--colour-chart", "0000/C0/L000.exr"], "give the image and its chart's corners"),
+        (["--chart-corners", "1,2 3,4 5,6 7,8"], "give the image and its chart's corners"),
+        (["--colour-chart", "{camera}.exr", *PLACE], "corners of 1 image, and --colour-chart names 3"),
     ],
 )
 def test_wrong_charts_stop_the_run(
