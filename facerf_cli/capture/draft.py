@@ -45,11 +45,7 @@ _WANTED = {
     "height": "in pixels",
 }
 # Files.
-_EXAMPLE = "{subject}/{camera}/{light}.exr"
-_LAYOUTS = ("{light}", "{subject}/{light}", "{subject}/{camera}/{light}")  # by the number of folders
-_CAMERA_IN_NAME = re.compile(r"((?:c|cam|camera|view)[-_ ]?\d+)([-_ ])(.+)", re.IGNORECASE)
 _DEEPEST = 8  # folders below the capture that are searched
-_LEAST_SHARE = 0.5  # of the expected frames: with fewer, the layout is another one
 # Lists of lights.
 _LIST_SUFFIX, _LIST_NAMES = ".lp", ("lights.txt", "light_directions.txt")
 _LIST_LIMIT_BYTES = 4 << 20
@@ -79,11 +75,10 @@ class Frames:
         return len(self.ids("subject")) * len(self.ids("camera")) * len(self.ids("light"))
 
 
-def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> dict[str, Any]:
-    """Draft the content of `stage.json`, with notes under "draft".
+def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[str, Any]:
+    """Draft the content of `stage.json`, with notes under "draft"; UsageError for a folder without a capture.
 
-    An empty `pattern` means the layout for the images' folder depth. UsageError for a folder without a
-    capture.
+    Without a `pattern` the UsageError has one that may fit.
     """
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a capture")
@@ -91,11 +86,16 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> d
     if not images:
         raise UsageError(f"{folder}: no images found (looked for {' '.join(sorted(suffixes))})")
     try:
-        frames, chosen = frames_by_pattern(images, pattern) if pattern else frames_by_depth(images)
+        if not pattern:
+            examples = [example_pattern(path) for path in images]
+            likely = Counter(examples).most_common(1)[0][0]
+            example = f"'{likely}' for {_list([images[examples.index(likely)]])}"
+            raise UsageError(f"--pattern is needed; say what the parts of a path are, such as {example}")
+        frames = frames_by_pattern(images, pattern)
         if len(lights := frames.ids("light")) < _LEAST_LIGHTS:
             names = f"{counted(len(lights), 'light')} ({', '.join(lights)})"
             raise UsageError(
-                f"{names}, but a capture has {_LEAST_LIGHTS} or more; give its folder or --pattern"
+                f"{names}, but a capture has {_LEAST_LIGHTS} or more; give its folder, or correct --pattern"
             )
         headers = {camera: _read_headers(folder, frames, camera) for camera in frames.ids("camera")}
         if not any(any(of_camera.values()) for of_camera in headers.values()):
@@ -103,11 +103,10 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str = "") -> d
     except UsageError as error:
         raise UsageError(f"{folder}: {error}") from None
     directions, about_list = _read_directions(folder, lists, frames)
-    content = _content(folder, chosen, frames, headers, directions)
+    content = _content(folder, pattern, frames, headers, directions)
     notes = [
-        _summary(chosen, frames),
+        _summary(pattern, frames),
         *(f"fill in: {note}" for note in _gaps(content)),
-        *(["check: pattern: chosen by folder depth; --pattern gives another one"] if not pattern else []),
         *([about_list] if about_list else []),
         *(f"check: {note}" for note in _assumptions(headers, content)),
     ]
@@ -301,7 +300,7 @@ def _natural_order(text: str) -> list[str | int]:
     return [int(piece) if place % 2 else piece for place, piece in enumerate(pieces)] + [text]
 
 
-def frames_by_pattern(images: Sequence[str], pattern: str) -> tuple[Frames, str]:
+def frames_by_pattern(images: Sequence[str], pattern: str) -> Frames:
     """Sort images by the pattern of --pattern; UsageError for a wrong one, or one that no image matches."""
     try:
         frames = sort_frames(images, require_pattern(pattern, "--pattern", ["light"]))
@@ -309,38 +308,15 @@ def frames_by_pattern(images: Sequence[str], pattern: str) -> tuple[Frames, str]
         raise UsageError(str(error)) from None
     if not frames.paths:
         raise UsageError(f"--pattern {pattern}: no image matches, not even {images[0]}; correct the pattern")
-    return frames, pattern
+    return frames
 
 
-def frames_by_depth(images: Sequence[str]) -> tuple[Frames, str]:
-    """Sort images by the layout for their folder depth; return its pattern too.
-
-    UsageError where the images do not share a depth and a suffix, or lack most of the frames of that layout.
-    """
-    depths = sorted({path.count("/") for path in images})
-    suffixes = sorted({PurePosixPath(path).suffix for path in images})
-    if len(depths) > 1 or depths[0] >= len(_LAYOUTS):
-        reason = f"images lie in {' and '.join(map(str, depths))} folders"
-    elif len(suffixes) > 1:
-        reason = f"images end in {' and '.join(suffixes)}"
-    else:
-        pattern = _with_cameras_of_names(images, _LAYOUTS[depths[0]]) + suffixes[0]
-        frames = sort_frames(images, pattern)
-        if len(frames.paths) >= max(_LEAST_SHARE * frames.expected, 1):
-            return frames, pattern
-        reason = f"by {pattern}, {len(frames.paths)} of {frames.expected} frames exist"
-    raise UsageError(f"the layout of the images is unknown ({reason}); give --pattern, such as '{_EXAMPLE}'")
-
-
-def _with_cameras_of_names(images: Sequence[str], layout: str) -> str:
-    """The layout with {camera} in front of {light}, if all names begin with a camera's, as in cam2_L017."""
-    named = [_CAMERA_IN_NAME.fullmatch(PurePosixPath(path).stem) for path in images]
-    if "{camera}" in layout or not all(named):
-        return layout
-    by_name = layout.replace("{light}", f"{{camera}}{named[0][2] if named[0] else ''}{{light}}")
-    frames = sort_frames(images, by_name + PurePosixPath(images[0]).suffix)
-    cameras = {match[1] for match in named if match}
-    return by_name if len(cameras) > 1 and set(frames.ids("camera")) == cameras else layout
+def example_pattern(path: str) -> str:
+    """Guess what the parts of an image's path are: its name the light, its folders subject and camera."""
+    *folders, _ = path.split("/")
+    fields = ["{subject}", "{camera}"][: len(folders)]
+    above = folders[: len(folders) - len(fields)]
+    return "/".join([*above, *fields, "{light}" + PurePosixPath(path).suffix])
 
 
 def read_light_list(path: Path) -> list[ListedLight]:

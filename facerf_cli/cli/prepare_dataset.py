@@ -56,7 +56,7 @@ def prepare_dataset(
             metavar="PATTERN",
             help="With --describe, find the images by this path below CAPTURE, such as "
             "'{subject}/{camera}/{light}.exr'.",
-            show_default="by folder depth",
+            show_default=False,
             rich_help_panel=CAPTURE,
         ),
     ] = "",

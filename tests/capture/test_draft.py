@@ -12,7 +12,6 @@ import pytest
 from facerf_cli.capture.draft import (
     as_text,
     draft_stage,
-    frames_by_depth,
     frames_by_pattern,
     match_lights,
     read_light_list,
@@ -23,6 +22,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import ACESCG
 
+FOLDERS = "{subject}/{camera}/{light}.exr"
 SUFFIXES = frozenset({".exr", ".png", ".pgm"})
 FACING = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
 
@@ -48,23 +48,8 @@ def noted(stage: dict[str, object], words: str) -> bool:
     return any(words in note for note in notes)
 
 
-@pytest.mark.parametrize(
-    ("form", "pattern"),
-    [
-        ("s{}/cam{}_L{}.exr", "{subject}/{camera}_{light}.exr"),
-        ("s{}/C{}-{}.exr", "{subject}/{camera}-{light}.exr"),
-        ("s{}/az{}_el{}.exr", "{subject}/{light}.exr"),  # a grid of lights
-    ],
-)
-def test_cameras_are_seen_in_the_prefixes_of_names(tmp_path: Path, form: str, pattern: str) -> None:
-    stage = draft_stage(stage_at(tmp_path, form=form), SUFFIXES)
-    assert stage["pattern"] == pattern
-    assert len(stage["cameras"]) == (2 if "{camera}" in pattern else 1)
-    assert len(stage["lights"]) == (4 if "{camera}" in pattern else 8)
-
-
 def test_the_draft_has_what_files_say_and_null_for_the_rest(tmp_path: Path) -> None:
-    stage = draft_stage(stage_at(tmp_path), SUFFIXES)
+    stage = draft_stage(stage_at(tmp_path), SUFFIXES, FOLDERS)
     assert [light["id"] for light in stage["lights"]] == ["L1", "L2", "L3", "L10"]
     assert all(light["direction"] is None for light in stage["lights"])
     sizes = [(camera["id"], camera["width"], camera["height"]) for camera in stage["cameras"]]
@@ -76,7 +61,7 @@ def test_the_draft_has_what_files_say_and_null_for_the_rest(tmp_path: Path) -> N
 
 
 def test_a_draft_is_refused_until_it_is_filled_in(tmp_path: Path) -> None:
-    stage = draft_stage(stage_at(tmp_path), SUFFIXES)
+    stage = draft_stage(stage_at(tmp_path), SUFFIXES, FOLDERS)
     assert json.loads(as_text(stage)) == stage and as_text(stage).count('"direction"') == 4
     (tmp_path / "stage.json").write_text(as_text(stage))
     with pytest.raises(InputError, match=r"lights\[0\]: direction is null; fill it in \(and 5 more\)"):
@@ -93,9 +78,9 @@ def test_a_draft_is_refused_until_it_is_filled_in(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("form", "pattern", "subjects"),
     [
-        ("s{}/L{2}.exr", "", ["s1", "s2"]),
-        ("anna/L{2}.exr", "", ["anna"]),
-        ("L{2}.exr", "", ["folder"]),
+        ("s{}/L{2}.exr", "{subject}/{light}.exr", ["s1", "s2"]),
+        ("anna/L{2}.exr", "{subject}/{light}.exr", ["anna"]),
+        ("L{2}.exr", "{light}.exr", ["folder"]),
         ("raw/s{}_L{2}.exr", "raw/{subject}_{light}.exr", ["s1", "s2"]),
         ("raw/L{2}.exr", "raw/{light}.exr", ["folder"]),
     ],
@@ -106,7 +91,6 @@ def test_one_camera_is_the_world(tmp_path: Path, form: str, pattern: str, subjec
     (folder / "scene.lp").write_text("4\nL1.jpg 0.6 0 0.8\nL2.jpg 0 1 0\nL3.jpg -1 0 0\nL10.jpg 0 0 2\n")
     stage = draft_stage(folder, SUFFIXES, pattern)
     assert stage["cameras"][0]["world_to_camera"] == FACING and noted(stage, "directions from scene.lp")
-    assert noted(stage, "chosen by folder depth") == (not pattern)
     (folder / "stage.json").write_text(as_text(stage))
     capture = read_capture(folder)
     assert list(capture.subjects) == subjects and list(capture.cameras) == ["C0"]
@@ -135,15 +119,16 @@ def test_a_pattern_may_repeat_the_subject(tmp_path: Path) -> None:
 def test_a_list_that_is_of_other_images_is_said(tmp_path: Path) -> None:
     folder = stage_at(tmp_path)
     (folder / "lights.txt").write_text("K1 0 0 1\n")
-    assert noted(draft_stage(folder, SUFFIXES), "name none of the 4 lights")
+    assert noted(draft_stage(folder, SUFFIXES, FOLDERS), "name none of the 4 lights")
     (folder / "lights.txt").write_text("K1 0 0\n")
-    stage = draft_stage(folder, SUFFIXES)
+    stage = draft_stage(folder, SUFFIXES, FOLDERS)
     assert noted(stage, "line 1") and stage["lights"][0]["direction"] is None
 
 
 def test_headers_that_differ_leave_the_colour_space_open(tmp_path: Path) -> None:
     folder = stage_at(tmp_path, form="s{}/cam{}/L{}.png")
-    assert draft_stage(folder, SUFFIXES)["colour_space"] == "sRGB"
+    png = "{subject}/{camera}/{light}.png"
+    assert draft_stage(folder, SUFFIXES, png)["colour_space"] == "sRGB"
     import OpenImageIO as oiio
 
     for path in folder.glob("s1/cam0/*.png"):
@@ -151,7 +136,7 @@ def test_headers_that_differ_leave_the_colour_space_open(tmp_path: Path) -> None
         stream = oiio.ImageOutput.create(path.name)
         assert stream.open(str(path), spec) and stream.write_image(np.zeros((6, 8, 3), np.uint16))
         stream.close()
-    stage = draft_stage(folder, SUFFIXES)
+    stage = draft_stage(folder, SUFFIXES, png)
     assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
 
 
@@ -170,10 +155,10 @@ def with_primaries(folder: Path, chromaticities: tuple[float, ...]) -> Path:
 
 def test_known_primaries_name_the_colour_space(tmp_path: Path) -> None:
     assert ACESCG.chromaticities is not None
-    stage = draft_stage(with_primaries(tmp_path / "known", ACESCG.chromaticities), SUFFIXES)
+    stage = draft_stage(with_primaries(tmp_path / "known", ACESCG.chromaticities), SUFFIXES, FOLDERS)
     assert stage["colour_space"] == "ACEScg" and noted(stage, "ACEScg, from the headers")
     camera_s = (0.78, 0.31, 0.22, 0.88, 0.09, -0.08, 0.3127, 0.329)
-    stage = draft_stage(with_primaries(tmp_path / "unknown", camera_s), SUFFIXES)
+    stage = draft_stage(with_primaries(tmp_path / "unknown", camera_s), SUFFIXES, FOLDERS)
     assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
 
 
@@ -193,21 +178,38 @@ def test_faults_of_the_files_are_noted(tmp_path: Path) -> None:
 
 def test_folders_that_are_no_capture(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such folder"):
-        draft_stage(tmp_path / "nowhere", SUFFIXES)
+        draft_stage(tmp_path / "nowhere", SUFFIXES, FOLDERS)
     with pytest.raises(UsageError, match="no images found"):
-        draft_stage(tmp_path, SUFFIXES)
+        draft_stage(tmp_path, SUFFIXES, FOLDERS)
     image(tmp_path / "anna.png")
     image(tmp_path / "bob.png")
     with pytest.raises(UsageError, match="2 lights"):
-        draft_stage(tmp_path, SUFFIXES)
+        draft_stage(tmp_path, SUFFIXES, "{light}.png")
     image(tmp_path / "carl.png")
     for path in tmp_path.glob("*.png"):
         path.write_bytes(b"torn")
     with pytest.raises(UsageError, match="cannot be read"):
-        draft_stage(tmp_path, SUFFIXES)
-    image(tmp_path / "deep/er/than/three.png")
-    with pytest.raises(UsageError, match=r"0 and 3 folders\); give --pattern, such as '{subject}/{camera}/"):
-        draft_stage(tmp_path, SUFFIXES)
+        draft_stage(tmp_path, SUFFIXES, "{light}.png")
+
+
+@pytest.mark.parametrize(
+    ("path", "pattern"),
+    [
+        ("L1.png", "{light}.png"),
+        ("anna/L1.exr", "{subject}/{light}.exr"),
+        ("anna/C0/L1.exr", FOLDERS),
+        ("raw/anna/C0/L1.exr", "raw/{subject}/{camera}/{light}.exr"),
+    ],
+)
+def test_without_a_pattern_the_error_has_one_of_the_folders_own_names(
+    tmp_path: Path, path: str, pattern: str
+) -> None:
+    image(tmp_path / path)
+    image(tmp_path / path.replace("1", "2"))
+    image(tmp_path / "a stray/of/0/pictures/chart.exr")
+    with pytest.raises(UsageError) as raised:
+        draft_stage(tmp_path, SUFFIXES, "")
+    assert str(raised.value).endswith(f"say what the parts of a path are, such as '{pattern}' for {path}")
 
 
 def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
@@ -219,13 +221,12 @@ def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
         shutil.copytree(folder / "s1", folder / name)
     os.mkfifo(folder / "lights.txt")
     os.mkfifo(folder / "s1/cam0/L4.exr")
-    stage = draft_stage(folder, SUFFIXES)
+    stage = draft_stage(folder, SUFFIXES, FOLDERS)
     assert noted(stage, "3 subjects, 1 camera") and noted(stage, "ids not of letters")
     assert all(note.isprintable() for note in stage["draft"])
 
 
 PEOPLE, CAMERAS, LIGHTS = range(1, 5), range(1, 4), range(1, 13)
-FOLDERS = "{subject}/{camera}/{light}.exr"
 
 
 def crossed(
@@ -233,23 +234,6 @@ def crossed(
 ) -> list[str]:
     """The paths of every subject, camera and light, by a format string of s, c and l."""
     return [form.format(s=s, c=c, l=light) for s, c, light in product(subjects, cameras, lights)]  # type: ignore[call-overload]
-
-
-@pytest.mark.parametrize(
-    ("paths", "said"),
-    [
-        (crossed("images/{s}/{c}/{l}.exr"), "images lie in 3 folders"),
-        ([*crossed("{s}/{c}/{l}.exr"), "chart.exr"], "images lie in 0 and 2 folders"),
-        ([*crossed("{s}/{c}/{l}.exr"), "1/1/1.png"], r"images end in \.exr and \.png"),
-        (crossed("yaleB{s:02}/yaleB{s:02}_P00{l}.pgm", cameras=[1]), "48 of 192 frames exist"),
-        ([f"C{c}/IMG_{100 * c + n:04}.jpg" for c in range(3) for n in range(50)], "150 of 450 frames exist"),
-    ],
-)
-def test_another_layout_needs_a_pattern(paths: list[str], said: str) -> None:
-    with pytest.raises(UsageError, match=said) as raised:
-        frames_by_depth(paths)
-    assert "give --pattern, such as '{subject}/{camera}/{light}.exr'" in str(raised.value)
-    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +256,7 @@ def test_another_layout_needs_a_pattern(paths: list[str], said: str) -> None:
 def test_a_given_pattern_names_subject_camera_and_light(
     paths: list[str], pattern: str, first: tuple[str, ...]
 ) -> None:
-    frames, _ = frames_by_pattern(paths, pattern)
+    frames = frames_by_pattern(paths, pattern)
     assert sorted(frames.paths.values()) == sorted(paths) and not frames.strays
     assert tuple(frames.ids(field)[0] for field in ("subject", "camera", "light")) == first
     for (subject, camera, light), path in frames.paths.items():

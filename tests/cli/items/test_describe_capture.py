@@ -9,6 +9,7 @@ import pytest
 from facerf_cli.main import main
 from tests.dataset.capture import write_capture
 
+DESCRIBE = ("--describe", "--pattern", "{subject}/{camera}/{light}.exr")
 Said = pytest.CaptureFixture[str]
 
 
@@ -28,7 +29,7 @@ def bare(given: Path, tmp_path: Path) -> Path:
 
 
 def test_a_draft_filled_in_is_the_true_description(given: Path, bare: Path, capsys: Said) -> None:
-    assert main(["prepare-dataset", str(bare), "--describe"]) == 0
+    assert main(["prepare-dataset", str(bare), *DESCRIBE]) == 0
     said = capsys.readouterr()
     assert said.out == f"{bare / 'stage.json'}\n" and "fill in: direction of 4 of 4 lights" in said.err
     draft, true = (json.loads((folder / "stage.json").read_text()) for folder in (bare, given))
@@ -53,8 +54,9 @@ def test_a_pattern_says_which_part_of_a_path_is_what(bare: Path, capsys: Said) -
     for subject in ("0000", "0001"):
         (bare / subject).rename(bare / "raw" / subject)
     assert main(["prepare-dataset", str(bare), "--describe"]) == 2
-    assert "images lie in 3 folders); give --pattern, such as '{subject}/" in capsys.readouterr().err
     pattern = "raw/{subject}/{camera}/{light}.exr"
+    said = capsys.readouterr().err
+    assert f"--pattern is needed; say what the parts of a path are, such as '{pattern}' for raw/" in said
     assert main(["prepare-dataset", str(bare), "--describe", "--pattern", pattern]) == 0
     assert f"{pattern}: 2 subjects, 3 cameras, 4 lights" in capsys.readouterr().err
     assert json.loads((bare / "stage.json").read_text())["pattern"] == pattern
@@ -65,18 +67,18 @@ def test_a_pattern_says_which_part_of_a_path_is_what(bare: Path, capsys: Said) -
 def test_nothing_is_overwritten(bare: Path, capsys: Said) -> None:
     (bare / "stage.json").write_text("mine")
     for output in ([], ["-o", str(bare / "stage.json")]):
-        assert main(["prepare-dataset", str(bare), "--describe", *output]) == 2
+        assert main(["prepare-dataset", str(bare), *DESCRIBE, *output]) == 2
         assert "there already" in capsys.readouterr().err
     assert (bare / "stage.json").read_text() == "mine"
-    assert main(["prepare-dataset", str(bare), "--describe", "-o", str(bare)]) == 2
+    assert main(["prepare-dataset", str(bare), *DESCRIBE, "-o", str(bare)]) == 2
     assert "is a folder" in capsys.readouterr().err
-    assert main(["prepare-dataset", str(bare), "--describe", "-o", str(bare / "new/draft.json")]) == 0
+    assert main(["prepare-dataset", str(bare), *DESCRIBE, "-o", str(bare / "new/draft.json")]) == 0
     assert (bare / "new/draft.json").is_file()
 
 
 def test_a_dry_run_writes_nothing(bare: Path, capsys: Said) -> None:
     for there in (False, True):  # it refuses nothing, either
-        assert main(["prepare-dataset", str(bare), "--describe", "--dry-run"]) == 0
+        assert main(["prepare-dataset", str(bare), *DESCRIBE, "--dry-run"]) == 0
         said = capsys.readouterr()
         assert said.out == f"{bare} -> {bare / 'stage.json'}\n" and "fill in: direction" in said.err
         assert (bare / "stage.json").exists() == there
@@ -98,13 +100,13 @@ def test_a_dry_run_writes_nothing(bare: Path, capsys: Said) -> None:
 )
 def test_options_of_preparing_are_refused(bare: Path, capsys: Said, line: str) -> None:
     option, *_ = {"-j": "--jobs"}.get(line[:2], line).split()
-    assert main(["prepare-dataset", str(bare), "--describe", *line.split()]) == 2
+    assert main(["prepare-dataset", str(bare), *DESCRIBE, *line.split()]) == 2
     assert f"{option} is for preparing; leave it out with --describe" in capsys.readouterr().err
     assert not (bare / "stage.json").exists()
 
 
 def test_a_folder_that_is_no_capture_and_a_line_without_output(tmp_path: Path, capsys: Said) -> None:
-    assert main(["prepare-dataset", str(tmp_path), "--describe"]) == 2
+    assert main(["prepare-dataset", str(tmp_path), *DESCRIBE]) == 2
     assert "no images found" in capsys.readouterr().err
     assert main(["prepare-dataset", str(tmp_path)]) == 2
     assert "give -o DATASET" in capsys.readouterr().err
