@@ -19,9 +19,7 @@ from facerf_cli.files.light_files import (
     Harmonics,
     LightRecord,
     read_light,
-    read_numbers,
     write_light,
-    write_numbers,
 )
 from facerf_cli.files.spaces import space_of_profile
 from facerf_cli.files.texts import read_rig
@@ -61,14 +59,6 @@ def test_a_light_comes_back(folder: Path, rows: list[tuple[float, float, float]]
     assert torch.equal(read.weights, weights) and read.rig == note
     assert read.sh is not None and torch.equal(read.sh.coefficients, weights[:1])
     assert read.attributes == {"facerf:input": note}
-
-
-@DRAWN
-@given(values=st.lists(FINITE, min_size=9, max_size=9))
-def test_numbers_come_back(folder: Path, values: list[float]) -> None:
-    numbers = torch.tensor(values, dtype=torch.float32)
-    write_numbers(folder / "a.txt", numbers)
-    assert torch.equal(read_numbers(folder / "a.txt", (9,)), numbers)
 
 
 @DRAWN
@@ -125,7 +115,6 @@ def test_any_value_of_an_option_is_read_or_refused(option: str, text: str) -> No
 
 READERS = {
     "a.pts": read_landmarks,
-    "a.txt": lambda path: read_numbers(path, (9, 27)),
     "a.lp": read_light_list,
     "a.toml": read_rig,
 }

@@ -54,12 +54,6 @@ def _light(path: Path) -> None:
     face_model_of_map(path)
 
 
-def _numbers(path: Path) -> None:
-    from facerf_cli.files.light_files import read_numbers
-
-    read_numbers(path, (9, 27))
-
-
 def _map(path: Path) -> None:
     from facerf_cli.files.light_files import read_map_file
 
@@ -306,7 +300,6 @@ DOORS: dict[str, Door] = {
     "environment maps": Door(samples.images, _map, (mutations.png, mutations.bytes_), 1),
     "OLAT stacks": Door(samples.stacks, _stack, (mutations.json_inside, mutations.bytes_), 3),
     "light JSON": Door(samples.lights, _light, _JSON, 2),
-    "light numbers": Door(samples.numbers, _numbers, _TEXT, 1),
     "landmarks": Door(samples.landmarks, _landmarks, (*_JSON, mutations.text), 2),
     "LP files": Door(samples.light_lists, _light_list, _TEXT, 1),
     "CSV tables": Door(samples.shifts, _table, _TEXT, 1),

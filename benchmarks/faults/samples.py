@@ -217,14 +217,6 @@ def lights() -> Samples:
 
 
 @cache
-def numbers() -> Samples:
-    """Text lights of 9 and 27 numbers."""
-    return {
-        f"{n}.txt": "".join(f"{value:.9g}\n" for value in np.linspace(-1, 1, n)).encode() for n in (9, 27)
-    }
-
-
-@cache
 def landmarks() -> Samples:
     """68 landmarks as .pts and JSON."""
     points = fit_arrays()["landmarks_px"].tolist()

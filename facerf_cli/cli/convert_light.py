@@ -37,8 +37,8 @@ def convert_light(
         list[str],
         typer.Argument(
             metavar="LIGHT...",
-            help="Lat-long maps (.exr, .hdr), lights of estimate-light (.json), DPR's or SfSNet's numbers "
-            "(.txt); folders of them, or - for a list.",
+            help="Lat-long maps (.exr, .hdr), lights of estimate-light (.json); folders of them, or - for a "
+            "list.",
             show_default=False,
         ),
     ],
@@ -48,8 +48,8 @@ def convert_light(
     """Convert lights between maps, weights of a rig, spherical harmonics, and the axes of other programs.
 
     Forms: latlong (EXR); json (weights of a rig, and spherical harmonics); sh (spherical harmonics alone,
-    JSON); dpr and sfsnet (text); blender and mitsuba (EXR, oriented as these programs expect for a head that
-    faces the viewer). Maps are scene-linear; files name their convention where they can.
+    JSON); blender and mitsuba (EXR, oriented as these programs expect for a head that faces the viewer). Maps
+    are scene-linear; files name their convention where they can.
 
     Spherical harmonics lose what is finer than their order; the weights of a rig are integrated from a map as
     `relight` does.

@@ -1,7 +1,6 @@
-"""Lights on disk: JSON of a rig's weights and spherical harmonics, plain numbers, and environment maps.
+"""Lights on disk: JSON of a rig's weights and spherical harmonics, and environment maps.
 
-A JSON light is written by `facerf estimate-light` and `convert-light`; text files of numbers are the formats
-of DPR and SfSNet; any image can be an environment map.
+A JSON light is written by `facerf estimate-light` and `convert-light`; any image can be an environment map.
 """
 
 import json
@@ -23,7 +22,6 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, LINEAR_BYTES, LinearImage, read_image
-from facerf_cli.files.texts import read_bytes, text_of
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
 from facerf_cli.light.sh import CONVENTION
@@ -38,7 +36,6 @@ AXES = "camera: x to the picture's right, y up, z toward the camera; directions 
 UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
 _LIMIT_BYTES = 4 << 20
 _MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441  # 441: spherical harmonics of order 20
-_TEXT_LIMIT_BYTES = 1 << 16  # of a text file of numbers; the longest format has 27
 _LARGEST = 1e30  # magnitude of a number; its square still fits double precision
 _GPANO = (
     "FullPanoHeight FullPanoWidth CroppedAreaImageHeight CroppedAreaImageWidth CroppedAreaTop CroppedAreaLeft"
@@ -176,25 +173,6 @@ def read_light(path: Path) -> LightRecord:
 def _is_attribute(value: Any) -> bool:
     """Return whether an image's header can store the value."""
     return isinstance(value, str) or (isinstance(value, int | float) and abs(value) < 1 << 31)
-
-
-def write_numbers(path: Path, numbers: Tensor) -> None:
-    """Write numbers [N], one in each line, in the format of DPR and SfSNet."""
-    with atomic_path(path) as temporary:
-        temporary.write_text("".join(f"{value:.9g}\n" for value in numbers.tolist()), encoding="utf-8")
-
-
-def read_numbers(path: Path, counts: tuple[int, ...]) -> Tensor:
-    """Read numbers [N] from a text file, separated by white space; N must be one of `counts`."""
-    wanted = " or ".join(map(str, counts))
-    content = read_bytes(path, _TEXT_LIMIT_BYTES, f"give a text file of {wanted} numbers")
-    try:
-        values = [float(word) for word in text_of(content).split()]
-    except ValueError:
-        raise InputError(f"{path}: not a text file of numbers; a light has {wanted}") from None
-    if len(values) not in counts or not all(abs(value) < _LARGEST for value in values):
-        raise InputError(f"{path}: {len(values)} numbers; a light has {wanted}, all finite")
-    return torch.tensor(values)
 
 
 def read_map_file(path: Path | str) -> Tensor:

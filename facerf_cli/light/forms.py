@@ -21,11 +21,9 @@ from facerf_cli.light.sh import (
     order_of,
     positive_latlong,
     rig_coefficients,
-    rotated,
     sh_to_latlong,
 )
 from facerf_cli.light.sphere import (
-    LUMINANCE,
     RigLight,
     golden_spiral,
     latlong_directions,
@@ -51,8 +49,6 @@ _ROWS_BETWEEN = 512  # of the map by which one rig is converted to another
 #   the head looks along -Y, Z up, as in its front view; our map moves right by a quarter of its width. In
 #   Blender 4.5.15 (bpy, Cycles) a white ball under two converted maps has our irradiance to 1 %.
 _ADDED_AZIMUTH_DEG: dict[MapAxes, float] = {"facerf": 0, "mitsuba": 0, "blender": -90}
-_CAMERA_TO_DPR = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
-_SFSNET_ORDER = [0, 2, 3, 1, 6, 7, 5, 8, 4]  # our index of each of its nine coefficients
 
 
 def rig_to_latlong(light: RigLight, height: int) -> Tensor:
@@ -224,38 +220,3 @@ def _rotated(envmap: Tensor, azimuth_deg: float) -> Tensor:
     if pixels == round(pixels):
         return envmap.roll(round(pixels), dims=1)
     return resampled(envmap, len(envmap), azimuth_deg)
-
-
-def to_dpr(coefficients: Tensor) -> Tensor:
-    """Convert the luminance of coefficients [K, 3], K >= 9, to the nine numbers of DPR.
-
-    Zhou et al., *Deep Single-Image Portrait Relighting*, 2019. Its shading is its basis at the normal times
-    the nine (utils/utils_SH.py: the orthonormal harmonics in our order, times the cosine lobe's pi, 2 pi / 3,
-    pi / 4), with x right, y into the image and z up (the half-sphere of its testNetwork_demo_512.py). Here
-    its shading is the radiance of a white surface, irradiance over pi. In its own examples the first number
-    is about 0.8, so a light far from that should be scaled.
-    """
-    grey = coefficients[:9] @ torch.tensor(LUMINANCE).to(coefficients)
-    return rotated(grey[:, None], _CAMERA_TO_DPR)[:, 0] / math.pi
-
-
-def from_dpr(numbers: Tensor) -> Tensor:
-    """Convert the nine numbers of DPR to coefficients [9, 3] of a grey light."""
-    return rotated(math.pi * numbers[:, None], _CAMERA_TO_DPR.T).expand(9, 3).contiguous()
-
-
-def to_sfsnet(coefficients: Tensor) -> Tensor:
-    """Convert coefficients [K, 3], K >= 9, to the 27 numbers of SfSNet, nine per channel.
-
-    Sengupta et al., *SfSNet*, 2018 (functions/normal_harmonics.m, create_shading_recon.m): orthonormal
-    harmonics times the cosine lobe at the normal, in the order 1, z, x, y, 3z^2-1, xz, yz, x^2-y^2, xy. Its
-    source does not name its axes; here they are x right, y up, z toward the camera. The unit is DPR's.
-    """
-    return (coefficients[_SFSNET_ORDER] / math.pi).T.reshape(27)
-
-
-def from_sfsnet(numbers: Tensor) -> Tensor:
-    """Convert the 27 numbers of SfSNet to coefficients [9, 3]."""
-    coefficients = numbers.new_zeros(9, 3)
-    coefficients[_SFSNET_ORDER] = math.pi * numbers.reshape(3, 9).T
-    return coefficients

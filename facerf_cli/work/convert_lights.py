@@ -13,20 +13,14 @@ from facerf_cli.files.light_files import (
     LightRecord,
     read_light_file,
     read_map_file,
-    read_numbers,
     write_light,
-    write_numbers,
 )
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.forms import (
     LightForms,
     MapAxes,
-    from_dpr,
     from_map_axes,
-    from_sfsnet,
-    to_dpr,
     to_map_axes,
-    to_sfsnet,
 )
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.run.logs import LOGGER_NAME
@@ -44,9 +38,6 @@ def write_forms(item: Item, work: ConvertLight) -> str:
     for form, path in zip(work.forms, work.outputs_of(item), strict=True):
         if form == "json" or form == "sh":
             _write_json(path, light, form, attributes, work)
-        elif form == "dpr" or form == "sfsnet":
-            numbers = to_dpr if form == "dpr" else to_sfsnet
-            write_numbers(path, numbers(light.harmonics(2)))
         else:
             _write_map(path, light, "facerf" if form == "latlong" else form, attributes, work)
     return str(light)
@@ -81,7 +72,4 @@ def _read(path: Path, from_axes: MapAxes) -> tuple[LightForms, Attributes]:
     if path.suffix.lower() == ".json":
         light, known = read_light_file(path)
         return light, {**known, **said}
-    if path.suffix.lower() == ".txt":
-        numbers = read_numbers(path, (9, 27))  # DPR's, or SfSNet's
-        return LightForms(coefficients=(from_dpr if len(numbers) == 9 else from_sfsnet)(numbers)), said
     return LightForms(envmap=from_map_axes(read_map_file(path), from_axes)), said

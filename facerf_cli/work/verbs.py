@@ -219,19 +219,17 @@ class PredictOlat(PhotoWork):
         return replace(self, frame=self.frame or ("photo" if self.pose is None else "face"))
 
 
-Form = Literal["latlong", "json", "sh", "dpr", "sfsnet", "blender", "mitsuba"]
+Form = Literal["latlong", "json", "sh", "blender", "mitsuba"]
 MOST_ORDER = 20
 LARGEST_MAP_PX = 8192
 _ENDINGS: dict[Form, str] = {
     "latlong": "_latlong.exr",
     "json": "_rig.json",
     "sh": "_sh.json",
-    "dpr": "_dpr.txt",
-    "sfsnet": "_sfsnet.txt",
     "blender": "_blender.exr",
     "mitsuba": "_mitsuba.exr",
 }
-_LIGHT_SUFFIXES = frozenset({".exr", ".hdr", ".json", ".txt"})
+_LIGHT_SUFFIXES = frozenset({".exr", ".hdr", ".json"})
 
 
 def parse_forms(names: Sequence[str]) -> tuple[Form, ...]:
@@ -246,7 +244,7 @@ class ConvertLight:
     """`facerf convert-light`.
 
     Attributes:
-        forms: Write this form: latlong, json, sh, dpr, sfsnet, blender or mitsuba. Repeatable.
+        forms: Write this form: latlong, json, sh, blender or mitsuba. Repeatable.
         from_axes: Read input maps in the orientation of this program.
         width_px: Write maps of this width; the height is half of it.
         order: Write spherical harmonics of this order in json and sh.

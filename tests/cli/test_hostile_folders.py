@@ -15,7 +15,6 @@ from facerf_cli.errors import InputError
 from facerf_cli.evaluation.pairs import read_array
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
-from facerf_cli.files.light_files import read_numbers
 from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.files.read import decode
 from facerf_cli.files.texts import is_regular, read_toml, require_regular
@@ -87,7 +86,6 @@ OPENERS = {
     "a stack": read_olat_stack,
     "landmarks": read_landmarks,
     "a list of lights": read_light_list,
-    "numbers": lambda path: read_numbers(path, (9,)),
     "TOML": lambda path: read_toml(path, 100, ""),
     "a fit": load_fit,
     "an array": read_array,

@@ -15,9 +15,7 @@ from facerf_cli.files.light_files import (
     LightRecord,
     read_light,
     read_map_file,
-    read_numbers,
     write_light,
-    write_numbers,
 )
 from facerf_cli.files.read import read_image
 
@@ -96,18 +94,6 @@ def test_a_list_is_no_light(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text("[1]")
     with pytest.raises(InputError, match=r"a\.json is \[1\]; an object"):
         read_light(tmp_path / "a.json")
-
-
-def test_numbers_are_written_one_in_each_line(tmp_path: Path) -> None:
-    path = tmp_path / "light.txt"
-    write_numbers(path, random_rows(3).reshape(9))
-    assert len(path.read_text().splitlines()) == 9
-    assert torch.equal(read_numbers(path, (9, 27)), random_rows(3).reshape(9))
-    with pytest.raises(InputError, match="9 numbers; a light has 27"):
-        read_numbers(path, (27,))
-    path.write_text("1 2 three")
-    with pytest.raises(InputError, match="not a text file of numbers"):
-        read_numbers(path, (3,))
 
 
 def pano(

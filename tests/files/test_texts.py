@@ -9,7 +9,6 @@ import pytest
 from facerf_cli.errors import InputError
 from facerf_cli.files import texts as json_reader
 from facerf_cli.files.documents import Document, Name, checked, distinct
-from facerf_cli.files.light_files import read_numbers
 from facerf_cli.files.texts import MOST_RIG_LIGHTS, parse_json, read_json, read_rig, read_text, read_toml
 from facerf_cli.light.entries import parse_lights
 
@@ -43,7 +42,7 @@ def test_what_is_beyond_them_is_refused(text: str | bytes, said: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
 def test_byte_order_marks_are_no_part_of_a_text(tmp_path: Path, encoding: str) -> None:
-    """In JSON, TOML, lists of lights and of numbers; PowerShell writes UTF-16."""
+    """In JSON, TOML and lists of lights; PowerShell writes UTF-16."""
     path, mark = tmp_path / "a.txt", "\ufeff" if encoding == "utf-16-be" else ""
 
     def written(text: str) -> Path:
@@ -54,7 +53,6 @@ def test_byte_order_marks_are_no_part_of_a_text(tmp_path: Path, encoding: str) -
     assert read_toml(written('key = "é"'), 99, "") == {"key": "é"}
     assert read_text(written("é"), 99, "") == "é"
     assert parse_lights(str(written("0,10\n20,30\n"))) == [(0, 10), (20, 30)]
-    assert read_numbers(written("1 2 3"), (3,)).tolist() == [1, 2, 3]
 
 
 def test_depth_and_numbers_at_the_limits_pass() -> None:

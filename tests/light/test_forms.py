@@ -9,15 +9,10 @@ from torch import Tensor
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.forms import (
     MapAxes,
-    from_dpr,
     from_map_axes,
-    from_sfsnet,
     rig_to_latlong,
-    to_dpr,
     to_map_axes,
-    to_sfsnet,
 )
-from facerf_cli.light.sh import irradiance, rig_coefficients
 from facerf_cli.light.sphere import (
     RigLight,
     azel_to_direction,
@@ -26,65 +21,6 @@ from facerf_cli.light.sphere import (
     latlong_solid_angles,
     rig_directions,
 )
-
-NORMALS = rig_directions(60).double()
-
-
-def drawn_light() -> Tensor:
-    return torch.randn(9, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
-
-
-def dpr_shading(normals: np.ndarray, nine: np.ndarray) -> np.ndarray:
-    """DPR's shading at normals [N, 3] in its axes, written out from its published formula."""
-    x, y, z = normals.T
-    a0, a1, a2 = math.pi, 2 * math.pi / 3, math.pi / 4
-    terms = [
-        a0 * 0.5 / math.sqrt(math.pi) * np.ones_like(x),
-        a1 * math.sqrt(3 / (4 * math.pi)) * y,
-        a1 * math.sqrt(3 / (4 * math.pi)) * z,
-        a1 * math.sqrt(3 / (4 * math.pi)) * x,
-        a2 * math.sqrt(15 / (4 * math.pi)) * x * y,
-        a2 * math.sqrt(15 / (4 * math.pi)) * y * z,
-        a2 * math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
-        a2 * math.sqrt(15 / (4 * math.pi)) * x * z,
-        a2 * math.sqrt(15 / (16 * math.pi)) * (x * x - y * y),
-    ]
-    return np.stack(terms, -1) @ nine
-
-
-def test_dprs_shading_is_our_white_surfaces_radiance() -> None:
-    grey = drawn_light()[:, :1].expand(9, 3)
-    nine = to_dpr(grey)
-    in_dprs_axes = torch.stack([NORMALS[:, 0], -NORMALS[:, 2], NORMALS[:, 1]], -1)
-    shading = torch.from_numpy(dpr_shading(in_dprs_axes.numpy(), nine.numpy()))
-    ours = irradiance(NORMALS, grey)[:, 0] / math.pi
-    torch.testing.assert_close(shading, ours, rtol=0, atol=1e-6)
-    torch.testing.assert_close(from_dpr(nine), grey)
-
-
-def test_dprs_own_example_lights_the_right_of_a_face_from_the_front() -> None:
-    # data/example_light/rotate_light_1/txt/rotate_light_01.txt of its repository, to five digits
-    example = [1.08413, -0.46427, 0.08723, 0.67148, -0.36221, 0.01640, -0.23573, -0.02072, 0.29257]
-    coefficients = from_dpr(torch.tensor(example))
-    right, left, front, back = irradiance(
-        torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], [0, 0, -1]]), coefficients
-    )
-    assert right[0] > 2 * left[0] and front[0] > 1.5 * back[0]
-
-
-def test_a_coloured_light_becomes_its_luminance() -> None:
-    nine = from_dpr(to_dpr(drawn_light()))
-    torch.testing.assert_close(nine[:, 0], drawn_light() @ torch.tensor([0.2126, 0.7152, 0.0722]).double())
-
-
-def test_sfsnets_order_and_channels() -> None:
-    light = rig_coefficients(RigLight(azel_to_direction(90, 0)[None], torch.tensor([[1.0, 0, 0]])), 2)
-    numbers = to_sfsnet(light).reshape(3, 9)
-    assert numbers[1:].abs().max() == 0
-    # The light comes from +x: only 1, x, 3z^2-1 (as -1) and x^2-y^2 are lit, in SfSNet's places for them.
-    assert (numbers[0].abs() > 1e-3).tolist() == [True, False, True, False, True, False, False, True, False]
-    assert numbers[0, 2] > 0 and numbers[0, 4] < 0
-    torch.testing.assert_close(from_sfsnet(to_sfsnet(drawn_light())), drawn_light())
 
 
 @pytest.mark.parametrize("height", [64, 33])
