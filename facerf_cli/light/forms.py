@@ -4,13 +4,12 @@ Axes here are the camera's: x right, y up, z toward the camera; the centre of a 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 import torch
-from scipy.sparse import csr_matrix, diags
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -25,19 +24,13 @@ from facerf_cli.light.sh import (
 )
 from facerf_cli.light.sphere import (
     RigLight,
-    golden_spiral,
     latlong_directions,
-    latlong_solid_angles,
     rig_directions,
 )
 
-_POINTS_PER_CELL = 64  # at which radiance is found
-_FEWEST_POINTS, _MOST_POINTS = 4096, 1 << 17
-_NEIGHBOURS = 8  # points over which a blur extends
-_ROUNDS = 200  # of smoothing and correction, in which cells become smooth
-_LAST_ROUNDS = 30  # of correction alone
-_SMOOTHING, _TEXEL_BLUR = 1.0, 0.7  # standard deviations of blurs, in spacings of the points
-_TEXELS_AT_ONCE = 1 << 16
+_NEIGHBOURS = 8  # lights around a texel
+_WIDTH = 0.35  # standard deviation of a light's Gaussian, in spacings of the lights
+_SMOOTH_GAINS = 3  # the first is the splat itself
 MapAxes = Literal["facerf", "blender", "mitsuba"]
 DEFAULT_ROWS = 256  # of a map whose size is not given
 DEFAULT_ORDER = 2  # which a matte surface shows
@@ -54,91 +47,46 @@ _ADDED_AZIMUTH_DEG: dict[MapAxes, float] = {"facerf": 0, "mitsuba": 0, "blender"
 def rig_to_latlong(light: RigLight, height: int) -> Tensor:
     """Radiance [height, 2 height, 3] float32 of a smooth map that has the weights [L, 3] of a rig's light.
 
-    The power of each light is spread over its cell, then smoothed over the sphere and corrected, many times
-    in alternation. This is mass-preserving interpolation of values that are known by area (Tobler, *Smooth
-    Pycnophylactic Interpolation for Geographical Regions*, 1979), with correction factors that are smooth,
-    too (Richardson-Lucy: the factor of a point is a mean over the cells to which it contributes). A single
-    light becomes a soft disc in its cell, and non-negative weights give a non-negative map.
-
-    `envmap_weights` gives them back within 1 % of the largest if a cell is several texels wide: for the rig
-    of 150 lights from a height of 128 up. Lights of the same direction are one light. Negative weights (of a
-    spherical-harmonic model) are spread separately and subtracted.
+    Three times the gain that each light's weight lacks in the map is splatted by a Gaussian, normalised over
+    the lights around a texel; then each cell is scaled to its weight. So a single light is a soft disc in its
+    cell, and non-negative weights give a non-negative map. `envmap_weights` gives them back within 1 % of the
+    largest if a cell is several texels wide: for the rig of 150 lights from a height of 128 up. Lights of the
+    same direction are one light. Negative weights (of a spherical-harmonic model) are converted separately
+    and subtracted.
     """
-    directions, weights = _distinct_lights(light)
-    points = _points(directions)
-    parts = np.concatenate([weights.clip(min=0), (-weights).clip(min=0)], 1)  # [L, 6]
-    spread = _spread(parts, directions, points)
-    radiance = spread[:, :3] - spread[:, 3:]
-    envmap = _to_map(radiance, points, max(height, cell_rows(len(directions))))
-    return envmap if len(envmap) == height else resampled(envmap, height)
+    if bool((light.weights < 0).any()):
+        above, below = (RigLight(light.directions, (s * light.weights).clamp(min=0)) for s in (1, -1))
+        return rig_to_latlong(above, height) - rig_to_latlong(below, height)
+    coarse = cell_rows(len(light.directions)) // 2
+    rows = max(height, coarse)
+    directions = light.directions.double().cpu()
+    with_cell = np.unique(nearest_light(directions, coarse, 2 * coarse).numpy())
+    lights = directions[with_cell]
+    tree = cKDTree(lights.numpy())
+    _, nearest = tree.query(directions.numpy())
+    weights = torch.zeros(len(lights), 3).index_add_(0, torch.from_numpy(nearest), light.weights.cpu())
+
+    def lacking(envmap: Tensor) -> Tensor:
+        return weights / envmap_weights(envmap, lights).clamp(min=1e-30)
+
+    gains: list[Tensor] = []
+    for _ in range(_SMOOTH_GAINS):
+        gains.append(lacking(_splat(gains, tree, coarse)))
+    envmap = _splat(gains, tree, rows)
+    envmap *= lacking(envmap)[nearest_light(lights, rows, 2 * rows)]
+    return envmap if rows == height else resampled(envmap, height)
 
 
-def _distinct_lights(light: RigLight) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and weights [L, 3] of the lights that have a cell; others are added to the nearest."""
-    directions = light.directions.double().cpu().numpy()
-    rows = cell_rows(len(directions))
-    own = directions[np.unique(nearest_light(light.directions, rows, 2 * rows).numpy())]
-    weights = np.zeros((len(own), 3))
-    np.add.at(weights, cKDTree(own).query(directions)[1], light.weights.double().cpu().numpy())
-    return own, weights
-
-
-def _points(directions: np.ndarray) -> np.ndarray:
-    """Unit vectors [N, 3]: uniform on the sphere, and one in each cell [L, 3] that they miss."""
-    count = min(max(_POINTS_PER_CELL * len(directions), _FEWEST_POINTS), _MOST_POINTS)
-    even = golden_spiral(count)
-    missed = np.setdiff1d(np.arange(len(directions)), cKDTree(directions).query(even)[1])
-    return np.concatenate([even, directions[missed]])
-
-
-def _spread(weights: np.ndarray, directions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Radiance [N, C] at points [N, 3] of a map with non-negative weights [L, C] of cells [L, 3]."""
-    smooth, to_weights = _matrices(directions.tobytes())
-    # [N, L], rows sum to 1
-    shares = (diags(1 / np.asarray(to_weights.sum(0)).ravel()) @ to_weights.T).tocsr()
-    radiance = shares @ (weights / np.asarray(to_weights.sum(1)))
-    rounds = min(_ROUNDS, _ROUNDS * len(points) // (_POINTS_PER_CELL * len(directions)))
-    for index in range(rounds + _LAST_ROUNDS):
-        if index < rounds:
-            radiance = smooth @ radiance
-        found = to_weights @ radiance
-        radiance *= shares @ np.divide(weights, found, out=np.zeros_like(found), where=found > 0)
-    return radiance
-
-
-@lru_cache(maxsize=2)  # photos in sequence have the same rig
-def _matrices(directions_bytes: bytes) -> tuple[csr_matrix, csr_matrix]:
-    """Matrices that smooth radiance at the points [N, N], and give the weights of its map's cells [L, N]."""
-    directions = np.frombuffer(directions_bytes).reshape(-1, 3)
-    points = _points(directions)
-    rows = cell_rows(len(directions))
-    texels = latlong_directions(rows, 2 * rows, torch.float64).reshape(-1, 3).numpy()
-    areas = latlong_solid_angles(rows, 2 * rows, torch.float64).reshape(-1).numpy()
-    cell = cKDTree(directions).query(texels)[1]
-    shape = (len(directions), len(texels))
-    sums = csr_matrix((areas / math.pi, (cell, np.arange(len(texels)))), shape)
-    return _blur(points, points, _SMOOTHING), sums @ _blur(texels, points, _TEXEL_BLUR)
-
-
-def _to_map(radiance: np.ndarray, points: np.ndarray, height: int) -> Tensor:
-    """Resample radiance [N, 3] at the points to a map [height, 2 height, 3] float32."""
-    texels = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
-    parts = torch.split(texels, _TEXELS_AT_ONCE)
-    blocks = [_blur(part.numpy(), points, _TEXEL_BLUR) @ radiance for part in parts]
-    return torch.from_numpy(np.concatenate(blocks)).float().reshape(height, 2 * height, 3)
-
-
-def _blur(at: np.ndarray, points: np.ndarray, width: float) -> csr_matrix:
-    """Matrix [M, N] from points to directions [M, 3]: a Gaussian over the neighbours, rows sum to 1.
-
-    `width` is its standard deviation in spacings of the points.
-    """
-    spacing = math.sqrt(4 * math.pi / len(points))
-    distance, near = cKDTree(points).query(at, k=_NEIGHBOURS)
-    share = np.exp(-0.5 * (distance / (width * spacing)) ** 2)
-    row = np.repeat(np.arange(len(at)), _NEIGHBOURS)
-    matrix = csr_matrix((share.ravel(), (row, near.ravel())), (len(at), len(points)))
-    return diags(1 / np.asarray(matrix.sum(1)).ravel()) @ matrix
+def _splat(gains: Sequence[Tensor], lights: cKDTree, rows: int) -> Tensor:
+    """Product [rows, 2 rows, 3] of gains [L, 3] of lights, each a mean of those around a texel."""
+    envmap = torch.ones(rows, 2 * rows, 3)
+    for row, texels in zip(envmap, latlong_directions(rows, 2 * rows, torch.float64).numpy(), strict=True):
+        distance, near = lights.query(texels, k=range(1, min(_NEIGHBOURS, lights.n) + 1))
+        nearer = (distance[:, :1] ** 2 - distance**2) * lights.n / (4 * math.pi * _WIDTH**2)
+        share = torch.from_numpy(np.exp(0.5 * nearer)).float()
+        for gain in gains:
+            row *= torch.einsum("nk,nkc->nc", share / share.sum(1, keepdim=True), gain[near])
+    return envmap
 
 
 @dataclass(frozen=True, eq=False)
