@@ -54,7 +54,7 @@ def test_two_sides_of_an_edge_keep_their_own_values() -> None:
     read = places(colours, trust, grid(), photo, 1.0)
     found, bled = (
         F.grid_sample(values[None], at[None], padding_mode="border", align_corners=False)[0, 0]
-        for values, at in ((EdgeFill.of(colours, trust, ONES).filled(maps), read), (maps, grid()))
+        for values, at in ((EdgeFill.of(colours, trust, ONES, trust).filled(maps), read), (maps, grid()))
     )
     away = distance(SIDE * SCALE, 1)[:HEIGHT, :WIDTH]
     sure = away.abs() > BESIDE
@@ -67,8 +67,23 @@ def test_maps_of_any_layout_stay_as_they_are() -> None:
     colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
     by_pixel = torch.rand(SIDE, SIDE, 2, generator=torch.Generator().manual_seed(0))
     before = by_pixel.clone()
-    found = EdgeFill.of(colours, trust_in(colours, ONES, 0 * ONES), ONES).filled(by_pixel.permute(2, 0, 1))
+    trust = trust_in(colours, ONES, 0 * ONES)
+    found = EdgeFill.of(colours, trust, ONES, trust).filled(by_pixel.permute(2, 0, 1))
     assert torch.equal(by_pixel, before) and (found.permute(1, 2, 0) != before).any()
+
+
+def test_a_block_of_light_on_plain_cloth_fades_and_none_of_it_crosses_an_edge() -> None:
+    share = skin(SIDE, SCALE)
+    colours = colours_of(mixed(share, DARK, BRIGHT)).expand(3, -1, -1)
+    trust = trust_in(colours, ONES, 0 * ONES)
+    away = distance(SIDE, SCALE) / SCALE
+    jumps = torch.where(away > 6, 3.0, 1.0)[None]  # within the bright half
+    found = EdgeFill.of(colours, trust, ONES, 0 * ONES).filled(jumps)[0]
+    rows = slice(8, -8)
+    steepest = found[rows].diff(dim=1).abs().max()
+    assert steepest < 0.3 * jumps.diff(dim=2).max()
+    dark = away < -1
+    assert (found[dark] - 1).abs().max() < 0.05
 
 
 def test_where_there_is_no_edge_nothing_changes() -> None:
@@ -79,13 +94,16 @@ def test_where_there_is_no_edge_nothing_changes() -> None:
     photo = torch.full((HEIGHT, WIDTH, 3), 0.2)
     for colours, solid, loose in ((shades, 1, 0), (edges, 0, 0), (edges, 1, 1)):
         trust = trust_in(colours, solid * ONES, loose * ONES)
-        assert torch.equal(EdgeFill.of(colours, trust, ONES).filled(maps), maps)
+        assert torch.equal(EdgeFill.of(colours, trust, ONES, trust).filled(maps), maps)
         assert torch.equal(places(colours, trust, grid(), photo, 1.0), grid())
 
 
 @pytest.mark.parametrize("glossy", [False, True])
 def test_no_light_of_a_hand_is_on_the_cloth_behind_it(glossy: bool) -> None:
-    """The hand is cloth to the segmentation, and light on it is four times as bright."""
+    """The hand is cloth to the segmentation, and light on it is four times as bright.
+
+    A block of light elsewhere on the cloth has no hard edge.
+    """
     view = astronaut.field().views[0]
     size = view.person.image.shape[-1]
     side_px = 2 * size  # of the square, which the photo is a little wider than
@@ -104,9 +122,11 @@ def test_no_light_of_a_hand_is_on_the_cloth_behind_it(glossy: bool) -> None:
     lit = torch.zeros(15, size, size)
     rows = slice(3 if glossy else 0, 6 if glossy else 3)
     lit[rows] = blurred(mixed(share, 0.5, 2)[None], 1.0)
+    lit[rows, :, :20] *= 2
     both = skin(side_px + 20, 1)[:side_px], distance(side_px + 20, 1)[:side_px].numpy()
     photo = mixed(both[0], DARK, BRIGHT)[..., None].expand(-1, -1, 3).numpy().copy()
     enlarged = Enlarged(replace(view, person=person, maps=maps), photo)
     relit = luminance(enlarged.relit(lit, 0.0, None)(photo, slice(0, side_px), slice(0, side_px + 20)))
-    cloth, far = (both[1] < -BESIDE) & (both[1] > -FAR), both[1] < -FAR
+    cloth, far = (both[1] < -BESIDE) & (both[1] > -FAR), (both[1] < -FAR) & (both[1] > -3 * FAR)
+    assert np.abs(np.diff(relit, axis=1))[:, 30:50].max() < 0.15 * relit[far].mean()
     assert np.abs(relit[cloth] / relit[far].mean() - 1).max() < 0.15

@@ -1,7 +1,8 @@
 """Coarse maps at the edges of a photo, where they mix both sides: a finger and the cloth behind it.
 
 Colours tell the sides apart: classes know no finger before a jacket. Pixels of the maps near an edge take the
-values of pixels around them that have their colour and lie farther from any edge (`EdgeFill`). A pixel of the
+values of pixels around them that have their colour and lie farther from any edge (`EdgeFill`). So does plain
+cloth everywhere: where the proxy of the person ends on it, maps jump, and blocks show. A pixel of the
 photo reads the maps at the centre of those pixels around it that have its colour (`places`); where all of
 them have it, this is its own place.
 """
@@ -20,22 +21,25 @@ _NEAR_PX = 2  # distance from an edge within which maps are mixed, in their pixe
 _EDGE = 0.12  # difference of colours of an edge
 _REACH_PX, _SPREAD_PX = 4, 2.0  # of the pixels whose values one near an edge takes, and standard deviation
 _ALIKE = 0.06  # difference of colours that count as the same
-_FAR = 0.95  # trust in pixels that keep their values
+_FAR = 0.95  # share from which on pixels keep their values
 _LEAST_TRUST, _LEAST_WEIGHT = 1e-4, 1e-3
 
 
 class EdgeFill(NamedTuple):
-    """Pixels [N] of maps [S, S] near edges, their trust [N], and weights [N, S * S] of what they take."""
+    """Pixels [N] of maps [S, S], what they keep [N], and weights [N, S * S] of what they take."""
 
     pixels: Tensor
-    trust: Tensor
+    kept: Tensor
     weights: csr_array
 
     @staticmethod
-    def of(colours: Tensor, trust: Tensor, own: Tensor) -> "EdgeFill":
-        """Pixels of colours [3, S, S] where trust [S, S] is below 1; they take of a person's `own`."""
+    def of(colours: Tensor, trust: Tensor, own: Tensor, kept: Tensor) -> "EdgeFill":
+        """Pixels of colours [3, S, S] that keep a share below 1, `kept` [S, S], of their values.
+
+        They take of a person's `own`, by their trust [S, S].
+        """
         side, flat, trusted = own.shape[-1], colours.flatten(1), (trust * own).flatten()
-        pixels = torch.nonzero(trust.flatten() < _FAR)[:, 0]
+        pixels = torch.nonzero(kept.flatten() < _FAR)[:, 0]
         steps = list(product(range(-_REACH_PX, _REACH_PX + 1), repeat=2))
         around = np.empty((len(pixels), len(steps)), np.int32)
         weights = np.empty(around.shape, np.float32)
@@ -52,13 +56,13 @@ class EdgeFill(NamedTuple):
         used = weights > 0
         ends = np.concatenate([[0], used.sum(1).cumsum()])
         taken = csr_array((weights[used], around[used], ends), (len(pixels), side**2))
-        return EdgeFill(pixels, trust.flatten()[pixels], taken)
+        return EdgeFill(pixels, kept.flatten()[pixels], taken)
 
     def filled(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] with these pixels filled."""
         flat = maps.flatten(1).T.clone(memory_format=torch.contiguous_format)
         taken = torch.from_numpy(self.weights @ flat.numpy())
-        flat[self.pixels] = torch.lerp(taken, flat[self.pixels], self.trust[:, None])
+        flat[self.pixels] = torch.lerp(taken, flat[self.pixels], self.kept[:, None])
         return flat.T.reshape(maps.shape)
 
 

@@ -48,7 +48,8 @@ class Enlarged:
             classes[[class_index(name) for name in names]].sum(0, keepdim=True) for names in (_HAIR, _SOLID)
         )
         self._trust = 1 - self.own * (1 - trust_in(self._colours, solid[0], hair[0]))
-        self._edges = EdgeFill.of(self._colours, self._trust, self.own)
+        kept = self._trust * (1 - classes[class_index("garment")])
+        self._edges = EdgeFill.of(self._colours, self._trust, self.own, kept)
         self._hair = torch.cat([self._filled(view.maps.albedo[0].mean(0, keepdim=True)), hair])
         self._albedo_maps = torch.cat(
             [self._gain_lines(), self._filled(self._edges.filled(view.maps.bias[0]))]
