@@ -29,6 +29,7 @@ PHOTO_SUFFIXES = frozenset(
     {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".tif", ".tiff", ".webp", ".jxl", ".heic"}
     | {".heif", ".avif", ".jp2", ".psd", ".tga", ".bmp", ".gif", ".dpx", ".cin", ".pgm", ".ppm"}
 )
+MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 LANDMARK_SUFFIXES = frozenset({".pts", ".json"})
 COMPANION = "FILE|DIR|PATTERN"  # the placeholder of options that name a file for each input
 FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".mkv", ".m4v", ".avi", ".mxf", ".mts", ".m2ts"})

@@ -9,6 +9,7 @@ positions of lights relative to the object.
 """
 
 import json
+import logging
 import math
 import os
 import re
@@ -20,15 +21,18 @@ from typing import Any
 
 import numpy as np
 
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
-from facerf_cli.capture.stage_json import FACING, STAGE_FORMAT
+from facerf_cli.capture.stage_json import FACING, STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
 from facerf_cli.files.texts import read_text
 from facerf_cli.image.colour import LINEAR, find_space
-from facerf_cli.run.logs import counted
+from facerf_cli.run.logs import LOGGER_NAME, counted
 
+log = logging.getLogger(LOGGER_NAME)
 _LONE_CAMERA = "C0"  # id where the pattern has no {camera}
 _LONE_SUBJECT = "subject"  # id where it has no {subject}, and the folder's name cannot be one
 _LEAST_LIGHTS = 3  # fewer determine no normals
@@ -73,6 +77,29 @@ class Frames:
     def expected(self) -> int:
         """Number of frames if every camera has every subject under every light."""
         return len(self.ids("subject")) * len(self.ids("camera")) * len(self.ids("light"))
+
+
+def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: bool) -> None:
+    """Write a draft of stage.json to `output` or into the folder, and print its path and notes.
+
+    UsageError where the file exists. A dry run prints the notes only.
+    """
+    path = folder / STAGE_FILE if output is None else output
+    if path.is_dir() and not dry_run:
+        raise UsageError(f"-o {path}: is a folder; give the draft's name, such as {path / STAGE_FILE}")
+    if not dry_run and (path.exists() or path.is_symlink()):
+        raise UsageError(
+            f"{path}: is there already, and a draft replaces nothing; move it, or give -o another name"
+        )
+    stage = draft_stage(folder, PHOTO_SUFFIXES, pattern)
+    for note in stage["draft"]:
+        log.info("%s", note)
+    if dry_run:
+        print(f"{folder} -> {path}")
+        return
+    with atomic_path(path) as temporary:
+        temporary.write_text(as_text(stage), encoding="utf-8", errors="backslashreplace")
+    print(path)
 
 
 def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def import_model(
         raise UsageError(f"-o {output}: not a face model; give a file that ends in .npz")
     refuse_read([output], [path for path in (source, landmarks) if path])
     _refuse_existing(output, overwrite)
-    from facerf_cli.work.face_model_files import import_to
+    from facerf_cli.face.model_files import import_to
 
     model = import_to(output, kind, source, landmarks)
     log.info(
@@ -97,7 +97,7 @@ def list_models(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object a line instead.")] = False,
 ) -> None:
     """List the built-in face model, the imported ones in the working folder and those to fetch."""
-    from facerf_cli.work.face_model_files import list_rows
+    from facerf_cli.face.model_files import list_rows
 
     rows = list_rows()
     if as_json:
@@ -131,7 +131,7 @@ def show_model(
     if output is not None:
         refuse_read([output], [Path(model)])
         _refuse_existing(output, overwrite)
-    from facerf_cli.work.face_model_files import show
+    from facerf_cli.face.model_files import show
 
     show(model, output)
 

@@ -72,11 +72,11 @@ def prepare_dataset(
     lacks most frames, or in which no face is found, is left out, too; dataset.json lists both. A subject with
     less than half of the lights, or fewer than 10, fails. findings.jsonl has the findings of the checks.
     """
-    from facerf_cli.work.prepare import describe_capture, prepare_capture
-
     if describe:
         others = [name for name in context.params if name not in _DESCRIBES]
         refuse_given(context, others, "is for preparing; leave it out with --describe")
+        from facerf_cli.capture.draft import describe_capture
+
         describe_capture(capture, pattern, output, batch.dry_run)
         return
     refuse_given(context, ["pattern"], "is for --describe; leave it out, stage.json has the pattern")
@@ -84,6 +84,8 @@ def prepare_dataset(
         raise UsageError(
             "-o: is missing; give -o DATASET, a folder (or --describe, for a draft of stage.json)"
         )
+    from facerf_cli.dataset.prepare_capture import prepare_capture
+
     batch = replace(batch, output=output)
     settings = settings_of(context)
     code = prepare_capture(capture, reading, chart, checking, content, batch, settings)

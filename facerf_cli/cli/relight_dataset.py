@@ -34,7 +34,7 @@ def relight_dataset(
     training sums stacks.
     """
     from facerf_cli.dataset.pairs import RELIT
-    from facerf_cli.work.prepare import relight_subjects
+    from facerf_cli.dataset.relight_subjects import relight_subjects
 
     batch = replace(batch, output=dataset / RELIT)
     raise typer.Exit(relight_subjects(dataset, pairs, batch, settings_of(context)))

@@ -6,7 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, split_frame
+from facerf_cli.batch.inputs import (
+    MAP_SUFFIXES,
+    PHOTO_SUFFIXES,
+    Item,
+    NamePattern,
+    collect_items,
+    split_frame,
+)
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import (
     MOST_FRAMES,
@@ -25,7 +32,6 @@ from facerf_cli.option import LIGHT, option
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
 
-MAP_SUFFIXES = frozenset({".exr", ".hdr"})
 Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
 ROOM = "room"  # the name of a room's light, and of its layer

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facerf_cli.face import model_files as face_model
 from facerf_cli.face.importers import ict as published
 from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
 from facerf_cli.files.read import read_image
 from facerf_cli.main import main
-from facerf_cli.work import face_model_files as face_model
 
 Capture = pytest.CaptureFixture[str]
 

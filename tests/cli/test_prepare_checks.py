@@ -32,7 +32,7 @@ def plant(monkeypatch: pytest.MonkeyPatch) -> Plant:
         def check_subject(capture: Capture, subject: str) -> list[Finding]:
             return [found for found in findings if found.subject == subject]
 
-        monkeypatch.setattr("facerf_cli.work.prepare.check_subject", check_subject)
+        monkeypatch.setattr("facerf_cli.dataset.prepare_capture.check_subject", check_subject)
 
     return planted
 

@@ -1,17 +1,14 @@
-"""Work of `facerf prepare-dataset`: draft a stage.json, or check and prepare the subjects of a capture."""
+"""All subjects of a capture checked and prepared, for `facerf prepare-dataset`."""
 
 import logging
-import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
 
 import numpy as np
-from rich.progress import track
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import Recipe, json_rows, require_same
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings, torch_device
@@ -19,7 +16,6 @@ from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
-from facerf_cli.capture.draft import as_text, draft_stage
 from facerf_cli.capture.findings import (
     Finding,
     Selection,
@@ -28,31 +24,25 @@ from facerf_cli.capture.findings import (
     select_frames,
     stopping,
 )
+from facerf_cli.capture.findings_report import (
+    FINDINGS_FILE,
+    collect_findings,
+    keep_findings,
+    require_sound,
+    show_findings,
+    write_findings,
+)
 from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
-from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
-from facerf_cli.dataset.cost import cost_of_sources, in_words, recipe_bytes
+from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
     LARGEST_CROP_PX,
-    Dataset,
     DatasetFolder,
     Split,
     describe_dataset,
     preparation,
-    read_dataset,
 )
-from facerf_cli.dataset.pairs import (
-    GIVE_BEFORE,
-    PAIRS_NAME,
-    RELIT,
-    Pair,
-    draw_pairs,
-    image_path,
-    load_pairs,
-    pairs_path,
-    relight_subject,
-    write_pairs,
-)
+from facerf_cli.dataset.pairs import GIVE_BEFORE, PAIRS_NAME, RELIT
 from facerf_cli.dataset.prepare import (
     Preparation,
     index_page,
@@ -60,8 +50,8 @@ from facerf_cli.dataset.prepare import (
     prepared_subjects,
     subject_outputs,
 )
-from facerf_cli.dataset.settings import DatasetSettings, PairSettings
-from facerf_cli.dataset.weights import envmap_names
+from facerf_cli.dataset.progress import with_bar
+from facerf_cli.dataset.settings import DatasetSettings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import CROP_STEP_PX
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, load_face_model
@@ -70,48 +60,10 @@ from facerf_cli.files.documents import write_document
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import serving_files
 from facerf_cli.relighting.models import Networks
-from facerf_cli.run import memory
-from facerf_cli.run.logs import LOGGER_NAME, STDERR, counted
-from facerf_cli.run.workers import one_thread, process_died, spread
-from facerf_cli.synth.sky.skies import parse_envmaps
-from facerf_cli.work.capture_findings import (
-    FINDINGS_FILE,
-    collect_findings,
-    keep_findings,
-    require_sound,
-    show_findings,
-    write_findings,
-)
-from facerf_cli.work.light_setups import MAP_SUFFIXES
+from facerf_cli.run.logs import LOGGER_NAME, counted
+from facerf_cli.run.workers import one_thread, process_died
 
-T = TypeVar("T")
-R = TypeVar("R")
-_DRAWN = "procedural:"
-_TEST_MAPS_OF = 10  # one in so many maps is for the split test alone
 log = logging.getLogger(LOGGER_NAME)
-
-
-def describe_capture(folder: Path, pattern: str, output: Path | None, dry_run: bool) -> None:
-    """Write a draft of stage.json to `output` or into the folder, and print its path and notes.
-
-    UsageError where the file exists. A dry run prints the notes only.
-    """
-    path = folder / STAGE_FILE if output is None else output
-    if path.is_dir() and not dry_run:
-        raise UsageError(f"-o {path}: is a folder; give the draft's name, such as {path / STAGE_FILE}")
-    if not dry_run and (path.exists() or path.is_symlink()):
-        raise UsageError(
-            f"{path}: is there already, and a draft replaces nothing; move it, or give -o another name"
-        )
-    stage = draft_stage(folder, PHOTO_SUFFIXES, pattern)
-    for note in stage["draft"]:
-        log.info("%s", note)
-    if dry_run:
-        print(f"{folder} -> {path}")
-        return
-    with atomic_path(path) as temporary:
-        temporary.write_text(as_text(stage), encoding="utf-8", errors="backslashreplace")
-    print(path)
 
 
 def prepare_capture(
@@ -169,20 +121,6 @@ def check_all(
         log.info("checked: %s, nothing found", counted(len(items), "subject"))
     print(batch.output / FINDINGS_FILE)
     return 1 if stopping(findings, strict) else 0
-
-
-def with_bar(
-    work: Callable[[T], R],
-    items: Sequence[T],
-    title: str,
-    batch: BatchOptions,
-    settings: Settings,
-    died: Callable[[T, Exception], R],
-) -> Iterator[R]:
-    """Map items by the workers of --jobs or --ray, with a progress bar."""
-    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-    results = spread(work, items, batch.workers(settings), died)
-    return iter(track(results, title, len(items), console=STDERR, transient=True, disable=not shown))
 
 
 def _check(capture: Capture, item: Item) -> list[Finding]:
@@ -323,106 +261,3 @@ def _write_dataset(
     if moved := {row.get("subject") for row in pairs if split_of.get(row.get("subject")) != row.get("split")}:
         words = "%s: the pairs of %d subjects are of another split; %s"
         log.warning(words, folder / RELIT, len(moved), GIVE_BEFORE)
-
-
-def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, settings: Settings) -> int:
-    """Write the pairs and, unless lazy, the sources of the dataset in a folder; return the exit code."""
-    dataset, overwrite = read_dataset(folder), batch.overwrite == "always"
-    maps, test_maps = _maps_of_splits(dataset, wanted, batch.output, settings.seed)
-    pairs = draw_pairs(dataset, maps, wanted.per_subject, settings.seed, test_maps)
-    if not pairs:
-        raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
-    if batch.dry_run:
-        _say_cost(dataset, pairs, wanted.lazy, overwrite)
-    else:
-        write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
-        if test_maps != maps:
-            log.info("maps: %d, and %d others for the split test alone", len(maps), len(test_maps))
-    if wanted.lazy:
-        print(pairs_path(dataset))
-        return 0
-    work = _Relight(dataset, wanted.per_subject, overwrite)
-    subjects = dict.fromkeys(pair.subject for pair in pairs)
-    items = [Item(folder / "olat" / name, batch.output / name, name) for name in subjects]
-    return run_items("relight-dataset", items, work, work.outputs_of, batch, settings)
-
-
-def _say_cost(dataset: Dataset, pairs: list[Pair], lazy: bool, overwrite: bool) -> None:
-    """Log what the pairs and the sources that are missing will take."""
-    log.info("%d recipes with their weights: %s", len(pairs), in_words(recipe_bytes(dataset, pairs)))
-    if not lazy:
-        todo = [pair for pair in pairs if overwrite or not image_path(dataset, *pair.key).exists()]
-        log.info("%d sources of %d px: %s", len(todo), dataset.crop_px, cost_of_sources(dataset, todo))
-
-
-def _maps_of_splits(
-    dataset: Dataset, wanted: PairSettings, output: Path, seed: int
-) -> tuple[list[str], list[str]]:
-    """Names of the maps of training and validation, and those of the test; UsageError where they share one.
-
-    Drawn maps of the test follow those of --envmaps in their sequence.
-    """
-    maps = _envmap_names("--envmaps", wanted.envmaps, output, seed)
-    if wanted.envmaps_test is not None:
-        drawn = len(maps) if wanted.envmaps.startswith(_DRAWN) else 0
-        test_maps = _envmap_names("--envmaps-test", wanted.envmaps_test, output, seed, drawn)
-        if shared := sorted(
-            {os.path.realpath(name) for name in maps} & set(map(os.path.realpath, test_maps))
-        ):
-            raise UsageError(
-                f"--envmaps-test {wanted.envmaps_test}: has {len(shared)} maps of --envmaps, such as "
-                f"{Path(shared[0]).name}; give the test maps of its own"
-            )
-        return maps, test_maps
-    if not dataset.splits["test"] or not (dataset.splits["train"] or dataset.splits["validation"]):
-        return maps, maps
-    if len(maps) < 2:
-        raise UsageError(
-            f"--envmaps {wanted.envmaps}: is one map, and the split test needs others; give it some by "
-            "--envmaps-test"
-        )
-    test_maps = maps[::_TEST_MAPS_OF]
-    return [name for index, name in enumerate(maps) if index % _TEST_MAPS_OF], test_maps
-
-
-def _envmap_names(option: str, envmaps: str, output: Path, seed: int, first: int = 0) -> list[str]:
-    """Names of the maps of an option; drawn ones begin at number `first` of their sequence."""
-    if envmaps.startswith(_DRAWN):
-        maps = parse_envmaps(envmaps, seed)
-        return envmap_names(replace(maps, maps=first + len(maps)))[first:]
-    if not Path(envmaps).exists():
-        raise UsageError(f"{option} {envmaps}: no such folder; give one of lat-long maps, or procedural:N")
-    return envmap_names([item.input_path for item in collect_items([envmaps], output, MAP_SUFFIXES)])
-
-
-@dataclass(frozen=True)
-class _Relight:
-    """Relights one subject."""
-
-    dataset: Dataset
-    per_subject: int
-    overwrite: bool
-
-    def outputs_of(self, item: Item) -> list[Path]:
-        """Paths of the sources of the subject's pairs."""
-        return [image_path(self.dataset, item.name, index) for index in range(self.per_subject)]
-
-    def __call__(self, item: Item) -> Outcome:
-        """Write the sources that are missing."""
-        pairs, weights = load_pairs(self.dataset)[item.name]
-        made = relight_subject(self.dataset, pairs, weights, memory.limit_bytes(), self.overwrite)
-        return Outcome(self.outputs_of(item), {"pictures": len(pairs), "made": made})
-
-
-def _spread_maps(
-    batch: BatchOptions, settings: Settings, work: Callable[[T], R], maps: Sequence[T]
-) -> Iterator[R]:
-    if batch.shard.of > 1:  # shards would write the same pairs at the same time
-        raise UsageError(
-            "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
-        )
-    return with_bar(work, maps, "maps", batch, settings, _map_died)
-
-
-def _map_died(task: Any, error: Exception) -> Any:
-    return f"{task.name}: {process_died(error)}"
