@@ -77,7 +77,12 @@ def _read_chart(
     capture: Capture, image: Path, cameras: list[str], corners_px: np.ndarray, overlay: str
 ) -> ChartCorrection:
     raw = read_frame(image, capture.colour_space)
-    _refuse(image, _faults_of_corners(corners_px, *raw.shape[:2]))
+    height, width = raw.shape[:2]
+    if not ((corners_px >= 0) & (corners_px <= [width, height])).all():
+        raise InputError(f"{image}: --chart-corners lie outside its {width} x {height} pixels; correct them")
+    if not is_convex(corners_px):
+        advice = "give them in order around the chart"
+        raise InputError(f"{image}: --chart-corners make no convex quadrilateral; {advice}")
     tries = []
     for turned in four_turns(corners_px):
         patches = sample(raw, turned)
@@ -105,13 +110,6 @@ def _read_chart(
 def _refuse(image: Path, faults: Iterator[str]) -> None:
     for fault in faults:
         raise InputError(f"{image}: {fault}")
-
-
-def _faults_of_corners(corners_px: np.ndarray, height: int, width: int) -> Iterator[str]:
-    if not ((corners_px >= 0) & (corners_px <= [width, height])).all():
-        yield f"--chart-corners lie outside its {width} x {height} pixels; correct them"
-    elif not is_convex(corners_px):
-        yield "--chart-corners make no convex quadrilateral; give them in order around the chart"
 
 
 def _faults_of_light(image: Path, patches: Patches, black_level: float) -> Iterator[str]:

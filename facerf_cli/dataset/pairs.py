@@ -167,8 +167,10 @@ def write_pairs(dataset: Dataset, drawn: list[Pair], overwrite: bool, spread: Sp
             return old
         _require_agreement(dataset, before, drawn)
     weights, pairs = compute_pair_weights(dataset, drawn, spread)
-    if overwrite:
-        _remove_old(dataset)
+    if overwrite:  # pairs first: then a killed run leaves no image that passes for a new pair's
+        pairs_path(dataset).unlink(missing_ok=True)
+        for path in _images(dataset):
+            path.unlink()
     else:
         _require_agreement(dataset, old, pairs)  # now the exposures, too: the envmaps may have changed
     text = "".join(json_line(asdict(pair)) + "\n" for pair in pairs)
@@ -192,13 +194,6 @@ def _require_agreement(dataset: Dataset, old: list[Pair], new: list[Pair]) -> No
 
 def _images(dataset: Dataset) -> list[Path]:
     return list((dataset.folder / RELIT).glob("*/[0-9]*.exr"))
-
-
-def _remove_old(dataset: Dataset) -> None:
-    """Delete old pairs, then images, so that a killed run leaves no image that passes for a new pair's."""
-    pairs_path(dataset).unlink(missing_ok=True)
-    for path in _images(dataset):
-        path.unlink()
 
 
 def weights_path(dataset: Dataset) -> Path:

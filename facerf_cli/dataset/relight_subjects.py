@@ -14,7 +14,6 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.cost import cost_of_sources, in_words, recipe_bytes
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import (
-    Pair,
     draw_pairs,
     image_path,
     load_pairs,
@@ -46,7 +45,10 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     if not pairs:
         raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
     if batch.dry_run:
-        _say_cost(dataset, pairs, wanted.lazy, overwrite)
+        log.info("%d recipes with their weights: %s", len(pairs), in_words(recipe_bytes(dataset, pairs)))
+        if not wanted.lazy:
+            todo = [pair for pair in pairs if overwrite or not image_path(dataset, *pair.key).exists()]
+            log.info("%d sources of %d px: %s", len(todo), dataset.crop_px, cost_of_sources(dataset, todo))
     else:
         write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
         if test_maps != maps:
@@ -58,14 +60,6 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     items = [Item(folder / "olat" / name, batch.output / name, name) for name in subjects]
     return run_items("relight-dataset", items, work, work.outputs_of, batch, settings)
-
-
-def _say_cost(dataset: Dataset, pairs: list[Pair], lazy: bool, overwrite: bool) -> None:
-    """Log what the pairs and the sources that are missing will take."""
-    log.info("%d recipes with their weights: %s", len(pairs), in_words(recipe_bytes(dataset, pairs)))
-    if not lazy:
-        todo = [pair for pair in pairs if overwrite or not image_path(dataset, *pair.key).exists()]
-        log.info("%d sources of %d px: %s", len(todo), dataset.crop_px, cost_of_sources(dataset, todo))
 
 
 def _maps_of_splits(

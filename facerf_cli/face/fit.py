@@ -220,7 +220,9 @@ def fit_batch(
     problem, begin = fit_problem(model, target_px, camera, settings, trust)
     state = minimise(problem, begin if start is None else better_start(problem, begin, start), settings.steps)
     distance_px = residuals(problem, state).difference_px.norm(dim=-1)
-    error_iod = (distance_px * trust).sum(1) / trust.sum(1) / _iod_px(target_px)
+    left, right = OUTER_EYE_CORNERS
+    iod_px = (target_px[:, left] - target_px[:, right]).norm(dim=-1)
+    error_iod = (distance_px * trust).sum(1) / trust.sum(1) / iod_px
     coefficients = state.coordinates @ problem.basis.spread.mT
     alpha, beta = coefficients[:, : len(model.identity)], coefficients[:, len(model.identity) :]
     return FitBatch(state.rotation, state.translation_m, alpha, beta, error_iod)
@@ -267,11 +269,6 @@ def _principal_modes(
     turned = whitened @ turn
     visible = turned.norm(dim=1).amax(0) > _INVISIBLE_M
     return turned[..., visible], stds[:, None] * turn[:, visible]
-
-
-def _iod_px(landmarks_px: Tensor) -> Tensor:
-    left, right = OUTER_EYE_CORNERS
-    return (landmarks_px[:, left] - landmarks_px[:, right]).norm(dim=-1)
 
 
 def better_start(problem: Problem, begin: FitState, start: FitStart) -> FitState:

@@ -347,7 +347,7 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     if any(name is not None for name, _ in places):
         return lights, None
     if given:
-        return lights, _file_name(text)
+        return lights, "light_" + re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_")
     return lights, lights[0].name if lights[0].names else "light_" + "+".join(one.name for one in lights)
 
 
@@ -428,8 +428,3 @@ def named_map(entry: str, turns: Sequence[float], is_numbered: bool) -> LitImage
         return None
     frames = tuple((StudioLight(envmap=Path(path), rotate_deg=degrees),) for degrees in turns)
     return LitImage(frames, is_numbered, (name,), name)
-
-
-def _file_name(text: str) -> str:
-    """An image's name from the settings of its light."""
-    return "light_" + re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_")

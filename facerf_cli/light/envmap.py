@@ -158,7 +158,10 @@ def ball(
     The ball fills the square and is seen from far along +z. Both kinds reflect all light: under a constant
     map both have the radiance of the map.
     """
-    normals, inside = _ball_normals(side_px * _BALL_SAMPLES)
+    x = (torch.arange(side_px * _BALL_SAMPLES) + 0.5) * (2 / (side_px * _BALL_SAMPLES)) - 1
+    y, x = torch.meshgrid(-x, x, indexing="ij")
+    z2 = 1 - x * x - y * y
+    normals, inside = torch.stack([x, y, z2.clamp(min=0).sqrt()], -1), z2 > 0
     radiance = torch.zeros(*inside.shape, 3)
     if kind == "mirror":
         toward_camera = torch.tensor([0.0, 0, 1])
@@ -167,14 +170,6 @@ def ball(
     else:
         radiance[inside] = look_up(_irradiance(envmap, rotate_deg) / math.pi, normals[inside])
     return F.avg_pool2d(radiance.permute(2, 0, 1), _BALL_SAMPLES).permute(1, 2, 0)
-
-
-def _ball_normals(side: int) -> tuple[Tensor, Tensor]:
-    """Normals [side, side, 3] of the unit ball, and the pixels that it covers [side, side] bool."""
-    x = (torch.arange(side) + 0.5) * (2 / side) - 1
-    y, x = torch.meshgrid(-x, x, indexing="ij")
-    z2 = 1 - x * x - y * y
-    return torch.stack([x, y, z2.clamp(min=0).sqrt()], -1), z2 > 0
 
 
 def look_up(latlong: Tensor, directions: Tensor) -> Tensor:

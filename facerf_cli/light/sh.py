@@ -151,7 +151,8 @@ def latlong_coefficients(envmap: Tensor, order: int) -> Tensor:
     across = _across(width, order)  # [W, 2 order + 1]
     some_rows = torch.split(envmap.cpu(), max(1, _VALUES_AT_ONCE // (3 * width)))
     by_row = torch.cat([torch.einsum("hwc,wm->hmc", part.double(), across) for part in some_rows])
-    about_pole = torch.einsum("hk,hkc->kc", _down(height, order), by_row[:, _column_of(order)])
+    columns = [order + m for degree in range(order + 1) for m in range(-degree, degree + 1)]
+    about_pole = torch.einsum("hk,hkc->kc", _down(height, order), by_row[:, columns])
     return rotated(about_pole, _MAP_POLAR.T).float()
 
 
@@ -162,11 +163,6 @@ def sh_to_latlong(coefficients: Tensor, height: int) -> Tensor:
     order_of(coefficients)
     values = torch.cat([radiance(coefficients.cpu(), part) for part in parts])
     return values.float().reshape(height, 2 * height, 3)
-
-
-def _column_of(order: int) -> Tensor:
-    """order + m of every index l*l+l+m."""
-    return torch.tensor([order + m for degree in range(order + 1) for m in range(-degree, degree + 1)])
 
 
 def _across(width: int, order: int) -> Tensor:
