@@ -22,10 +22,9 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
-from facerf_cli.files.image_metadata import Attributes
 from facerf_cli.files.read import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
-from facerf_cli.files.write import half_floats, warn_of_clamped, write_parts
+from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, write_parts
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.image.strips import Band
 from facerf_cli.run import memory
@@ -44,6 +43,7 @@ _MOST_CHANNELS = 16  # of a part; other programs may add some
 _LENGTH_TOLERANCE = 0.01  # a direction's length may differ from 1 by this
 _SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
 _HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
+_OF_STACK = (_HEADER, _DIRECTION, "facerf:light")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,56 +67,54 @@ class StackHeader:
 
 
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
-    """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive."""
+    """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive.
 
-    def parts() -> Iterator[np.ndarray]:
-        for batch in _apart(olats):
-            yield from batch.permute(0, 2, 3, 1).cpu().numpy()
-        # Last, since it may be summed as the lights arrive.
-        yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
-
+    OpenEXR keeps 1.8 MB for each of its threads and each part until it closes a file, and touches little of
+    it. So this thread alone compresses; and what a prediction has filled is given back first, since fresh
+    memory costs nothing until it is touched.
+    """
     beyond: list[int] = []
+
+    def bands() -> Iterator[Band]:
+        for batch in olats:
+            memory.give_back()
+            yield from map(band, batch.permute(0, 2, 3, 1).cpu().numpy())
+        # Last, since it may be summed as the lights arrive.
+        yield band(np.concatenate([header.source, header.seen[..., None], header.normals], -1))
 
     def band(part: np.ndarray) -> Band:
         data, count = half_floats(path, part)
         beyond.append(count)
         return data.__getitem__
 
-    with _one_thread():
-        write_parts(path, _specs(header), map(band, parts()))
-    warn_of_clamped(path, sum(beyond))
-
-
-def _apart(olats: Iterable[Tensor]) -> Iterator[Tensor]:
-    """Pass batches on when what their prediction has freed is given back.
-
-    OpenEXR keeps 1.8 MB a thread for each part until it closes a file, and touches little of it: that is
-    cheap in fresh memory, not in what a prediction has filled.
-    """
-    for batch in olats:
-        memory.give_back()
-        yield batch
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compress in this thread, since OpenEXR keeps memory for each of its threads and each part."""
     threads = oiio.get_int_attribute("exr_threads")
     oiio.attribute("exr_threads", -1)
     try:
-        yield
+        write_parts(path, _specs(header), bands())
     finally:
         oiio.attribute("exr_threads", threads)
+    warn_of_clamped(path, sum(beyond))
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
     """Return the image specification of every part."""
     height, width = header.seen.shape
-    attributes: Attributes = header.metadata
+
+    def part(name: str, channels: tuple[str, ...]) -> oiio.ImageSpec:
+        spec = new_spec((height, width, len(channels)), "half")
+        spec.channelnames = channels
+        spec.attribute("name", name)
+        spec.attribute("compression", COMPRESSION)
+        spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
+        for key, value in header.metadata.items():
+            spec.attribute(key, value)
+        return spec
+
     specs = []
     numbers = header.rig_lights or range(len(header.directions))
     for number, direction in zip(numbers, header.directions.tolist(), strict=True):
-        spec = _part(width, height, f"light{number:03d}", ("R", "G", "B"), attributes)
+        spec = part(f"light{number:03d}", ("R", "G", "B"))
         spec.attribute(_DIRECTION, oiio.TypeDesc("vector"), tuple(direction))
         spec.attribute("facerf:light", number)
         specs.append(spec)
@@ -129,22 +127,7 @@ def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
         "fit": {name: value.tolist() for name, value in header.fit.items()},
     }
     specs[0].attribute(_HEADER, json.dumps(content))
-    return [*specs, _part(width, height, "source", _SOURCE_CHANNELS, attributes)]
-
-
-def _part(
-    width: int, height: int, name: str, channels: tuple[str, ...], attributes: Attributes
-) -> oiio.ImageSpec:
-    spec = oiio.ImageSpec(width, height, len(channels), "half")
-    spec.channelnames = channels
-    spec.attribute("name", name)
-    spec.attribute("compression", COMPRESSION)
-    spec.attribute("oiio:ColorSpace", "lin_rec709_scene")
-    spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
-    spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), REC709_CHROMATICITIES)
-    for key, value in attributes.items():
-        spec.attribute(key, value)
-    return spec
+    return [*specs, part("source", _SOURCE_CHANNELS)]
 
 
 def is_olat_stack(path: Path) -> bool:
@@ -171,7 +154,29 @@ def read_olat_header(path: Path) -> StackHeader:
     """Read a stack without its OLATs, for which memory is not asked."""
     with _opened(path) as stack:
         _ask_for(stack, 0)
-        return _read_header(stack)
+        document, directions, metadata = stack.document, [], {}
+        for entry in stack.stream.spec().extra_attribs:
+            is_ours = entry.name.startswith("facerf:") and entry.name not in _OF_STACK
+            if is_ours or entry.name in ("Software", "IPTC:DigitalSourceType"):
+                metadata[entry.name] = entry.value
+        for number in range(document.lights):
+            value = _part_at(stack, number).getattribute(_DIRECTION)
+            direction = np.array(value if isinstance(value, tuple) else (), np.float64)
+            if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < _LENGTH_TOLERANCE:
+                raise InputError(f"{path}: a part of the OLAT stack has no direction; write the stack again")
+            directions.append(direction / np.linalg.norm(direction))
+        source = _pixels(stack, document.lights, _SOURCE_CHANNELS).astype(np.float32)
+    return StackHeader(
+        kind=document.kind,
+        directions=np.array(directions),
+        rotation=document.rotation,
+        source=source[..., :3],
+        seen=source[..., 3],
+        normals=source[..., 4:],
+        layout_version=document.layout_version,
+        fit=document.fit,
+        metadata=metadata,
+    )
 
 
 def read_olats(path: Path, lights: slice | Sequence[int] = slice(None), rows: slice = slice(None)) -> Tensor:
@@ -235,22 +240,18 @@ def _opened(path: Path) -> Iterator[_Stack]:
         raise InputError(f"{path}: not an OLAT stack: {one_line(oiio_error())}")
     try:
         spec = stream.spec()
-        yield _Stack(path, stream, _document(path, spec), (spec.height, spec.width))
+        text = _text_of(spec)
+        if not text:
+            raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
+        try:
+            document = checked(_StackDocument, parse_json(text), _HEADER)
+        except (ValueError, InputError) as error:
+            kind = "damaged OLAT stack, or written by another version of facerf"
+            raise InputError(f"{path}: {kind} ({error})") from None
+        yield _Stack(path, stream, document, (spec.height, spec.width))
     finally:
         oiio_error(stream)
         stream.close()
-
-
-def _document(path: Path, spec: oiio.ImageSpec) -> _StackDocument:
-    text = _text_of(spec)
-    if not text:
-        raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
-    try:
-        return checked(_StackDocument, parse_json(text), _HEADER)
-    except (ValueError, InputError) as error:
-        raise InputError(
-            f"{path}: damaged OLAT stack, or written by another version of facerf ({error})"
-        ) from None
 
 
 def _ask_for(stack: _Stack, lights: int, share: float = 1.0) -> None:
@@ -261,43 +262,12 @@ def _ask_for(stack: _Stack, lights: int, share: float = 1.0) -> None:
     memory.require(what, int(needed), "a stack of fewer lights or pixels")
 
 
-def _read_header(stack: _Stack) -> StackHeader:
-    document, attributes = stack.document, stack.stream.spec().extra_attribs
-    directions = np.array([_direction(stack, number) for number in range(document.lights)])
-    source = _pixels(stack, document.lights, _SOURCE_CHANNELS).astype(np.float32)
-    return StackHeader(
-        kind=document.kind,
-        directions=directions,
-        rotation=document.rotation,
-        source=source[..., :3],
-        seen=source[..., 3],
-        normals=source[..., 4:],
-        layout_version=document.layout_version,
-        fit=document.fit,
-        metadata={entry.name: entry.value for entry in attributes if _is_provenance(entry.name)},
-    )
-
-
 def _read_lights(stack: _Stack, numbers: Sequence[int], rows: slice = slice(None)) -> Tensor:
     height, width = stack.shape
     olats = np.empty((len(numbers), len(range(height)[rows]), width, 3), np.float16)
     for place, number in enumerate(numbers):
         olats[place] = _pixels(stack, number, ("R", "G", "B"), rows)
     return torch.from_numpy(olats).permute(0, 3, 1, 2)
-
-
-def _is_provenance(name: str) -> bool:
-    return name in ("Software", "IPTC:DigitalSourceType") or (
-        name.startswith("facerf:") and name not in (_HEADER, _DIRECTION, "facerf:light")
-    )
-
-
-def _direction(stack: _Stack, number: int) -> np.ndarray:
-    value = _part_at(stack, number).getattribute(_DIRECTION)
-    direction = np.array(value if isinstance(value, tuple) else (), np.float64)
-    if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < _LENGTH_TOLERANCE:
-        raise InputError(f"{stack.path}: a part of the OLAT stack has no direction; write the stack again")
-    return direction / np.linalg.norm(direction)
 
 
 def _part_at(stack: _Stack, number: int) -> oiio.ImageSpec:

@@ -84,7 +84,7 @@ def write_exr(
     parts = _exr_parts(pixels, alpha, layers or {})
     specs, beyond = [], []
     for part in parts:
-        spec = _spec((*pixels.shape[:2], len(part.channels)), part.kind)
+        spec = new_spec((*pixels.shape[:2], len(part.channels)), part.kind)
         spec.channelnames = tuple(part.channels)
         spec.alpha_channel = 3 if part is parts[0] and alpha is not None else -1
         if len(parts) > 1:
@@ -205,7 +205,7 @@ def write_tiff(
             np.float32, copy=False
         )
 
-    spec = _spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
+    spec = new_spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
     spec.attribute("compression", "zip")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if space.is_linear:
@@ -274,7 +274,7 @@ def write_display(
         data = encode_display(exposed, view, None if share is None else rows_of(share, rows), more)
         return data if opaque is None or jpeg else np.dstack([data, opaque.astype(np.float32)])
 
-    spec = _spec((*pixels.shape[:2], 3 if alpha is None or jpeg else 4), f"uint{8 if jpeg else bits}")
+    spec = new_spec((*pixels.shape[:2], 3 if alpha is None or jpeg else 4), f"uint{8 if jpeg else bits}")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if view.is_srgb:
         spec.attribute("oiio:ColorSpace", "sRGB")
@@ -285,7 +285,8 @@ def write_display(
     return chosen_ev
 
 
-def _spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
+def new_spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
+    """Return the specification of an image [H, W, C] of a kind of values, such as "half"."""
     spec = oiio.ImageSpec(shape[1], shape[0], shape[2], kind)
     spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
     return spec
