@@ -13,6 +13,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +46,11 @@ def arrays_apart(
             raise ValueError(f"reading it takes longer than {time_s:.0f} s") from None
         if ended.returncode == _REFUSED:
             raise ValueError(printable_line(ended.stderr.decode(errors="replace")))
-        if ended.returncode:
-            raise ValueError(f"it makes its reader fail ({_death(ended.returncode)})")
+        if code := ended.returncode:
+            death = f"signal {-code}" if code < 0 else f"exit code {code}"
+            with suppress(ValueError):  # no name
+                death = signal.Signals(-code).name
+            raise ValueError(f"it makes its reader fail ({death})")
         file.seek(0)
         try:
             with np.load(file, allow_pickle=False) as arrays:
@@ -55,35 +59,23 @@ def arrays_apart(
             raise ValueError(f"its reader sent no arrays ({error})") from None
 
 
-def _death(code: int) -> str:
-    try:
-        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    except ValueError:
-        return f"signal {-code}"
-
-
 def serve() -> None:
     """The child: read and send."""
     _, _, module, reader, path, *limits = sys.argv
-    _limit()
+    if sys.platform != "win32":
+        import resource
+
+        own = {
+            resource.RLIMIT_AS: _MEMORY_BYTES,
+            resource.RLIMIT_FSIZE: _SENT_BYTES,
+            resource.RLIMIT_CORE: 0,
+        }
+        for limit, value in own.items():
+            most = resource.getrlimit(limit)[1]
+            resource.setrlimit(limit, (value if most < 0 else min(value, most), most))
     try:
         arrays = getattr(importlib.import_module(module), reader)(Path(path), *map(int, limits))
         np.savez(sys.stdout.buffer, **arrays)
     except Exception as error:  # whatever a damaged file makes its library raise
         print(str(error) or type(error).__name__, file=sys.stderr)
         sys.exit(_REFUSED)
-
-
-def _limit() -> None:
-    if sys.platform == "win32":
-        return
-    import resource
-
-    limits = {
-        resource.RLIMIT_AS: _MEMORY_BYTES,
-        resource.RLIMIT_FSIZE: _SENT_BYTES,
-        resource.RLIMIT_CORE: 0,
-    }
-    for limit, value in limits.items():
-        most = resource.getrlimit(limit)[1]
-        resource.setrlimit(limit, (value if most < 0 else min(value, most), most))

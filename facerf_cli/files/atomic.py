@@ -75,7 +75,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def hidden_folder(path: Path) -> Iterator[Path]:
     """Yield a hidden folder next to an output, of this process alone, which goes with the block."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep_once(path.parent)
+    if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # for each file it would be quadratic
+        _swept.add(absolute)
+        sweep_leftovers(path.parent)
     name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
     room = path.parent / name
     _open.add(room)
@@ -124,14 +126,6 @@ atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has le
 def _machine() -> str:
     """An id of this machine, since machines that share a folder may use the same process ids."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
-
-
-def _sweep_once(folder: Path) -> None:
-    """Remove leftovers at the first write in a folder: a search for each file would be quadratic."""
-    absolute = Path(os.path.abspath(folder))
-    if absolute not in _swept:
-        _swept.add(absolute)
-        sweep_leftovers(folder)
 
 
 def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
@@ -234,12 +228,7 @@ def _acquire(lock: "FileLock", path: Path) -> None:
         except FileNotFoundError:
             pass
         except Timeout:
-            log.warning(wait, path.parent, _owner(path))
-            waits = True
-
-
-def _owner(path: Path) -> str:
-    """The process that wrote a lock."""
-    with suppress(OSError):  # it has just ended
-        return printable_line(path.read_text(errors="replace")[:20])
-    return "unknown"
+            owner, waits = "unknown", True
+            with suppress(OSError):  # it has just ended
+                owner = printable_line(path.read_text(errors="replace")[:20])
+            log.warning(wait, path.parent, owner)

@@ -36,6 +36,10 @@ _RAW = (
     " .rwl .sr2 .srf .srw .x3f"
 )
 _RAW_SUFFIXES = frozenset(_RAW.split())
+_UNDEVELOPED = (  # OpenImageIO reads its thumbnail
+    "a raw file of a camera, or a thumbnail first, is not read; develop it to EXR, TIFF or JPEG, as with"
+    " darktable or RawTherapee"
+)
 _HAVE_WINDOWS = ("openexr", "rla")
 # Formats whose two resolutions are for print, and differ by mistake; viewers show their pixels square.
 _PRINTED = ("jpeg", "png", "tiff")
@@ -201,10 +205,8 @@ def open_image(path: Path, layer: str | None = None) -> Iterator[Opened]:
 
     Raises InputError for what is not read: unknown formats, raw files of cameras, a layer that is not there.
     """
-    advice = "develop it to EXR, TIFF or JPEG, as with darktable or RawTherapee"
-    raw = InputError(f"{path}: a raw file of a camera, or a thumbnail first, is not read; {advice}")
     if path.suffix.lower() in _RAW_SUFFIXES:
-        raise raw
+        raise InputError(f"{path}: {_UNDEVELOPED}")
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
     stream = oiio.ImageInput.open(utf8_path(path), settings)
@@ -222,7 +224,7 @@ def open_image(path: Path, layer: str | None = None) -> Iterator[Opened]:
             specs.append(stream.spec())
         oiio_error(stream)  # that there are no more
         if form == "tiff" and quirks.is_raw_tiff(path, *specs):
-            raise raw
+            raise InputError(f"{path}: {_UNDEVELOPED}")
         chosen, choice = chosen_layer(path, specs if form == "openexr" else specs[:1], layer)
         if specs[chosen.part].deep:
             raise InputError(f"{path}: a deep image is not read; flatten it, as by oiiotool --flatten")

@@ -16,7 +16,7 @@ from facerf_cli.files.film_writer import check_writable, comment_of, write_film
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
-from tests.files.test_stated_by_files import bt2020_of, write_png
+from tests.files.made import bt2020_of, write_png
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PCM = "pcm_s16le"

@@ -1,26 +1,19 @@
 """Headers of images and their XMP packets."""
 
 import math
-import os
-import re
 import tracemalloc
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import embed_xmp, plate_metadata, read_header, xmp_packet
-from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import ACES, ACESCG, LINEAR, LINEAR_P3, LINEAR_REC2020, SRGB, ColourSpace
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
-
-IPTC = "{http://iptc.org/std/Iptc4xmpExt/2008-02-29/}DigitalSourceType"
+from tests.files.made import IPTC, properties, write_oiio
 
 
 def test_size_kind_and_space(tmp_path: Path) -> None:
@@ -29,32 +22,20 @@ def test_size_kind_and_space(tmp_path: Path) -> None:
     write_display(tmp_path / "a.png", pixels)
     floating, display = read_header(tmp_path / "a.exr"), read_header(tmp_path / "a.png")
     assert floating is not None and display is not None
-    assert (floating.width_px, floating.height_px, floating.is_floating, floating.space) == (
-        9,
-        6,
-        True,
-        LINEAR,
-    )
-    assert (display.width_px, display.height_px, display.bits, display.space) == (9, 6, 8, SRGB)
+    for header, *kind in ((floating, True, 16, LINEAR), (display, False, 8, SRGB)):
+        assert (header.width_px, header.height_px) == (9, 6)
+        assert [header.is_floating, header.bits, header.space] == kind
 
 
 def test_the_size_is_upright(tmp_path: Path) -> None:
-    spec = oiio.ImageSpec(9, 6, 3, "uint8")
-    spec.attribute("Orientation", 6)
-    stream = oiio.ImageOutput.create("a.jpg")
-    assert stream.open(str(tmp_path / "a.jpg"), spec) and stream.write_image(np.zeros((6, 9, 3), np.uint8))
-    stream.close()
-    header = read_header(tmp_path / "a.jpg")
+    header = read_header(
+        write_oiio(tmp_path / "a.jpg", np.zeros((6, 9, 3), np.uint8), "uint8", Orientation=6)
+    )
     assert header is not None and (header.width_px, header.height_px) == (6, 9)
 
 
-def write_primaries(path: Path, chromaticities: tuple[float, ...], kind: str = "float[8]") -> Path:
-    spec = oiio.ImageSpec(9, 6, 3, "half")
-    spec.attribute("chromaticities", oiio.TypeDesc(kind), chromaticities)
-    stream = oiio.ImageOutput.create(path.name)
-    assert stream.open(str(path), spec) and stream.write_image(np.full((6, 9, 3), 0.5, np.float32))
-    stream.close()
-    return path
+def write_primaries(path: Path, chromaticities: tuple[float, ...]) -> Path:
+    return write_oiio(path, np.full((6, 9, 3), 0.5, np.float32), "half", chromaticities=chromaticities)
 
 
 @pytest.mark.parametrize(
@@ -91,29 +72,8 @@ def test_impossible_primaries_are_ignored(
 
 
 def test_primaries_of_another_type_are_ignored(tmp_path: Path) -> None:
-    header = read_header(write_primaries(tmp_path / "a.exr", (0.3,) * 6, "float[6]"))
+    header = read_header(write_primaries(tmp_path / "a.exr", (0.3,) * 6))
     assert header is not None and header.space == LINEAR
-
-
-def test_a_name_that_is_not_utf8_is_an_error(tmp_path: Path) -> None:
-    name = tmp_path / os.fsdecode(b"\xff.exr")
-    name.write_bytes(b"not an image")
-    for read in (read_header, read_image, is_olat_stack):
-        with pytest.raises(InputError, match="not UTF-8; rename"):
-            read(name)
-    with pytest.raises(InputError, match="not UTF-8"):
-        write_display(name.with_suffix(".png"), np.zeros((2, 2, 3), np.float32))
-
-
-def test_a_file_that_is_no_image_has_no_header(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"not an image")
-    assert read_header(tmp_path / "a.png") is None and read_header(tmp_path / "b.png") is None
-    assert read_header(tmp_path) is None and oiio.geterror() == ""
-
-
-def properties(data: bytes) -> dict[str, str]:
-    (packet,) = re.findall(rb"<x:xmpmeta.*?</x:xmpmeta>", data, re.S)
-    return ElementTree.fromstring(packet)[0][0].attrib
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])

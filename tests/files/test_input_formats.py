@@ -3,12 +3,9 @@
 import logging
 import shutil
 import struct
-import sys
-import zlib
 from pathlib import Path
 
 import numpy as np
-import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
@@ -20,11 +17,11 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.run import memory
 from tests import icc_profiles
+from tests.files.made import LEVELS, levels_of, write_cineon, write_oiio, write_png, write_psd
 
 ULTRA_HDR = Path(__file__).with_name("ultra_hdr.jpg")  # examples/astronaut.jpg, with a gain map
 QUADS = Path(__file__).with_name("quads.heic")  # 600 x 400: its pixels outgrow what a small allocation keeps
 HEIC = Path(__file__).with_name("phone.heic")  # upright: green above red on the left, blue below right
-LEVELS = np.random.default_rng(2).integers(0, 256, (24, 40, 3), np.uint8)
 BLOCKS = np.repeat(np.repeat(LEVELS[::8, ::8], 8, 0), 8, 1)  # which lossy formats keep roughly
 LOSSY = {
     **dict.fromkeys((".jpg", ".jpeg", ".jpe", ".jfif"), 3),
@@ -34,61 +31,23 @@ LOSSY = {
 }  # largest error inside a block, of 255
 
 
-def save_by_oiio(path: Path, values: np.ndarray, kind: str = "uint8", **attributes: object) -> Path:
-    spec = oiio.ImageSpec(values.shape[1], values.shape[0], values.shape[2], kind)
-    for name, value in attributes.items():
-        spec.attribute(name.replace("__", ":"), value)
-    stream = oiio.ImageOutput.create(str(path))
-    assert stream.open(str(path), spec) and stream.write_image(np.ascontiguousarray(values))
-    assert stream.close()
-    return path
-
-
-def save_psd(path: Path, values: np.ndarray, *numbered: tuple[int, bytes]) -> Path:
-    """A flattened PSD of 8 bits, by its specification, with image resources."""
-    height, width, _ = values.shape
-    resources = b"".join(
-        b"8BIM" + struct.pack(">HHI", number, 0, len(data)) + data + bytes(len(data) % 2)
-        for number, data in numbered
-    )
-    head = b"8BPS" + struct.pack(">H6xHIIHHI", 1, 3, height, width, 8, 3, 0)
-    body = struct.pack(">I", len(resources)) + resources + struct.pack(">IH", 0, 0)
-    path.write_bytes(head + body + np.moveaxis(values, -1, 0).tobytes())
-    return path
-
-
-def save_cineon(path: Path, codes: np.ndarray) -> Path:
-    """A Cineon file of three 10-bit code values in each 32-bit word."""
-    height, width, _ = codes.shape
-    head = bytearray(2048)
-    struct.pack_into(">6I", head, 0, 0x802A5FD7, 2048, 1024, 1024, 0, 2048 + 4 * width * height)
-    head[24:28], head[193] = b"V4.5", 3
-    for channel in range(3):
-        numbers = 0, channel + 1, 10, 0, width, height, 0, 0, 1023, 2.046
-        struct.pack_into(">4B2I4f", head, 196 + 28 * channel, *numbers)
-    head[681] = 5
-    red, green, blue = np.moveaxis(codes.astype(np.uint32), -1, 0)
-    path.write_bytes(bytes(head) + (red << 22 | green << 12 | blue << 2).astype(">u4").tobytes())
-    return path
-
-
 def save(path: Path, levels: np.ndarray) -> Path:
     """Write 8-bit sRGB values in the format of the suffix."""
     suffix = path.suffix
     if suffix in (".heic", ".heif"):
         shutil.copy(HEIC, path)
     elif suffix == ".psd":
-        save_psd(path, levels)
+        write_psd(path, levels)
     elif suffix == ".cin":
-        save_cineon(path, levels.astype(int) * 4)
+        write_cineon(path, levels.astype(int) * 4)
     elif suffix == ".jp2":
         Image.fromarray(levels).save(path)  # OpenImageIO writes files that it does not read
     elif suffix == ".avif":
         Image.fromarray(levels).save(path, quality=100, subsampling="4:4:4")
     elif suffix in (".exr", ".hdr"):
-        save_by_oiio(path, levels / np.float32(255), "float")
+        write_oiio(path, levels / np.float32(255), "float")
     else:
-        save_by_oiio(path, levels, **({"CompressionQuality": 98} if suffix in LOSSY else {}))
+        write_oiio(path, levels, "uint8", **({"CompressionQuality": 98} if suffix in LOSSY else {}))
     return path
 
 
@@ -106,14 +65,14 @@ def test_every_suffix_that_folders_are_searched_for_is_read(tmp_path: Path, suff
 def test_a_photo_of_a_phone() -> None:
     image = read_image(HEIC)
     assert image.colourspace_name == "Display P3" and image.pixels.shape == (64, 48, 3)
-    stored = 255 * linear_to_srgb(read_image(HEIC, "sRGB").pixels)
+    stored = levels_of(HEIC, "sRGB")
     for at, level in {(5, 5): (40, 200, 60), (-5, 5): (50, 60, 210), (5, -5): (220, 60, 40)}.items():
         np.testing.assert_allclose(stored[at], level, atol=4)
 
 
 def test_a_heic_of_the_size_of_a_photo() -> None:
     """Pixels outlive the memory of pi-heif's image."""
-    stored = 255 * linear_to_srgb(read_image(QUADS).pixels)
+    stored = levels_of(QUADS)
     assert stored.shape == (400, 600, 3)
     for at, level in {
         (9, 9): (200, 60, 40), (9, -9): (40, 180, 60), (-9, 9): (50, 70, 200), (-9, -9): (128, 128, 128),
@@ -121,20 +80,9 @@ def test_a_heic_of_the_size_of_a_photo() -> None:
         np.testing.assert_allclose(stored[at], level, atol=4)
 
 
-def test_a_heic_under_another_name_and_a_broken_one(tmp_path: Path) -> None:
+def test_a_heic_under_another_name(tmp_path: Path) -> None:
     shutil.copy(HEIC, tmp_path / "a.jpg")
     assert read_image(tmp_path / "a.jpg").pixels.shape == (64, 48, 3)
-    whole = HEIC.read_bytes()
-    for size in (13, 200, len(whole) - 300):
-        (tmp_path / "cut.heic").write_bytes(whole[:size])
-        with pytest.raises(InputError, match=r"cut.heic: (not a readable image|damaged)") as caught:
-            read_image(tmp_path / "cut.heic")
-        assert "\n" not in str(caught.value)
-    (tmp_path / "text.heic").write_text("no image at all\n" * 9)
-    with pytest.raises(InputError, match="not a readable image"):
-        read_image(tmp_path / "text.heic")
-    with pytest.raises(InputError, match="48 x 64 pixels; at most"):
-        read_image(HEIC, limit_px=1000)
 
 
 def test_a_heic_beyond_the_budget_is_refused_as_others_are() -> None:
@@ -142,12 +90,6 @@ def test_a_heic_beyond_the_budget_is_refused_as_others_are() -> None:
     with pytest.raises(
         InputError, match=r"phone\.heic: \d+ x \d+ pixels: needs \S+ GB of memory, .* --memory"
     ):
-        read_image(HEIC)
-
-
-def test_without_pi_heif_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(InputError, match=r"pip install 'facerf\[heic\]'"):
         read_image(HEIC)
 
 
@@ -187,61 +129,39 @@ def test_every_orientation_is_another_image(tmp_path: Path) -> None:
         path = by_pillow(LEVELS, tmp_path / f"{orientation}.png", orientation)
         with Image.open(path) as stored:
             expected = np.asarray(ImageOps.exif_transpose(stored))
-        found = np.rint(255 * linear_to_srgb(read_image(path).pixels)).astype(int)
+        found = np.rint(levels_of(path)).astype(int)
         np.testing.assert_array_equal(found, expected)
-
-
-def test_a_film_scan_that_is_cut_short(tmp_path: Path) -> None:
-    path = save_cineon(tmp_path / "a.cin", LEVELS[:5, :7].astype(int))
-    path.write_bytes(path.read_bytes()[: 2048 + 4 * 35])
-    assert read_image(path).pixels.shape == (5, 7, 3)
-    path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(InputError, match=r"a\.cin: damaged or cut short"):
-        read_image(path)
 
 
 def test_film_scans_are_decoded_by_the_cineon_curve(tmp_path: Path) -> None:
     """Code values of black, of 18 % grey and of white."""
     codes = np.broadcast_to([95, 445, 685], (6, 9, 3))
-    image = read_image(save_cineon(tmp_path / "a.cin", codes))
+    image = read_image(write_cineon(tmp_path / "a.cin", codes))
     assert image.colourspace_name == "Cineon log"
     np.testing.assert_allclose(image.pixels[0, 0], [0, 0.15, 1], atol=0.003)
     values = (codes / 1023).astype(np.float32)
     for transfer in ("Logarithmic", "Printing density"):
-        path = save_by_oiio(
+        path = write_oiio(
             tmp_path / "a.dpx", values, "uint16", oiio__BitsPerSample=10, dpx__Transfer=transfer
         )
         np.testing.assert_allclose(read_image(path).pixels, image.pixels, atol=2e-3)
 
 
-def test_a_dpx_on_its_side_is_refused(tmp_path: Path) -> None:
-    path = save_by_oiio(tmp_path / "a.dpx", LEVELS, Orientation=6)
-    with pytest.raises(InputError, match="lies on its side is not read; save it upright"):
-        read_image(path)
-
-
 def test_a_psd_has_its_profile(tmp_path: Path) -> None:
-    image = read_image(save_psd(tmp_path / "a.psd", LEVELS, (1039, icc_profiles.DISPLAY_P3)))
+    image = read_image(write_psd(tmp_path / "a.psd", LEVELS, (1039, icc_profiles.DISPLAY_P3)))
     assert image.colourspace_name == "Display P3"
 
 
-def test_a_psd_without_its_composite_is_called_that(tmp_path: Path) -> None:
-    """Photoshop then stores white in its place, and says so in the resource of its version."""
-    version = struct.pack(">IB", 1, 1) + bytes(12)
-    resources = (1039, b"odd"), (1057, version)
-    assert read_image(save_psd(tmp_path / "a.psd", LEVELS, *resources)).pixels.shape == LEVELS.shape
-    save_psd(tmp_path / "a.psd", LEVELS, resources[0], (1057, version[:4] + b"\0" + version[5:]))
-    with pytest.raises(InputError, match=r"a\.psd: a PSD without a composite .* Maximize Compatibility"):
-        read_image(tmp_path / "a.psd")
+def test_a_psd_that_has_its_composite(tmp_path: Path) -> None:
+    """Photoshop says so in the resource of its version."""
+    resources = (1039, b"odd"), (1057, struct.pack(">IB", 1, 1) + bytes(12))
+    assert read_image(write_psd(tmp_path / "a.psd", LEVELS, *resources)).pixels.shape == LEVELS.shape
 
 
 def test_the_colour_code_of_a_png(tmp_path: Path) -> None:
-    """A cICP chunk: primaries of P3 (12), the curve of sRGB (13)."""
-    data = save_by_oiio(tmp_path / "a.png", LEVELS).read_bytes()
-    body = b"cICP" + bytes([12, 13, 0, 1])
-    chunk = struct.pack(">I", 4) + body + struct.pack(">I", zlib.crc32(body))
-    (tmp_path / "a.png").write_bytes(data[:33] + chunk + data[33:])
-    assert read_image(tmp_path / "a.png").colourspace_name == "Display P3"
+    """Primaries of P3 (12), the curve of sRGB (13)."""
+    path = write_png(tmp_path / "a.png", LEVELS, (b"cICP", bytes([12, 13, 0, 1])))
+    assert read_image(path).colourspace_name == "Display P3"
 
 
 def test_floats_without_a_stated_space_are_one_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -254,29 +174,25 @@ def test_floats_without_a_stated_space_are_one_line(tmp_path: Path, caplog: pyte
         ("a.hdr", {}, 0),  # Radiance files are Rec.709
     ):
         caplog.clear()
-        read_image(save_by_oiio(tmp_path / name, values, "float", **attributes))
+        read_image(write_oiio(tmp_path / name, values, "float", **attributes))
         said = [record.getMessage() for record in caplog.records]
         assert len(said) == lines
         if lines:
             assert said[0].endswith(f"{name}: does not say its colour space; read as linear Rec.709")
     caplog.clear()
     read_image(tmp_path / "bare.exr", "ACEScg")
-    read_image(save_by_oiio(tmp_path / "a.png", LEVELS))
+    read_image(write_oiio(tmp_path / "a.png", LEVELS, "uint8"))
     assert not caplog.records
 
 
-def test_the_header_of_a_heic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """`read_header` agrees with the pixels, under any name; None without pi-heif, or of a damaged file."""
+def test_the_header_of_a_heic(tmp_path: Path) -> None:
+    """`read_header` agrees with the pixels, under any name."""
     other = tmp_path / "IMG_1.jpg"
     other.write_bytes(HEIC.read_bytes())
     for path in (HEIC, other):
         header = read_header(path)
         assert header is not None and (header.height_px, header.width_px) == read_image(HEIC).pixels.shape[:2]
         assert (header.is_floating, header.bits) == (False, 8)
-    (tmp_path / "cut.heic").write_bytes(HEIC.read_bytes()[:200])
-    assert read_header(tmp_path / "cut.heic") is None
-    monkeypatch.setitem(sys.modules, "pi_heif", None)
-    assert read_header(HEIC) is None
 
 
 def test_an_ultra_hdr_jpeg_is_decoded_once() -> None:
