@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
+from skimage.draw import polygon2mask
 
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import whole
@@ -13,6 +14,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.portrait.mesh import SeenEyes
+from facerf_cli.relighting import composition as module
 from facerf_cli.relighting.composition import Composition
 from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
 from facerf_cli.relighting.iris import blur_px, opening, outlined
@@ -211,3 +213,24 @@ def test_lips_and_eyes_get_no_grain_that_mixes_their_colours() -> None:
     )
     rows = slice(120, 160)
     np.testing.assert_allclose(grain.given(red.__getitem__)(rows)[..., 0], red[rows][..., 0], atol=1e-3)
+
+
+def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In front of the face they keep nothing. Layers add up."""
+    person, photo = astronaut.person(), astronaut.photo()
+    composition = Composition(astronaut.models().face, photo, person.head, reflectance=person.reflectance)
+    inner = person.head.fit.crop.to_photo(person.head.landmarks_px)[60:68]
+    teeth = polygon2mask(photo.shape[:2], inner[:, ::-1]) & (luminance(photo) > 0.3)
+    lights = torch.stack([azel_to_direction(*light) for light in ((0.0, 0.0), (0.0, 55.0), (-70.0, 0.0))])
+
+    def shown(lights: Lights) -> list[np.ndarray]:
+        return [composition.image(relit).pixels[teeth] for relit in composition.relit(lights)]
+
+    each, (both,) = shown(Lights.each(lights)), shown(Lights(lights, torch.ones(1, 3, 3)))
+    np.testing.assert_allclose(both, sum(each), rtol=1e-3)
+    monkeypatch.setattr(module, "_CAVITY", 0.0)
+    front, above, aside = (
+        kept.mean() / whole.mean() for kept, whole in zip(each, shown(Lights.each(lights)), strict=True)
+    )
+    assert 0.9 < front < 1.1
+    assert above < 0.8 and aside < 0.8

@@ -53,6 +53,8 @@ _DARK = 0.08  # e above, a share of the source's mean
 _NOISY = 2.0  # times e: the luminance below which colours of pixels are noise
 _OWN_REGIONS = ("eyes", "mouth", "brows")  # keep the photo's own detail, scaled as the skin around them
 _OWN_SIDE = 128  # texels of their mask; finer ones take seconds to draw
+_LIPS = 0.7  # cosine to the face's front from which on lips keep no light from the teeth
+_CAVITY = 0.75  # of the light that they keep from them
 _TINY = 1e-8
 
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light
@@ -93,13 +95,14 @@ class Relit:
     """A head under one light: its texture [3, T, T], and the light around it.
 
     `surround` is [3, s, s] of a `Surround`, [views, 15, S, S] of a `WholePerson`; None of a face alone.
-    `mirrored` is what the eyes of a whole person mirror [N, 3, s, s]; `own` [3] the share of
-    the photo's own light.
+    `mirrored` is what the eyes of a whole person mirror [N, 3, s, s]; `mouth` [3, T, T] the texture in what
+    falls into the mouth; `own` [3] the share of the photo's own light.
     """
 
     texture: Tensor
     surround: Tensor | None = None
     mirrored: Tensor | None = None
+    mouth: Tensor | None = None
     own: Tensor | None = None
 
     def plus(self, rgb: Tensor, other: "Relit") -> "Relit":
@@ -108,8 +111,8 @@ class Relit:
         def both(one: Tensor | None, two: Tensor | None) -> Tensor | None:
             return None if one is None or two is None else one + rgb[:, None, None] * two
 
-        texture = self.texture + rgb[:, None, None] * other.texture
-        return Relit(texture, both(self.surround, other.surround), both(self.mirrored, other.mirrored))
+        names = ("texture", "surround", "mirrored", "mouth")
+        return Relit(*(both(getattr(self, name), getattr(other, name)) for name in names))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +189,7 @@ class Composition:
     @property
     def nbytes(self) -> int:
         """Bytes of the head under one sum of lights."""
-        return self._head.face.texture.nbytes + (self.surround.nbytes if self.surround else 0)
+        return 2 * self._head.face.texture.nbytes + (self.surround.nbytes if self.surround else 0)
 
     def relit(self, lights: Lights) -> Iterator[Relit]:
         """Relight the head under each sum of lights, the photo's own light among them; see `_by_lights`."""
@@ -206,14 +209,21 @@ class Composition:
         assert reflectance is not None
         if self.person and isinstance(reflectance, PortraitField):
             lit, _ = both(lambda: reflectance.lit(directions, weights, near), lambda: self._finish)
-            textures = reflectance.field.relit(directions, weights * (1 - from_behind(directions))[:, None])
+            forward = self._head.fit.rotation[:, 2]
+
+            def arriving(toward: Tensor, weights: Tensor) -> Tensor:
+                """Weights of all light on the face, then of what of it falls into the mouth."""
+                front = weights * (1 - from_behind(toward))[..., None]
+                return torch.cat([front, front * _into_mouth(toward, forward)[..., None]])
+
+            textures = reflectance.field.relit(directions, arriving(directions, weights))
             for points, rgb in near:
                 texture = near_texture(reflectance.field, points, self.vertices_m, side)
-                texture = texture * (1 - from_behind(-points.toward))
-                textures = textures + rgb[..., None, None] * texture
+                textures = textures + arriving(-points.toward, rgb)[..., None, None] * texture
+            textures, mouths = textures.chunk(2)
             stacked = torch.stack([view.stacked for view in lit], 1)
             mirrored = reflectance.views[0].mirrored(lights, self.vertices_m.mean(0))
-            yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored)
+            yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored, mouths)
             return
         changes = self.surround.changes if isinstance(self.surround, Surround) else None
         pairs: Iterable[tuple[Tensor, Tensor | None]]
@@ -276,7 +286,7 @@ class Composition:
             return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
         assert self.surround is not None and relit.surround is not None
         around = self.surround.over_photo(self.own, relit.surround, self._display_ev)
-        detail, view = self._detail.relit(relit.texture), self.view
+        detail, view = self._detail.relit(relit.texture, relit.mouth), self.view
 
         def of(rows: slice) -> np.ndarray:
             person, rims = np.split(around(rows), [3], -1)  # the field of the face knows no hair around it
@@ -372,14 +382,15 @@ def in_own_light(pixels: Band, photo: Pixels, share: Tensor) -> Band:
 class PhotoDetail:
     """The photo's own detail, added to relit textures in the window [h, w] of a view (formula above).
 
-    Eyes, brows and teeth stay the photo's: they are scaled as the skin around them.
+    Eyes, brows and teeth stay the photo's: they are scaled as the skin around them, teeth by the light that
+    falls into the mouth.
     """
 
     def __init__(self, face: FaceTexture, view: FaceView, photo: Pixels) -> None:
         self._view, self._texture = view, face.texture
-        own = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS]).amax(0)
-        side = face.texture.shape[1:]
-        own = F.interpolate(own[None, None], side, mode="bilinear", align_corners=False)[0, 0]
+        masks = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS])[None]
+        masks = F.interpolate(masks, face.texture.shape[1:], mode="bilinear", align_corners=False)[0]
+        own, self._mouth = masks.amax(0), masks[_OWN_REGIONS.index("mouth")]
         self.trusted = face.visible * (1 - own)
         self.mean_source = _mean(face.texture, self.trusted)
         self.floor = _DARK * float(self.mean_source.mean()) + _TINY
@@ -399,10 +410,16 @@ class PhotoDetail:
         bias = np.where(finer, floor * (pixels - source) / (source + floor), 0)
         return pixels, gain, bias, own
 
-    def relit(self, texture: Tensor) -> Band:
-        """The photo's pixels in rows [h, w, 3] of the window under the light of a relit texture [3, T, T]."""
+    def relit(self, texture: Tensor, mouth: Tensor | None = None) -> Band:
+        """The photo's pixels in rows [h, w, 3] of the window under the light of a relit texture [3, T, T].
+
+        `mouth` [3, T, T] is relit by what falls into the mouth.
+        """
         mean_change = (_mean(texture, self.trusted) / self.mean_source.clamp(min=_TINY)).numpy()
-        textures = torch.cat([texture, inpaint(texture, self.trusted) / self._around_source])
+        around = inpaint(texture, self.trusted)
+        if mouth is not None:
+            around = torch.lerp(around, inpaint(mouth, self.trusted), _CAVITY * self._mouth)
+        textures = torch.cat([texture, around / self._around_source])
 
         def of(rows: slice) -> np.ndarray:
             pixels, gain, bias, own = self._seen(rows)
@@ -418,6 +435,11 @@ def _steady_colours(pixels: np.ndarray, around: np.ndarray, dark: float) -> np.n
     light, mean = (luminance(image)[..., None] for image in (pixels, around))
     share = (1 - light / dark).clip(min=0)
     return pixels + share * (around * light / mean.clip(min=_TINY) - pixels)
+
+
+def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
+    """Share [...] of lights from directions [..., 3] that falls between lips; the face looks `forward`."""
+    return smoothstep(directions @ forward / _LIPS)
 
 
 def _mean(texture: Tensor, weight: Tensor) -> Tensor:

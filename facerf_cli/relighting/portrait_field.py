@@ -224,7 +224,7 @@ class PortraitView:
             toward, weights = lights.arriving(torch.from_numpy(shadows.origins.mean(0)), centre_m)
             *_, arrives = maps.shaded(toward[None], shadows.along(toward)[None])
             found.append(mirrored_in_cornea(toward, weights, arrives[0].mean((1, 2))))
-        return torch.stack(found, 1) if found else torch.zeros(len(lights), 0)
+        return torch.stack(found, 1) if found else torch.zeros(len(lights), 0, 3, 1, 1)
 
     def relit(self, lit: PortraitLight) -> Tensor:
         """Radiance [M, 3, S, S] of the person in the square, at the resolution of the maps."""

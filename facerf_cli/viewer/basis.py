@@ -173,9 +173,10 @@ def basis_of_photo(
     for relit in _single(composition, rig):
         add(relit)
         mean = relit if mean is None else mean.plus(torch.ones(1), relit)
-    assert mean is not None and mean.surround is not None and mean.mirrored is not None
+    assert mean is not None and mean.surround is not None
+    assert mean.mirrored is not None and mean.mouth is not None
     dark_eyes = torch.zeros_like(mean.mirrored)
-    mean = Relit(*(part / len(rig) for part in (mean.texture, mean.surround, mean.mirrored)))
+    mean = Relit(*(part / len(rig) for part in (mean.texture, mean.surround, mean.mirrored, mean.mouth)))
     add(replace(mean, mirrored=dark_eyes))  # which do not mirror a room
     shown = whole(composition.light_layer(mean), *composition.size_px)
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
