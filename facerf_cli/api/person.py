@@ -155,6 +155,11 @@ class Person(pipeline.FittedPerson):
         seen = backdrop(linear, size, partial(rays_of_rows, camera), rotate_deg, blur)
         return self._out(whole(seen, *size), envmap)
 
+    @property
+    def even(self) -> Light:
+        """Even light from all around, under which the skin is as bright as in the photo."""
+        return self._composition.even * Light.around()
+
     @cached_property
     def light(self) -> Light:
         """The light of the photo, estimated over a rig of 150 lights."""

@@ -24,7 +24,8 @@ _FORMS = ("AZ,EL", "AZ,EL,STRENGTH", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of lights: what a room sends back, by the background
-OWN = "own"  # the word, and by default the name, of the photo's own light
+# Words, and by default names, of lights by the photo: its own, and even light as bright.
+OWN, EVEN = "own", "even"
 _PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has those of one
 # Keys of one kind of light.
 _NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=, az=, el=)", "maps (map=)"
@@ -54,7 +55,8 @@ class StudioLight:
 
     Or a lat-long map, with `rotate_deg` added to every azimuth; or the photo's `own` light, under which the
     person is as photographed. A light that has none of these comes from all around, as of a room or a dull
-    sky: every surface that nothing shades receives the same.
+    sky: every surface that nothing shades receives the same. If `even` it is so bright that skin is as in the
+    photo.
 
     Camera axes. At the face's centre its irradiance is that of a far light of its colour: `rgb` times the
     colour of a blackbody of `kelvin`, times 2 to `stops`; a map's radiance is multiplied by these. `size_m`
@@ -75,6 +77,7 @@ class StudioLight:
     rotate_deg: float = 0.0
     face: int | None = None
     own: bool = False
+    even: bool = False
 
     @property
     def is_around(self) -> bool:
@@ -91,6 +94,7 @@ WORDS = {  # lights that have a word
     "front": StudioLight((0.0, 0.0)),
     "around": StudioLight(),
     OWN: StudioLight(own=True),
+    EVEN: StudioLight(even=True),
 }
 
 
@@ -339,8 +343,10 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
         if places[0][0] is not None:
             raise UsageError(f"{where} the light has two names; leave name= out")
         places = [(given.pop("name"), places[0][1])]
-    own = given.get("from") == OWN
-    places = [(OWN if name is None and (own or place == OWN) else name, place) for name, place in places]
+    places = [
+        (word if name is None and (word := place or given.get("from")) in (OWN, EVEN) else name, place)
+        for name, place in places
+    ]
     lights = [light_by_keys(given, "--light", *place) for place in places]
     if len({bool(light.names) for light in lights}) > 1:
         raise UsageError(f"{where} some lights have names; give each one, as in key=40,20, or none")

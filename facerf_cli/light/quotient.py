@@ -18,28 +18,37 @@ _SHARPNESS = 8.0  # exponent of the likeness: the higher, the more alike a light
 
 @dataclass(frozen=True)
 class Quotient:
-    """Photo over its reconstruction [3, t, t], and the visible reconstruction, grey [t, t]."""
+    """Photo over its reconstruction [3, t, t], and the visible reconstruction, grey [t, t].
+
+    `albedo` [3, t, t], if not None, are factors of the field's albedo, which the reconstruction has.
+    """
 
     ratio: Tensor
     explained: Tensor
+    albedo: Tensor | None = None
 
     @staticmethod
-    def of(photo: Tensor, explained: Tensor, visible: Tensor) -> "Quotient":
+    def of(photo: Tensor, explained: Tensor, visible: Tensor, albedo: Tensor | None = None) -> "Quotient":
         """Divide a photo by its reconstruction, scene-linear textures [3, t, t]; visible [t, t] in 0..1."""
+        explained = explained if albedo is None else explained * albedo
         floor = _FLOOR * (photo.mean(0) * visible).sum() / visible.sum().clamp_min(1e-6)
         ratio = ((photo + floor) / (explained + floor).clamp_min(1e-12)).clamp(*_RANGE)
-        return Quotient(1 + visible * (ratio - 1), explained.mean(0) * visible)
+        return Quotient(1 + visible * (ratio - 1), explained.mean(0) * visible, albedo)
 
     def corrected(self, olats: Tensor) -> Tensor:
         """Multiply OLAT textures [l, 3, T, T] by the quotient, to a power that is each light's likeness.
 
+        Albedo is multiplied in all lights.
+
         Likeness is the cosine between the OLAT and the reconstruction. It compares the shading of the face,
         not light directions: a photo under a dome of light hardly corrects a light from the side.
         """
+        side = olats.shape[-2:]
+        if self.albedo is not None:
+            olats = olats * F.interpolate(self.albedo[None], side, mode="bilinear", align_corners=False)
         small = F.interpolate(olats, self.explained.shape, mode="area").mean(1)
         lengths = (small * (self.explained > 0)).flatten(1).norm(dim=1) * self.explained.norm()
         likeness = (small * self.explained).sum((1, 2)) / lengths.clamp_min(1e-12)
         power = likeness.clamp(0, 1)[:, None, None, None] ** _SHARPNESS
-        side = olats.shape[-2:]
         ratio = F.interpolate(self.ratio[None].log(), side, mode="bilinear", align_corners=False)
         return olats * torch.exp(power * ratio)

@@ -187,6 +187,13 @@ class Composition:
         return self._photo
 
     @property
+    def even(self) -> float:
+        """Brightness of even light, from all around, under which skin is as bright as in the photo."""
+        reflectance = self._reflectance
+        balance = reflectance.balance if isinstance(reflectance, Field | PortraitField) else None
+        return 1.0 if balance is None else balance.even
+
+    @property
     def nbytes(self) -> int:
         """Bytes of the head under one sum of lights."""
         return 2 * self._head.face.texture.nbytes + (self.surround.nbytes if self.surround else 0)

@@ -28,7 +28,8 @@ from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
-from facerf_cli.raster.texture import bake_attributes
+from facerf_cli.raster.texture import bake_attributes, blurred
+from facerf_cli.relighting.baked_in import without_baked_in
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.rims import from_behind
@@ -42,6 +43,8 @@ _LIGHTS_AT_ONCE = 16
 _EVEN_LIGHTS = 16  # that shine as even light does
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
+_FEATURES = [class_index(name) for name in ("brows", "eyes", "lips", "mouth", "glasses")]
+_MAKE_UP = 0.01  # blur of features, in sides: skin near to them keeps its colours
 _CLOTH = ("garment", "headwear")
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
@@ -119,7 +122,20 @@ class PortraitView:
     def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
         """The view of a person with its maps, corrected by the photo's estimated light."""
         found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
-        return found if source is None else found._corrected(source)
+        return found if source is None else found._without_baked_in(source)._corrected(source)
+
+    def _without_baked_in(self, source: SourceLight) -> "PortraitView":
+        """The view whose albedo has neither shade nor glare of the photo's light on skin."""
+        person, lamp = self.person, source.light.directions[:1]
+        features = blurred(person.classes[_FEATURES].sum(0)[None], _MAKE_UP * person.image.shape[-1])[0]
+        skin = person.classes[BARE].sum(0) * (1 - 4 * features).clamp_min(0)
+        (key,), _, _ = self._shaded(lamp, person.visibility(lamp))
+        return self._with_albedo(without_baked_in(self.maps.albedo[0], person.image, skin, key))
+
+    def _with_albedo(self, gains: Tensor) -> "PortraitView":
+        """The view whose albedo is multiplied by gains [3, S, S]."""
+        colours = {name: getattr(self.maps, name) * gains for name in ("gain", "bias", "albedo")}
+        return replace(self, maps=self.maps._replace(**colours))
 
     def _corrected(self, source: SourceLight) -> "PortraitView":
         """The view in the units of the photo's light, corrected to give the photo back under it."""
@@ -140,9 +156,7 @@ class PortraitView:
             return self
         rig, person = rig_directions(_EVEN_LIGHTS), self.person
         even = self.relit(self.lit(rig, torch.full((1, len(rig), 3), 1 / len(rig))))[0]
-        gains = balance.gains(even, person.image, person.classes)
-        colours = {name: getattr(self.maps, name) * gains for name in ("gain", "bias", "albedo")}
-        return replace(self, maps=self.maps._replace(**colours))
+        return self._with_albedo(balance.gains(even, person.image, person.classes))
 
     def _shaded(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Shading, highlights and the share that arrives [l, S, S] of single lights, given their visibility.

@@ -15,10 +15,12 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.face.head import FaceTexture
+from facerf_cli.face.topology import region_mask
 from facerf_cli.light.envmap import lights_around
 from facerf_cli.light.estimate import estimate_lamps, lamp_error
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.relighting.baked_in import without_baked_in
 from facerf_cli.relighting.field import SEEN_WELL, Field, shrunk, weighted_sum
 from facerf_cli.relighting.models import Models
 
@@ -49,8 +51,12 @@ def source_light(models: Models, face: FaceTexture, held: RigLight | None = None
     frame = _Frame.of(models, face)
     light = _estimated([frame]) if held is None else held
     small = frame.field.face
-    explained = weighted_sum([frame.under(light.directions[:1]), frame.around], light.weights[None])[0]
-    quotient = Quotient.of(small.texture, explained, small.visible)
+    lamp, even = frame.under(light.directions[:1]), frame.around.mean(0)
+    explained = weighted_sum([lamp, frame.around], light.weights[None])[0]
+    skin = small.visible * region_mask("skin", small.texture.shape[-1])
+    key = lamp[0].mean(0) / even.mean(0).clamp_min(_TINY)
+    plain = without_baked_in(even, small.texture, skin, key)
+    quotient = Quotient.of(small.texture, explained, small.visible, plain)
     return SourceLight(light, quotient, quotient.corrected(frame.around).mean(0))
 
 

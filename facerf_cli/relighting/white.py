@@ -34,23 +34,28 @@ _GROUPS = [BARE, *([number] for number in range(1, len(CLASSES)) if number not i
 class Balance:
     """The gain [3] of a face, and the log chromaticity [2] of the light that is taken out of the photo.
 
+    `even` is the brightness of even light, from all around, under which skin is as bright as in the photo.
     `off_white` is how far the photo's skin is from all colours of skin, in log chromaticity; in most photos
     about 0.
     """
 
     gain: Tensor
     light: Tensor
+    even: float
     off_white: float = 0.0
 
     @staticmethod
     def of(white: White, relit: Tensor, photo: Tensor, skin: Tensor) -> "Balance":
         """The balance of a face relit [3, ...] by even white light, by its photo [3, ...], scene-linear.
 
+        That light has the radiance 1 / 4: a surface that nothing shades receives that much of it.
         `skin` [...] is the share of skin. Grey photos, and those where little skin has a colour, keep theirs.
         """
         chromas = _chromas(relit, photo, skin)
+        seen, lit = (float(luminance((one * skin).flatten(1).sum(1).numpy())) for one in (photo, relit))
+        even = seen / max(4 * lit, 1e-6)
         if chromas is None:
-            return Balance(torch.ones(3), torch.zeros(2))
+            return Balance(torch.ones(3), torch.zeros(2), even)
         found, shown = chromas
         nearest = _nearest_skin(shown)
         off_white = float((shown - nearest).norm())
@@ -58,7 +63,7 @@ class Balance:
         if white == "scene":
             share = smoothstep(torch.tensor((off_white - _BALANCED) / (_FAR - _BALANCED)))
             wanted = torch.lerp(nearest, _nearest_skin(found), share)
-        return Balance(_gain(found, wanted), shown - wanted, off_white)
+        return Balance(_gain(found, wanted), shown - wanted, even, off_white)
 
     @property
     def is_far(self) -> bool:

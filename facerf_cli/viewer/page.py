@@ -5,7 +5,7 @@ import hashlib
 import io
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,14 @@ from facerf_cli.image.colour import (
     MOST_OVER_FRONT_EV,
     linear_to_srgb,
 )
-from facerf_cli.light.entries import ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK, WORDS, lit_images, preset_names
+from facerf_cli.light.entries import (
+    EVEN,
+    ROOM_BEFORE_BRIGHT,
+    ROOM_BEFORE_DARK,
+    WORDS,
+    lit_images,
+    preset_names,
+)
 from facerf_cli.light.envmap import rig_triangles
 from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
 
@@ -43,12 +50,14 @@ class PageMap:
 class Plate:
     """Images that a page shows besides its basis: all [H, W, ...].
 
-    `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown.
+    `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown;
+    `even` the brightness of even light by which skin is as bright as in the photo.
     """
 
     before: np.ndarray
     matte: np.ndarray
     background: np.ndarray | None = None
+    even: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "room": _room(basis),
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
-        **packed_lights(plate.background is not None),
+        **packed_lights(plate.background is not None, plate.even),
         "envmaps": [
             {
                 "name": one.name,
@@ -107,11 +116,17 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
     return {"triangles": _bytes(corners.astype("<u2").tobytes()), "shares": _floats(to_shares)}
 
 
-def packed_lights(of_photo: bool) -> dict[str, Any]:
-    """The light of each word, the photo's own only `of_photo`, and those of each shipped rig, with names."""
+def packed_lights(of_photo: bool, even: float = 1.0) -> dict[str, Any]:
+    """The light of each word, and those of each shipped rig, with names.
+
+    The photo's own, and even light of a brightness, only `of_photo`.
+    """
+    words = {word: light for word, light in WORDS.items() if of_photo or not (light.own or light.even)}
+    if of_photo:
+        words[EVEN] = replace(words[EVEN], rgb=(even, even, even))
     images = {preset: lit_images([preset])[0] for preset in preset_names()}
     return {
-        "words": {word: asdict(light) for word, light in WORDS.items() if of_photo or not light.own},
+        "words": {word: asdict(light) for word, light in words.items()},
         "presets": {
             preset: [
                 {"name": name, **asdict(light)}

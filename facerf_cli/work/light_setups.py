@@ -47,8 +47,9 @@ class LightSources:
         envmap: Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of
             estimate-light (.json), or procedural:N, maps of facerf envmap; NAME=MAP together with lights that
             have names. Repeatable.
-        light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, own (the photo's), a preset
-            (rembrandt), a rig file, keys (at=, size=), or NAME=LIGHT;stops=-1; docs/lights.md. Repeatable.
+        light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, own (the photo's), even
+            (delight), a preset (rembrandt), a rig file, keys (at=, size=), NAME=LIGHT;stops=-1;
+            docs/lights.md. Repeatable.
         light_from: Relight under the light of another photo, as estimate-light finds it. Repeatable.
         room: Add what a room sends back to lights: a share of them, from all around; a map; or none.
         rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
@@ -115,6 +116,11 @@ class LightSetup:
     def has_own(self) -> bool:
         """True where the photo's own light is one of the lights."""
         return any(light.own for light in self.lights)
+
+    @property
+    def by_photo(self) -> list[StudioLight]:
+        """The lights that are as bright as the photo."""
+        return [light for light in self.lights if light.own or light.even]
 
     def output(self, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None) -> Path:
         """The image's file, by a pattern of --name or the default: the photo's own frame number goes last."""

@@ -122,6 +122,16 @@ def on_face(setup: LightSetup, number: int) -> LightSetup:
     return replace(setup, lights=tuple(lights))
 
 
+def as_in_photo(setup: LightSetup, brightness: float) -> LightSetup:
+    """A setup whose even light has the brightness by which a person's skin is as in the photo."""
+
+    def bright(light: StudioLight) -> StudioLight:
+        red, green, blue = (brightness * value for value in light.rgb)
+        return replace(light, rgb=(red, green, blue), even=False)
+
+    return replace(setup, lights=tuple(bright(light) if light.even else light for light in setup.lights))
+
+
 def with_room(setup: LightSetup) -> LightSetup:
     """A setup with the light of its room as one of its lights."""
     if not setup.room:

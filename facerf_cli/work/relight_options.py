@@ -26,7 +26,7 @@ from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.light.entries import is_sweep, numbers, parse_lights
+from facerf_cli.light.entries import EVEN, OWN, is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
@@ -290,10 +290,9 @@ class Relight:
         of_light: Kind = "field" if self.reflectance == "portrait" else self.reflectance
         how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
         setups = collect_setups(sources, batch.output, photo.settings.seed, how)
-        if any(one.has_own for one in setups):
-            self._check_own(alone)
-            if self.exposure is None:
-                setups = tuple(replace(one, exposure_ev=0.0) if one.has_own else one for one in setups)
+        self._check_lights_by_photo(setups, alone)
+        if self.exposure is None:
+            setups = tuple(replace(one, exposure_ev=0.0) if one.by_photo else one for one in setups)
         if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
             raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
         sweeps = sources.rotate is not None and is_sweep(sources.rotate)
@@ -309,12 +308,16 @@ class Relight:
             reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
         )
 
-    def _check_own(self, alone: bool) -> None:
-        """Raise UsageError for what the photo's own light cannot shine on."""
-        if alone:
+    def _check_lights_by_photo(self, setups: Sequence[LightSetup], alone: bool) -> None:
+        """Raise UsageError for what the photo's own light, or even light as bright, cannot shine on."""
+        if alone and any(setup.has_own for setup in setups):
             raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
-        if self.reflectance not in ("field", "portrait"):
-            raise UsageError(f"--light own: is not for --reflectance {self.reflectance}; leave one out")
+        for light in (one for setup in setups for one in setup.by_photo):
+            if self.reflectance not in ("field", "portrait"):
+                word = OWN if light.own else EVEN
+                raise UsageError(
+                    f"--light {word}: is not for --reflectance {self.reflectance}; leave one out"
+                )
 
     @property
     def exposure_rule(self) -> Exposure:

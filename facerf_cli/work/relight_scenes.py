@@ -30,6 +30,7 @@ from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (
+    as_in_photo,
     each_alone,
     lights_over_rig,
     lights_over_stack,
@@ -113,13 +114,15 @@ def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
 class LitScene:
     """People of a photo, or a stack: its composer, the lights of setups, and what is behind.
 
-    `faces` are the numbers, from the left, of the people's faces in the order of the composer.
+    `faces` are the numbers, from the left, of the people's faces in the order of the composer, and `evens`
+    the brightness of even light on each.
     """
 
     composer: Composer
     setups: tuple[LightSetup, ...]
     lights_of: Callable[[tuple[LightSetup, ...]], Lights]
     faces: tuple[int, ...] = (0,)
+    evens: tuple[float, ...] = (1.0,)
     alpha: np.ndarray | None = None  # of the photo
     behind: Behind | None = None
     plate: Mapping[str, Any] = field(default_factory=dict)  # metadata of the photo that results keep
@@ -128,7 +131,7 @@ class LitScene:
     @cached_property
     def lights(self) -> list[Lights]:
         """The lights of all setups on each of the people."""
-        return [self.lights_of(_as_lit(self.setups, number)) for number in self.faces]
+        return [self.lights_of(one) for one in self._as_lit(self.setups)]
 
     def relit(self, part: slice) -> list[Any]:
         """The people under some of the setups."""
@@ -136,8 +139,12 @@ class LitScene:
 
     def relit_by_each(self, setup: LightSetup, part: slice) -> Iterator[Any]:
         """The people under some of the lights of a setup, each alone."""
-        lit = [_as_lit((setup,), number)[0] for number in self.faces]
-        return self._composed([self.lights_of(each_alone(one)[part]) for one in lit])
+        lit = self._as_lit((setup,))
+        return self._composed([self.lights_of(each_alone(one)[part]) for (one,) in lit])
+
+    def _as_lit(self, setups: tuple[LightSetup, ...]) -> list[tuple[LightSetup, ...]]:
+        """Setups as they shine on each of the people."""
+        return [_as_lit(setups, *one) for one in zip(self.faces, self.evens, strict=True)]
 
     def _composed(self, lights: Sequence[Lights]) -> Iterator[Any]:
         if isinstance(self.composer, GroupComposition):
@@ -145,9 +152,9 @@ class LitScene:
         return self.composer.relit(lights[0])
 
 
-def _as_lit(setups: Sequence[LightSetup], face: int) -> tuple[LightSetup, ...]:
+def _as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[LightSetup, ...]:
     """Setups as they shine on one of the people, with the light of their rooms."""
-    return tuple(with_room(on_face(setup, face)) for setup in setups)
+    return tuple(with_room(as_in_photo(on_face(setup, face), even)) for setup in setups)
 
 
 Scenes = Iterator[tuple[str, LitScene]]  # each with the tag of its files
@@ -223,7 +230,9 @@ def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Re
     people = [_composed(item, image, face, work) for face in by_size]
     composer = people[0] if len(people) == 1 else GroupComposition(people)
     numbers = tuple(face.number for face in by_size)
-    scene = LitScene(composer, work.setups, _over_rig(work), numbers, plate=plate_metadata(image.metadata))
+    evens = tuple(one.even for one in people)
+    plate = plate_metadata(image.metadata)
+    scene = LitScene(composer, work.setups, _over_rig(work), numbers, evens, plate=plate)
     if work.composite != "photo":
         return scene
     if work.identity:
@@ -321,6 +330,8 @@ def _check_stack(item: Item, work: Relight) -> None:
         wrong = "a stack holds its person's matte; give its photo"
     elif work.photo_of_stack is None and any(setup.has_own for setup in work.setups):
         wrong = "the photo's own light (own) needs its photo; give that with --photo"
+    elif any(light.even for setup in work.setups for light in setup.by_photo):
+        wrong = "even light (even) has the brightness of a photo; give that, or from=around"
     elif any(light.at_m is not None for setup in work.setups for light in setup.lights):
         wrong = "a stack holds far lights; for near ones (at=) give its photo"
     if wrong:

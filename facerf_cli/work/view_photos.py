@@ -92,7 +92,7 @@ def of_photo(
     basis = basis_of_photo(models, photo, head, field, composition)
     matte = composition.matte
     background = photo - matte[..., None] * composition.own[:]
-    return basis, Plate(photo, matte, background)
+    return basis, Plate(photo, matte, background, composition.even)
 
 
 def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from facerf_cli import viewer
-from facerf_cli.light.entries import OWN, WORDS, StudioLight, lit_images
+from facerf_cli.light.entries import EVEN, OWN, WORDS, StudioLight, lit_images
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import far_samples, intensity_of
 from facerf_cli.viewer.page import packed_lights
@@ -140,7 +140,8 @@ def test_the_photo_s_own_light_is_written_by_its_word(text: str, written: str, f
 
 def test_every_word_of_light_is_packed_and_own_of_photos_alone() -> None:
     assert set(packed_lights(True)["words"]) == set(WORDS)
-    assert set(WORDS) - set(packed_lights(False)["words"]) == {OWN}
+    assert set(WORDS) - set(packed_lights(False)["words"]) == {OWN, EVEN}
+    assert packed_lights(True, 1.5)["words"][EVEN]["rgb"] == (1.5, 1.5, 1.5)
 
 
 @pytest.mark.parametrize("text", FREE)
