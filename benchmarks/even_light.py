@@ -53,7 +53,7 @@ def main() -> None:
         except FacerfError as error:
             print(f"{name}: {error}")
             continue
-        for what, image in {"photo": photo, "around": person.relight(facerf.Light.around())}.items():
+        for what, image in {"photo": photo, "even": person.relight(person.even)}.items():
             found.setdefault((name, what), []).append(figures(person, image, key, truth))
     print_header("light", "image", "people", "band", "its size", "glare", "its size", "skin")
     for (name, what), rows in found.items():

@@ -38,7 +38,7 @@ class Quotient:
     def corrected(self, olats: Tensor) -> Tensor:
         """Multiply OLAT textures [l, 3, T, T] by the quotient, to a power that is each light's likeness.
 
-        Albedo is multiplied in all lights.
+        The factors of albedo are the same for all.
 
         Likeness is the cosine between the OLAT and the reconstruction. It compares the shading of the face,
         not light directions: a photo under a dome of light hardly corrects a light from the side.

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import facerf_cli as facerf
-from facerf_cli.files.images import read_image
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.entries import EVEN, lit_images
 from facerf_cli.relighting.white import Balance
