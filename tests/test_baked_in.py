@@ -37,11 +37,18 @@ def test_what_is_brighter_and_whiter_than_the_skin_around_is_glare() -> None:
     torch.testing.assert_close(found[:, 109, 109], SKIN, rtol=0.08, atol=0)
 
 
-def test_bright_skin_of_its_colour_grey_photos_and_what_is_no_skin_stay() -> None:
+def test_bright_skin_of_its_colour_grey_photos_and_what_is_no_skin_stay_and_all_without_a_key() -> None:
     one = torch.ones(3, SIDE, SIDE)
     lit, white = plain(), plain()
     lit[:, *SPOT] *= 1.6
     white[:, *SPOT] += 0.15
     grey = white.mean(0).expand(3, -1, -1)
-    for photo, skin in ((lit, WHOLE), (grey, WHOLE), (white, 0.5 * WHOLE)):
-        torch.testing.assert_close(without_baked_in(photo, photo, skin, WHOLE), one, rtol=0, atol=1e-4)
+    part, unlit = WHOLE.clone(), WHOLE.clone()
+    part[SPOT], unlit[SPOT] = 0.5, 0
+    for photo, skin, key in (
+        (lit, WHOLE, WHOLE),
+        (grey, WHOLE, WHOLE),
+        (white, part, unlit),
+        (white, WHOLE, 0 * WHOLE),
+    ):
+        torch.testing.assert_close(without_baked_in(photo, photo, skin, key), one, rtol=0, atol=1e-4)

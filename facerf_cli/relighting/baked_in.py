@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.network.inputs import is_grey
-from facerf_cli.raster.texture import blurred_within, smoothstep
+from facerf_cli.raster.texture import blurred, blurred_within, smoothstep
 
 _FINE, _NEAR, _AROUND = 1 / 224, 1 / 28, 1 / 10  # standard deviations of blurs, in sides
 _SURE = (0.6, 0.9)  # share of skin from which on a pixel counts, and counts whole
@@ -18,6 +18,7 @@ _BRIGHT = 0.9  # quantile of the key on skin
 _LIT = (0.2, 0.6)  # key over that, up to which skin lies in shade, and from which on it does not
 _WHITER = (0.02, 0.1)  # share of added white from which on skin glares, and surely does
 _BRIGHTER = (0.0, 0.2)  # log of its brightness over that around, likewise
+_LEAST = 0.01  # share of plain skin around, below which nothing is known of it
 _MOST = 1.5  # log of a factor
 _TINY = 1e-6
 
@@ -36,7 +37,10 @@ def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor) -
     baked = torch.maximum(shade, _glare(photo, skin * (1 - shade)))
     logs = albedo.clamp_min(1e-4).log()
     coarse = blurred_within(logs, skin, _FINE * side)
-    around = blurred_within(logs, (skin * (1 - baked)) ** 4, _AROUND * side)
+    plain = (skin * (1 - baked)) ** 4
+    around = blurred_within(logs, plain, _AROUND * side)
+    (near,) = blurred(plain[None], _AROUND * side)
+    baked = baked * near / (near + _LEAST)
     return (skin * baked * (around - coarse)).clamp(-_MOST, _MOST).exp()
 
 

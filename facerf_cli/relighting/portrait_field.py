@@ -122,14 +122,16 @@ class PortraitView:
     def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
         """The view of a person with its maps, corrected by the photo's estimated light."""
         found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
-        return found if source is None else found._without_baked_in(source)._corrected(source)
+        return found if source is None else found._corrected(source)
 
-    def _without_baked_in(self, source: SourceLight) -> "PortraitView":
-        """The view whose albedo has neither shade nor glare of the photo's light on skin."""
-        person, lamp = self.person, source.light.directions[:1]
+    def _without_baked_in(self, key: Tensor) -> "PortraitView":
+        """The view without shade and glare of the photo in its albedo, by the shading [S, S] of the key.
+
+        Where that is 0 all over, there is no key, and all stays.
+        """
+        person = self.person
         features = blurred(person.classes[_FEATURES].sum(0)[None], _MAKE_UP * person.image.shape[-1])[0]
         skin = person.classes[BARE].sum(0) * (1 - 4 * features).clamp_min(0)
-        (key,), _, _ = self._shaded(lamp, person.visibility(lamp))
         return self._with_albedo(without_baked_in(self.maps.albedo[0], person.image, skin, key))
 
     def _with_albedo(self, gains: Tensor) -> "PortraitView":
@@ -147,8 +149,10 @@ class PortraitView:
         explained = torch.einsum("lc,lcij->cij", weights, olats)
         shown, found = ((image * skin).sum((1, 2), True) for image in (self.person.image, explained))
         exposure = shown / found.clamp_min(1e-6)  # white, as the photo's light leaves it
+        plain = replace(self, exposure=exposure)._without_baked_in(shade[0] * used[0])
+        olats = plain.maps.albedo * shade[:, None] + glow[:, None]
         correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
-        return replace(self, exposure=exposure, correction=correction)
+        return replace(plain, correction=correction)
 
     def balanced(self, balance: Balance | None) -> "PortraitView":
         """The view whose albedo has the white of a balance."""
