@@ -45,7 +45,7 @@ def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor) -
 
 
 def _glare(photo: Tensor, skin: Tensor) -> Tensor:
-    """How surely each pixel [S, S] of skin glares: a colour is that around it, and white besides."""
+    """The certainty [S, S] that skin glares: colours are those around, and white besides."""
     if is_grey(photo):
         return torch.zeros_like(skin)
     near, around = (blurred_within(photo, skin, blur * photo.shape[-1]) for blur in (_FINE, _NEAR))

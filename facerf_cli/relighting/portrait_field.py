@@ -43,8 +43,7 @@ _LIGHTS_AT_ONCE = 16
 _EVEN_LIGHTS = 16  # that shine as even light does
 _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
-_FEATURES = [class_index(name) for name in ("brows", "eyes", "lips", "mouth", "glasses")]
-_MAKE_UP = 0.01  # blur of features, in sides: skin near to them keeps its colours
+_APART = 0.01  # blur of what is no skin, in sides: skin near to it keeps its make-up and its hair
 _CLOTH = ("garment", "headwear")
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
@@ -130,8 +129,9 @@ class PortraitView:
         Where that is 0 all over, there is no key, and all stays.
         """
         person = self.person
-        features = blurred(person.classes[_FEATURES].sum(0)[None], _MAKE_UP * person.image.shape[-1])[0]
-        skin = person.classes[BARE].sum(0) * (1 - 4 * features).clamp_min(0)
+        bare = person.classes[BARE].sum(0)
+        others = blurred(1 - bare[None], _APART * person.image.shape[-1])[0]
+        skin = bare * (1 - 4 * others).clamp_min(0)
         return self._with_albedo(without_baked_in(self.maps.albedo[0], person.image, skin, key))
 
     def _with_albedo(self, gains: Tensor) -> "PortraitView":
