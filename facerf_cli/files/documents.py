@@ -61,7 +61,8 @@ def _said(error: ErrorDetails, where: str) -> str:
     """An error of pydantic in the words of ours."""
     kind, path, value = error["type"], list(error["loc"]), error["input"]
     if kind == "missing":
-        return f"{_place(where, path[:-1])} has no {path[-1]!r}; {_advice(path)}"
+        advice = "give a file that facerf wrote, or add it" if path == ["format"] else "add it"
+        return f"{_place(where, path[:-1])} has no {path[-1]!r}; {advice}"
     place = _place(where, path)
     if value is None:
         return f"{place} is null; fill it in"
@@ -72,10 +73,6 @@ def _said(error: ErrorDetails, where: str) -> str:
     text = json.dumps(value, default=str)
     shown = text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
     return f"{place} is {shown}; {wanted}"
-
-
-def _advice(path: list[int | str]) -> str:
-    return "give a file that facerf wrote, or add it" if path == ["format"] else "add it"
 
 
 def _place(where: str, path: list[int | str]) -> str:

@@ -8,6 +8,7 @@ stack, the head's rotation and the fit, so that a stack can be relit without its
 """
 
 import json
+import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,6 +22,7 @@ from pydantic import Field, PlainValidator
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.read import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
@@ -44,6 +46,7 @@ _LENGTH_TOLERANCE = 0.01  # a direction's length may differ from 1 by this
 _SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
 _HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
 _OF_STACK = (_HEADER, _DIRECTION, "facerf:light")
+_ARRAYS = ("kind", "directions", "rotation", "source", "seen", "normals", "layout_version")  # of an .npz
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +97,28 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
     finally:
         oiio.attribute("exr_threads", threads)
     warn_of_clamped(path, sum(beyond))
+
+
+def write_olat_npz(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
+    """Write a stack as arrays for NumPy, without pickles; its `olats` are [L, H, W, 3] float16.
+
+    Its other arrays have the names of `StackHeader`'s fields, those of the fit begin with `fit_`.
+    """
+    shape, beyond = (len(header.directions), *header.seen.shape, 3), 0
+    rest = {name: getattr(header, name) for name in _ARRAYS}
+    rest |= {f"fit_{name}": value for name, value in header.fit.items()} | header.metadata
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as file:
+        with file.open("olats.npy", "w", force_zip64=True) as entry:
+            description = {"descr": "<f2", "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(entry, description)
+            for batch in olats:
+                data, clamped = half_floats(path, batch.permute(0, 2, 3, 1).cpu().numpy())
+                beyond += clamped
+                entry.write(data.astype("<f2").tobytes())
+        for name, value in rest.items():
+            with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asarray(value), allow_pickle=False)
+    warn_of_clamped(path, beyond)
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:

@@ -17,8 +17,7 @@ from facerf_cli.face.fit import fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
-from facerf_cli.files.olat_npz import write_olat_npz
-from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.olat_stack import StackHeader, write_olat_npz, write_olat_stack
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
