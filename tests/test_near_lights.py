@@ -35,7 +35,8 @@ class Shown:
 
     def under(self, directions: Tensor, shares: Tensor) -> np.ndarray:
         """The person under far lights [L, 3], white, of shares [L]."""
-        return over_black(self.composition, Lights(directions, shares[None, :, None].expand(-1, -1, 3)))
+        weights = shares[None, :, None].expand(-1, -1, 3)
+        return over_black(self.composition, Lights(directions, weights, keys=(slice(len(shares)),)))
 
     def reached_by(self, light: StudioLight) -> Tensor:
         """Share [S, S] of a near light that arrives."""

@@ -25,12 +25,14 @@ class Light:
     """Single lights that shine together: unit directions toward them [L, 3], rgb weights [L, 3].
 
     Directions are in camera space. Lights add and scale: `2 * key + sum(rims)`. Either may be a tensor, to
-    which gradients then flow. `own_rgb` [3], if not None, is the share of the photo's own light.
+    which gradients then flow. `own_rgb` [3], if not None, is the share of the photo's own light. `keys` are
+    the numbers of lights whose shadows have edges, as those of `Light.single` have.
     """
 
     directions: Array
     weights: Array
     own_rgb: Array | None = None
+    keys: tuple[int, ...] = ()
     __array_ufunc__ = None  # so that numpy leaves `array * light` to the light
 
     @staticmethod
@@ -42,7 +44,7 @@ class Light:
         if not (np.isfinite((azimuth_deg, *rgb)).all() and abs(elevation_deg) <= 90 and min(rgb) >= 0):
             raise ValueError(f"no light from {azimuth_deg}, {elevation_deg} degrees of {rgb}")
         direction = azel_to_direction(azimuth_deg, elevation_deg)
-        return Light(direction.numpy()[None], np.array([rgb], np.float32))
+        return Light(direction.numpy()[None], np.array([rgb], np.float32), keys=(0,))
 
     @staticmethod
     def around(rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
@@ -80,7 +82,8 @@ class Light:
         directions = _joined(self.directions, other.directions)
         one, two = self.own_rgb, other.own_rgb
         own = two if one is None else one if two is None else one + two
-        return Light(directions, _joined(self.weights, other.weights), own)
+        keys = (*self.keys, *(len(self.directions) + key for key in other.keys))
+        return Light(directions, _joined(self.weights, other.weights), own, keys)
 
     def __radd__(self, other: int) -> "Light":
         return self if other == 0 else NotImplemented  # where `sum` begins
@@ -93,7 +96,7 @@ class Light:
             return values * (np.array(factor, np.float32) if isinstance(factor, tuple) else factor)
 
         own = None if self.own_rgb is None else scaled(self.own_rgb)
-        return Light(self.directions, scaled(self.weights), own)
+        return Light(self.directions, scaled(self.weights), own, self.keys)
 
     __rmul__ = __mul__
 
@@ -132,15 +135,17 @@ def sums_of(lights: Sequence[Light]) -> Lights:
         dark = RigLight(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3))
         rigs = [rig if len(rig.directions) else dark for rig in rigs]
     if len(rigs) == 1:
-        return replace(Lights.of_rig(rigs[0]), own=own)
+        keys = tuple(slice(key, key + 1) for key in lights[0].keys)
+        return replace(Lights.of_rig(rigs[0]), own=own, keys=keys)
     directions = torch.cat([rig.directions for rig in rigs])
     places = torch.arange(len(directions))
     if not directions.requires_grad:
         directions, places = torch.unique(directions, dim=0, return_inverse=True)
-    each = zip(rigs, torch.split(places, [len(rig.directions) for rig in rigs]), strict=True)
+    each = list(zip(rigs, torch.split(places, [len(rig.directions) for rig in rigs]), strict=True))
+    sharp = {int(at[key]) for light, (_, at) in zip(lights, each, strict=True) for key in light.keys}
     nothing = torch.zeros(len(directions), 3)
     weights = torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each])
-    return Lights(directions, weights, own=own)
+    return Lights(directions, weights, own=own, keys=tuple(slice(key, key + 1) for key in sorted(sharp)))
 
 
 def rig(lights: int = 150) -> np.ndarray:

@@ -115,7 +115,8 @@ class Person(pipeline.FittedPerson):
         """
         layer, size = self._composition.light_layer, self._composition.size_px
         found = [
-            whole(layer(relit), *size) for relit in _one_by_one(self._composition, directions_of(lights))
+            whole(layer(relit), *size)
+            for relit in _one_by_one(self._composition, Lights.each(directions_of(lights)))
         ]
         return self._out(np.stack(found), lights)
 
@@ -291,12 +292,13 @@ class Person(pipeline.FittedPerson):
                 raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
             with torch.no_grad():
                 relit = list(composition.relit(some))
+            each = Lights.each(some.directions, some.keys)
             for weights, own, one in zip(some.weights, some.owns, relit, strict=True):
                 bands = {"rgb": layer_of(one)} if cut_out else composition.bands(one, behind=behind)
                 arrays = self._with_layers(composition, one, layers, bands)
                 image = torch.from_numpy(arrays.pop("rgb"))
                 if weights.requires_grad:
-                    image = _OfWeights.apply(weights, some.directions, composition, layer_of, image)  # type: ignore[no-untyped-call]
+                    image = _OfWeights.apply(weights, each, composition, layer_of, image)  # type: ignore[no-untyped-call]
                 if own is not None and own.requires_grad:
                     layer = torch.from_numpy(whole(composition.own_layer(cut_out), *composition.size_px))
                     image = image + (own - own.detach()) * layer
@@ -335,7 +337,7 @@ class Person(pipeline.FittedPerson):
     def _layer(self, name: str) -> Any:
         if name == "albedo" and self.kind != "portrait":
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
-        relit = next(_one_by_one(self._composition, torch.tensor([[0.0, 0.0, 1.0]])))
+        relit = next(_one_by_one(self._composition, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
         return self._out(self._with_layers(self._composition, relit, [name], {})[name])
 
     @property
@@ -356,20 +358,20 @@ class Person(pipeline.FittedPerson):
         return values.detach().numpy() if isinstance(values, Tensor) else values
 
 
-def _one_by_one(composition: Composition, directions: Tensor) -> Iterator[Relit]:
-    """The person under each light [L, 3] alone, some at a time."""
+def _one_by_one(composition: Composition, each: Lights) -> Iterator[Relit]:
+    """The person under each of L lights alone, some at a time."""
     with torch.no_grad():
-        for some in torch.split(directions, _LIGHTS_AT_ONCE):
-            yield from composition.relit(Lights.each(some))
+        for first in range(0, len(each), _LIGHTS_AT_ONCE):
+            yield from composition.relit(each[first : first + _LIGHTS_AT_ONCE])
 
 
 class _OfWeights(torch.autograd.Function):
     """An image [H, W, 3] as a function of the weights [L, 3] of lights [L, 3], in which it is linear."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, directions: Tensor, composition: Composition, *more: Any) -> Any:
+    def forward(ctx: Any, weights: Tensor, each: Lights, composition: Composition, *more: Any) -> Any:
         """The image, which is composed already; `layer_of` gives that of each light."""
-        (ctx.layer_of, image), ctx.directions, ctx.composition = more, directions, composition
+        (ctx.layer_of, image), ctx.each, ctx.composition = more, each, composition
         return image
 
     @staticmethod
@@ -377,7 +379,7 @@ class _OfWeights(torch.autograd.Function):
         """Sum the gradient [H, W, 3] over the image of each light."""
         images = (
             torch.from_numpy(whole(ctx.layer_of(relit), *ctx.composition.size_px))
-            for relit in _one_by_one(ctx.composition, ctx.directions)
+            for relit in _one_by_one(ctx.composition, ctx.each)
         )
         return (
             torch.stack([(slopes[0].cpu() * image).sum((0, 1)) for image in images]),

@@ -3,6 +3,8 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
 _AROUND = 24  # samples of a light from all around
 _NEAREST_M = 0.05  # distance below which a light does not grow any more
 _FULL_CONE = 0.8  # share of a spot's cone in which it has its full strength; from there it falls to 0
+_WIDEST_DEG = 36.0  # side of a light, as seen from the face, from which on its shadows have no edges
 WHITE_K = 6504.0  # the correlated colour temperature of D65
 
 
@@ -56,6 +59,12 @@ def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
     return directions, torch.ones(len(directions)) / (directions @ middle).sum()
 
 
+def is_narrow(directions: Tensor) -> bool:
+    """Tell if the samples [n, 3] of a light lie so near each other that its shadows have edges."""
+    middle = F.normalize(directions.mean(0), dim=0)
+    return bool((directions @ middle).min() > math.cos(math.radians(_WIDEST_DEG / 2**0.5)))
+
+
 def is_of_rig(directions: Tensor, lights: int = _AROUND) -> Tensor:
     """Which of directions [N, 3] are of a rig of so many lights; by default of light from all around."""
     return (directions[:, None] == rig_directions(lights)).all(-1).any(-1)
@@ -82,7 +91,7 @@ class PointLights:
         offset = torch.tensor(light.at_m)
         distance_m = float(offset.norm())
         away = offset / distance_m
-        wide_deg = math.degrees(2 * math.atan2(light.size_m / 2, distance_m))
+        wide_deg = _wide_deg(light)
         places = centre_m + offset + light.size_m * _grid(away, wide_deg)
         half = None if light.spot_deg is None else light.spot_deg / 2
         unit = PointLights(places, -away, 1.0, light.size_m > 0, half)
@@ -109,6 +118,18 @@ class PointLights:
         return directions, irradiance
 
 
+class KeyLight(NamedTuple):
+    """A light whose shadows have edges: the number of its sum, and of that in which it shines alone.
+
+    `samples` are its directions among those of far lights, or its place among near ones.
+    """
+
+    number: int
+    alone: int
+    is_near: bool
+    samples: slice
+
+
 @dataclass(frozen=True, eq=False)
 class Lights:
     """M sums of lights: far ones from unit directions [L, 3], camera space, and J near ones; rgb weights.
@@ -122,6 +143,7 @@ class Lights:
     near: tuple[StudioLight, ...] = ()
     near_weights: Tensor | None = None  # [M, J, 3]
     own: Tensor | None = None  # [M, 3], of the photo's own light
+    keys: tuple[slice, ...] = ()  # of far lights, each the samples of one whose shadows have edges
 
     @staticmethod
     def of_rig(light: RigLight) -> "Lights":
@@ -129,9 +151,9 @@ class Lights:
         return Lights(light.directions, light.weights[None])
 
     @staticmethod
-    def each(directions: Tensor) -> "Lights":
+    def each(directions: Tensor, keys: tuple[slice, ...] = ()) -> "Lights":
         """Each light [L, 3] alone, of rgb 1."""
-        return Lights(directions, torch.eye(len(directions))[..., None].expand(-1, -1, 3))
+        return Lights(directions, torch.eye(len(directions))[..., None].expand(-1, -1, 3), keys=keys)
 
     def __len__(self) -> int:
         return len(self.weights)
@@ -140,11 +162,32 @@ class Lights:
         """Some of the sums, without the near lights that shine in none of them."""
         own = None if self.own is None else self.own[sums]
         if self.near_weights is None:
-            return Lights(self.directions, self.weights[sums], own=own)
+            return Lights(self.directions, self.weights[sums], own=own, keys=self.keys)
         some = self.near_weights[sums]
         used = (some != 0).any(0).any(1)
         near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
-        return Lights(self.directions, self.weights[sums], near, some[:, used], own)
+        return Lights(self.directions, self.weights[sums], near, some[:, used], own, self.keys)
+
+    def with_keys_alone(self) -> tuple["Lights", list["KeyLight"]]:
+        """These sums, then each key light alone that shines in one of them with others; and the keys.
+
+        Key lights are those of `keys`, and near ones that are not wide.
+        """
+        near = torch.zeros(len(self), 0, 3) if self.near_weights is None else self.near_weights
+        sums = [[far, near] for far, near in zip(self.weights, near, strict=True)]
+        narrow = [at for at, light in enumerate(self.near) if _wide_deg(light) <= _WIDEST_DEG]
+        kinds = [(0, samples) for samples in self.keys] + [(1, slice(at, at + 1)) for at in narrow]
+        keys: list[KeyLight] = []
+        for number, (kind, samples) in product(range(len(self)), kinds):
+            alone = [torch.zeros_like(weights) for weights in sums[number]]
+            alone[kind][samples] = sums[number][kind][samples]
+            if not alone[kind].any():
+                continue
+            others = not all(map(torch.equal, alone, sums[number]))
+            keys.append(KeyLight(number, len(sums) if others else number, kind == 1, samples))
+            sums += [alone] * others
+        far, near = (torch.stack(weights) for weights in zip(*sums, strict=True))
+        return Lights(self.directions, far, self.near, near if self.near else None), keys
 
     @property
     def owns(self) -> Sequence[Tensor | None]:
@@ -179,6 +222,12 @@ class Lights:
         if self.own is not None:
             total = total + self.own
         return [float(value) for value in luminance(total.numpy())]
+
+
+def _wide_deg(light: StudioLight) -> float:
+    """Angle of the side of a near light, as seen from the face."""
+    assert light.at_m is not None
+    return math.degrees(2 * math.atan2(light.size_m / 2, math.hypot(*light.at_m)))
 
 
 def _grid(axis: Tensor, wide_deg: float) -> Tensor:

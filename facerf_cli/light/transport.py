@@ -138,6 +138,12 @@ def occluded(
     return np.asarray(scene.run(*rays, dists=reach, query="OCCLUDED")) != -1
 
 
+def first_hits_m(scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Distance [N] of the first hit of rays [N, 3]; huge where there is none."""
+    rays = (np.ascontiguousarray(origins), np.ascontiguousarray(directions))
+    return np.asarray(scene.run(*rays, query="DISTANCE"))
+
+
 def hits_within(
     scene: rtcore_scene.EmbreeScene, origins: np.ndarray, directions: np.ndarray, reach_m: float
 ) -> np.ndarray:

@@ -1,5 +1,6 @@
 """A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -37,6 +38,7 @@ SEEN_PX = 224  # and in which it sees a photo: face and hair come out better, ea
 SIDES = 3.0  # its side in extents of the landmarks: the larger side of their bounds
 _WIDEST = 7.0  # and the largest side of the square around the whole person
 _NEAR_IRIS = 1.5  # reach of the pixels whose light an iris mirrors, in its radii
+_FINEST = 3  # pixels along one of the maps, up to which shadows are traced
 _OVERHANG = 0.03  # of a person over the square, in sides, that needs no wider one; and its margin
 
 
@@ -100,6 +102,13 @@ class SeenPerson:
         """The lights that reach each pixel, at half the square's side."""
         half = replace(self.square, size_px=self.square.size_px // 2)
         return Shadows(self.proxy, proxy_maps(self.proxy, square_camera(self.fit, half)))
+
+    @cached_property
+    def finer(self) -> ProxyMaps:
+        """The proxy as finely as the photo shows it, up to `_FINEST` pixels for each of the maps."""
+        times = min(_FINEST, math.ceil(1 / self.square.scale))
+        fine = replace(self.square, size_px=self.square.size_px * times)
+        return proxy_maps(self.proxy, square_camera(self.fit, fine))
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""

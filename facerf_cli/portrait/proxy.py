@@ -36,8 +36,8 @@ from facerf_cli.run.threads import in_threads
 ASSET = Path(__file__).parents[1] / "assets" / "proxy_person.safetensors"
 _HAIR_M = 0.07  # most that the scalp is pushed out by
 _ANGLES, _SMOOTH = 48, 2.0  # around the head, in which the hair's outline is measured, and its smoothing
-_OFF_M = 0.003  # of rays, from the surface: hides its facets
-_RADIUS_DEG, _RAYS = 3.0, 2  # of the disc of a light, and rays to it from each point
+OFF_M = 0.003  # of rays, from the surface: hides its facets
+RADIUS_DEG, _RAYS = 3.0, 2  # of the disc of a light, and rays to it from each point
 _SOFT_PX = 0.7  # standard deviation of a blur of visibility
 _SEED = 7
 _SOLVED_PX, _SOLVED_SIDES = 48, 3.0  # side at which the light is estimated, in a square of so many faces
@@ -143,12 +143,12 @@ class Shadows:
     def __init__(self, proxy: Proxy, maps: ProxyMaps) -> None:
         self.covered, self._inside = maps.covered, maps.covered.numpy() > 0
         normals, points = (field.numpy()[:, self._inside].T for field in (maps.normals, maps.positions_m))
-        self.origins = (points + _OFF_M * normals).astype(np.float32)
+        self.origins = (points + OFF_M * normals).astype(np.float32)
         self._scene = proxy.scene
         # by pixel of the square, so that those of neighbouring frames of a shot are alike
         numbers = np.random.default_rng(_SEED).random((_RAYS, 2, *self._inside.shape)).astype(np.float32)
         self.numbers = numbers[:, :, self._inside][..., None]
-        self._places = [places_on_disc(_RADIUS_DEG, *pair) for pair in self.numbers]
+        self._places = [places_on_disc(RADIUS_DEG, *pair) for pair in self.numbers]
 
     def along(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights from camera-space directions [L, 3] that arrives."""

@@ -16,7 +16,7 @@ negative weights, such as the paper's plain least squares gives, can make pixels
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -41,6 +41,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
+from facerf_cli.relighting.cast_shadows import CastShadow, cast_shadow
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
 from facerf_cli.relighting.grain import Grain
@@ -96,7 +97,8 @@ class Relit:
 
     `surround` is [3, s, s] of a `Surround`, [views, 15, S, S] of a `WholePerson`; None of a face alone.
     `mirrored` is what the eyes of a whole person mirror [N, 3, s, s]; `mouth` [3, T, T] the texture in what
-    falls into the mouth; `own` [3] the share of the photo's own light.
+    falls into the mouth; `own` [3] the share of the photo's own light; `keys` are
+    key lights alone, and the shadow that each casts.
     """
 
     texture: Tensor
@@ -104,6 +106,7 @@ class Relit:
     mirrored: Tensor | None = None
     mouth: Tensor | None = None
     own: Tensor | None = None
+    keys: "tuple[tuple[Relit, CastShadow], ...]" = field(default=(), kw_only=True)
 
     def plus(self, rgb: Tensor, other: "Relit") -> "Relit":
         """This and another light of rgb 1, made so bright [3]."""
@@ -209,8 +212,9 @@ class Composition:
         Of the field, which is linear in light, the surround is summed over its lights, too; the models that
         the paper compares with are not linear where they are clamped.
         """
-        reflectance, directions, weights = self._reflectance, lights.directions, lights.weights
-        near = lights.around(self.vertices_m.mean(0))
+        reflectance, count = self._reflectance, len(lights)
+        lights, keys = lights.with_keys_alone() if self.person else (lights, [])
+        directions, weights, near = lights.directions, lights.weights, lights.around(self.vertices_m.mean(0))
         fit, side = self._target.fit, self._head.face.texture.shape[-1]
         turn = None if fit is None else self._head.fit.turn_to(fit.rotation)
         assert reflectance is not None
@@ -230,7 +234,12 @@ class Composition:
             textures, mouths = textures.chunk(2)
             stacked = torch.stack([view.stacked for view in lit], 1)
             mirrored = reflectance.views[0].mirrored(lights, self.vertices_m.mean(0))
-            yield from map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored, mouths)
+            every = list(map(Relit, reflectance.blended(textures, lit[0]), stacked, mirrored, mouths))
+            cast: list[list[tuple[Relit, CastShadow]]] = [[] for _ in range(count)]
+            for key in keys:
+                light = near[key.samples.start][0] if key.is_near else directions[key.samples].detach()
+                cast[key.number].append((every[key.alone], cast_shadow(reflectance.views[0], light)))
+            yield from (replace(one, keys=tuple(some)) for one, some in zip(every, cast, strict=False))
             return
         changes = self.surround.changes if isinstance(self.surround, Surround) else None
         pairs: Iterable[tuple[Tensor, Tensor | None]]
@@ -289,6 +298,27 @@ class Composition:
 
     def _by_light(self, relit: Relit) -> Band:
         """Pixels as `_relit_pixels`, without the photo's own light."""
+        person, coarse = self.person, self._by_maps(relit)
+        if person is None or self._finish is None or relit.mirrored is None:
+            return coarse
+        alone = [
+            (None if one.texture is relit.texture else self._by_maps(one), cast) for one, cast in relit.keys
+        ]
+
+        def of(rows: slice) -> np.ndarray:
+            pixels = coarse(rows)
+            changes = [(image, person.change(shadow, rows)) for image, shadow in alone]
+            parts = [
+                (pixels if image is None else image(rows)) * (change - 1)
+                for image, change in changes
+                if (change != 1).any()
+            ]
+            return sum(parts, pixels)
+
+        return self._finish[1].lit(of, relit.mirrored)
+
+    def _by_maps(self, relit: Relit) -> Band:
+        """Pixels as `_by_light`, without what only the photo's pixels show: shadows' edges, and eyes."""
         if self._photo is None:
             return self.view.in_frame(lambda rows: self.view.render(relit.texture, rows), 3)
         assert self.surround is not None and relit.surround is not None
@@ -303,10 +333,7 @@ class Composition:
                 part += self.face_share(inside)[..., None] * (detail(inside) - part)
             return person + rims if rims.size else person
 
-        if self._finish is None or relit.mirrored is None:
-            return of
-        grain, eyes = self._finish
-        return eyes.lit(grain.given(of), relit.mirrored)
+        return of if self._finish is None or relit.mirrored is None else self._finish[0].given(of)
 
     def face_share(self, inside: slice) -> np.ndarray:
         """Share [h, w] of the face in rows of the view's window, without what is seen before it."""

@@ -18,6 +18,7 @@ from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
+from facerf_cli.relighting.cast_shadows import CastShadow, change
 from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
 from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
 from facerf_cli.relighting.rims import Rims
@@ -143,6 +144,11 @@ class Enlarged:
         }[name]
         filled = self._filled(self._edges.filled(maps))
         return lambda pixels, *where: _by_pixel(read(filled, pixels, *where))
+
+    def change(self, shadow: CastShadow, rows: slice, columns: slice) -> np.ndarray:
+        """Factor [h, w] of a light's image by the shadow that it casts."""
+        grid = self._grid(rows, columns)
+        return np.asarray(change(CastShadow(*(_enlarged(maps, grid) for maps in shadow))).numpy())
 
     def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under the light of maps [15, S, S] and its own [3]."""

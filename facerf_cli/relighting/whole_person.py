@@ -13,6 +13,7 @@ from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Band, Layer
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.parse import uncovered_rows
+from facerf_cli.relighting.cast_shadows import CastShadow
 from facerf_cli.relighting.enlarged import Enlarged, Shown
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.grain import Grain
@@ -51,6 +52,14 @@ class WholePerson:
         rims = self._rims if lit[:, 9:].any() else None
         relit = [view.relit(one, display_ev, rims) for view, one in zip(self._views, lit, strict=True)]
         return self._joined(photo, relit)
+
+    def change(self, shadow: CastShadow, rows: slice) -> np.ndarray:
+        """Factor [h, W, 1] of a light's image in some rows, by its shadow in the narrower view."""
+        columns, weight = self._views[0].weight(rows)
+        factor = np.ones((len(weight), self._size_px[1], 1), np.float32)
+        if weight.any():
+            factor[:, columns, 0] += weight * (self._views[0].change(shadow, rows, columns) - 1)
+        return factor
 
     @cached_property
     def _rims(self) -> Rims:

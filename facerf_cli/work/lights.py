@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
-from itertools import groupby
+from itertools import accumulate, groupby, pairwise
 from pathlib import Path
 
 import torch
@@ -16,7 +16,7 @@ from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import ball, lights_around, rotated_weights
 from facerf_cli.light.forms import rig_to_latlong
-from facerf_cli.light.studio_points import Lights, far_samples, intensity_of
+from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.light_of_photo import light_of_photo
@@ -75,7 +75,8 @@ def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling
     maps = (tuple(light for light in setup.lights if light.envmap is not None) for setup in setups)
     every, of_maps = _maps_over_rig(tuple(LightSetup("", lights=lights) for lights in maps), rig, sampling)
     directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
-    return replace(single, directions=directions, weights=weights)
+    keys = tuple(slice(len(every) + key.start, len(every) + key.stop) for key in single.keys)
+    return replace(single, directions=directions, weights=weights, keys=keys)
 
 
 @lru_cache(maxsize=1)
@@ -93,7 +94,11 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
         weights.append(torch.zeros(len(setups), len(towards), 3))
         weights[-1][row] = rgb
     some = slice(len(directions) > 1, None)
-    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), own=own_weights(setups))
+    ends = [0, *accumulate(map(len, directions[some]))]
+    keys = tuple(
+        slice(*at) for at, toward in zip(pairwise(ends), directions[some], strict=True) if is_narrow(toward)
+    )
+    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), own=own_weights(setups), keys=keys)
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
