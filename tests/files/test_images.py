@@ -38,23 +38,6 @@ def test_floats_are_linear(tmp_path: Path, suffix: str, kind: str, tolerance: fl
     assert image.pixels.dtype == np.float32 and image.alpha is None
 
 
-@pytest.mark.parametrize(("suffix", "kind", "tolerance"), [
-    ("png", "uint8", 0.5 / 255), ("png", "uint16", 0.5 / 65535), ("tif", "uint8", 0.5 / 255),
-    ("tif", "uint16", 0.5 / 65535)
-])  # fmt: skip
-def test_integers_are_srgb(tmp_path: Path, suffix: str, kind: str, tolerance: float) -> None:
-    rgb = VALUES[..., :3]
-    image = read_image(write_oiio(tmp_path / f"a.{suffix}", rgb, kind))
-    assert image.colourspace_name == "sRGB"
-    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels), rgb, atol=tolerance * 1.01)
-
-
-def test_jpeg_is_srgb(tmp_path: Path) -> None:
-    ramp = np.linspace(0.1, 0.9, 64, dtype=np.float32)[None, :, None] * np.ones((40, 1, 3), np.float32)
-    path = write_oiio(tmp_path / "a.jpg", ramp, "uint8", CompressionQuality=98)
-    np.testing.assert_allclose(colour.linear_to_srgb(read_image(path).pixels), ramp, atol=0.01)
-
-
 @pytest.mark.parametrize(
     ("suffix", "kind"), [("pgm", "uint8"), ("pgm", "uint16"), ("png", "uint8"), ("jpg", "uint8")]
 )
