@@ -156,12 +156,13 @@ def measure(comparison: Comparison, measures: Measures, faces: bool = True) -> l
     """
     _check(comparison)
     case, landmarks_px = comparison.case, comparison.landmarks_px if faces else None
-    true = shown(comparison.truth, comparison)
+    truth, mask = comparison.truth, comparison.mask
+    true = shown(truth, truth, mask)
     descriptor = None if landmarks_px is None else face_descriptor(true, landmarks_px)
     rows = []
     for method, prediction in comparison.predictions.items():
         values = _pixel_values(prediction, comparison, measures.space)
-        ours = shown(prediction, comparison)
+        ours = shown(prediction, truth, mask)
         if measures.vgg_weights is not None:
             values["lpips"] = perceptual_metric(measures.lpips, measures.vgg_weights)(ours, true)
         if descriptor is not None and landmarks_px is not None:
@@ -169,19 +170,15 @@ def measure(comparison: Comparison, measures: Measures, faces: bool = True) -> l
         values |= comparison.extra.get(method, {})
         rows.append(Row(case.name, case.person, method, case.facts, values))
     if descriptor is not None and comparison.source is not None and comparison.source_face is not None:
-        mask, places_px = comparison.source_face
-        given = face_descriptor(_encoded(comparison.source, comparison.source, mask), places_px)
+        source, (face, places_px) = comparison.source, comparison.source_face
+        given = face_descriptor(shown(source, source, face), places_px)
         distance = float(np.linalg.norm(given - descriptor))
         rows.append(Row(case.name, case.person, SOURCE, case.facts, {"face_distance": distance}))
     return rows
 
 
-def shown(image: np.ndarray, comparison: Comparison) -> np.ndarray:
-    """Encode an image [H, W, 3] for a viewer: masked, at the truth's exposure, sRGB in 0..1."""
-    return _encoded(image, comparison.truth, comparison.mask)
-
-
-def _encoded(image: np.ndarray, exposed_as: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def shown(image: np.ndarray, exposed_as: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Encode an image [H, W, 3] for a viewer: masked, exposed as an image within the mask, sRGB in 0..1."""
     exposed = np.clip(image * np.float32(2.0 ** auto_exposure_ev(exposed_as, mask)), 0, 1)
     return linear_to_srgb(exposed) * mask[..., None].astype(np.float32)
 

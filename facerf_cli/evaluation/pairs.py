@@ -15,6 +15,7 @@ from tokenize import TokenError
 
 import numpy as np
 
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions, folder_name
@@ -23,9 +24,7 @@ from facerf_cli.files.texts import read_text, require_regular
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import find_faces
 
-SUFFIXES = frozenset(
-    {".exr", ".hdr", ".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".avif", ".pgm", ".ppm", ".npy"}
-)
+SUFFIXES = PHOTO_SUFFIXES | {".npy"}
 _PARTS = 64  # most items
 _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file

@@ -14,9 +14,9 @@ import numpy as np
 from pydantic import BeforeValidator
 
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.measure import Row
+from facerf_cli.evaluation.measure import METRICS, Row
 from facerf_cli.evaluation.strips import ERROR_COLOURS, ERROR_HIGHEST, Strip
-from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, cell_words, metric_named, published_for
+from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, cell_words, published_for
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document
 from facerf_cli.files.sheets import filled_page
@@ -106,7 +106,7 @@ def choose_cases(
     With them go a `few` near the median of all rows, and a `few` of the best. Only cases `among` some are
     chosen, and none without a finite figure.
     """
-    sign = 1 if metric_named(metric).lower_is_better else -1
+    sign = 1 if METRICS[metric].lower_is_better else -1
     figures = {
         row.case: sign * row.values.get(metric, math.nan) for row in rows if row.method == rows[0].method
     }
@@ -158,7 +158,7 @@ def page(
         highest=ERROR_HIGHEST,
         everywhere=ALL,
         figure=_figure,
-        metric_named=metric_named,
+        metric_named=METRICS.__getitem__,
         axis_of=_axis,
         cell_words=cell_words,
         spread_of=_spread,
@@ -171,7 +171,7 @@ def _axis(groups: Sequence[Group], metric: str) -> tuple[float, float]:
     cells = [cell for group in groups for cell in group.cells.get(metric, {}).values()]
     ends = [end for cell in cells for end in (*np.quantile(cell.values, _QUANTILES), cell.interval.mean)]
     low, high = float(min(ends, default=0)), float(max(ends, default=1))
-    low = 0.0 if low >= 0 and metric_named(metric).lower_is_better else low
+    low = 0.0 if low >= 0 and METRICS[metric].lower_is_better else low
     return (low, high) if high > low else (low, low + 1)
 
 
@@ -188,4 +188,4 @@ def _figure(values: Mapping[str, float], metric: str) -> str:
     """A figure with its metric's digits; empty where it is missing."""
     if metric not in values:
         return ""
-    return f"{values[metric]:.{metric_named(metric).digits}f}" if math.isfinite(values[metric]) else "none"
+    return f"{values[metric]:.{METRICS[metric].digits}f}" if math.isfinite(values[metric]) else "none"

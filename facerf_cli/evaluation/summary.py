@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from facerf_cli.evaluation.measure import METRICS, NEAR_BLACK, Metric, Row
+from facerf_cli.evaluation.measure import METRICS, NEAR_BLACK, Row
 from facerf_cli.image.metrics import Interval, mean_interval
 from facerf_cli.run.logs import counted
 
@@ -25,44 +25,31 @@ _PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 
 @dataclass(frozen=True)
 class PublishedFigure:
-    """A published figure: mean and standard deviation over images of one metric of one method.
+    """A published figure: mean and standard deviation over images of one metric of one method, as published.
 
-    `group` is the fact and value of our figures that it is shown with ('pose', 'same pose'); None is all
-    images. `source` and `data` name where it was published and what it was measured on.
+    `fact` and `value` name the group of our figures that it is shown with ('pose', 'same pose'); all images
+    if they are ''. `source` and `data` name where it was published and what it was measured on.
     """
 
     method: str
     metric: str
-    mean: float
-    sd: float | None
-    group: tuple[str, str] | None
+    mean: str
+    sd: str  # '' if not published
+    fact: str
+    value: str
     source: str
     data: str
-    digits: int | None  # after the decimal point, as published; None: as ours
 
-    def words(self, digits: int) -> tuple[str, str]:
-        """Format mean and standard deviation, with the published digits if they are known."""
-        digits = digits if self.digits is None else self.digits
-        return f"{self.mean:.{digits}f}", "" if self.sd is None else f"{self.sd:.{digits}f}"
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figure for JSON."""
+        return vars(self) | {"mean": float(self.mean), "sd": float(self.sd) if self.sd else None}
 
 
 def published(*protocols: str) -> tuple[PublishedFigure, ...]:
     """Read the figures that are shown with those of protocols, from published.csv."""
     with Path(__file__).with_name("published.csv").open(encoding="utf-8") as stream:
-        return tuple(
-            PublishedFigure(
-                row["method"],
-                row["metric"],
-                float(row["mean"]),
-                float(row["sd"]) if row["sd"] else None,
-                (row["fact"], row["value"]) if row["fact"] else None,
-                row["source"],
-                row["data"],
-                int(row["digits"]) if row["digits"] else None,
-            )
-            for row in csv.DictReader(stream)
-            if row["protocol"] in protocols
-        )
+        rows = [row for row in csv.DictReader(stream) if row.pop("protocol") in protocols]
+    return tuple(PublishedFigure(**row) for row in rows)
 
 
 @dataclass(frozen=True)
@@ -150,7 +137,7 @@ class Summary:
             "methods": self.methods,
             "metrics": self.metrics,
             "groups": groups,
-            "published": [vars(figure) for figure in self.layout.published],
+            "published": [figure.as_dict() for figure in self.layout.published],
         }
 
 
@@ -185,15 +172,10 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
 
 
-def metric_named(name: str) -> Metric:
-    """A metric's title and digits; a metric of a single protocol has its name as title."""
-    return METRICS.get(name) or Metric(name.replace("_", " "), digits=4)
-
-
 def published_for(summary: Summary, group: Group, metric: str) -> list[PublishedFigure]:
     """The published figures of a group and a metric."""
-    key = (group.fact, group.value) if group.fact else None
-    return [one for one in summary.layout.published if one.metric == metric and one.group == key]
+    key = metric, group.fact, group.value
+    return [one for one in summary.layout.published if (one.metric, one.fact, one.value) == key]
 
 
 def natural(text: str) -> list[tuple[int, float, str]]:
@@ -234,7 +216,7 @@ def _interval(values: Sequence[tuple[str, float]]) -> Interval | None:
 
 
 def _won(metric: str, differences: Sequence[float]) -> float:
-    better = -1.0 if metric_named(metric).lower_is_better else 1.0
+    better = -1.0 if METRICS[metric].lower_is_better else 1.0
     won = [0.5 if apart == 0 else float(better * apart > 0) for apart in differences]
     return sum(won) / len(won) if won else math.nan
 
@@ -265,7 +247,7 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
 
 def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) -> Table:
     """The groups' rows: one for each method, then the published figures."""
-    how = metric_named(metric)
+    how = METRICS[metric]
     better = "less" if how.lower_is_better else "more"
     table = Table(
         title=Text(f"\n{how.title} ({better} is better)"),
@@ -287,7 +269,7 @@ def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) 
             rows.append([title, method, str(cell.interval.images), *cell_words(cell, how.digits)])
             title = ""
         for figure in published_for(summary, group, metric):
-            rows.append([f"published, {figure.source}", figure.method, "", *figure.words(how.digits)])
+            rows.append([f"published, {figure.source}", figure.method, "", figure.mean, figure.sd])
     for row in rows:
         table.add_row(*map(Text, row[: len(table.columns)]))
     return table

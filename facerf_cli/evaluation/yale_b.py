@@ -78,19 +78,20 @@ class Relighting:
     source: str
     light: str  # a flash or an environment
 
-    @property
-    def angle_deg(self) -> float | None:
-        """The angle between the flash and the camera's axis; None for an environment."""
-        flash = Flash.named(self.light)
-        return None if flash is None else flash.angle_deg
+    def case(self, subject: str) -> Case:
+        """The case, named by the path of its prediction in the benchmark.
 
-    @property
-    def angle_bin(self) -> str | None:
-        """The class of the angle, for a single flash from the frontal source; else None."""
-        if self.column != "frontal" or self.angle_deg is None:
-            return None
-        bins = (f"{low}-{high} deg" for low, high in pairwise(ANGLES_DEG) if low <= self.angle_deg < high)
-        return next(bins, None)
+        Angles are those between a flash and the camera's axis; classes are of the frontal source alone.
+        """
+        facts: dict[str, str | float] = {"column": self.column, "source": self.source}
+        flash = Flash.named(self.light)
+        for low, high in pairwise(ANGLES_DEG):
+            if flash is not None and self.column == "frontal" and low <= flash.angle_deg < high:
+                facts["angle"] = f"{low}-{high} deg"
+        facts["subjects"] = "settings" if subject in SETTINGS_SUBJECTS else "test"
+        if flash is not None:
+            facts["angle_deg"] = flash.angle_deg
+        return Case(f"{subject}/{self.source}/{self.light}", subject, facts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +209,7 @@ def compare_subject(
         relit = _relit_by_all(subject, photo, face, of_source, methods, room)
         for row, one in enumerate(of_source):
             yield Comparison(
-                case=_case(name, one),
+                case=one.case(name),
                 truth=_rgb(subject.image(one.light)),
                 mask=face_mask().astype(np.float32),
                 predictions={method: _rgb(images[row]) for method, images in relit.items()},
@@ -217,17 +218,6 @@ def compare_subject(
                 source_face=None if places_px is None else (face_mask(), places_px),
                 grey_as_given=True,
             )
-
-
-def _case(subject: str, one: Relighting) -> Case:
-    """The case, named by the path of its prediction in the benchmark."""
-    facts: dict[str, str | float] = {"column": one.column, "source": one.source}
-    if one.angle_bin is not None:
-        facts["angle"] = one.angle_bin
-    facts["subjects"] = "settings" if subject in SETTINGS_SUBJECTS else "test"
-    if one.angle_deg is not None:
-        facts["angle_deg"] = one.angle_deg
-    return Case(f"{subject}/{one.source}/{one.light}", subject, facts)
 
 
 def _rgb(grey: np.ndarray) -> np.ndarray:

@@ -119,20 +119,6 @@ def test_an_own_field_is_measured_alone_or_its_row_names_both(
 
 
 @pytest.mark.usefixtures("toys")
-def test_a_missing_prediction_of_another_method(folder: Path, tmp_path: Path, capsys: Said) -> None:
-    others, out = tmp_path / "others", tmp_path / "out"
-    line = ["evaluate", "yale-b", str(folder), "-o", str(out), "--compare", str(others)]
-    path = others / "yaleB07" / "frontal" / "A-025E+00.npy"
-    path.parent.mkdir(parents=True)
-    np.save(path, np.full((192, 168), 0.5, np.float32))
-    assert main([*line, "--subjects", "yaleB07"]) == 1
-    said = capsys.readouterr()
-    assert "no prediction for case yaleB07/frontal/A+035E+40" in said.err
-    assert "frontal/A-025E+00" not in said.err and said.err.count("no prediction for case") == 5
-    assert not (out / "summary.json").exists()
-
-
-@pytest.mark.usefixtures("toys")
 def test_no_table_without_a_subject(folder: Path, tmp_path: Path, capsys: Said) -> None:
     out = tmp_path / "out"
     write_pgm(folder / "yaleB05" / f"yaleB05_P00{FEW[1].name}.pgm", np.zeros((96, 84)))
@@ -140,9 +126,3 @@ def test_no_table_without_a_subject(folder: Path, tmp_path: Path, capsys: Said) 
     said = capsys.readouterr()
     assert "84 x 96 pixels, not 168 x 192" in said.err and "Traceback" not in said.err
     assert (out / "cases" / "yaleB07.json").is_file() and not (out / "summary.json").exists()
-
-
-def test_a_dry_run_writes_nothing(folder: Path, tmp_path: Path, capsys: Said) -> None:
-    out = tmp_path / "out"
-    assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--dry-run"]) == 0
-    assert "yaleB05.json" in capsys.readouterr().out and not out.exists()

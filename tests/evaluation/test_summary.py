@@ -108,7 +108,7 @@ def test_an_image_measured_twice_is_our_bug() -> None:
 def test_published_figures_are_those_of_their_group() -> None:
     summary = summarise(LAYOUT, rows())
     shown = [[figure.mean for figure in published_for(summary, g, "si_mse")] for g in summary.groups]
-    assert shown == [[], [0.00084], [0.0007]]
+    assert shown == [[], ["0.00084"], ["0.00070"]]
     protocols = ("olat", "reconstruction", "transfer", "olat --against", "geometry")
     tables = [published(protocol) for protocol in protocols]
     assert [len(table) for table in tables] == [2, 8, 8, 2, 4]  # those of the paper are whole

@@ -134,7 +134,7 @@ def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]
     ]
     ours = published("yale-b")
     for method in dict.fromkeys(row.method for row in ours):
-        assert [row.mean for row in ours if row.method == method] in figures, method
+        assert [float(row.mean) for row in ours if row.method == method] in figures, method
     quotient = [row for row in ours if row.method == "quotient image"]
     assert len(ours) == 11 * 4 and len(quotient) == 11
     assert all(row.data == "same images, 21 people, given more data" for row in quotient)
