@@ -27,9 +27,6 @@ from facerf_cli.evaluation.summary import Layout
 from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS, choose_subjects, compare_subject
 
 _PUBLISHED_SUBJECTS = 21  # of Extended Yale B
-_RED = "one photo cannot separate red light from red skin"
-
-
 MakeBench = Callable[[], Bench]  # when a protocol needs it: it loads networks
 
 
@@ -100,7 +97,8 @@ def _reconstruction_notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[
 
 def _transfer_notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
     yield _field_is(options, "the photo that it is read from")
-    yield f"si_mse_channels fits a scale for each channel: {_RED}."
+    why = "one photo cannot separate red light from red skin"
+    yield f"si_mse_channels fits a scale for each channel: {why}."
     if chosen.groups is None:
         yield "Where expressions differ, mouths differ, which no reflectance describes."
     yield _light_by(options)

@@ -74,9 +74,10 @@ class Evaluation:
         return f"evaluate {self.protocol.name}"
 
     @property
-    def shows_face_distance(self) -> bool:
-        """True if Face dis is measured."""
-        return self.options.measures.face_distance or "face_distance" in self.protocol.layout.metrics
+    def metrics(self) -> tuple[str, ...]:
+        """The metrics of the tables: the protocol's, and Face dis if it is asked for."""
+        more = ("face_distance",) if self.options.measures.face_distance else ()
+        return tuple(dict.fromkeys((*self.protocol.layout.metrics, *more)))
 
     def run(self, prepare: Callable[[], object] | None = None) -> int:
         """Measure the items and write their tables; return the exit code, 0 done, 1 some failed.
@@ -153,7 +154,7 @@ class Evaluation:
         wrong: list[str] = []
         images: list[str] = []
         strips: dict[str, tuple[Strip, bytes]] = {}
-        metric, measures = self.protocol.layout.metrics[0], self.options.measures
+        metric, measures = self.metrics[0], self.options.measures
         scaled = metric.startswith("si_") and measures.space == "linear"
         for own in self.protocol.compare(self.options, self.bench, self.chosen.items[item]):
             if self.options.pictures:
@@ -166,7 +167,7 @@ class Evaluation:
             if wrong:  # all that is missing is named at once
                 continue
             comparison = replace(own, predictions={**own.predictions, **others})
-            rows += measure(comparison, measures, self.shows_face_distance)
+            rows += measure(comparison, measures, "face_distance" in self.metrics)
             strip, image = draw_strip(comparison, scaled)
             jpeg = io.BytesIO()
             image.save(jpeg, "JPEG", quality=_STRIP_QUALITY, subsampling=0)
@@ -235,12 +236,11 @@ class Evaluation:
         rows = [row for of_item in figures for row in of_item.rows]
         strips = [strip for of_item in figures for strip in of_item.strips]
         folder, options, layout = self.options.output, self.options, self.protocol.layout
-        more = ("face_distance",) if self.shows_face_distance else ()
         ablation = (f"{self.protocol.name} --against",) if options.against else ()
         layout = replace(
             layout,
             title=layout.title.format(truth=folder_name(options.truth) if options.truth else ""),
-            metrics=tuple(dict.fromkeys((*layout.metrics, *more))),
+            metrics=self.metrics,
             published=published(self.protocol.name, *ablation),
             notes=tuple(self.protocol.notes(options, self.chosen)),
         )

@@ -14,7 +14,7 @@ import torch
 
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, image_path, read_pairs, weights_path
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation import people
 from facerf_cli.evaluation.comparisons import (
     COMPOSITE,
@@ -32,7 +32,7 @@ from facerf_cli.evaluation.comparisons import (
 )
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import EvaluateOptions
-from facerf_cli.evaluation.people import DatasetPerson, Reading, compare_people
+from facerf_cli.evaluation.people import Bench, DatasetPerson, PersonPairs, Reading, compare_people
 from facerf_cli.evaluation.selection import couples_of, evenly, olat_pairs
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
@@ -277,6 +277,12 @@ def test_any_other_trouble_with_a_source_is_an_error(person: DatasetPerson) -> N
 
     with pytest.raises(InputError, match="damaged"):
         list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare, []))
+
+
+def test_joint_fits_of_another_face_model_are_refused(dataset: Dataset) -> None:
+    bench = Bench((unlit(),), (), reading(), iter)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="has fits of other; give it as --face-model"):
+        PersonPairs(replace(dataset, face_model="other"), "0000", []).compared(compare_olats, bench)
 
 
 def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
