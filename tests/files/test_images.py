@@ -28,31 +28,54 @@ def warned(caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch) ->
     return caplog
 
 
-@pytest.mark.parametrize(("suffix", "kind", "tolerance"), [
-    ("exr", "half", 5e-4), ("exr", "float", 0), ("hdr", "float", 1 / 128), ("tif", "float", 0),
-])  # fmt: skip
-def test_floats_are_linear(tmp_path: Path, suffix: str, kind: str, tolerance: float) -> None:
-    rgb = VALUES[..., :3] * 40
-    image = read_image(write_oiio(tmp_path / f"a.{suffix}", rgb, kind))
-    np.testing.assert_allclose(image.pixels, rgb, rtol=tolerance, atol=40 * tolerance)
-    assert image.pixels.dtype == np.float32 and image.alpha is None
+RGB, ALPHA = VALUES[..., :3], VALUES[..., 3]
+GREY = np.full((11, 16, 1), 188 / 255, np.float32)
+BY_SRGB, GREY_LINEAR = colour.srgb_to_linear(RGB), colour.srgb_to_linear(GREY).repeat(3, -1)
+HOLED = np.where(np.arange(23)[:, None] < 3, 0, ALPHA)  # colour without cover is light
+STRAIGHT = {"oiio__UnassociatedAlpha": 1}
+SRGB, LINEAR, ACESCG, REC2020 = colour.SRGB, colour.LINEAR, colour.ACESCG, colour.LINEAR_REC2020
+# Values, how they are written, their space, the pixels that are read and their alpha, and the tolerance.
+WRITTEN = {
+    "half.exr": (40 * RGB, {"kind": "half"}, LINEAR, 40 * RGB, None, 0.02),
+    **{f"a.{kind}": (40 * RGB, {}, LINEAR, 40 * RGB, None, 0) for kind in ("exr", "tif")},
+    "a.hdr": (40 * RGB, {}, LINEAR, 40 * RGB, None, 40 / 128),
+    **{
+        f"{kind}.{suffix}": (GREY, {"kind": kind}, SRGB, GREY_LINEAR, None, 2e-4)
+        for suffix, kind in (("pgm", "uint8"), ("pgm", "uint16"), ("png", "uint8"), ("jpg", "uint8"))
+    },
+    "grey.png": (
+        VALUES[..., :2], {"kind": "uint16", "channels": "YA", **STRAIGHT}, SRGB,
+        colour.srgb_to_linear(VALUES[..., :1]).repeat(3, -1), VALUES[..., 1], 2e-5,
+    ),
+    **{
+        f"straight.{suffix}": (VALUES, {"kind": "uint16", **STRAIGHT}, SRGB, BY_SRGB, ALPHA, 2e-5)
+        for suffix in ("png", "tif")
+    },
+    "over.exr": (
+        np.dstack([np.where(HOLED[..., None] > 0, RGB * HOLED[..., None], RGB), HOLED]), {}, LINEAR,
+        RGB, HOLED, 1e-5,
+    ),
+    "no_alpha.exr": (VALUES, {"channels": "RGBZ"}, LINEAR, RGB, None, 0),
+    "layer.exr": (RGB, {"channels": ("skin.R", "skin.G", "skin.B")}, LINEAR, RGB, None, 0),
+    **{
+        f"{number}.exr": (RGB, how, space, colour.to_linear_rec709(RGB, space), None, 1e-5)
+        for number, (how, space) in enumerate((
+            ({"chromaticities": ACESCG.chromaticities}, ACESCG), ({"oiio__ColorSpace": "ACEScg"}, ACESCG),
+            ({"oiio__ColorSpace": "sRGB"}, SRGB), ({"oiio__ColorSpace": "lin_rec2020_scene"}, REC2020),
+        ))
+    },
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("suffix", "kind"), [("pgm", "uint8"), ("pgm", "uint16"), ("png", "uint8"), ("jpg", "uint8")]
-)
-def test_grey_becomes_three_equal_channels(tmp_path: Path, suffix: str, kind: str) -> None:
-    grey = np.full((11, 16, 1), 188 / 255, np.float32)
-    image = read_image(write_oiio(tmp_path / f"a.{suffix}", grey, kind))
-    assert image.pixels.shape == (11, 16, 3)
-    np.testing.assert_allclose(image.pixels, colour.srgb_to_linear(grey).repeat(3, -1), atol=2e-4)
-
-
-def test_grey_with_alpha(tmp_path: Path) -> None:
-    path = write_oiio(tmp_path / "a.png", VALUES[..., :2], "uint16", ("Y", "A"), oiio__UnassociatedAlpha=1)
-    image = read_image(path)
-    np.testing.assert_allclose(image.alpha, VALUES[..., 1], atol=1e-5)
-    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels[..., 2]), VALUES[..., 0], atol=1e-5)
+@pytest.mark.parametrize("name", list(WRITTEN))
+def test_pixels_and_alpha_are_those_that_were_written(tmp_path: Path, name: str) -> None:
+    values, how, space, pixels, alpha, tolerance = WRITTEN[name]
+    image = read_image(write_oiio(tmp_path / name, values, **how))
+    assert image.pixels.dtype == np.float32 and image.colourspace_name == space.name
+    np.testing.assert_allclose(image.pixels, pixels, rtol=0, atol=tolerance)
+    assert (image.alpha is None) == (alpha is None)
+    if alpha is not None:
+        np.testing.assert_allclose(image.alpha, alpha, atol=1e-5)
 
 
 def test_pnm_by_its_bytes(tmp_path: Path) -> None:
@@ -63,55 +86,6 @@ def test_pnm_by_its_bytes(tmp_path: Path) -> None:
     (tmp_path / "a.pgm").write_bytes(b"P5\n3 2\n1023\n" + np.arange(0, 600, 100, dtype=">u2").tobytes())
     encoded = colour.linear_to_srgb(read_image(tmp_path / "a.pgm").pixels[..., 0]) * 1023
     np.testing.assert_allclose(encoded, [[0, 100, 200], [300, 400, 500]], atol=0.02)
-
-
-@pytest.mark.parametrize("suffix", ["png", "tif"])
-def test_alpha_is_separated_from_colour(tmp_path: Path, suffix: str) -> None:
-    image = read_image(write_oiio(tmp_path / f"a.{suffix}", VALUES, "uint16", oiio__UnassociatedAlpha=1))
-    np.testing.assert_allclose(image.alpha, VALUES[..., 3], atol=1e-5)
-    np.testing.assert_allclose(colour.linear_to_srgb(image.pixels), VALUES[..., :3], atol=1e-5)
-
-
-def test_exr_is_divided_by_its_alpha_but_keeps_light_without_cover(tmp_path: Path) -> None:
-    rgb, alpha = VALUES[..., :3], VALUES[..., 3:].copy()
-    alpha[:3] = 0
-    premultiplied = np.where(alpha > 0, rgb * alpha, rgb)
-    path = write_oiio(
-        tmp_path / "a.exr", np.concatenate([premultiplied, alpha], -1), oiio__UnassociatedAlpha=0
-    )
-    image = read_image(path)
-    np.testing.assert_allclose(image.pixels, rgb, rtol=1e-5)
-    np.testing.assert_array_equal(image.alpha, alpha[..., 0])
-
-
-def test_a_fourth_channel_that_is_no_alpha_is_left_out(tmp_path: Path) -> None:
-    path = write_oiio(tmp_path / "a.exr", VALUES, channels=("R", "G", "B", "Z"))
-    image = read_image(path)
-    assert image.alpha is None
-    np.testing.assert_array_equal(image.pixels, VALUES[..., :3])
-
-
-def test_an_exr_with_layers_only_gives_its_first(tmp_path: Path) -> None:
-    path = write_oiio(tmp_path / "a.exr", VALUES[..., :3], channels=("skin.R", "skin.G", "skin.B"))
-    np.testing.assert_array_equal(read_image(path).pixels, VALUES[..., :3])
-
-
-def test_chromaticities_of_an_exr(tmp_path: Path) -> None:
-    rgb = VALUES[..., :3]
-    path = write_oiio(tmp_path / "a.exr", rgb, chromaticities=colour.ACESCG.chromaticities)
-    expected = colour.to_linear_rec709(rgb, colour.ACESCG)
-    assert np.abs(expected - rgb).max() > 0.1
-    np.testing.assert_allclose(read_image(path).pixels, expected, atol=1e-5)
-
-
-@pytest.mark.parametrize(("name", "space"), [
-    ("ACEScg", colour.ACESCG), ("sRGB", colour.SRGB), ("lin_rec2020_scene", colour.LINEAR_REC2020),
-])  # fmt: skip
-def test_colour_space_that_an_exr_names(tmp_path: Path, name: str, space: colour.ColourSpace) -> None:
-    path = write_oiio(tmp_path / "a.exr", VALUES[..., :3], oiio__ColorSpace=name)
-    image = read_image(path)
-    np.testing.assert_allclose(image.pixels, colour.to_linear_rec709(VALUES[..., :3], space), atol=1e-5)
-    assert image.colourspace_name == space.name
 
 
 def test_an_icc_profile_by_its_name(tmp_path: Path, warned: pytest.LogCaptureFixture) -> None:
@@ -240,9 +214,6 @@ def test_no_time_is_written_so_that_two_runs_give_the_same_bytes(tmp_path: Path)
     assert b"capDate" not in (tmp_path / "a.exr").read_bytes()
 
 
-RGB, ALPHA = (
-    np.random.default_rng(6).random((23, 34, 4)).astype(np.float32)[..., at] for at in (slice(3), 3)
-)
 LAYERS = {"person.A": ALPHA, "albedo": RGB[::-1], "normal": RGB * 2 - 1, "depth": ALPHA[..., None] + 1}
 FACTS = Provenance("me.jpg", "default").attributes()
 
