@@ -32,8 +32,8 @@ from facerf_cli.face.head import Head
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import mean_interval, si_mse
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import FittedPerson, explain
-from facerf_cli.relighting.composition import Target
+from facerf_cli.person import Person, Target
+from facerf_cli.pipeline import explain
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 
 METHODS = ("field", "diffuse-sh", "diffuse-sh low-pass", "diffuse-sh unrefined", "specular-sh", "prt")
@@ -117,7 +117,7 @@ def measure(
     errors = []
     for view, light, truth in steps:
         shown = Target(view.view.fit, "face")
-        image = FittedPerson(models, None, head, explained.reflectance).image(light, shown).pixels
+        image = Person(models, None, head, explained.reflectance).image(light, shown).pixels
         errors.append(si_mse(image, truth, view.view.mask))
     return errors, seconds
 

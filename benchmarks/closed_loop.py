@@ -36,8 +36,9 @@ from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectance_of
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.composition import Composition
+from facerf_cli.relighting.face_in_photo import FaceInPhoto
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
+from facerf_cli.relighting.people import People
 from facerf_cli.training.losses import load_features
 
 TURNS_DEG = (0, 120)  # of each map
@@ -111,15 +112,14 @@ def estimates(
     photo = read_image(path).pixels
     landmarks_px = find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px
     head = fit_photo(models, photo, landmarks_px)
-    composition = Composition(models.face, photo, head, reflectance=reflectance_of(models, head))
+    people = People([FaceInPhoto(models.face, photo, head, reflectance_of(models, head))])
     weights = torch.stack([light.weights for light in lights])
-    all_relit = composition.relit(Lights(RIG, weights))
-    for light, relit in zip(lights, all_relit, strict=True):
+    for light, (relit,) in zip(lights, people.relit(Lights(RIG, weights)), strict=True):
         face = replace(head.face, texture=relit.texture)
         for method, found in by_both(models, replace(head, face=face), features):
             yield light, ("texture", method, found)
-        ev = composition.exposure_ev(relit, "auto")
-        relit_photo = through_png(composition.image(relit, ev).pixels * np.float32(2.0**ev))
+        ev = people.exposure_ev([relit], "auto")
+        relit_photo = through_png(people.image([relit], ev).pixels * np.float32(2.0**ev))
         seen_px = find_faces(SHIPPED_NETWORKS.people, relit_photo, light.name)[0].landmarks_px
         if np.linalg.norm(seen_px.mean(0) - landmarks_px.mean(0)) > _MOVED_PX:
             print(f"PNG {path.stem} {light.name}: left out, another face was detected")

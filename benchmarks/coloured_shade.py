@@ -20,7 +20,8 @@ from _common import arguments, print_header, print_row, required
 
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import find_for, fit
+from facerf_cli.person import fit
+from facerf_cli.pipeline import find_for
 from facerf_cli.relighting.models import Models, load_models
 
 WHITE, WARM, COOL = (1, 1, 1), (1.5, 0.9, 0.55), (0.75, 1, 1.4)
@@ -76,7 +77,9 @@ def errors(
 ) -> list[float]:
     """Errors of the colours of `CLASSES`; NaN of one that is not seen."""
     photo = colours[0] * key + _DIM * colours[1] * side
-    person = fit(models, photo, find_for(models.networks.people, "landmarks", photo, "a frame")[0])
+    person = fit(
+        models, photo, white=None, face=find_for(models.networks.people, "landmarks", photo, "a frame")[0]
+    )
     relit = person.image(RigLight(toward[None], torch.ones(1, 3))).pixels
     return [error(relit, side, person.segmentation.layer(name) > 0.9) for name in CLASSES]
 

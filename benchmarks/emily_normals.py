@@ -11,15 +11,11 @@ change of the normal between neighbours in the face over the truth's.
 from pathlib import Path
 
 import numpy as np
-import torch
 from _common import SHARED, arguments, print_header, print_row, required
 from PIL import Image
 
+from facerf_cli.api import fit, load_models
 from facerf_cli.files.read import read_image
-from facerf_cli.pipeline import find_for, fit
-from facerf_cli.relighting.models import load_models
-from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.relighting.whole_person import WholePerson
 
 VIEWS = range(1, 8)
 _BLACK = 10  # of 255: darker pixels show nothing
@@ -41,11 +37,7 @@ def measured(folder: Path, view: int) -> tuple[float, float, float]:
     """Mean angles in degrees over the face and the rest, and the sharpness in the face."""
     models, path = load_models(), folder / f"view_{view}.jpg"
     photo, file = read_image(path).pixels, np.load(folder / f"truth_{view}.npz", allow_pickle=False)
-    field = fit(models, photo, find_for(models.networks.people, "landmarks", photo, path.name)[0]).reflectance
-    assert isinstance(field, PortraitField)
-    dark = torch.zeros(len(field.views), 15, *field.person.image.shape[1:])
-    whole = WholePerson(photo, field).layer("normal", dark, photo)["normal"]
-    (found, seen), (truth, known) = unit(whole(slice(0, len(photo)))), unit(file["normal"].astype(np.float32))
+    (found, seen), (truth, known) = unit(fit(models, photo).normals), unit(file["normal"].astype(np.float32))
     shown = known & seen & (truth[..., 2] > 0.1) & (np.asarray(Image.open(path).convert("L")) > _BLACK)
     away_deg = np.degrees(np.arccos((found * truth).sum(-1).clip(-1, 1)))
     face = shown & file["face"]

@@ -42,6 +42,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.person import Person
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.relighting.sequence import Follower, ShotView
@@ -79,7 +80,7 @@ def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | N
     """Relight a frame by the target's light."""
     reflectance = pipeline.reflectance_of(models, head, "portrait", photo=frame, steady=steady)
     light = RigLight(rig_directions(LIGHTS), TARGET)
-    return pipeline.FittedPerson(models, frame, head, reflectance).image(light).pixels
+    return Person(models, frame, head, reflectance).image(light).pixels
 
 
 def exposed(results: list[np.ndarray], clip: Clip) -> np.ndarray:

@@ -22,7 +22,8 @@ from facerf_cli.image.colour import SOFT_VIEW, encode_display, most_exposure_ev
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import direction_to_azel, golden_spiral, rig_directions
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.pipeline import FittedPerson, find_for, head_of, reflectance_of
+from facerf_cli.person import Person
+from facerf_cli.pipeline import find_for, head_of, reflectance_of
 from facerf_cli.relighting.models import load_models
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
@@ -77,7 +78,7 @@ def measure(path: Path, folder: Path, count: int, size_px: int) -> None:
     shown = drawn(text, [address for _, address, _ in given], folder)
     print(f"{time.perf_counter() - begun:.0f} s for {len(shown)} states in software")
     field = reflectance_of(models, head, "portrait", photo=photo)
-    whole = FittedPerson(models, photo, head, field).composed()
+    whole = Person(models, photo, head, field).composed()
     seen = whole.matte > 0.5
     print("light                    EV relight   page    mean   95 %   99 %    most")
     errors: dict[str, list[np.ndarray]] = {}

@@ -24,9 +24,9 @@ from facerf_cli.files.write import write_display
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.pipeline import FittedPerson, find_for, fit, head_of, reflectance_of
+from facerf_cli.person import Person, Target, fit
+from facerf_cli.pipeline import find_for, head_of, reflectance_of
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.source_light import source_light
@@ -85,7 +85,7 @@ def measure(models: Models, paths: list[Path], sheet: Path | None) -> None:
             continue
         found = {"copy": np.repeat(photo[None], len(weights), 0)}
         for kind in ("field", "portrait"):
-            person = FittedPerson(models, photo, head, reflectance_of(models, head, kind, photo=photo))
+            person = Person(models, photo, head, reflectance_of(models, head, kind, photo=photo))
             composition = person.composed(Target(background="none"))
             relit = composition.relit(Lights(rig, weights))
             found[kind] = np.stack([composition.image(one).pixels for one in relit])
@@ -130,7 +130,9 @@ def _ssim(image: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> float:
 def print_speed(models: Models) -> None:
     """Print times in forward passes, and how well a photo comes back under its own light."""
     photo = read_image(ASTRONAUT).pixels
-    found = fit(models, photo, find_for(models.networks.people, "landmarks", photo, "astronaut")[0])
+    found = fit(
+        models, photo, white=None, face=find_for(models.networks.people, "landmarks", photo, "astronaut")[0]
+    )
     field = found.reflectance
     assert isinstance(field, PortraitField)
     rig = rig_directions(150)

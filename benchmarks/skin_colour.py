@@ -14,7 +14,6 @@ import numpy as np
 from _common import arguments, photos, print_header, print_row
 
 import facerf_cli as facerf
-from facerf_cli.api.person import Person
 from facerf_cli.image.colour import (
     SOFT_VIEW,
     encode_display,
@@ -22,6 +21,7 @@ from facerf_cli.image.colour import (
     luminance,
     srgb_to_linear,
 )
+from facerf_cli.person import Person
 from facerf_cli.pipeline import reflectance_of
 
 LIGHTS = {

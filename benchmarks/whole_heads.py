@@ -15,7 +15,8 @@ from _common import WHOLE_YALE_B, arguments, required
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.light.sphere import RigLight, azel_to_direction
-from facerf_cli.pipeline import find_for, fit
+from facerf_cli.person import fit
+from facerf_cli.pipeline import find_for
 from facerf_cli.relighting.models import load_models
 
 
@@ -33,7 +34,12 @@ def main() -> None:
     for subject, source in sources:
         photo = np.repeat(portrait.frame(data, subject, source)[..., None], 3, -1).astype(np.float32)
         try:
-            person = fit(models, photo, find_for(models.networks.people, "landmarks", photo, source)[0])
+            person = fit(
+                models,
+                photo,
+                white=None,
+                face=find_for(models.networks.people, "landmarks", photo, source)[0],
+            )
         except FacerfError as error:
             print(f"{subject} {source}: {error}", file=sys.stderr)
             continue

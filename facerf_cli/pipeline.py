@@ -1,6 +1,6 @@
 """The method, one function an arrow: from one photo to the face under any light, from any head pose.
 
-    photo -> fit_photo or regress_photo -> head -> reflectance_of -> FittedPerson -> image
+    photo -> fit_photo or regress_photo -> head -> reflectance_of -> Person (person.py) -> images
                                             head -> estimate_light -> light
                                             head -> predict_olat -> a texture for each light
 
@@ -10,7 +10,6 @@ scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,22 +25,18 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import FitStart, Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.image.colour import without_fireflies
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
 from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, FaceBox, find_faces
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
-from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.relighting import White
-from facerf_cli.relighting.composition import AS_IN_PHOTO, Composition, RelitImage, Target
 from facerf_cli.relighting.field import (
     MEMORY_BYTES,
     Field,
@@ -193,62 +188,6 @@ def reflectance_of(
     (source, field), views = both(of_face, of_person)
     seen = [(one, maps_of(models.networks.portrait, one)) for one in views]
     return PortraitField.of(models.face, head, field, source, seen)
-
-
-@dataclass(frozen=True, eq=False)
-class FittedPerson:
-    """One face of a photo [H, W, 3], fitted once: each light, pose and layer then costs what itself costs.
-
-    Without a photo it is the face alone, in the frame of its crop. The person's matte [H, W] may be given.
-    """
-
-    models: Models
-    photo: np.ndarray | None
-    head: Head
-    reflectance: Reflectance
-    given_matte: np.ndarray | None = None
-
-    @cached_property
-    def segmentation(self) -> Segmentation:
-        """Classes and matte of the person in the photo."""
-        assert self.photo is not None
-        if isinstance(self.reflectance, PortraitField):
-            return self.reflectance.person.segmentation
-        landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        people, matte, others = self.models.networks.people, self.given_matte, self.head.others
-        return segment(people, to_display(self.photo), landmarks_px, matte, others)
-
-    @property
-    def share(self) -> np.ndarray:
-        """The person's share [H, W] of the photo."""
-        return self.segmentation.matte if self.given_matte is None else self.given_matte
-
-    def composed(self, target: Target = AS_IN_PHOTO) -> Composition:
-        """Prepare images of the person in a pose, before a background, that differ by their light alone.
-
-        The target's matte says which part of the person changes.
-        """
-        if self.photo is not None and target.composite == "photo":
-            part = target.matte
-            target = replace(target, matte=self.share if part is None else self.share * part)
-        return Composition(self.models.face, self.photo, self.head, target, self.reflectance)
-
-    def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:
-        """The person under one light (paper, 'Relighting')."""
-        composition = self.composed(target)
-        return composition.image(next(composition.relit(Lights.of_rig(light))))
-
-
-def fit(
-    models: Models,
-    photo: np.ndarray,
-    face: FaceBox,
-    kind: RelightKind = "portrait",
-    sides: Sides | None = None,
-) -> FittedPerson:
-    """Fit a face found in a photo [H, W, 3], and read its reflectance."""
-    head = head_of(models, photo, face, sides)
-    return FittedPerson(models, photo, head, reflectance_of(models, head, kind, photo=photo))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 
 from facerf_cli.face.head import Head
 from facerf_cli.files.read import read_image
-from facerf_cli.pipeline import FittedPerson, fit
+from facerf_cli.person import Person, fit
 from facerf_cli.portrait.find import Face, find_faces
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.portrait_field import PortraitField
@@ -32,9 +32,9 @@ def face() -> Face:
 
 
 @cache
-def person() -> FittedPerson:
+def person() -> Person:
     """The astronaut with her portrait field."""
-    return fit(models(), photo(), face(), sides=models().sides(TEXTURE))
+    return fit(models(), photo(), face=face(), texture_side=TEXTURE, white=None)
 
 
 def head() -> Head:

@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.image.strips import whole
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import KeyLight, Lights, far_samples
+from facerf_cli.person import Target
 from facerf_cli.portrait.proxy import OFF_M, Proxy, ProxyMaps
 from facerf_cli.relighting.cast_shadows import CastShadow, change, visibility
-from facerf_cli.relighting.composition import Composition, Target
+from facerf_cli.relighting.people import People
 from tests import astronaut
 
 SIDE, WIDE_M = 96, 0.2  # of a floor, that faces the camera
@@ -109,19 +109,19 @@ def test_key_lights_are_singled_out() -> None:
 
 
 @pytest.fixture(scope="module")
-def composition() -> Composition:
-    return astronaut.person().composed(Target(background="none"))
+def people() -> People:
+    found = astronaut.person().composed(Target(background="none"))
+    assert isinstance(found, People)
+    return found
 
 
-def test_shadows_act_on_bare_skin_alone(composition: Composition) -> None:
+def test_shadows_act_on_bare_skin_alone(people: People) -> None:
     """Elsewhere, and where the coarse visibility does not change, the image is that of the maps."""
     direction = azel_to_direction(45.0, 30.0)[None]
-    (relit,) = composition.relit(Lights.each(direction, (slice(0, 1),)))
+    ((relit,),) = people.relit(Lights.each(direction, (slice(0, 1),)))
     ((alone, _),) = relit.keys
     assert alone.texture is relit.texture
-    fine, coarse = (
-        whole(composition.light_layer(one), *composition.size_px) for one in (relit, replace(relit, keys=()))
-    )
+    fine, coarse = (people.light_layer([one]) for one in (relit, replace(relit, keys=())))
     segmentation = astronaut.field().person.segmentation
     skin = sum(segmentation.layer(name)[:] for name in ("skin", "lips", "ears", "neck", "beard"))
     changed = (fine != coarse).any(-1)
@@ -129,10 +129,10 @@ def test_shadows_act_on_bare_skin_alone(composition: Composition) -> None:
     assert fine.min() >= 0
 
 
-def test_layers_of_lights_add_up(composition: Composition) -> None:
+def test_layers_of_lights_add_up(people: People) -> None:
     directions = torch.cat([azel_to_direction(45.0, 30.0)[None], azel_to_direction(-80.0, 10.0)[None]])
     weights = torch.tensor([[1.0, 0.0], [0.0, 0.1], [1.0, 0.1]])[..., None].expand(-1, -1, 3)
-    relit = composition.relit(Lights(directions, weights, keys=(slice(0, 1), slice(1, 2))))
-    key, fill, both = (whole(composition.light_layer(one), *composition.size_px) for one in relit)
+    relit = people.relit(Lights(directions, weights, keys=(slice(0, 1), slice(1, 2))))
+    key, fill, both = map(people.light_layer, relit)
     assert fill.max() > 0.02
     np.testing.assert_allclose(both, key + fill, atol=1e-5 * both.max())

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
-from types import SimpleNamespace
-from typing import cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,24 +18,17 @@ from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
-from facerf_cli.raster.camera import pose_to_rotation, project
+from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
-from facerf_cli.relighting.composition import (
-    Background,
-    Composition,
-    PhotoDetail,
-    Relit,
-    RelitImage,
-    Surround,
-    Target,
-)
-from facerf_cli.relighting.whole_person import WholePerson
+from facerf_cli.relighting.face_in_photo import FaceInPhoto, Surround
+from facerf_cli.relighting.people import Background, People
+from facerf_cli.relighting.photo_detail import PhotoDetail
+from facerf_cli.relighting.subject import Relit, RelitImage
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)
 RIG = rig_directions()
 ROTATION, TRANSLATION_M = pose_to_rotation(14, 4, -3), torch.tensor([0.0, 0.01, -1.25])
-FOLLOWING = Target()
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +84,10 @@ def view() -> FaceView:
     return view_face(scene().vertices, photo_camera(CROP, HEIGHT_PX, WIDTH_PX), CROP.side_px)
 
 
-def composed(
-    photo: np.ndarray, source: Tensor, seen: Tensor, target: Target = FOLLOWING, crop: Crop = CROP
-) -> Composition:
-    """The composition of the scene's face in a photo."""
+def in_photo(
+    photo: np.ndarray, source: Tensor, seen: Tensor, matte: np.ndarray | None = None, crop: Crop = CROP
+) -> FaceInPhoto:
+    """The scene's face in a photo, whose textures are given."""
     model = load_face_model("builtin")
     none = torch.zeros(1)
     fit = FaceFit(
@@ -108,7 +100,8 @@ def composed(
         none,
         0.0,
     )
-    return Composition(model, photo, Head(photo, fit, FaceTexture(source, seen, source)), target)
+    unknown: Any = None
+    return FaceInPhoto(model, photo, Head(photo, fit, FaceTexture(source, seen, source)), unknown, matte)
 
 
 def compose(
@@ -116,13 +109,17 @@ def compose(
     source: Tensor,
     relit: Tensor,
     seen: Tensor,
-    target: Target = FOLLOWING,
+    matte: np.ndarray | None = None,
     crop: Crop = CROP,
 ) -> np.ndarray:
     """The photo with the scene's face relit."""
-    composition = composed(photo, source, seen, target, crop)
-    assert isinstance(composition.surround, Surround)
-    return composition.image(Relit(relit, composition.surround.changes(relit[None])[0])).pixels
+    face = in_photo(photo, source, seen, matte, crop)
+    return People([face]).image([Relit(relit, face.surround.changes(relit[None])[0])]).pixels
+
+
+def detailed(detail: PhotoDetail, texture: Tensor, rows: slice) -> np.ndarray:
+    """The photo's pixels in rows of the window under a relit texture."""
+    return detail.pixels(detail.ready(texture), detail.observe(rows), rows)
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -171,14 +168,9 @@ def in_half(background: Background, ev: float, behind: np.ndarray | None = None)
     photo, source, seen = unwrapped()
     matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
     matte[:, 200:] = 1
-    composition = composed(photo, source, seen, Target(matte=matte, background=background))
-    assert isinstance(composition.surround, Surround)
-    relit = scene().lit(OTHER)
-    return composition.image(
-        Relit(relit, composition.surround.changes(relit[None])[0]),
-        ev,
-        None if behind is None else behind.__getitem__,
-    )
+    face, relit = in_photo(photo, source, seen, matte), scene().lit(OTHER)
+    lit = [Relit(relit, face.surround.changes(relit[None])[0])]
+    return People([face], background).image(lit, ev, behind)
 
 
 def test_the_photos_background_looks_as_it_was_at_any_exposure() -> None:
@@ -206,7 +198,7 @@ def test_a_matte_says_what_may_change() -> None:
     photo, source, seen = unwrapped()
     matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
     matte[:, 200:] = 1
-    result = compose(photo, source, scene().lit(OTHER), seen, Target(matte=matte))
+    result = compose(photo, source, scene().lit(OTHER), seen, matte)
     whole = compose(photo, source, scene().lit(OTHER), seen)
     np.testing.assert_array_equal(result[:, :200], photo[:, :200])
     np.testing.assert_allclose(result[:, 200:], whole[:, 200:], atol=1e-5)
@@ -252,7 +244,8 @@ def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:
     centres = (torch.arange(side) + 0.5) / side
     uv = torch.stack(torch.meshgrid(centres, centres, indexing="xy"), -1)
     whole = torch.ones(side, side)
-    screen = FaceView(side, side, 0, 0, uv, whole, whole, lambda rows: torch.zeros(side, side, 6)[rows])
+    camera = Camera(1.0, side, side, side / 2, side / 2)
+    screen = FaceView(side, side, 0, 0, uv, whole, whole, torch.zeros(1, 3), camera)
     return FaceTexture(source, whole, source), screen, screen.render(source).numpy()
 
 
@@ -261,7 +254,7 @@ def test_a_dark_source_is_rendered_and_not_multiplied() -> None:
     source[:, 16:19, 22:25] = 1e-6  # a cheek's
     face, screen, shown = flat_face(source)
     photo = shown + np.float32(1e-3)  # noise of the photo over the texture
-    relit = PhotoDetail(face, screen, photo).relit(torch.full((3, 32, 32), 0.3))(slice(0, 32))
+    relit = detailed(PhotoDetail(face, screen, photo), torch.full((3, 32, 32), 0.3), slice(0, 32))
     np.testing.assert_allclose(relit, 0.3, atol=0.02)  # the quotient would be 300
 
 
@@ -275,11 +268,11 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
     )
     skin = torch.nn.functional.interpolate(own_region[None, None], (48, 48), mode="bilinear")[0, 0] < 1e-3
     bright = skin.numpy() & (luminance(photo) > 2 * detail.floor)  # below, colours are noise
-    returned = detail.relit(face.texture)(rows)
+    returned = detailed(detail, face.texture, rows)
     np.testing.assert_allclose(returned[bright], photo[bright], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(returned[skin], photo[skin], atol=detail.floor)
     one_sided = face.texture * (torch.arange(48) > 24)
-    assert detail.relit(one_sided)(rows).min() >= 0
+    assert detailed(detail, one_sided, rows).min() >= 0
 
 
 def test_the_colour_of_dark_pixels_is_not_multiplied() -> None:
@@ -288,20 +281,8 @@ def test_the_colour_of_dark_pixels_is_not_multiplied() -> None:
     face, screen, shown = flat_face(source)
     photo = shown.copy()
     photo[17, 23] = 0.02, 0.013, 0.0  # a camera's black in one channel
-    relit = PhotoDetail(face, screen, photo).relit(torch.full((3, 32, 32), 0.4))(slice(0, 32))[17, 23]
+    relit = detailed(PhotoDetail(face, screen, photo), torch.full((3, 32, 32), 0.4), slice(0, 32))[17, 23]
     assert relit[2] > 0.4 * relit[0]  # the quotient would be yellow: 0
-
-
-def test_what_is_before_the_face_is_not_of_it() -> None:
-    photo, source, seen = unwrapped()
-    composition = composed(photo, source, seen, FOLLOWING)
-    rows = slice(0, len(composition.view.mask))
-    whole = composition.face_share(rows)
-    half = np.tile(np.arange(WIDTH_PX) < WIDTH_PX // 2, (HEIGHT_PX, 1))
-    covered = SimpleNamespace(bare_face=half.__getitem__)
-    composition.person = cast(WholePerson, covered)
-    left, columns = composition.view.window[1].start, np.arange(whole.shape[1])
-    np.testing.assert_array_equal(composition.face_share(rows), whole * (left + columns < WIDTH_PX // 2))
 
 
 def test_eyes_keep_their_detail() -> None:
@@ -309,7 +290,7 @@ def test_eyes_keep_their_detail() -> None:
     eyes = region_mask("eyes", 128) > 0.99
     source[:, eyes] = torch.rand(int(eyes.sum()), generator=torch.Generator().manual_seed(1))
     face, screen, photo = flat_face(source)
-    relit = PhotoDetail(face, screen, photo).relit(torch.full((3, 128, 128), 0.2))(slice(0, 128))
+    relit = detailed(PhotoDetail(face, screen, photo), torch.full((3, 128, 128), 0.2), slice(0, 128))
     np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
 
 

@@ -7,17 +7,17 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 from skimage.draw import polygon2mask
+from torch import Tensor
 
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import whole
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.portrait.mesh import SeenEyes
-from facerf_cli.relighting import composition as module
-from facerf_cli.relighting.composition import Composition
+from facerf_cli.relighting import photo_detail as module
 from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
 from facerf_cli.relighting.iris import blur_px, opening, outlined
+from facerf_cli.relighting.person_in_photo import PersonInPhoto
 from tests import astronaut
 
 SIDE, IRIS = 40, np.array([[20.0, 18.0, 10.0]])
@@ -62,19 +62,25 @@ def test_a_light_is_seen_alike_whatever_else_shines() -> None:
 
 
 def eyes(photo: np.ndarray) -> Eyes:
-    return Eyes(photo.__getitem__, SeenEyes(IRIS, LIDS[None]), (SIDE, SIDE))
+    return Eyes(photo, SeenEyes(IRIS, LIDS[None]), (SIDE, SIDE))
+
+
+def lit(photo: np.ndarray, relit: np.ndarray, mirrored: Tensor, rows: slice = slice(0, SIDE)) -> np.ndarray:
+    """Some rows of a relit image with mirror images in the eyes."""
+    seen = eyes(photo)
+    return seen.lit(relit[rows].copy(), seen.ready(mirrored), rows)
 
 
 def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
     photo = DARK.copy()
     photo[14:17, 15:18] = 3.0
     relit, mirrored = 2 * photo, image_of(40, 0)
-    found = whole(eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored[None]), SIDE, SIDE)
+    found = lit(photo, relit, mirrored[None])
     assert found[14:17, 15:18].max() < 0.2  # 6 before
     assert found[18, 22:28].max() > 0.5 and found[18, 12:18].max() < 0.2
     assert np.array_equal(found[:5], relit[:5]) and np.array_equal(found[:, :8], relit[:, :8])
     rows = slice(17, 21)
-    part = eyes(photo).lit(lambda rows: relit[rows].copy(), mirrored[None])(rows)
+    part = lit(photo, relit, mirrored[None], rows)
     assert np.array_equal(part, found[rows])
 
 
@@ -83,7 +89,7 @@ def test_a_lid_before_the_iris_keeps_its_light() -> None:
     photo = DARK.copy()
     photo[24:] = 0.5
     mirrored = torch.ones(1, 3, 64, 64)
-    found = whole(eyes(photo).lit(lambda rows: photo[rows].copy(), mirrored), SIDE, SIDE)
+    found = lit(photo, photo, mirrored)
     assert np.array_equal(found[24:], photo[24:])
     assert 0.1 < found[23, 20].min() < found[18, 20].min() and found[18, 20].min() > 1  # lashes shade it
 
@@ -97,7 +103,7 @@ def eye(shift: tuple[float, float] = (0.0, 0.0), radius_px: float = 10.0) -> np.
 
 
 def relit(photo: np.ndarray, mirrored: torch.Tensor) -> np.ndarray:
-    return whole(eyes(photo).lit(lambda rows: photo[rows].copy(), mirrored[None]), SIDE, SIDE)
+    return lit(photo, photo, mirrored[None])
 
 
 NOTHING = torch.zeros(3, 64, 64)
@@ -120,7 +126,7 @@ def test_what_is_black_in_the_photo_gets_no_brighter() -> None:
     photo = eye()
     photo[13:17, 18:21] = [1, 1, 0]
     dim = np.full_like(photo, 0.1)
-    assert whole(eyes(photo).lit(lambda rows: dim[rows].copy(), NOTHING[None]), SIDE, SIDE).max() <= 0.1
+    assert lit(photo, dim, NOTHING[None]).max() <= 0.1
 
 
 def test_a_catchlight_that_touches_the_white_of_the_eye_goes() -> None:
@@ -204,27 +210,27 @@ def test_each_eye_mirrors_a_near_light_where_it_sees_it() -> None:
 
 
 def test_lips_and_eyes_get_no_grain_that_mixes_their_colours() -> None:
-    person, photo = astronaut.person(), astronaut.photo()
-    composition = Composition(astronaut.models().face, photo, person.head, reflectance=person.reflectance)
-    assert composition.person is not None
-    grain, _ = composition.person.finish(photo, 0.0, composition.matte)
+    person = astronaut.person()
+    shown = person.in_photo()
+    assert isinstance(shown, PersonInPhoto)
+    grain, _ = shown._finish
     red = np.where(person.segmentation.layer("lips")[..., None] > 0.5, [1, 0, 0], [0, 0, 1]).astype(
         np.float32
     )
-    rows = slice(120, 160)
-    np.testing.assert_allclose(grain.given(red.__getitem__)(rows)[..., 0], red[rows][..., 0], atol=1e-3)
+    rows = grain.observe(slice(120, 160))
+    np.testing.assert_allclose(grain.given(red[rows.wide], rows)[..., 0], red[120:160, :, 0], atol=1e-3)
 
 
 def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest.MonkeyPatch) -> None:
     """In front of the face they keep nothing. Layers add up."""
     person, photo = astronaut.person(), astronaut.photo()
-    composition = Composition(astronaut.models().face, photo, person.head, reflectance=person.reflectance)
+    people = person.composed()
     inner = person.head.fit.crop.to_photo(person.head.landmarks_px)[60:68]
     teeth = polygon2mask(photo.shape[:2], inner[:, ::-1]) & (luminance(photo) > 0.3)
     lights = torch.stack([azel_to_direction(*light) for light in ((0.0, 0.0), (0.0, 55.0), (-70.0, 0.0))])
 
     def shown(lights: Lights) -> list[np.ndarray]:
-        return [composition.image(relit).pixels[teeth] for relit in composition.relit(lights)]
+        return [people.image(relit).pixels[teeth] for relit in people.relit(lights)]
 
     each, (both,) = shown(Lights.each(lights)), shown(Lights(lights, torch.ones(1, 3, 3)))
     np.testing.assert_allclose(both, sum(each), rtol=1e-3)

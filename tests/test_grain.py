@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from facerf_cli.image.strips import whole
 from facerf_cli.relighting import grain as module
 from facerf_cli.relighting.grain import Grain
 
@@ -12,9 +11,13 @@ random = np.random.default_rng(0)
 PORES = np.exp(0.02 * random.standard_normal((SIDE, SIDE))).astype(np.float32)
 SMOOTH = np.linspace(0.2, 1, SIDE, dtype=np.float32)[None, :, None].repeat(SIDE, 0).repeat(3, 2)
 ALL = np.ones((SIDE, SIDE), np.float32)
-
-
 NOTHING = np.zeros((SIDE, SIDE, 1), np.float32)
+
+
+def read(grain: Grain, relit: np.ndarray, rows: slice = slice(0, SIDE)) -> np.ndarray:
+    """Some rows of an image with the detail."""
+    seen = grain.observe(rows)
+    return grain.given(relit[seen.wide], seen)
 
 
 def given(
@@ -26,7 +29,7 @@ def given(
 ) -> np.ndarray:
     flat = np.stack([guided, coarse], -1)
     grain = Grain(flat.__getitem__, share, MAP_PX, sharpened.__getitem__)
-    return whole(grain.given(relit.__getitem__), SIDE, SIDE)
+    return read(grain, relit)
 
 
 def test_a_smooth_image_gets_the_photos_pores() -> None:
@@ -66,11 +69,10 @@ def test_hair_and_what_is_nearly_black_stay_as_they_are() -> None:
 def test_images_add_up_and_strips_show_no_borders() -> None:
     other = np.ascontiguousarray(SMOOTH.transpose(1, 0, 2))
     grain = Grain(np.stack([ALL, PORES], -1).__getitem__, ALL, MAP_PX, NOTHING.__getitem__)
-    both, one, two = (grain.given(image.__getitem__) for image in (SMOOTH + other, SMOOTH, other))
-    rows = slice(0, SIDE)
-    np.testing.assert_allclose(both(rows), one(rows) + two(rows), rtol=1e-5)
-    parts = np.concatenate([both(slice(0, 37)), both(slice(37, SIDE))])
-    np.testing.assert_allclose(parts, both(rows), rtol=1e-5)
+    both, one, two = (read(grain, image) for image in (SMOOTH + other, SMOOTH, other))
+    np.testing.assert_allclose(both, one + two, rtol=1e-5)
+    parts = [read(grain, SMOOTH + other, rows) for rows in (slice(0, 37), slice(37, SIDE))]
+    np.testing.assert_allclose(np.concatenate(parts), both, rtol=1e-5)
 
 
 def test_a_photo_that_is_read_in_strips_shows_no_borders(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,7 +83,7 @@ def test_a_photo_that_is_read_in_strips_shows_no_borders(monkeypatch: pytest.Mon
 
 def test_only_the_strips_that_show_the_person_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
     """A crowd's photo is large, and each of its people small."""
-    read: list[int] = []
+    asked: list[int] = []
     share = ALL.copy()
     share[:40] = 0
     truth = given(SMOOTH, PORES, PORES**2, share)
@@ -89,10 +91,10 @@ def test_only_the_strips_that_show_the_person_are_read(monkeypatch: pytest.Monke
     monkeypatch.setattr(module, "_STRIP_PX", 32 * SIDE)
 
     def flat(rows: slice) -> np.ndarray:
-        read.append(rows.start)
+        asked.append(rows.start)
         return np.stack([PORES, PORES**2], -1)[rows]
 
-    found = whole(Grain(flat, share, MAP_PX, NOTHING.__getitem__).given(SMOOTH.__getitem__), SIDE, SIDE)
-    assert read == [32, 64]
+    found = read(Grain(flat, share, MAP_PX, NOTHING.__getitem__), SMOOTH)
+    assert asked == [32, 64]
     np.testing.assert_allclose(found, truth, rtol=1e-6)  # as strips of the same photo differ
     assert np.array_equal(found[:30], SMOOTH[:30])

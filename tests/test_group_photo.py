@@ -1,4 +1,4 @@
-"""Several people in one image, by compositions with known answers."""
+"""Several people in one image, by people with known answers."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +12,23 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import LinearImage
-from facerf_cli.image.strips import Band, Layer, filled, whole
 from facerf_cli.portrait.find import FaceBox
-from facerf_cli.relighting.group import GroupComposition
+from facerf_cli.relighting.people import People
+from facerf_cli.relighting.subject import Request
 from facerf_cli.run import memory
+from facerf_cli.run.memory import batches
 from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import PhotoFace
-from facerf_cli.work.plan import batches, beside_people
+from facerf_cli.work.plan import beside_people
 
 SIZE = (4, 6)
+
+
+@dataclass
+class Lit:
+    grey: float
+    own: None = None
 
 
 @dataclass
@@ -32,82 +39,75 @@ class Plain:
     """
 
     columns: slice
-    share: float
-    keeps_alpha: bool = False
-
-    def matte(self) -> np.ndarray:
-        matte = np.zeros(SIZE)
-        matte[:, self.columns] = self.share
-        return matte
+    strength: float
 
     size_px, nbytes, photo = SIZE, 0, np.full((*SIZE, 3), 0.5)
+    own = photo
 
     @property
-    def keeps_photo(self) -> bool:
-        return not self.keeps_alpha
+    def matte(self) -> np.ndarray:
+        matte = np.zeros(SIZE)
+        matte[:, self.columns] = self.strength
+        return matte
 
-    def own_layer(self, straight: bool) -> Band:
-        return (self.photo if straight else self.photo * self.matte()[..., None]).__getitem__
+    def share(self, rows: slice) -> np.ndarray:
+        return self.matte[rows]
 
-    def share_in_photo(self, rows: slice) -> np.ndarray:
-        return self.matte()[rows]
+    def ready(self, relit: float, layers: Any) -> Lit:
+        return Lit(relit)
 
-    def person_and_share(self, relit: float) -> tuple[Band, Band]:
-        return np.full((*SIZE, 3), relit).__getitem__, self.matte().__getitem__
+    def observe(self, rows: slice) -> slice:
+        return rows
 
-    def bands(self, relit: float, ev: float, behind: Any) -> dict[str, Layer]:
-        person, matte = np.full((*SIZE, 3), relit), self.matte()
-        if self.keeps_alpha:
-            return {"rgb": person, "A": matte}
-        share = matte[..., None]
-        return {"rgb": share * person + (1 - share) * 0.5 * 2**-ev}
+    def pixels(self, relit: Lit, rows: slice) -> np.ndarray:
+        return np.full((*SIZE, 3), relit.grey)[rows]
 
-    def light_layer(self, relit: float) -> Band:
-        return (relit * self.matte()[..., None].repeat(3, -1)).__getitem__
-
-    def layers(self, names: Any, relit: float) -> dict[str, Layer]:
+    def layer(self, name: str, relit: Lit, rows: slice) -> dict[str, np.ndarray]:
+        matte = self.matte[rows]
+        whole = matte[..., None]
         return {
-            "person.A": self.matte(),
-            "class.skin": self.matte(),
-            "depth": np.full((*SIZE, 1), relit) * (self.matte() > 0)[..., None],
-            "albedo": np.full((*SIZE, 3), relit) * self.matte()[..., None],
+            "class.skin": matte,
+            "depth": relit.grey * (whole > 0),
+            "albedo": relit.grey * whole.repeat(3, -1),
         }
 
     def exposure_ev(self, relit: float, rule: str) -> float:
         return relit
 
 
-def group(keeps_alpha: bool = False) -> Any:
-    left, right = Plain(slice(0, 2), 1.0, keeps_alpha), Plain(slice(3, 5), 0.5)
-    return GroupComposition([left, right])  # type: ignore[list-item]
+def group(background: Any = "photo") -> Any:
+    left, right = Plain(slice(0, 2), 1.0), Plain(slice(3, 5), 0.5)
+    return People([left, right], background)  # type: ignore[list-item]
 
 
-def test_each_person_is_relit_and_the_background_is_the_first_ones() -> None:
-    image = filled(group().bands([2.0, 8.0], 1.0, None), *SIZE)
-    assert set(image) == {"rgb"}
+def test_each_person_is_relit_and_the_background_is_the_photos() -> None:
+    people = group()
+    image = people.rendered(Request([2.0, 8.0], ev=1.0))
+    assert set(image) == {"rgb"} and people.alpha() is None
     np.testing.assert_allclose(image["rgb"][0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
 
 
 def test_alpha_holds_all_people() -> None:
-    image = filled(group(keeps_alpha=True).bands([2.0, 8.0], 0.0, None), *SIZE)
-    np.testing.assert_allclose(image["A"][0], [1, 1, 0, 0.5, 0.5, 0])
-    np.testing.assert_allclose((image["rgb"] * image["A"][..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
-    assert image["rgb"][0, 3, 0] == 8  # not premultiplied
+    people = group("none")
+    pixels, alpha = people.rendered(Request([2.0, 8.0]))["rgb"], people.alpha()
+    np.testing.assert_allclose(alpha[0], [1, 1, 0, 0.5, 0.5, 0])
+    np.testing.assert_allclose((pixels * alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
+    assert pixels[0, 3, 0] == 8  # not premultiplied
 
 
 def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
     people = group()
-    one, other, both = (whole(people.light_layer(lit), *SIZE) for lit in ([1.0, 3.0], [1.0, 5.0], [2.0, 8.0]))
+    one, other, both = (people.light_layer(lit) for lit in ([1.0, 3.0], [1.0, 5.0], [2.0, 8.0]))
     np.testing.assert_allclose(one + other, both)
 
 
 def test_layers_hold_all_people() -> None:
     """Shares and colours add up, before others and the background; no depth lies between two people."""
     far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
-    people = GroupComposition([far, near, faint])  # type: ignore[list-item]
-    layers = filled(people.layers(["depth", "classes"], [2.0, 8.0, 4.0]), *SIZE)
-    for name in ("person.A", "class.skin"):
-        np.testing.assert_allclose(layers[name][0], [1, 1, 1, 1, 0.6, 0])
+    people = People([far, near, faint])  # type: ignore[list-item]
+    layers = people.rendered(Request([2.0, 8.0, 4.0], layers=["all"]))
+    for shares in (people.matte, layers["class.skin"]):
+        np.testing.assert_allclose(shares[0], [1, 1, 1, 1, 0.6, 0])
     np.testing.assert_allclose(layers["depth"][0, :, 0], [2, 2, 2, 8, 8, 0])
     np.testing.assert_allclose(
         layers["albedo"][0, :, 2], [2, 0.4 * 4 + 0.6 * 2, 2, 0.6 * 8 + 0.4 * 2, 0.6 * 8, 0]
@@ -149,19 +149,17 @@ def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
     drawn: list[int] = []
 
     class Below(Plain):
+        @property
         def matte(self) -> np.ndarray:
-            return super().matte() * (np.arange(SIZE[0]) > 1)[:, None]
+            return super().matte * (np.arange(SIZE[0]) > 1)[:, None]
 
-        def person_and_share(self, relit: float) -> tuple[Band, Band]:
-            def person(rows: slice) -> np.ndarray:
-                drawn.append(rows.start)
-                return np.full((rows.stop - rows.start, SIZE[1], 3), relit)
+        def observe(self, rows: slice) -> slice:
+            drawn.append(rows.start)
+            return rows
 
-            return person, self.matte().__getitem__
-
-    group: Any = GroupComposition([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
-    for band in (group.bands((0.2, 0.8), 0.0, None)["rgb"], group.light_layer((0.2, 0.8))):
-        drawn.clear()
-        rows = [band(slice(row, row + 1)) for row in range(SIZE[0])]
-        assert drawn == [2, 3]
-        assert rows[0][0, 1] == pytest.approx(0.2) and rows[2][0, 1] == pytest.approx(0.5)
+    people = People([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
+    request = Request((0.2, 0.8), {"key": (0.2, 0.8)}).ready(people)
+    rows = [people.render(request, slice(row, row + 1)) for row in range(SIZE[0])]
+    assert drawn == [2, 3]
+    for name in ("rgb", "key"):
+        assert rows[0][name][0, 1] == pytest.approx(0.2) and rows[2][name][0, 1] == pytest.approx(0.5)

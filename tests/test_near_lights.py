@@ -7,13 +7,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.image.strips import whole
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
-from facerf_cli.pipeline import FittedPerson, reflectance_of
-from facerf_cli.relighting.composition import Composition, Target
+from facerf_cli.person import Person, Target
+from facerf_cli.pipeline import reflectance_of
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.subject import Subject
 from tests import astronaut
 
 TARGET = Target(background="none")
@@ -26,22 +26,22 @@ class Shown:
 
     def __init__(self) -> None:
         self.field: PortraitField = astronaut.field()
-        self.composition: Composition = astronaut.person().composed(TARGET)
+        self.people = astronaut.person().composed(TARGET)
         self.matte = self.field.person.segmentation.matte
 
     def image(self, *lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
         """The person under near lights of a colour."""
-        return over_black(self.composition, near(*lights, rgb=rgb))
+        return over_black(self.people, near(*lights, rgb=rgb))
 
     def under(self, directions: Tensor, shares: Tensor) -> np.ndarray:
         """The person under far lights [L, 3], white, of shares [L]."""
         weights = shares[None, :, None].expand(-1, -1, 3)
-        return over_black(self.composition, Lights(directions, weights, keys=(slice(len(shares)),)))
+        return over_black(self.people, Lights(directions, weights, keys=(slice(len(shares)),)))
 
     def reached_by(self, light: StudioLight) -> Tensor:
         """Share [S, S] of a near light that arrives."""
         lights = near(light)
-        around = lights.around(self.composition.vertices_m.mean(0))
+        around = lights.around(self.people.vertices_m.mean(0))
         return self.field.views[0].lit(lights.directions, lights.weights, around).reached[0, 0]
 
 
@@ -49,8 +49,8 @@ def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
     return Lights(*DARK, lights, torch.tensor(rgb).expand(1, len(lights), 3))
 
 
-def over_black(composition: Composition, lights: Lights) -> np.ndarray:
-    return whole(composition.light_layer(next(composition.relit(lights))), *composition.size_px)
+def over_black(people: Subject, lights: Lights) -> np.ndarray:
+    return people.light_layer(next(people.relit(lights)))
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Shown)
     dark = {name: 0 * getattr(maps, name) for name in ("gloss", "lit", "around", "shadow")}
     matt = replace(view, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
     light = StudioLight(at_m=(0.1, 0.2, 0.3))
-    ((points, rgb),) = near(light).around(person.composition.vertices_m.mean(0))
+    ((points, rgb),) = near(light).around(person.people.people[0].vertices_m.mean(0))
     lit = matt.lit(*DARK, [(points, rgb)])
     offsets = points.places_m[0, :, None, None] - view.person.maps.positions_m
     cosine = (offsets / offsets.norm(dim=0) * maps.normals[0]).sum(0).clamp_min(0)
@@ -144,10 +144,10 @@ def test_other_models_have_near_lights_too(person: Shown, kind: str) -> None:
     """Their textures add up, and so does what surrounds the face where it follows the field."""
     models, photo, head = astronaut.models(), astronaut.photo(), astronaut.head()
     reflectance = reflectance_of(models, head, kind)  # type: ignore[arg-type]
-    composition = FittedPerson(models, photo, head, reflectance).composed(TARGET)
+    people = Person(models, photo, head, reflectance).composed(TARGET)
 
     def image(*lights: StudioLight) -> np.ndarray:
-        return over_black(composition, near(*lights))
+        return over_black(people, near(*lights))
 
     both, key, rim = image(KEY, RIM), image(KEY), image(RIM)
     np.testing.assert_allclose(

@@ -12,17 +12,11 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.light.estimate import estimate_signed_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
-from facerf_cli.pipeline import (
-    Estimator,
-    FittedPerson,
-    estimate_light,
-    fit_photo,
-    predict_olat,
-    reflectance_of,
-)
+from facerf_cli.person import Person, Target
+from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.relighting.composition import Composition, Target
+from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
 from facerf_cli.relighting.models import Models
 from facerf_cli.run import memory
@@ -101,14 +95,14 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     turned = replace(head.fit, rotation=pose_to_rotation(30, 0, 0))
     straight = replace(head.fit, rotation=pose_to_rotation(0, 0, 0))
     targets = [Target(fit, "face") for fit in (straight, turned)]
-    person = FittedPerson(models, None, head, reflectance_of(models, head))
+    person = Person(models, None, head, reflectance_of(models, head))
     images = [person.image(light, target) for target in targets]
     for image in images:
         assert image.alpha is not None and image.pixels.shape == (256, 256, 3)
         assert (image.pixels[image.alpha == 0] == 0).mean() > 0.5
     # the point nearest to the camera
     noses = [
-        Composition(models.face, None, head, target).view.surface(slice(0, 256))[..., 5] for target in targets
+        FaceAlone(models.face, head, fit=target.fit).view.surface(slice(0, 256))[..., 5] for target in targets
     ]
     columns = [int(torch.where(z == 0, -torch.inf, z).amax(0).argmax()) for z in noses]
     assert columns[1] > columns[0] + 10  # yaw > 0 turns the nose to the image's right

@@ -1,5 +1,6 @@
 """The portrait field of a photo: its own light gives the photo back, and the whole person is relit."""
 
+from copy import copy
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -13,20 +14,24 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import filled, strips
+from facerf_cli.image.strips import strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.pipeline import FittedPerson, fit, reflectance_of
+from facerf_cli.person import Person, Target, fit
+from facerf_cli.pipeline import reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SEEN_PX, wider_square
-from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
-from facerf_cli.relighting.portrait_field import PortraitField, PortraitView, maps_of
+from facerf_cli.relighting.people import People
+from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView, maps_of
 from facerf_cli.relighting.source_light import source_light
+from facerf_cli.relighting.subject import Request
 from tests import astronaut
+
+NAMES = ("albedo", "specular", "normal", "position", "depth", "shadow")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +45,7 @@ def photo() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def person() -> FittedPerson:
+def person() -> Person:
     return astronaut.person()
 
 
@@ -67,7 +72,7 @@ def lamp(azimuth_deg: float, elevation_deg: float = 0.0) -> RigLight:
 
 
 def test_under_its_own_light_the_photo_comes_back(
-    photo: np.ndarray, person: FittedPerson, field: PortraitField
+    photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     models, head = person.models, person.head
     image = person.image(source_light(models, head.face).light).pixels
@@ -81,7 +86,11 @@ def test_under_its_own_light_the_photo_comes_back(
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
     face = find_faces(SHIPPED_NETWORKS.people, grey, "grey")[0]
-    image = fit(models, grey, face, sides=models.sides(64)).image(lamp(60), Target(background="none")).pixels
+    image = (
+        fit(models, grey, face=face, texture_side=64, white=None)
+        .image(lamp(60), Target(background="none"))
+        .pixels
+    )
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
 
 
@@ -181,7 +190,7 @@ def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
 
 
 def test_a_lamp_lights_the_side_that_it_is_on(
-    photo: np.ndarray, person: FittedPerson, field: PortraitField
+    photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     """Hair, neck and garment, too: halves of the person beside the head's middle."""
     target = Target(background="none")
@@ -197,80 +206,86 @@ def test_a_lamp_lights_the_side_that_it_is_on(
         assert left[on_left].mean() > 1.3 * right[on_left].mean()
 
 
-def test_a_lamp_behind_leaves_the_face_dark(
-    photo: np.ndarray, person: FittedPerson, field: PortraitField
-) -> None:
+def test_a_lamp_behind_leaves_the_face_dark(photo: np.ndarray, person: Person, field: PortraitField) -> None:
     target = Target(background="none")
     behind, ahead = (person.image(lamp(azimuth, 10), target).pixels for azimuth in (180, 0))
     skin = field.person.segmentation.layer("skin")[:] > 0.9
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
 
 
-def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: FittedPerson) -> None:
+def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: Person) -> None:
     """The field of a face knows no hair beside it: it would light a temple through the hair."""
     directions = torch.cat([lamp(azimuth, 20).directions for azimuth in (30, 140, 175)])
-    composition = person.composed(Target(background="none"))
+    people = person.composed(Target(background="none"))
     weights = torch.cat([torch.eye(3), torch.ones(1, 3)])[..., None].expand(-1, -1, 3)
-    relit = list(composition.relit(Lights(directions, weights)))
-    ahead, behind = relit[0].texture, relit[2].texture
+    relit = list(people.relit(Lights(directions, weights)))
+    ahead, behind = relit[0][0].texture, relit[2][0].texture
     assert behind.abs().max() < 1e-4 * ahead.max()
-    *each, together = (composition.image(one).pixels for one in relit)
+    *each, together = (people.image(one).pixels for one in relit)
     np.testing.assert_allclose(sum(each), together, atol=1e-4 * together.max())
     assert min(one.min() for one in each) > -1e-12  # rounding
 
 
 def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
-    photo: np.ndarray, person: FittedPerson, field: PortraitField
+    photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
-    composition = person.composed()
-    relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
-    names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
-    layers = filled(composition.layers(names, relit), *composition.size_px)
-    assert {"person.A", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
+    people = person.composed()
+    relit = next(people.relit(Lights.of_rig(lamp(40, 30))))
+    names = (*NAMES, "classes", "face", "uv")
+    layers = people.rendered(Request(relit, layers=names))
+    assert {"rgb", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
     for name, layer in layers.items():
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
         assert name in ("normal", "position") or layer.min() >= 0
-    assert composition.image(relit).pixels.min() >= 0
     face_alone = replace(person, photo=None).composed()
     with pytest.raises(UsageError, match="--aov albedo"):
-        face_alone.layers(("albedo",), relit)
+        face_alone.rendered(Request(relit[0], layers=("albedo",)))
 
 
 def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
-    photo: np.ndarray, person: FittedPerson
+    photo: np.ndarray, person: Person
 ) -> None:
     """No hard edge where a little of a neighbour is in a pixel; where the photo has no alpha is nothing."""
     alpha = np.ones(photo.shape[:2], np.float32)
     alpha[:, : photo.shape[1] // 2] = 0
-    composition = person.composed(Target(alpha=alpha))
-    relit = next(composition.relit(Lights.of_rig(lamp(40, 30))))
-    assert composition.person is not None and relit.surround is not None
-    whole = np.ones_like(alpha)
-    names = ("albedo", "specular", "normal", "position", "depth", "shadow")
-    cut = filled(composition.layers(names, relit), *composition.size_px)
-    matte = cut["person.A"]
+    people = person.composed(Target(alpha=alpha))
+    request = Request(next(people.relit(Lights.of_rig(lamp(40, 30)))), layers=NAMES)
+    cut, matte = people.rendered(request), people.matte
     assert ((matte > 0.02) & (matte < 0.9)).sum() > 100
-    for name in names:
-        layer = composition.person.layer(name, relit.surround, composition.own, whole)
-        all_over, share = filled(layer, *composition.size_px)[name], matte[..., None]
-        expected = all_over * (share if name in ("albedo", "specular") else share > 0.02)
+    assert isinstance(people, People)
+    whole = copy(people.people[0])
+    whole.matte = np.ones_like(alpha)  # of the same colours
+    all_over = People([whole]).rendered(request)
+    for name in NAMES:
+        share = matte[..., None]
+        expected = all_over[name] * (share if name in ("albedo", "specular") else share > 0.02)
         np.testing.assert_allclose(cut[name], expected, atol=1e-6)
 
 
+def test_what_is_before_the_face_is_not_of_it(person: Person) -> None:
+    """Hair and glasses over the face are not the face's field."""
+    shown = copy(person.in_photo())
+    height, width = shown.size_px
+    half = np.tile(np.arange(width) < width // 2, (height, 1))
+    shown._bare_face = half  # type: ignore[assignment]
+    seen = shown.observe(slice(0, height))
+    mask = shown.view.mask[seen.inside].numpy()
+    np.testing.assert_array_equal(seen.face_share, mask * half[shown.view.window])
+
+
 def test_no_pixel_depends_on_the_strip_that_it_is_in(
-    photo: np.ndarray, person: FittedPerson, monkeypatch: pytest.MonkeyPatch
+    photo: np.ndarray, person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Image and layers of a photo are the same in one strip and in strips of 32 rows."""
-    names = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
+    names = (*NAMES, "classes", "face", "uv")
 
     key, behind = lamp(40, 30), lamp(160, 10)
     lights = RigLight(torch.cat([key.directions, behind.directions]), torch.ones(2, 3))
 
     def shown() -> list[np.ndarray]:
-        composition = person.composed()
-        relit = next(composition.relit(Lights.of_rig(lights)))
-        layers = filled(composition.layers(names, relit), *composition.size_px)
-        return [composition.image(relit).pixels, *layers.values()]
+        people = person.composed()
+        relit = next(people.relit(Lights.of_rig(lights)))
+        return list(people.rendered(Request(relit, layers=names)).values())
 
     at_once = shown()
     monkeypatch.setattr("facerf_cli.image.strips.STRIP_PX", 1)
@@ -287,7 +302,7 @@ def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitF
     head, wide = field.views
     assert wide.person.square.side_px > head.person.square.side_px
     matte = head.person.segmentation.matte
-    columns, weight = Enlarged(head, np.zeros((*matte.shape, 3), np.float32)).weight(slice(0, len(matte)))
+    columns, weight = Enlarged(head, matte.shape, 0.0).weight(slice(0, len(matte)))
     assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
     assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
 
@@ -295,13 +310,18 @@ def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitF
 def test_strands_break_up_light_from_behind_and_nothing_else_does(field: PortraitField) -> None:
     """Shading of 1, from the front and from behind: skin is alike, and hair has a contrast of its own."""
     view, photo = field.views[0], astronaut.photo()
-    enlarged, rows, columns = Enlarged(view, photo), slice(0, photo.shape[0]), slice(0, photo.shape[1])
-    lit = torch.zeros(15, *view.person.image.shape[1:])
-    lit[:3], lit[9:12] = 1, 1
+    enlarged, rows, columns = (
+        Enlarged(view, photo.shape[:2], 0.0),
+        slice(0, len(photo)),
+        slice(0, photo.shape[1]),
+    )
+    ones = torch.ones(3, *view.person.image.shape[1:])
+    lit = PortraitLight(ones, 0 * ones, ones, torch.cat([ones, 0 * ones]))
     where_they_are = SimpleNamespace(
         at=lambda rows, columns: (torch.zeros(2, *photo[rows, columns].shape[:2]), torch.tensor(1.0))
     )
-    relit = enlarged.relit(lit, 0.0, cast(Any, where_they_are))(photo, rows, columns)
+    seen = enlarged.observe(photo, rows, columns)
+    relit = enlarged.radiance(enlarged.ready(lit), seen, cast(Any, where_they_are))
     ratio = luminance(relit[..., 3:]) / luminance(relit[..., :3]).clip(1e-6)
     classes = F.grid_sample(
         view.person.classes[None], enlarged._grid(rows, columns)[None], align_corners=False
@@ -327,7 +347,8 @@ def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:
 def test_without_light_all_is_black(field: PortraitField) -> None:
     lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
     for view, one in zip(field.views, lit, strict=True):
-        assert one.stacked.shape == (2, 15, *view.person.image.shape[1:]) and one.stacked.abs().max() == 0
+        assert one.shading.shape == (2, *view.person.image.shape)
+        assert max(float(maps.abs().max()) for maps in one.tensors) == 0
 
 
 def test_a_turned_head_is_the_fields(field: PortraitField) -> None:

@@ -145,7 +145,8 @@ def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pyt
     def made_again(*given: object, **more: object) -> None:
         raise AssertionError("made again")
 
-    monkeypatch.setattr("facerf_cli.pipeline.Composition", made_again)
+    for name in ("FaceAlone", "PersonInPhoto"):
+        monkeypatch.setattr(f"facerf_cli.person.{name}", made_again)
     monkeypatch.setattr("facerf_cli.pipeline.reflectance_of", made_again)
     assert np.isfinite(one.relight(facerf.Light.single(20, 0))).all()
     with pytest.raises(AssertionError, match="made again"):

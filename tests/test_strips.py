@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
-from facerf_cli.image.strips import block_means, box_means, enlarged, filled, strips, whole
+from facerf_cli.image.strips import block_means, box_means, enlarged, in_strips, strips
 from facerf_cli.portrait.matte import PersonColours, lifted, shrunk
 from tests.oracles.person_colours import slow_person_colours
 
@@ -87,23 +87,22 @@ def test_a_read_does_not_depend_on_strips(tmp_path: Path, monkeypatch: pytest.Mo
     assert (found.pixels == at_once.pixels).all() and (found.alpha == at_once.alpha).all()
 
 
-def test_layers_are_filled_band_by_band(tmp_path: Path) -> None:
+def test_layers_are_rendered_strip_by_strip(tmp_path: Path) -> None:
     asked: list[slice] = []
 
-    def rows(band: slice) -> np.ndarray:
-        asked.append(band)
-        return np.repeat(np.arange(band.start, band.stop, dtype=np.float32)[:, None], WIDTH, 1)
+    def render(rows: slice) -> dict[str, np.ndarray]:
+        asked.append(rows)
+        row = np.repeat(np.arange(rows.start, rows.stop, dtype=np.float32)[:, None], WIDTH, 1)
+        return {"row": row, "bright": 1e3 * row}
 
-    assert (whole(rows, HEIGHT, WIDTH)[:, 0] == np.arange(HEIGHT)).all()
+    assert (in_strips(render, HEIGHT, WIDTH)["row"][:, 0] == np.arange(HEIGHT)).all()
     assert asked == [slice(0, 64), slice(64, 128), slice(128, 150)]
-    ready = np.ones((HEIGHT, WIDTH), np.float32)
 
     def empty(name: str, shape: tuple[int, ...]) -> np.ndarray:
         return np.memmap(tmp_path / name, np.float16, "w+", shape=shape)
 
-    layers = {"bright": lambda band: 1e3 * rows(band), "ready": ready}
-    found = filled(layers, HEIGHT, WIDTH, empty)
-    assert list(found) == ["bright", "ready"] and found["ready"] is ready
+    found = in_strips(render, HEIGHT, WIDTH, empty)
+    assert list(found) == ["row", "bright"]
     np.testing.assert_allclose(found["bright"][:, 0], (1e3 * np.arange(HEIGHT)).clip(max=65504), rtol=1e-3)
 
 

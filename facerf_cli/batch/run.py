@@ -12,12 +12,12 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from facerf_cli.batch.inputs import Item, NamePattern, file_pattern, files_read, refuse_read
 from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, json_rows, lines_of, read_row
@@ -30,6 +30,9 @@ from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, escaped, printable_line, progress_bar, unexpected
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, process_died, spread
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
 log = logging.getLogger(LOGGER_NAME)
@@ -256,46 +259,31 @@ def run_items(
         if index and index.edited:
             kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
             log.warning(kept, len(index.edited))
-        failures = 0
-        results = _results(verb, todo, process, outputs_of, options, settings, index is not None)
-        with closing(results):
-            for result in results:
-                if index and result.made:
-                    index.add(result.made, outputs_of(result.item))
-                add_row(report, verb, result)
-                failures += _print_result(result, options)
+        failures, workers = 0, options.workers(settings)
+        at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
+        work = partial(_run_one, process, index is not None, settings.job_bytes(at_once))
+        memory.collect_as_usual()
+        try:
+            with _progress(settings) as progress, closing(spread(work, todo, workers, _broken)) as results:
+                task = progress.add_task(verb, total=len(todo))
+                for result in results:
+                    if result.stops_the_run is not None:
+                        raise result.stops_the_run
+                    if index and result.made:
+                        index.add(result.made, outputs_of(result.item))
+                    add_row(report, verb, result)
+                    failures += _print_result(result, options)
+                    progress.advance(task)
+        finally:
+            if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
+                for folder in {path.parent for item in todo for path in outputs_of(item)}:
+                    sweep_leftovers(folder)
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
         elif failures and is_new:
             records = [report, options.output / lock_name, *([index.path] if index else [])]
             _remove_what_is_empty(options.output, records)
         return 1 if failures else 0
-
-
-def _results(
-    verb: str,
-    todo: Sequence[Item],
-    process: Callable[[Item], Outcome],
-    outputs_of: Callable[[Item], Sequence[Path]],
-    options: BatchOptions,
-    settings: Settings,
-    indexed: bool,
-) -> Generator[ItemResult]:
-    """Process items by the workers and yield their results in order; raise what concerns the whole run."""
-    memory.collect_as_usual()
-    workers = options.workers(settings)
-    at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
-    work = partial(_run_one, process, indexed, settings.job_bytes(at_once))
-    try:
-        with closing(spread(work, todo, workers, _broken)) as results:
-            for result in _with_progress(results, len(todo), verb, settings):
-                if result.stops_the_run is not None:
-                    raise result.stops_the_run
-                yield result
-    finally:
-        if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
-            for folder in {path.parent for item in todo for path in outputs_of(item)}:
-                sweep_leftovers(folder)
 
 
 def all_finished(
@@ -427,15 +415,8 @@ def print_path(text: object) -> None:
     print(escaped(str(text)) if sys.stdout.isatty() else text, flush=True)
 
 
-def _with_progress(
-    results: Iterator[ItemResult], total: int, verb: str, settings: Settings
-) -> Iterator[ItemResult]:
-    """Pass the results through, with a progress bar on stderr if that is a terminal."""
+def _progress(settings: Settings) -> "Progress":
+    """A progress bar on stderr if that is a terminal."""
     from rich.progress import MofNCompleteColumn  # --help does without it
 
-    shown = settings.verbosity >= 0 and not settings.log_json
-    with progress_bar(MofNCompleteColumn(), shown=shown) as progress:
-        task = progress.add_task(verb, total=total)
-        for result in results:
-            yield result
-            progress.advance(task)
+    return progress_bar(MofNCompleteColumn(), shown=settings.verbosity >= 0 and not settings.log_json)

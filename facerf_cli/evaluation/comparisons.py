@@ -26,8 +26,10 @@ from facerf_cli.image.colour import luminance
 from facerf_cli.image.metrics import light_error_deg, tone_drift_deg
 from facerf_cli.light.sphere import direction_to_azel
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.composition import Composition, Relit, Target
+from facerf_cli.person import Target
+from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.subject import Relit
 
 LAMBERT = "lambert"  # the source's texture under the cosine of the light: the least a method must beat
 COMPOSITE = "composite"  # the first method's face back in its photo, with its detail
@@ -78,8 +80,8 @@ def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:
     head = view.head
     turn = head.fit.turn_to(view.fit.rotation)
     cosine = torch.einsum("c,cd,dij->ij", light, turn, head.face.normals).clamp_min(0)
-    composition = Composition(models.face, None, head, Target(view.fit, "face"))
-    return composition.image(Relit(head.face.texture * cosine)).pixels
+    face = FaceAlone(models.face, head, fit=view.fit)
+    return face.image(Relit(head.face.texture * cosine)).pixels
 
 
 def _angles(light: Tensor, view: HeadView) -> dict[str, str | float]:

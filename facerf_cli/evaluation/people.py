@@ -26,19 +26,11 @@ from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.pipeline import (
-    DEFAULT_ESTIMATOR,
-    Estimator,
-    FittedPerson,
-    explain,
-    find_for,
-    head_of,
-    reflectance_of,
-)
+from facerf_cli.person import Person, Target
+from facerf_cli.pipeline import DEFAULT_ESTIMATOR, Estimator, explain, find_for, head_of, reflectance_of
 from facerf_cli.portrait.find import FaceBox
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import LOGGER_NAME
 
@@ -67,14 +59,14 @@ class Method:
 
     def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
         """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
-        return FittedPerson(self.models, None, head, reflectance).image(light, target).pixels
+        return Person(self.models, None, head, reflectance).image(light, target).pixels
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
     ) -> Iterator[np.ndarray]:
         """Yield an image under each weighted sum of lights; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
-        composition = FittedPerson(self.models, photo, head, reflectance).composed(target)
+        composition = Person(self.models, photo, head, reflectance).composed(target)
         for relit in composition.relit(lights):
             yield composition.image(relit).pixels
 

@@ -4,7 +4,6 @@ Also drawings for visual checks: a fit over its photo, and a face model shaded a
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel
 from facerf_cli.face.topology import CONTOUR, grid_triangles, grid_uv, region_mask
 from facerf_cli.image.colour import auto_exposure_ev
-from facerf_cli.image.strips import Band, strips
+from facerf_cli.image.strips import strips
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, smoothstep, vertex_normals
@@ -62,7 +61,16 @@ class FaceView:
     uv: Tensor  # [h, w, 2]
     coverage: Tensor  # [h, w] 0 or 1
     mask: Tensor  # [h, w] 0..1, the face inside jaw and hairline with a soft border
-    surface: Callable[[slice], Tensor]  # normals and positions [n, w, 6] of rows, camera space
+    vertices_camera: Tensor  # [V, 3]
+    camera: Camera  # of the window
+
+    def surface(self, rows: slice) -> Tensor:
+        """Unit normals and positions [n, w, 6] in rows of the window, camera space, m."""
+        triangles = grid_triangles()
+        attributes = torch.cat([vertex_normals(self.vertices_camera, triangles), self.vertices_camera], 1)
+        fragments = rasterize(self.vertices_camera, triangles, rows_of_camera(self.camera, rows))
+        normal, position_m = torch.split(interpolate(attributes, triangles, fragments), 3, -1)
+        return torch.cat([F.normalize(normal, dim=-1), position_m], -1)
 
     @property
     def normal(self) -> Tensor:
@@ -75,24 +83,19 @@ class FaceView:
 
     def full(self, window: Tensor) -> np.ndarray:
         """Place values of the window [h, w, ...] in the photo [H, W, ...], zero elsewhere."""
-        return self.in_frame(lambda rows: window[rows], *window.shape[2:])(slice(0, self.height_px))
+        return self.placed(window, slice(0, self.height_px))
 
-    def in_frame(self, of: Callable[[slice], Tensor], *channels: int) -> Band:
-        """An image [H, W, ...] in the photo's frame from values of rows of the window; zero elsewhere."""
-
-        def in_photo(rows: slice) -> np.ndarray:
-            frame = np.zeros((rows.stop - rows.start, self.width_px, *channels), np.float32)
-            inside = self.rows_inside(rows)
-            if inside.start < inside.stop:
-                frame[self.rows_of(inside, rows), self.window[1]] = of(inside).detach().numpy()
-            return frame
-
-        return in_photo
+    def placed(self, values: Tensor, rows: slice) -> np.ndarray:
+        """Rows [n, W, ...] of the photo with values [m, w, ...] of the `rows_inside` them, zero elsewhere."""
+        frame = np.zeros((rows.stop - rows.start, self.width_px, *values.shape[2:]), np.float32)
+        if len(values):
+            frame[self.rows_of(self.rows_inside(rows), rows), self.window[1]] = values.detach().numpy()
+        return frame
 
     def rows_inside(self, rows: slice) -> slice:
-        """The window's rows, counted from its own first one, among rows of the photo."""
-        height = len(self.coverage)
-        return slice(max(0, rows.start - self.top), max(0, min(height, rows.stop - self.top)))
+        """The window's rows, counted from its own first one, among rows of the photo; maybe none."""
+        first, last = rows.start - self.top, min(len(self.coverage), rows.stop - self.top)
+        return slice(max(0, first), max(0, first, last))
 
     def in_photo(self, inside: slice) -> slice:
         """Rows of the window as rows of the photo."""
@@ -132,14 +135,7 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     if not inside.all():  # where the face turns away the UV mask is steep in the image, so it is softened
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
         mask = mask * smoothstep(edge_px / max(_FEATHER * side_px, 1))
-    attributes = torch.cat([vertex_normals(vertices_camera, triangles), vertices_camera], 1)
-
-    def surface(rows: slice) -> Tensor:
-        fragments = rasterize(vertices_camera, triangles, rows_of_camera(window, rows))
-        normal, position_m = torch.split(interpolate(attributes, triangles, fragments), 3, -1)
-        return torch.cat([F.normalize(normal, dim=-1), position_m], -1)
-
-    return FaceView(camera.height_px, camera.width_px, top, left, uv, coverage, mask, surface)
+    return FaceView(camera.height_px, camera.width_px, top, left, uv, coverage, mask, vertices_camera, window)
 
 
 def rows_of_camera(camera: Camera, rows: slice) -> Camera:

@@ -36,7 +36,7 @@ from facerf_cli.image.colour import (
     from_linear_rec709,
     rgb_to_xyz,
 )
-from facerf_cli.image.strips import Band, rows_of, strips
+from facerf_cli.image.strips import Band, Rows, rows_of, strips
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
@@ -250,7 +250,7 @@ def write_display(
     metadata: Attributes | None = None,
     view: View = PLAIN_VIEW,
     share: np.ndarray | None = None,
-    added: Band | None = None,
+    added: Rows | None = None,
     bits: Literal[8, 16] = 8,
     quality: int = JPEG_QUALITY,
 ) -> float:
@@ -270,7 +270,7 @@ def write_display(
             seen = seen * opaque[..., None]
         gain = np.float32(2.0**chosen_ev)
         exposed = np.nan_to_num(seen * gain)
-        more = None if added is None else added(rows) * gain
+        more = None if added is None else added[rows] * gain
         data = encode_display(exposed, view, None if share is None else rows_of(share, rows), more)
         return data if opaque is None or jpeg else np.dstack([data, opaque.astype(np.float32)])
 

@@ -2,9 +2,9 @@
 
 import logging
 import mmap
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,10 +22,27 @@ _HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
 
 
-T = TypeVar("T")
-# Values [h, W, ...] of some rows of an image.
-Band = Callable[[slice], np.ndarray]
-Layer = Band | np.ndarray  # of an image [H, W, ...]: computed by rows, or whole already
+Band = Callable[[slice], np.ndarray]  # gives some rows [h, W, ...] of an image
+Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # makes the array of a layer, by its name and shape
+
+
+class Rows(Protocol):
+    """An image [H, W, ...] that is read some rows at a time: an array, or what computes them."""
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Some rows [h, W, ...]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """An image [H, W, C] times a factor, which may be one of each channel [C]."""
+
+    image: Rows
+    factor: np.ndarray | np.float32
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Some rows [h, W, C]."""
+        return np.asarray(self.image[rows] * self.factor)
 
 
 def strips(shape: Sequence[int], strip_px: int | None = None) -> Iterator[slice]:
@@ -36,29 +53,22 @@ def strips(shape: Sequence[int], strip_px: int | None = None) -> Iterator[slice]
         yield slice(first, min(height, first + step))
 
 
-def whole(band: Band, height_px: int, width_px: int) -> np.ndarray:
-    """All rows of an image, computed band by band."""
-    return filled({"": band}, height_px, width_px)[""]
+def new_array(name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """An array in memory; see `Empty`."""
+    return np.empty(shape, np.float32)
 
 
-def filled(
-    layers: Mapping[str, Layer],
+def in_strips(
+    render: Callable[[slice], Mapping[str, np.ndarray]],
     height_px: int,
     width_px: int,
-    empty: Callable[[str, tuple[int, ...]], np.ndarray] = lambda _, shape: np.empty(shape, np.float32),
+    empty: Empty = new_array,
 ) -> dict[str, np.ndarray]:
-    """Arrays [H, W, ...] of an image's layers: the one loop over bands.
-
-    `empty` makes the array of a layer, by its name and shape.
-    """
-    found = {name: layer for name, layer in layers.items() if isinstance(layer, np.ndarray)}
-    bands = {name: layer for name, layer in layers.items() if not isinstance(layer, np.ndarray)}
+    """Arrays [H, W, ...] of what `render` gives of rows [h, W, ...], by name: the one loop over strips."""
+    found: dict[str, np.ndarray] = {}
     beyond, at_once = 0, max(1, min(_AT_ONCE, memory.left_bytes() // _BUDGET))
-
-    def made(rows: slice) -> tuple[slice, dict[str, np.ndarray]]:
-        return rows, {name: band(rows) for name, band in bands.items()}
-
-    for rows, parts in in_threads(made, strips((height_px, width_px)), at_once):
+    rendered = in_threads(lambda rows: (rows, render(rows)), strips((height_px, width_px)), at_once)
+    for rows, parts in rendered:
         for name, values in parts.items():
             if name not in found:
                 found[name] = empty(name, (height_px, *values.shape[1:]))
@@ -69,28 +79,7 @@ def filled(
             release(found[name])
     if beyond:
         log.warning("%d values of layers beyond the range of half floats are set to %g", beyond, _HALF_MAX)
-    return {name: found[name] for name in layers}
-
-
-def by_rows(layer: Layer) -> Band:
-    """A layer as a function of rows."""
-    return layer.__getitem__ if isinstance(layer, np.ndarray) else layer
-
-
-def remembered(function: Callable[..., T]) -> Callable[..., T]:
-    """A function that keeps its last result, by its first argument, rows, from which the others follow.
-
-    So images share what no light changes.
-    """
-    last = threading.local()
-
-    def of(rows: Any, *others: Any) -> T:
-        if getattr(last, "rows", None) != rows:
-            last.rows, last.result = rows, function(rows, *others)
-        found: T = last.result
-        return found
-
-    return of
+    return found
 
 
 def rows_of(array: np.ndarray, rows: slice) -> np.ndarray:
@@ -171,14 +160,21 @@ def covering(image: np.ndarray, height: int, width: int) -> np.ndarray:
     return covered
 
 
-def resized_rows(image: np.ndarray, size: tuple[int, int]) -> Band:
+class Resized:
     """`resized`, by rows; those of a larger image are computed as they are asked for."""
-    if size[0] < image.shape[0] or size[1] < image.shape[1]:
-        small = resized(image, *size)
-        return lambda rows: small[rows]
-    maps = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
-    rest = (size[1], *image.shape[2:])
-    return lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1).reshape(-1, *rest)
+
+    def __init__(self, image: np.ndarray, size: tuple[int, int]) -> None:
+        self._size, self._rest = size, image.shape[2:]
+        self._small = resized(image, *size) if size[0] < image.shape[0] or size[1] < image.shape[1] else None
+        self._maps = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Some rows [h, W, ...]."""
+        if self._small is not None:
+            return self._small[rows]
+        return np.moveaxis(enlarged(self._maps, self._size, rows), 0, -1).reshape(
+            -1, self._size[1], *self._rest
+        )
 
 
 def fitted(height: int, width: int, most_px: float) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.image.strips import Band, enlarged, whole
+from facerf_cli.image.strips import Resized, in_strips
 from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong_solid_angles
 
 Sampling = Literal["cell", "smooth", "paper"]
@@ -241,37 +241,44 @@ def lights_around(directions: Tensor, lights: Tensor) -> tuple[Tensor, Tensor]:
     return index, share
 
 
-def backdrop(
-    envmap: Tensor,
-    size: tuple[int, int],
-    rays: Callable[[tuple[int, int], slice], Tensor],
-    rotate_deg: float = 0.0,
-    blur: float = 0.0,
-) -> Band:
-    """The map [H, W, 3] in a frame of a size, by rows: radiance.
+class Backdrop:
+    """A map [H, W, 3] in a frame, by rows: radiance.
 
-    `rays` gives viewing rays of any length, camera space, of some rows of the frame at another size.
-    `rotate_deg` is added to every azimuth of the map; `blur` is the standard deviation of a lens's blur as a
-    share of the longer side.
+    Args:
+        envmap: The map [h, 2 h, 3].
+        size: Height and width of the frame.
+        rays: Gives viewing rays of any length, camera space, of some rows of the frame at another size.
+        rotate_deg: Angle that is added to every azimuth of the map.
+        blur: Standard deviation of a lens's blur, as a share of the longer side.
     """
-    sigma_px = blur * max(size)
-    scale = min(1.0, _SHARP_PX / sigma_px) if sigma_px else 1.0
-    small = max(2, round(size[0] * scale)), max(2, round(size[1] * scale))
 
-    def towards(rows: slice) -> Tensor:
-        return F.normalize(rays(small, rows), dim=-1)
+    def __init__(
+        self,
+        envmap: Tensor,
+        size: tuple[int, int],
+        rays: Callable[[tuple[int, int], slice], Tensor],
+        rotate_deg: float = 0.0,
+        blur: float = 0.0,
+    ) -> None:
+        sigma_px = blur * max(size)
+        scale = min(1.0, _SHARP_PX / sigma_px) if sigma_px else 1.0
+        small = max(2, round(size[0] * scale)), max(2, round(size[1] * scale))
+        self._size, self._rays, self._soft = small, rays, None
+        first, last = (self._towards(slice(row, row + 1)) for row in (0, small[0] - 1))
+        step = float((first[0, 0] - last[0, -1]).norm()) / math.hypot(*small)  # radians in a pixel
+        self._mean = mean_radiance(envmap, max(16, round(_TURN / 2 / max(step, 1e-6))), rotate_deg)
+        if sigma_px:
+            sigma = sigma_px * small[1] / size[1]
+            drawn = in_strips(lambda rows: {"": self._drawn(rows)}, *small)[""]
+            self._soft = Resized(gaussian_filter(drawn, (sigma, sigma, 0), mode="nearest"), size)
 
-    first, last = (towards(slice(row, row + 1)) for row in (0, small[0] - 1))
-    step = float((first[0, 0] - last[0, -1]).norm()) / math.hypot(*small)  # radians in a pixel
-    mean = mean_radiance(envmap, max(16, round(_TURN / 2 / max(step, 1e-6))), rotate_deg)
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Some rows [h, W, 3] of the frame."""
+        return self._drawn(rows) if self._soft is None else self._soft[rows]
 
-    def drawn(rows: slice) -> np.ndarray:
-        directions = towards(rows)
-        return look_up(mean, directions.reshape(-1, 3)).view(directions.shape).numpy()
+    def _towards(self, rows: slice) -> Tensor:
+        return F.normalize(self._rays(self._size, rows), dim=-1)
 
-    if not sigma_px:
-        return drawn
-    sigma = sigma_px * small[1] / size[1]
-    soft = gaussian_filter(whole(drawn, *small), (sigma, sigma, 0), mode="nearest")
-    maps = soft.transpose(2, 0, 1)
-    return lambda rows: np.moveaxis(enlarged(maps, size, rows), 0, -1)
+    def _drawn(self, rows: slice) -> np.ndarray:
+        directions = self._towards(rows)
+        return np.asarray(look_up(self._mean, directions.reshape(-1, 3)).view(directions.shape).numpy())

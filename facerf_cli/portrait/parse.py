@@ -11,7 +11,7 @@ from torch import Tensor
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.topology import MIRROR_68
-from facerf_cli.image.strips import Band, block_means, enlarged
+from facerf_cli.image.strips import block_means, enlarged
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
@@ -203,10 +203,15 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
     return _bare(classes, _places(crop) / (size_px[1], size_px[0]))
 
 
-def uncovered_rows(classes: Tensor, size_px: tuple[int, int]) -> Band:
-    """The same share [H, W] of the photo's own pixels, by the classes [C, h, w] of the whole photo."""
-    covered = covering(classes)[None].numpy()
-    return lambda rows: _share_bare(enlarged(covered, size_px, rows)[0])
+class UncoveredRows:
+    """The same share [H, W] of a photo's pixels, by rows, by the classes [C, h, w] of the whole photo."""
+
+    def __init__(self, classes: Tensor, size_px: tuple[int, int]) -> None:
+        self._covered, self._size_px = covering(classes)[None].numpy(), size_px
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Some rows [h, W]."""
+        return _share_bare(enlarged(self._covered, self._size_px, rows)[0])
 
 
 def uncovered_by(matte: np.ndarray, crop: Crop) -> np.ndarray:

@@ -6,7 +6,7 @@ and, for detail, at head and chest and at squares of several sizes around the he
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from facerf_cli.face.head import OtherHead
-from facerf_cli.image.strips import Band, enlarged, fitted
+from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
@@ -78,9 +78,9 @@ class Segmentation:
         person = person + _LEAST_SHARE * whole / whole.sum().clamp_min(1e-6)
         return person / person.sum(0).clamp_min(1e-6)
 
-    def layers(self) -> dict[str, Band]:
-        """All classes of the person, by rows, by the names that they have in an EXR file."""
-        return {f"class.{name}": partial(self.layer, name) for name in CLASSES[1:]}
+    def layers(self, rows: slice) -> dict[str, np.ndarray]:
+        """Shares [h, W] of all classes of the person in some rows, by the names that they have in an EXR."""
+        return {f"class.{name}": self.layer(name, rows) for name in CLASSES[1:]}
 
 
 def segment(

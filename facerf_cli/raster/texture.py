@@ -90,7 +90,7 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
     grid = (2 * uv - 1).flatten(0, -4) if uv.dim() > 3 else (2 * uv - 1)[None]
     images = texture.reshape(-1, *texture.shape[-3:]).expand(len(grid), -1, -1, -1)
     found = F.grid_sample(images, grid.to(texture.dtype), padding_mode="border", align_corners=False)
-    return found.permute(0, 2, 3, 1).view(*uv.shape[:-1], -1)
+    return found.permute(0, 2, 3, 1).view(*uv.shape[:-1], found.shape[1])
 
 
 def render_texture(

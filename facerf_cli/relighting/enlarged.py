@@ -4,16 +4,15 @@ Its maps are coarse. The gain is enlarged with the photo as a guide, so that the
 every pore and hair; bias, shading and highlights are smooth, but for the photo's edges (`edges.py`).
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.face.landmarks import display_ev, to_display
+from facerf_cli.face.landmarks import to_display
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
-from facerf_cli.image.strips import remembered
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
@@ -32,16 +31,41 @@ _HAIR = ("hair", "beard")
 _SOLID = ("glasses", "headwear", "garment", "hand")  # their edges are kept sharp
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
-# Values [h, w, C] for the photo's pixels [h, w, 3], not negative, in some rows and columns.
-Shown = Callable[[np.ndarray, slice, slice], np.ndarray]
+
+@dataclass(frozen=True, eq=False)
+class ViewRows:
+    """What no light changes in some rows and columns of the photo.
+
+    Attributes:
+        grid: Places [h, w, 2] in the maps where the pixels find their like, in -1..1.
+        albedo: The photo without its light [3, h, w].
+        strands: What strands of hair do to highlights [h, w].
+    """
+
+    rows: slice
+    columns: slice
+    pixels: np.ndarray
+    grid: Tensor
+    albedo: Tensor
+    strands: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class ViewLight:
+    """Light from the front and from behind: shading and highlights [6, S, S] each, continued and smooth."""
+
+    front: Tensor
+    rear: Tensor
 
 
 class Enlarged:
-    """The person of a view under sums of lights, over the photo [H, W, 3]."""
+    """The person of a view under sums of lights, over the photo [H, W, 3].
 
-    def __init__(self, view: PortraitView, photo: np.ndarray) -> None:
-        self._view, self._size_px = view, photo.shape[:2]
-        self._display_ev = display_ev(photo)
+    `display_ev` is the exposure at which the photo is shown to the guided filter.
+    """
+
+    def __init__(self, view: PortraitView, size_px: tuple[int, int], display_ev: float) -> None:
+        self._view, self._size_px, self._display_ev = view, size_px, display_ev
         classes = view.person.classes
         self.own = (1 - classes[0] > _SURE).float()
         self._colours = colours_of(view.person.image / view.person.exposure)
@@ -55,8 +79,6 @@ class Enlarged:
         self._albedo_maps = torch.cat(
             [self._gain_lines(), self._filled(self._edges.filled(view.maps.bias[0]))]
         )
-        self._alike = remembered(self._places_alike)
-        self._seen = remembered(self._without_light)
 
     @property
     def pixel_px(self) -> float:
@@ -72,101 +94,86 @@ class Enlarged:
         away = torch.maximum(x.abs()[None], y.abs()[:, None])
         return columns, ((1 - away) / _FEATHER).clamp(0, 1).numpy()
 
-    def relit(self, lit: Tensor, display_ev: float, rims: Rims | None) -> Shown:
-        """Radiance [h, w, 3] under the light of maps [15, S, S], but for that from behind.
-
-        With `rims` that from behind is there, too, apart: [h, w, 6]. `display_ev` is the exposure at which
-        the photo is shown to the guided filter.
-        """
-        light = PortraitLight.of(lit[None])
-        front = self._smooth(torch.cat([light.shading, light.highlights], 1)[0])
-        rear = light.behind[0] if rims is None else self._smooth(light.behind[0])
-
-        def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-            grid = self._alike((rows, columns), pixels)
-            albedo, strands = self._seen((rows, columns), pixels, display_ev)
-
-            def radiance(light: Tensor) -> Tensor:
-                shading, highlights = light.chunk(2)
-                return albedo * shading + highlights * strands
-
-            parts = [radiance(_enlarged(front, grid))]
-            if rims is not None:
-                offsets_px, brightness = rims.at(rows, columns)
-                offsets = offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
-                # Strands that stand before such a light show one by one.
-                behind = radiance(_enlarged(rear, grid + offsets))
-                parts.append(behind * (brightness * strands))
-            return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
-
-        return of
-
-    def _without_light(
-        self, where: tuple[slice, slice], pixels: np.ndarray, display_ev: float
-    ) -> tuple[Tensor, Tensor]:
-        """The photo without its light [3, h, w] in rows and columns, and what strands do to highlights."""
-        wide = _enlarged(torch.cat([self._albedo_maps, self._hair]), self._alike(where, pixels))
-        albedo, hair = self._albedo(pixels, wide, display_ev), wide[_ALBEDO_MAPS:]
+    def observe(self, pixels: np.ndarray, rows: slice, columns: slice) -> ViewRows:
+        """What no light changes in pixels [h, w, 3] of the photo."""
+        grid, unit = self._grid(rows, columns), self._view.person.exposure
+        grid = places(self._colours, self._trust, grid, torch.from_numpy(pixels), unit)
+        wide = _enlarged(torch.cat([self._albedo_maps, self._hair]), grid)
+        albedo, hair = self._albedo(pixels, wide), wide[_ALBEDO_MAPS:]
         finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
-        return albedo, torch.lerp(torch.ones_like(finer), finer, hair[1])
+        strands = torch.lerp(torch.ones_like(finer), finer, hair[1])
+        return ViewRows(rows, columns, pixels, grid, albedo, strands)
 
-    def without_light(self, display_ev: float) -> Shown:
+    def ready(self, light: PortraitLight) -> ViewLight:
+        """Light [3, S, S] that can be read at any pixel."""
+        front = self._smooth(torch.cat([light.shading, light.highlights]))
+        return ViewLight(front, self._smooth(light.behind) if light.behind.any() else light.behind)
+
+    def radiance(self, light: ViewLight, seen: ViewRows, rims: Rims | None) -> np.ndarray:
+        """Radiance [h, w, 3] under light but that from behind; with `rims` that follows [h, w, 6]."""
+
+        def lit(maps: Tensor, grid: Tensor) -> Tensor:
+            shading, highlights = _enlarged(maps, grid).chunk(2)
+            return seen.albedo * shading + highlights * seen.strands
+
+        parts = [lit(light.front, seen.grid)]
+        if rims is not None:
+            offsets_px, brightness = rims.at(seen.rows, seen.columns)
+            offsets = offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
+            # Strands that stand before such a light show one by one.
+            parts.append(lit(light.rear, seen.grid + offsets) * (brightness * seen.strands))
+        return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
+
+    def flat(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
         """Luminances [h, w, 2] of the photo without its light, by the guided gain and by the coarse one."""
         maps = torch.cat([self._albedo_maps, self._filled(self._view.maps.gain[0])])
-
-        def of(pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-            wide = _enlarged(maps, self._grid(rows, columns))
-            gains = self._gain(pixels, wide, display_ev), wide[_ALBEDO_MAPS:]
-            return np.stack([luminance(_by_pixel(gain) * pixels) for gain in gains], -1)
-
-        return of
+        wide = _enlarged(maps, self._grid(rows, columns))
+        gains = self._gain(pixels, wide), wide[_ALBEDO_MAPS:]
+        return np.stack([luminance(_by_pixel(gain) * pixels) for gain in gains], -1)
 
     def sharpened(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
         """Share [h, w, 1] of the maps' values at the photo's pixels that are sharpened."""
         return _by_pixel(_enlarged(1 - self._trust[None], self._grid(rows, columns)))
 
-    def layer(self, name: str, lit: Tensor) -> Shown:
-        """A layer of an image under the light of maps [15, S, S]; see `WholePerson.layer`."""
-
-        def read(maps: Tensor, pixels: np.ndarray, rows: slice, columns: slice) -> Tensor:
-            return _enlarged(maps, self._alike((rows, columns), pixels))
-
+    def layer_maps(self, name: str, light: PortraitLight) -> Tensor:
+        """Maps [C, S, S] of a layer under a light [3, S, S]; see `PersonInPhoto.layer`."""
         if name == "albedo":
-            return lambda pixels, *where: _by_pixel(
-                self._albedo(pixels, read(self._albedo_maps, pixels, *where), self._display_ev)
-                * self._view.exposure
-            )
-        light = PortraitLight.of(lit[None]).whole
+            return self._albedo_maps
+        light = light.whole
         maps = {
-            "specular": light.highlights[0].clamp_min(0) * self._view.exposure,
-            "shadow": light.reached[0],
+            "specular": light.highlights.clamp_min(0) * self._view.exposure,
+            "shadow": light.reached,
             "normal": self._view.maps.normals[0],
         }[name]
-        filled = self._filled(self._edges.filled(maps))
-        return lambda pixels, *where: _by_pixel(read(filled, pixels, *where))
+        return self._filled(self._edges.filled(maps))
 
     def change(self, shadow: CastShadow, rows: slice, columns: slice) -> np.ndarray:
         """Factor [h, w] of a light's image by the shadow that it casts."""
         grid = self._grid(rows, columns)
         return np.asarray(change(CastShadow(*(_enlarged(maps, grid) for maps in shadow))).numpy())
 
-    def exposure_ev(self, lit: Tensor, own: Tensor, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the person under the light of maps [15, S, S] and its own [3]."""
+    def layer(self, name: str, maps: Tensor, seen: ViewRows) -> np.ndarray:
+        """A layer [h, w, 3] of observed pixels, by its `layer_maps`."""
+        values = seen.albedo * self._view.exposure if name == "albedo" else _enlarged(maps, seen.grid)
+        return _by_pixel(values)
+
+    def exposure_ev(self, light: PortraitLight, own: Tensor, rule: ExposureRule) -> float:
+        """The exposure in EV, by a rule, of the person under a light [3, S, S] and its own [3]."""
         view = self._view
-        (relit,) = view.relit(PortraitLight.of(lit[None]))
+        (relit,) = view.relit(light)
         relit = relit + own[:, None, None] * view.person.image
         skin = view.person.classes[class_index("skin")].numpy()
         image = view.person.image.permute(1, 2, 0).numpy()
         return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())
 
-    def _albedo(self, pixels: np.ndarray, wide: Tensor, display_ev: float) -> Tensor:
+    def _albedo(self, pixels: np.ndarray, wide: Tensor) -> Tensor:
         """The photo without its light [3, h, w], from the maps over its pixels [h, w, 3]."""
         lit = torch.from_numpy(pixels).permute(2, 0, 1) / self._view.person.exposure
-        return lit * self._gain(pixels, wide, display_ev) + wide[12:_ALBEDO_MAPS]
+        return lit * self._gain(pixels, wide) + wide[12:_ALBEDO_MAPS]
 
-    def _gain(self, pixels: np.ndarray, wide: Tensor, display_ev: float) -> Tensor:
+    def _gain(self, pixels: np.ndarray, wide: Tensor) -> Tensor:
         """The gain [3, h, w], from the maps over the photo's pixels [h, w, 3]."""
-        guide = torch.from_numpy(to_display(pixels, display_ev)).permute(2, 0, 1).float() / 255
+        guide = torch.from_numpy(to_display(pixels, self._display_ev)).permute(2, 0, 1).float() / 255
         slopes, offset = torch.split(wide[:12], [9, 3])
         log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
         return log_gain.clamp(*self._gain_range).exp()
@@ -188,11 +195,6 @@ class Enlarged:
     def _filled(self, maps: Tensor) -> Tensor:
         """Maps [C, S, S] with the person's values continued over the background."""
         return inpaint(maps, self.own)
-
-    def _places_alike(self, where: tuple[slice, slice], pixels: np.ndarray) -> Tensor:
-        """Places [h, w, 2] in the maps where pixels [h, w, 3] in rows and columns find their like."""
-        grid, unit = self._grid(*where), self._view.person.exposure
-        return places(self._colours, self._trust, grid, torch.from_numpy(pixels), unit)
 
     def _grid(self, rows: slice, columns: slice) -> Tensor:
         """Places [h, w, 2] in the maps, in -1..1, of some of the photo's pixels."""

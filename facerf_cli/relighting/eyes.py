@@ -5,6 +5,7 @@ as blurred as the photo is, and fade toward the lids, whose lashes shade them. A
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import Band
+from facerf_cli.image.strips import Rows
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.studio_points import is_of_rig
 from facerf_cli.portrait.mesh import SeenEyes
@@ -74,29 +75,27 @@ class _Iris:
 class Eyes:
     """The irises of a person's eyes, as far as they show between the lids in a photo [H, W, 3]."""
 
-    def __init__(self, photo: Band, eyes: SeenEyes, size_px: tuple[int, ...]) -> None:
+    def __init__(self, photo: Rows, eyes: SeenEyes, size_px: tuple[int, ...]) -> None:
         found = (_iris(photo, eyes, number, size_px) for number in range(len(eyes.irises_px)))
         self._irises = [iris for iris in found if iris is not None]
 
-    def lit(self, relit: Band, mirrored: Tensor) -> Band:
-        """A relit image [H, W, 3], by rows, with the mirror images [N, 3, s, s] in its eyes."""
-        images = [_placed(iris, mirrored[iris.number]) for iris in self._irises]
+    def ready(self, mirrored: Tensor) -> list[np.ndarray]:
+        """Mirror images [h, w, 3] in the windows of the irises, of those [N, 3, s, s] of the corneas."""
+        return [_placed(iris, mirrored[iris.number]) for iris in self._irises]
 
-        def of(rows: slice) -> np.ndarray:
-            pixels = relit(rows)
-            for iris, image in zip(self._irises, images, strict=True):
-                first, last = max(rows.start, iris.rows.start), min(rows.stop, iris.rows.stop)
-                if first < last:
-                    part = pixels[first - rows.start : last - rows.start, iris.columns]
-                    own = slice(first - iris.rows.start, last - iris.rows.start)
-                    part *= iris.kept[own]
-                    part += image[own]
-            return pixels
-
-        return of
+    def lit(self, pixels: np.ndarray, images: Sequence[np.ndarray], rows: slice) -> np.ndarray:
+        """Some rows [h, W, 3] of a relit image, in place, with the mirror images in its eyes."""
+        for iris, image in zip(self._irises, images, strict=True):
+            first, last = max(rows.start, iris.rows.start), min(rows.stop, iris.rows.stop)
+            if first < last:
+                part = pixels[first - rows.start : last - rows.start, iris.columns]
+                own = slice(first - iris.rows.start, last - iris.rows.start)
+                part *= iris.kept[own]
+                part += image[own]
+        return pixels
 
 
-def _iris(photo: Band, eyes: SeenEyes, number: int, size_px: tuple[int, ...]) -> _Iris | None:
+def _iris(photo: Rows, eyes: SeenEyes, number: int, size_px: tuple[int, ...]) -> _Iris | None:
     """An iris of a photo [H, W, 3]; None where too little of it shows."""
     x_px, y_px, radius_px = eyes.irises_px[number].tolist()
     rows, columns = (
@@ -106,7 +105,7 @@ def _iris(photo: Band, eyes: SeenEyes, number: int, size_px: tuple[int, ...]) ->
     )
     if radius_px < _LEAST_PX or rows.start >= rows.stop or columns.start >= columns.stop:
         return None
-    pixels = photo(rows)[:, columns]
+    pixels = photo[rows][:, columns]
     light, between = luminance(pixels), opening(eyes.lids_px[number], rows, columns)
     corner = np.array([columns.start, rows.start, 0])
     x_px, y_px, radius_px = outlined(light, eyes.irises_px[number] - corner, between)

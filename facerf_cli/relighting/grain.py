@@ -13,11 +13,12 @@ strands show the photo's own light, where the photo is nearly black, and at stro
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from facerf_cli.image.strips import STRIP_PX, Band, box_means, remembered, strips
+from facerf_cli.image.strips import STRIP_PX, box_means, strips
 
 _BLUR = 0.5  # reach of G, in pixels of the maps
 _DARK = (0.02, 0.08)  # A at which w is 0, and 1, in units of the person's mean
@@ -28,21 +29,40 @@ _TINY, _MOST = 1e-6, 6e4  # of A in units of its mean
 _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
 
 
-class Grain:
-    """Gives an image the detail of luminances A and B, `flat` [H, W, 2], where `share` [H, W] is not 0.
+@dataclass(frozen=True, eq=False)
+class GrainRows:
+    """Rows of the photo, those around whose pixels reach into them, and where they are among these.
 
-    `share` is that of w; `map_px` is the side of the maps' pixels in those of the photo, `sharpened`
-    [H, W, 1] the share of R that is sharp at edges.
+    `inside` [h, W] is the person there, and `reached` [h, W, 1] the share of the blur that is inside.
     """
 
-    def __init__(self, flat: Band, share: np.ndarray, map_px: float, sharpened: Band) -> None:
-        self._sharpened = sharpened
+    rows: slice
+    wide: slice
+    own: slice
+    inside: np.ndarray
+    reached: np.ndarray
+
+
+class Grain:
+    """Gives an image the detail of luminances A and B, where `share` [H, W] is not 0.
+
+    Args:
+        flat: Gives A and B [h, W, 2] of some rows.
+        share: That of w.
+        map_px: Side of the maps' pixels in those of the photo.
+        sharpened: Gives the share [h, W, 1] of R that is sharp at edges.
+    """
+
+    def __init__(
+        self,
+        flat: Callable[[slice], np.ndarray],
+        share: np.ndarray,
+        map_px: float,
+        sharpened: Callable[[slice], np.ndarray],
+    ) -> None:
         self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
         self._margin = 2 * self._reach
-        self._means_inside = remembered(
-            lambda rows: self._means(self._inside[rows][..., None].astype(np.float32)).clip(min=_TINY)
-        )
         values = np.zeros((*share.shape, 2), np.float16)  # 0 where nobody is seen, as detail is
         unit, total, count = 0.0, 0.0, 0
         for rows in self._seen_strips(STRIP_PX):
@@ -58,22 +78,26 @@ class Grain:
         self._weight, self._detail = (np.zeros(share.shape, np.float16) for _ in range(2))
         for rows in self._seen_strips(_STRIP_PX):
             wide, own = self._around(rows, 2 * self._margin)
-            weight, detail = self._read(values[wide] * scale, share[wide], wide)
+            sharp = sharpened(wide)[..., 0]
+            weight, detail = self._read(values[wide] * scale, share[wide], sharp, self._inside[wide])
             self._weight[rows], self._detail[rows] = weight[own], detail[own]
 
     def _seen_strips(self, strip_px: int) -> Iterator[slice]:
         """The strips in which some of the person is seen: of a crowd's people few."""
         return (rows for rows in strips(self._inside.shape, strip_px) if self._inside[rows].any())
 
-    def _read(self, values: np.ndarray, share: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    def _read(
+        self, values: np.ndarray, share: np.ndarray, sharp: np.ndarray, inside: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Weight w and detail D [h, W] of some rows of A and B [h, W, 2], in units of the mean of A."""
-        low = self._blurred(values, rows)
+        reached = self._reached(inside)
+        low = self._blurred(values, inside, reached)
         seen = (low[..., 0] - _DARK[0]) / (_DARK[1] - _DARK[0])
         logs = np.log((values / low.clip(min=_TINY)).clip(1 / _LARGEST, _LARGEST))
         guided, coarse = logs[..., 0], logs[..., 1]
-        power = self._blurred(coarse[..., None] ** 2, rows)[..., 0]
+        power = self._blurred(coarse[..., None] ** 2, inside, reached)[..., 0]
         faint, calm = (np.exp(-power / strength**2) for strength in (_FAINT, _STRONG))
-        weight = share * seen.clip(0, 1) * (1 - self._sharpened(rows)[..., 0] * (1 - calm))
+        weight = share * seen.clip(0, 1) * (1 - sharp * (1 - calm))
         return weight, np.exp(guided + faint * (coarse - guided))
 
     def _around(self, rows: slice, margin: int) -> tuple[slice, slice]:
@@ -82,23 +106,25 @@ class Grain:
         wide = slice(max(0, start - margin), min(len(self._inside), stop + margin))
         return wide, slice(start - wide.start, stop - wide.start)
 
-    def given(self, relit: Band) -> Band:
-        """A relit image [H, W, 3], by rows, with the detail."""
+    def observe(self, rows: slice) -> GrainRows:
+        """What no light changes in rows of the photo."""
+        wide, own = self._around(rows, self._margin)
+        inside = self._inside[wide]
+        return GrainRows(rows, wide, own, inside, self._reached(inside))
 
-        def of(rows: slice) -> np.ndarray:
-            wide, own = self._around(rows, self._margin)
-            pixels = relit(wide)
-            low, pixels = self._blurred(pixels, wide)[own], pixels[own]
-            return np.asarray(
-                pixels + self._weight[rows, :, None] * (self._detail[rows, :, None] * low - pixels)
-            )
+    def given(self, relit: np.ndarray, seen: GrainRows) -> np.ndarray:
+        """Observed rows [h, W, 3] of a relit image with the detail; `relit` are the pixels of `seen.wide`."""
+        low, pixels = self._blurred(relit, seen.inside, seen.reached)[seen.own], relit[seen.own]
+        weight, detail = (values[seen.rows, :, None] for values in (self._weight, self._detail))
+        return np.asarray(pixels + weight * (detail * low - pixels))
 
-        return of
-
-    def _blurred(self, values: np.ndarray, rows: slice) -> np.ndarray:
+    def _blurred(self, values: np.ndarray, inside: np.ndarray, reached: np.ndarray) -> np.ndarray:
         """Some rows of an image [h, W, C], blurred inside the person, by two boxes."""
-        inside = self._inside[rows][..., None]
-        return self._means(values * inside) / self._means_inside(rows)
+        return self._means(values * inside[..., None]) / reached
+
+    def _reached(self, inside: np.ndarray) -> np.ndarray:
+        """Share [h, W, 1] of the blur that is inside."""
+        return self._means(inside[..., None].astype(np.float32)).clip(min=_TINY)
 
     def _means(self, values: np.ndarray) -> np.ndarray:
         return box_means(box_means(values, self._reach), self._reach)

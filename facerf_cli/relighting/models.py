@@ -1,6 +1,6 @@
 """The face model and every trained network, on its device, from the shipped file or the user's."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -41,14 +41,13 @@ class Sides:
 
 
 class Networks:
-    """The trained networks, each loaded when it is first needed, and kept on the device."""
+    """The trained networks, each loaded when it is first needed, and kept on the device.
 
-    reflectance: ReflectanceNetwork
-    geometry: nn.Module
-    diffuse_sh: DiffuseNetwork  # of the baseline of this name
-    light_features: LightNetwork  # S_f, frozen
-    parsing: ParsingNetwork
-    portrait: PortraitNetwork
+    Args:
+        files: File of each network, by its name.
+        device: Where they compute.
+        given: Networks in place of those of files.
+    """
 
     def __init__(
         self,
@@ -57,7 +56,7 @@ class Networks:
         given: Mapping[str, nn.Module] | None = None,
     ) -> None:
         self.files, self.device, self._given = dict(files), device, dict(given or {})
-        self._loaded: dict[str, Any] = dict(self._given)
+        self.__dict__.update(self._given)  # as a `cached_property` keeps them
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send the files to another process, which loads each network once, or the given networks."""
@@ -65,16 +64,44 @@ class Networks:
             return Networks, (self.files, self.device, self._given)
         return _networks_once, (tuple(self.files.items()), self.device)
 
-    def __getattr__(self, name: str) -> Any:
-        if name not in SHIPPED:
-            raise AttributeError(f"there is no network {name}")
-        if name not in self._loaded:
-            path = self.files[name]
-            network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
-            if name in _CHECKS:
-                _CHECKS[name](path, network)
-            self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
-        return self._loaded[name]
+    @cached_property
+    def reflectance(self) -> ReflectanceNetwork:
+        """The Reflectance Network."""
+        return self._loaded("reflectance")
+
+    @cached_property
+    def geometry(self) -> nn.Module:
+        """The Geometry Network."""
+        network = self._loaded("geometry")
+        _require_builtin_coefficients(self.files["geometry"], network)
+        return network
+
+    @cached_property
+    def diffuse_sh(self) -> DiffuseNetwork:
+        """The network of the baseline of this name."""
+        return self._loaded("diffuse_sh")
+
+    @cached_property
+    def light_features(self) -> LightNetwork:
+        """S_f, frozen."""
+        return self._loaded("light_features")
+
+    @cached_property
+    def parsing(self) -> ParsingNetwork:
+        """The Parsing Network."""
+        network = self._loaded("parsing")
+        _require_these_classes(self.files["parsing"], network)
+        return network
+
+    @cached_property
+    def portrait(self) -> PortraitNetwork:
+        """The Portrait Network."""
+        return self._loaded("portrait")
+
+    def _loaded(self, name: str) -> Any:
+        """A network of a file; raises InputError for one that is damaged or of another version."""
+        network = load_networks(self.files[name], LAYOUT_VERSION, (name,))[0][name]
+        return network.to(self.device).eval().requires_grad_(False)
 
     @cached_property
     def people(self) -> PeopleNetworks:
@@ -88,7 +115,8 @@ class Networks:
 
     def with_networks(self, **networks: nn.Module) -> "Networks":
         """Return the same networks with others in place of some."""
-        return Networks(self.files, self.device, {**self._loaded, **networks})
+        loaded = {name: network for name, network in vars(self).items() if name in SHIPPED}
+        return Networks(self.files, self.device, {**loaded, **networks})
 
     def sha256(self, name: str) -> str:
         """SHA-256 of the file that serves a network."""
@@ -96,9 +124,8 @@ class Networks:
 
     def served(self) -> dict[str, dict[str, str]]:
         """File and SHA-256 of each network that was needed so far, for reports."""
-        names = [name for name in SHIPPED if name in self._loaded]
-        files = {name: self.files[name] for name in names}
-        if "people" in self.__dict__:
+        files = {name: self.files[name] for name in SHIPPED if name in vars(self)}
+        if "people" in vars(self):
             files["mediapipe"] = ASSET
         return {name: described_file(path) for name, path in files.items()}
 
@@ -202,12 +229,6 @@ def _require_these_classes(path: Path, parsing: ParsingNetwork) -> None:
     settings = parsing.settings
     if (settings.classes, settings.landmarks) != (len(CLASSES), LANDMARKS):
         raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
-
-
-_CHECKS: dict[str, Callable[[Path, Any], None]] = {
-    "geometry": _require_builtin_coefficients,
-    "parsing": _require_these_classes,
-}
 
 
 @cache

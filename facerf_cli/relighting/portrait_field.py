@@ -62,20 +62,19 @@ class PortraitLight:
     reached: Tensor
     behind: Tensor
 
-    @staticmethod
-    def of(stacked: Tensor) -> "PortraitLight":
-        """The maps apart, which were `stacked`."""
-        return PortraitLight(*torch.split(stacked, [3, 3, 3, 6], 1))
+    def __getitem__(self, number: int) -> "PortraitLight":
+        """One of the sums: maps [3, S, S]."""
+        return PortraitLight(*(maps[number] for maps in self.tensors))
 
     @property
-    def stacked(self) -> Tensor:
-        """All maps [M, 15, S, S], as `WholePerson` takes them."""
-        return torch.cat([self.shading, self.highlights, self.reached, self.behind], 1)
+    def tensors(self) -> tuple[Tensor, ...]:
+        """All maps."""
+        return self.shading, self.highlights, self.reached, self.behind
 
     @property
     def whole(self) -> "PortraitLight":
         """The same with light from behind as any other."""
-        shading, highlights = torch.chunk(self.behind, 2, 1)
+        shading, highlights = torch.chunk(self.behind, 2, -3)
         nothing = torch.zeros_like(self.behind)
         return PortraitLight(self.shading + shading, self.highlights + highlights, self.reached, nothing)
 

@@ -18,6 +18,7 @@ from facerf_cli.errors import InputError
 SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by default
 _CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
 _GB = 1 << 30
+_RELIT_HELD = 4  # relit maps are held this many times while lights are added to them
 _M_ARENA_MAX = -8  # of malloc.h
 _SELDOM, _USUAL = (50_000, 10, 10), gc.get_threshold()
 _set: list[int] = []  # the limit, once it was set
@@ -55,6 +56,12 @@ def holding(held_bytes: int) -> Iterator[None]:
 def left_bytes() -> int:
     """The budget without what is held."""
     return max(0, limit_bytes() - sum(_held))
+
+
+def batches(count: int, bytes_each: int) -> list[slice]:
+    """As many of some sums of lights at a time as fit the memory."""
+    at_once = max(1, left_bytes() // (_RELIT_HELD * bytes_each))
+    return [slice(first, first + at_once) for first in range(0, count, at_once)]
 
 
 def give_back() -> None:

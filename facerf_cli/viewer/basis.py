@@ -6,7 +6,7 @@ square root.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,21 +14,21 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from facerf_cli.face.head import Head, shrunk_photo
+from facerf_cli.face.head import shrunk_photo
 from facerf_cli.image.colour import (
     AUTO_EXPOSURE_PERCENTILE,
     linear_to_srgb,
     luminance,
     srgb_to_linear,
 )
-from facerf_cli.image.strips import fitted, resized, whole
+from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.pipeline import FittedPerson
+from facerf_cli.person import Person
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.relighting.composition import Composition, Relit
-from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.people import People
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView
+from facerf_cli.relighting.subject import Relit
 
 RATIO_PX = 320  # the longer side of a ratio
 MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept
@@ -147,47 +147,41 @@ def _linear(encoded: np.ndarray, white: float) -> np.ndarray:
     return np.asarray(srgb_to_linear(encoded.astype(np.float32) / 255) * np.float32(white))
 
 
-def basis_of_photo(
-    models: Models, photo: np.ndarray, head: Head, field: PortraitField, composition: Composition
-) -> Basis:
-    """The basis of a photo's person under the lights over which `facerf relight` integrates maps.
+def basis_of_photo(person: Person, people: People) -> Basis:
+    """The basis of a person, the only one of `people`, under the lights over which `relight` integrates maps.
 
-    The images of single lights and of their mean, the last, are composed small; the mean is composed as
-    large as the photo [H, W, 3], too.
+    The images of single lights and of their mean, the last, are rendered small; the mean is rendered as large
+    as the photo, too.
     """
-    small_photo, small_head = shrunk_photo(photo, head, RATIO_PX)
+    photo, field = person.photo, person.reflectance
+    assert photo is not None and isinstance(field, PortraitField)
+    small_photo, small_head = shrunk_photo(photo, person.head, RATIO_PX)
     small_field = _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
-    small = FittedPerson(models, small_photo, small_head, small_field).composed()
-    rig = rig_directions()
+    small = People([Person(person.models, small_photo, small_head, small_field).in_photo()])
+    rig, view = rig_directions(), field.views[0]
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []
-    view = field.views[0]
 
     def add(relit: Relit) -> None:
-        assert relit.surround is not None
-        images.append(whole(small.light_layer(relit), *small.size_px).astype(np.float16))
-        (part,) = view.relit(PortraitLight.of(relit.surround[:1]))
+        images.append(small.light_layer([relit]).astype(np.float16))
+        (part,) = view.relit(relit.views[0])
         coarse.append(part.permute(1, 2, 0).numpy().astype(np.float16))
 
-    mean: Relit | None = None
-    for relit in _single(composition, rig):
-        add(relit)
-        mean = relit if mean is None else mean.plus(torch.ones(1), relit)
-    assert mean is not None and mean.surround is not None
-    assert mean.mirrored is not None and mean.mouth is not None
-    dark_eyes = torch.zeros_like(mean.mirrored)
-    mean = Relit(*(part / len(rig) for part in (mean.texture, mean.surround, mean.mirrored, mean.mouth)))
-    add(replace(mean, mirrored=dark_eyes))  # which do not mirror a room
-    shown = whole(composition.light_layer(mean), *composition.size_px)
+    total: list[Tensor] = []
+    for some in torch.split(rig, _LIGHTS_AT_ONCE):
+        for (relit,) in people.relit(Lights.each(some)):
+            add(relit)
+            assert relit.mirrored is not None and relit.mouth is not None
+            maps = [*relit.tensors, relit.mirrored, relit.mouth]
+            total = [one + of_all for one, of_all in zip(maps, total, strict=True)] if total else maps
+    texture, *maps, mirrored, mouth = (one / len(rig) for one in total)
+    views = tuple(PortraitLight(*maps[at : at + 4]) for at in range(0, len(maps), 4))
+    mean = Relit(texture, views=views, mirrored=mirrored, mouth=mouth)
+    add(replace(mean, mirrored=torch.zeros_like(mirrored)))  # eyes, which do not mirror a room
+    shown = people.light_layer([mean])
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
     samples = LightSamples.of(np.stack(coarse), 1 - classes[0], classes[class_index("skin")], source)
-    return Basis.of(rig.numpy(), np.stack(images), shown, composition.matte, samples)
-
-
-def _single(composition: Composition, lights: Tensor) -> Iterator[Relit]:
-    """A head under each of lights [L, 3] of rgb 1."""
-    for some in torch.split(lights, _LIGHTS_AT_ONCE):
-        yield from composition.relit(Lights.each(some))
+    return Basis.of(rig.numpy(), np.stack(images), shown, people.matte, samples)
 
 
 def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) -> PortraitField:

@@ -12,7 +12,7 @@ import numpy as np
 from facerf_cli.errors import UsageError
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
-from facerf_cli.image.strips import Band
+from facerf_cli.image.strips import Rows
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.output_options import Format, OutputOptions
 
@@ -33,7 +33,7 @@ class OutputImage:
     alpha: np.ndarray | None = None
     layers: Mapping[str, np.ndarray] = field(default_factory=dict)
     share: np.ndarray | None = None
-    added: Band | None = None
+    added: Rows | None = None
     header: Mapping[str, Any] = field(default_factory=dict)
 
 

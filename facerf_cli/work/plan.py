@@ -4,7 +4,7 @@ Readers ask, by a file's header, for what they decode; what work makes of a phot
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 
@@ -14,9 +14,8 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import face_window, photo_camera
 from facerf_cli.files.atomic import hidden_folder
+from facerf_cli.image.strips import Empty
 from facerf_cli.run import memory
-
-Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # an array for a layer, by its name and shape
 
 # Bytes of a pixel beside the photo that is read.
 # An 8-bit copy, the matte, the view of a face, the grain; of a stack's photo an image for several formats.
@@ -33,7 +32,6 @@ _FACE_PX, _BESIDE_FACE_PX = 32, 16  # of a face drawn in its photo, and of the p
 _COMPOSED_BYTES, _COMPOSED_PX = 80 << 20, 12
 _STRIP_BYTES, _BETWEEN = 32 << 20, 6  # of a strip of the image, and a sixth of all for what lies between
 _WEB_PX = 9  # of an image for web viewers: half floats, then bytes
-_RELIT_HELD = 4  # relit textures are held this many times while lights are added to them
 # Layers that are not only written as half floats.
 _FLOATS = ("rgb", "A", "person.A", "position", "depth", "uv")
 
@@ -56,12 +54,6 @@ def beside_stack(size_px: tuple[int, ...]) -> AbstractContextManager[None]:
 def prediction_bytes() -> int:
     """Bytes that a network's prediction may take."""
     return memory.limit_bytes()
-
-
-def batches(count: int, bytes_each: int) -> list[slice]:
-    """As many of some sums of lights at a time as fit the memory."""
-    at_once = max(1, memory.left_bytes() // (_RELIT_HELD * bytes_each))
-    return [slice(first, first + at_once) for first in range(0, count, at_once)]
 
 
 def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) -> None:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,17 @@ from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import most_exposure_ev
-from facerf_cli.image.strips import Band, filled, rows_of
+from facerf_cli.image.strips import Empty, rows_of
+from facerf_cli.relighting.subject import Request
 from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import with_room
 from facerf_cli.work.outputs import OutputImage, write_output
-from facerf_cli.work.photos import load_models_once
-from facerf_cli.work.plan import Empty, batches, beside_people, image_canvas
+from facerf_cli.work.photos import facts_of, load_models_once
+from facerf_cli.work.plan import beside_people, image_canvas
 from facerf_cli.work.relight_options import Relight
-from facerf_cli.work.relight_scenes import LitScene, scene_of_all, scenes_of
+from facerf_cli.work.relight_scenes import Scene, scenes_of
 from facerf_cli.work.sequence import view_of
 from facerf_cli.work.shots import shot_of
 
@@ -33,16 +35,19 @@ _digest_once = lru_cache(maxsize=256)(file_sha256)
 
 def relight_item(item: Item, work: Relight) -> Outcome:
     """Relight a photo or a stack under every setup."""
-    scenes, metadata, describe = scenes_of(item, work)
-    shared_ev = _shared_exposures(item, work)
     written: dict[Path, dict[str, float]] = {}
-    for tag, scene in scenes:
-        with beside_people(len(scene.faces), scene.composer.size_px):
-            written |= _write_setups(item, tag, scene, work, metadata, shared_ev)
+    people: list[dict[str, Any]] = []
+    facts: Mapping[str, Any] = {}
+    shared_ev = _shared_exposures(item, work)
+    for scene in scenes_of(item, work, together=work.composite == "photo"):
+        with beside_people(len(scene.faces), scene.subject.size_px):
+            written |= _write_setups(item, scene, work, shared_ev)
+        people[:0] = [face.described() for face in scene.people]
+        facts = facts_of(people, work.photo) if people else scene.facts
     outputs = [path.with_suffix(suffix) for path in written for suffix in work.output.suffixes]
-    names = dict.fromkeys(name for facts in written.values() for name in facts)
-    facts = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
-    return Outcome(outputs, describe() | facts)
+    names = dict.fromkeys(name for one in written.values() for name in one)
+    each = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
+    return Outcome(outputs, {**facts, **each})
 
 
 def _leader_of(item: Item, work: Relight) -> Item | None:
@@ -64,16 +69,14 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
     """Exposures of a photo or stack that others share; found once a process."""
     if isinstance(work.exposure_rule, float):
         return dict.fromkeys((setup.name for setup in work.setups), work.exposure_rule)
-    scene = scene_of_all(leader, work)
-    return _exposures_ev(scene, batches(len(scene.setups), scene.composer.nbytes), scene.relit, work)
+    scene = next(scenes_of(leader, work, together=True))
+    return _exposures_ev(scene, batches(len(scene.setups), scene.subject.nbytes), scene.relit, work)
 
 
 def _write_setups(
     item: Item,
-    tag: str,
-    scene: LitScene,
+    scene: Scene,
     work: Relight,
-    metadata: Mapping[str, Any],
     shared_ev: Mapping[str, float] | None,
 ) -> dict[Path, dict[str, float]]:
     """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
@@ -81,7 +84,7 @@ def _write_setups(
     Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
     of each image, and facts of it for the report: the exposure of the PNG in its place, the identity.
     """
-    parts = batches(len(scene.setups), scene.composer.nbytes)
+    parts = batches(len(scene.setups), scene.subject.nbytes)
     whole = scene.relit(parts[0]) if len(parts) == 1 else None
 
     def relit_by(part: slice) -> list[Any]:
@@ -92,11 +95,11 @@ def _write_setups(
     for part in parts:
         for setup, relit in zip(scene.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
-            path, ev = setup.output(item, tag, ".exr", work.name), exposures_ev[setup.name]
-            with image_canvas(path, scene.composer.size_px, len(work.output.formats)) as empty:
+            path, ev = setup.output(item, scene.tag, ".exr", work.name), exposures_ev[setup.name]
+            with image_canvas(path, scene.subject.size_px, len(work.output.formats)) as empty:
                 image = _rendered(scene, setup, relit, ev, work, empty)
                 image = replace(image, header={**scene.plate, **_made_by(setup, work)})
-                write_output(path, image, ev, work.output, {**metadata, "facerf:exposure_ev": ev})
+                write_output(path, image, ev, work.output, {**scene.metadata, "facerf:exposure_ev": ev})
                 written[path] = {"exposure_ev": ev}
                 if scene.identity is not None:
                     written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
@@ -124,49 +127,54 @@ def _options(work: Relight) -> str:
 
 
 def _rendered(
-    scene: LitScene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
+    scene: Scene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
     A soft view leaves what was photographed, and a given background, as it looks; in the photo's own light it
     bends what other lights add.
     """
-    composer, size_px = scene.composer, scene.composer.size_px
+    subject, lit = scene.subject, with_room(setup)
     behind = scene.behind(setup, ev) if scene.behind else None
-    arrays = filled(composer.bands(relit, ev, behind), *size_px, empty)
-    layers = filled(composer.layers(work.aov, relit), *size_px, empty)
-    keeps = "A" not in arrays and work.background.kind != "envmap"
-    share = layers.get("person.A") if keeps else None
-    lit = with_room(setup)
-    for part in batches(len(lit.names), composer.nbytes):
-        each = scene.relit_by_each(setup, part)
-        for name, one in zip(lit.names[part], each, strict=True):
-            layers |= filled({name: composer.light_layer(one)}, *size_px, empty)
-        del each, one  # before others are relit
+    parts = batches(len(lit.names), subject.nbytes)
+    arrays: dict[str, np.ndarray] = {}
+    for part in parts or [slice(0)]:
+        each = scene.relit_by_each(setup, part) if lit.names else ()
+        lights = dict(zip(lit.names[part], each, strict=True))
+        arrays |= subject.rendered(Request(None if arrays else relit, lights, work.aov, ev, behind), empty)
+        del lights  # before others are relit
+    pixels, alpha = arrays.pop("rgb"), subject.alpha(behind)
+    matte = subject.person_matte
+    layers = arrays if matte is None else {"person.A": matte, **arrays}
+    keeps = alpha is None and work.background.kind != "envmap"
     added = None
     if setup.has_own:
         others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
-        added = _sum_of(others, size_px[1], arrays.get("A"))
-    return OutputImage(arrays["rgb"], arrays.get("A", scene.alpha), layers, share, added)
+        added = SumOf(others, subject.size_px[1], alpha)
+    share = matte if keeps else None
+    return OutputImage(pixels, scene.alpha if alpha is None else alpha, layers, share, added)
 
 
-def _sum_of(layers: Sequence[np.ndarray], width: int, alpha: np.ndarray | None) -> Band:
+@dataclass(frozen=True, eq=False)
+class SumOf:
     """The sum [H, W, 3] of layers over black, by rows, not multiplied by alpha [H, W]."""
 
-    def of(rows: slice) -> np.ndarray:
-        total = np.zeros((rows.stop - rows.start, width, 3), np.float32)
-        for layer in layers:
-            total += rows_of(layer, rows)
-        return total if alpha is None else total / np.maximum(alpha[rows], 1e-3)[..., None]
+    layers: Sequence[np.ndarray]
+    width_px: int
+    alpha: np.ndarray | None
 
-    return of
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """Some rows [h, W, 3]."""
+        total = np.zeros((rows.stop - rows.start, self.width_px, 3), np.float32)
+        for layer in self.layers:
+            total += rows_of(layer, rows)
+        return total if self.alpha is None else total / np.maximum(self.alpha[rows], 1e-3)[..., None]
 
 
 def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
     """Raise InputError, before anything is written, where a light gives values that are no numbers."""
     for one in relit if isinstance(relit, Sequence) else [relit]:
-        tensors = [one.texture] if one.surround is None else [one.texture, one.surround]
-        if not all(tensor.isfinite().all() for tensor in tensors):
+        if not all(tensor.isfinite().all() for tensor in one.tensors):
             raise InputError(
                 f"{item.input_path}: relit by {setup.name} it has values that are NaN or infinite; check the "
                 "photo, its landmarks and the light"
@@ -174,7 +182,7 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
+    scene: Scene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(rule := work.exposure_rule, float):
@@ -186,7 +194,7 @@ def _exposures_ev(
             chosen_ev = setup.exposure_ev
             if chosen_ev is None:
                 most_ev = most_exposure_ev(rule, light)
-                chosen_ev = round(min(scene.composer.exposure_ev(relit, rule), most_ev), 2)
+                chosen_ev = round(min(scene.subject.exposure_ev(relit, rule), most_ev), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
             del relit  # a view of one holds all of its part, beside the next
     return found

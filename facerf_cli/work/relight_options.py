@@ -1,8 +1,5 @@
 """`facerf relight`: its options, what each image is made by, and where it goes. Light to import."""
 
-import itertools
-import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -13,17 +10,13 @@ from typing import Literal, Self
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.batch.inputs import (
     COMPANION,
-    PHOTO_SUFFIXES,
     Item,
     NamePattern,
-    collect_items,
-    files_read,
     only_item,
-    refuse_read,
     split_frame,
 )
-from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
+from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.light.entries import EVEN, OWN, is_sweep, numbers, parse_lights
@@ -38,12 +31,10 @@ from facerf_cli.work.light_setups import (
     in_room,
 )
 from facerf_cli.work.output_options import (
-    STDOUT,
     SUFFIXES,
     Exposure,
     Format,
     OutputOptions,
-    check_stdout,
     parse_exposure,
 )
 from facerf_cli.work.photo_options import (
@@ -57,11 +48,8 @@ from facerf_cli.work.photo_options import (
     white_option,
 )
 from facerf_cli.work.shots import (
-    FRAMES_IN_A_ROW,
     FilmOutput,
     Shot,
-    ShotOptions,
-    collect_frames,
     film_rate,
     recipe_of_shots,
 )
@@ -133,7 +121,7 @@ def _linear(encoded: float) -> float:
 
 @dataclass(frozen=True)
 class Relight:
-    """The options that images share; in the verb's file a subclass relights one item under every setup.
+    """The options that images share.
 
     Attributes:
         rig: Approximate maps by a rig of N lights, or by a file of directions.
@@ -218,55 +206,7 @@ class Relight:
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
     shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
 
-    def run(
-        self,
-        inputs: Sequence[str],
-        sources: LightSources,
-        wanted: ShotOptions,
-        batch: BatchOptions,
-        film: FilmOutput | None,
-    ) -> int:
-        """Relight photos, films and stacks under the sources; return the exit code.
-
-        Args:
-            inputs: Files, as the command line names them.
-            sources: The lights, as the command line names them.
-            wanted: Which inputs are one shot.
-            batch: Where the images go, and how; `STDOUT` for one image.
-            film: The film to which they are joined.
-        """
-        work = self._checked(sources, batch, film)
-        if batch.output == STDOUT:
-            _write_to_stdout(inputs, work)
-            return 0
-        if work.ball and not work.maps:
-            raise UsageError("--ball: shows maps; give --envmap, or leave it out")
-        items, shots = collect_frames(inputs, wanted, batch, work.photo)
-        if work.photo_of_stack is not None and not _holds_a_stack(items):
-            raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
-        batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1, print_outputs=film is None)
-        work = replace(work.with_leaders(items), shots=shots)
-        work.refuse_meeting(items)
-        images = [path for item in items for path in work.outputs_of(item)]
-        balls = [path for setup in work.maps if work.ball for path in _balls_of(setup, work, batch.output)]
-        refuse_read([film.path] if film else images + balls, files_read((items, work, sources), items))
-        key = film.key_of_new(items, shots, images, work.recipes_of, batch) if film else ""
-        if film is not None and not key:
-            return 0
-        index = FolderIndex(batch.output, "relight", batch.shard, work.recipes_of)
-        usable, finished = work, all_finished(items, work.outputs_of, batch, index)
-        index.edited.clear()  # they are judged again
-        if not finished:
-            usable = work.readable(batch.dry_run)
-            index.want(usable.recipes_of)
-        code = run_items("relight", items, usable, usable.outputs_of, batch, work.photo.settings, index=index)
-        if film is not None:
-            return film.joined(images, shots, key, code)
-        if work.ball and not batch.dry_run and batch.shard.number == 1:
-            _write_balls(usable, batch)
-        return max(code, int(len(usable.setups) < len(work.setups)))
-
-    def _checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> "Relight":
+    def checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> Self:
         """These options with the setups, and with what depends on other options; raises UsageError."""
         alone = self.composite == "face" or self.pose is not None
         if self.pose is not None and self.composite == "photo":
@@ -337,17 +277,13 @@ class Relight:
         tag = "" if self.composite == "photo" else self.photo.first_tag
         return [setup.output(item, tag, suffix, self.name) for suffix in self.output.suffixes]
 
-    def __call__(self, item: Item) -> Outcome:
-        """Relight an item."""
-        raise NotImplementedError
-
-    def for_stale(self, item: Item) -> "Relight":
+    def for_stale(self, item: Item) -> Self:
         """These settings with the lights of the item's stale images; a light has all of its frames."""
         stale = {setup.name for setup in self.setups if not item.stale.isdisjoint(self._images(item, setup))}
         setups = tuple(setup for setup in self.setups if setup.name in stale)
         return replace(self, setups=setups) if item.stale else self
 
-    def with_leaders(self, items: Sequence[Item]) -> "Relight":
+    def with_leaders(self, items: Sequence[Item]) -> Self:
         """These settings with the first photo of each group of --exposure-group."""
         groups = {self._group(item): item for item in reversed(items)}
         return replace(self, leaders=tuple(groups.values())) if self.exposure_group != "photo" else self
@@ -391,7 +327,7 @@ class Relight:
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
-    def readable(self, dry_run: bool) -> "Relight":
+    def readable(self, dry_run: bool) -> Self:
         """Load the models, and keep the setups whose maps can be read.
 
         A dry run loads no networks, and so estimates no light of a photo.
@@ -414,39 +350,3 @@ class Relight:
         if not setups:
             raise FacerfError("none of the maps serves; give others, or procedural:8 to draw some")
         return replace(self, setups=setups)
-
-
-def _holds_a_stack(items: Sequence[Item]) -> bool:
-    from facerf_cli.files.olat_stack import is_olat_stack
-
-    return any(is_olat_stack(item.input_path) for item in items)
-
-
-def _write_to_stdout(inputs: Sequence[str], work: Relight) -> None:
-    """Write the one image of one photo as bytes; raises UsageError where there are several."""
-    with tempfile.TemporaryDirectory() as folder:
-        items = collect_items(inputs, Path(folder), PHOTO_SUFFIXES)
-        images = len(items) * len(work.setups)
-        check_stdout(images if work.photo.face != "all" else 2 * images, work.output.formats)
-        (path,) = work.readable(False)(items[0]).outputs
-        sys.stdout.buffer.write(path.read_bytes())
-        sys.stdout.buffer.flush()
-
-
-def _balls_of(setup: LightSetup, work: Relight, folder: Path) -> list[Path]:
-    """The files of the balls under a map, of each format."""
-    return [folder / "balls" / f"{setup.name}{setup.frame}{suffix}" for suffix in work.output.suffixes]
-
-
-def _write_balls(work: Relight, options: BatchOptions) -> None:
-    """Write the balls under each map to `balls/NAME` in each format, unless they are there."""
-    files = {setup: _balls_of(setup, work, options.output) for setup in work.maps}
-    always = options.overwrite == "always"
-    missing = [setup for setup, paths in files.items() if always or not all(map(Path.exists, paths))]
-    if missing:
-        from facerf_cli.work.lights import readable, write_balls
-
-        drawn = readable(missing)
-        write_balls(drawn, [files[setup][0] for setup in drawn], work.exposure_rule, work.output)
-        for path in itertools.chain.from_iterable(files[setup] for setup in drawn):
-            print_path(path)

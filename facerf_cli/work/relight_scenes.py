@@ -12,21 +12,21 @@ import torch
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
 from facerf_cli.face.descriptor import face_descriptor
+from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.olat_stack import StackHeader, is_olat_stack, read_olat_header
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import linear_to_srgb
-from facerf_cli.image.strips import Band, covering
-from facerf_cli.light.envmap import backdrop
+from facerf_cli.image.strips import Rows, Scaled, covering
+from facerf_cli.light.envmap import Backdrop
 from facerf_cli.light.studio_points import Lights, intensity_of
-from facerf_cli.pipeline import FittedPerson, reflectance_of
+from facerf_cli.person import Person, Target, person_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
-from facerf_cli.relighting.composition import Composition, Target
-from facerf_cli.relighting.field import Field
-from facerf_cli.relighting.group import GroupComposition
-from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.face_alone import FaceAlone
+from facerf_cli.relighting.people import People
+from facerf_cli.relighting.subject import Subject
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (
@@ -43,7 +43,6 @@ from facerf_cli.work.photos import (
     FittedFace,
     companion,
     face_model,
-    facts_of,
     fit_each,
     fit_facts,
     load_models_once,
@@ -73,8 +72,7 @@ from facerf_cli.work.stack_composers import (
 log = logging.getLogger(LOGGER_NAME)
 _OFF_RIG_DEG = 1.0  # from which on a light that a stack lacks is named
 
-Composer = Composition | GroupComposition | StackImages
-Behind = Callable[[LightSetup, float], Band | None]  # the image behind a person, for a setup and an exposure
+Behind = Callable[[LightSetup, float], Rows | None]  # the image behind a person, for a setup and an exposure
 
 
 def _backdrop(work: Relight, camera: Camera) -> Behind:
@@ -85,17 +83,16 @@ def _backdrop(work: Relight, camera: Camera) -> Behind:
     """
     fixed, size_px = _fixed(work.background, camera), (camera.height_px, camera.width_px)
 
-    def behind(setup: LightSetup, ev: float) -> Band | None:
-        gain = np.float32(2.0**-ev)
+    def behind(setup: LightSetup, ev: float) -> Rows | None:
         if work.background.kind != "envmap":
-            return None if fixed is None else lambda rows: fixed[rows] * gain
+            return None if fixed is None else Scaled(fixed, np.float32(2.0**-ev))
         if (light := setup.envmap) is None or light.envmap is None:
-            return lambda rows: np.zeros((rows.stop - rows.start, camera.width_px, 3), np.float32)
+            return np.broadcast_to(np.float32(0), (*size_px, 3))
         with beside_person(size_px):
             envmap = read_map(light.envmap)
         rays, colour = partial(rays_of_rows, camera), intensity_of(light).numpy()
-        around = backdrop(envmap, size_px, rays, light.rotate_deg, work.background_blur)
-        return lambda rows: around(rows) * colour
+        around = Backdrop(envmap, size_px, rays, light.rotate_deg, work.background_blur)
+        return Scaled(around, colour)
 
     return behind
 
@@ -111,22 +108,38 @@ def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
 
 
 @dataclass(frozen=True, eq=False)
-class LitScene:
-    """People of a photo, or a stack: its composer, the lights of setups, and what is behind.
+class Scene:
+    """People of a photo in one image, a face alone, or a stack; the lights of setups, and what is behind.
 
-    `faces` are the numbers, from the left, of the people's faces in the order of the composer, and `evens`
-    the brightness of even light on each.
+    Attributes:
+        subject: What is relit.
+        setups: The lights of each image.
+        lights_of: Gives setups as sums of far and near lights.
+        metadata: Of all images.
+        people: Of a photo, from left to right.
+        faces: Their numbers, from the left, the nearest first.
+        evens: Brightness of even light on each.
+        tag: What follows the photo's name in those of its images.
+        alpha: The photo's [H, W].
+        behind: Gives the image behind the person.
+        plate: Metadata of the photo that results keep.
+        identity: Distance of an exposed image to the photo.
+        facts: Of a stack's fit, for the report.
     """
 
-    composer: Composer
+    subject: Subject
     setups: tuple[LightSetup, ...]
     lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    metadata: Mapping[str, Any]
+    people: Sequence[FittedFace] = ()
     faces: tuple[int, ...] = (0,)
     evens: tuple[float, ...] = (1.0,)
-    alpha: np.ndarray | None = None  # of the photo
+    tag: str = ""
+    alpha: np.ndarray | None = None
     behind: Behind | None = None
-    plate: Mapping[str, Any] = field(default_factory=dict)  # metadata of the photo that results keep
-    identity: Callable[[np.ndarray], float] | None = None  # of an exposed image, to the photo
+    plate: Mapping[str, Any] = field(default_factory=dict)
+    identity: Callable[[np.ndarray], float] | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def lights(self) -> list[Lights]:
@@ -135,21 +148,19 @@ class LitScene:
 
     def relit(self, part: slice) -> list[Any]:
         """The people under some of the setups."""
-        return list(self._composed([lights[part] for lights in self.lights]))
+        return list(self._relit([lights[part] for lights in self.lights]))
 
     def relit_by_each(self, setup: LightSetup, part: slice) -> Iterator[Any]:
         """The people under some of the lights of a setup, each alone."""
         lit = self._as_lit((setup,))
-        return self._composed([self.lights_of(each_alone(one)[part]) for (one,) in lit])
+        return self._relit([self.lights_of(each_alone(one)[part]) for (one,) in lit])
 
     def _as_lit(self, setups: tuple[LightSetup, ...]) -> list[tuple[LightSetup, ...]]:
         """Setups as they shine on each of the people."""
         return [_as_lit(setups, *one) for one in zip(self.faces, self.evens, strict=True)]
 
-    def _composed(self, lights: Sequence[Lights]) -> Iterator[Any]:
-        if isinstance(self.composer, GroupComposition):
-            return self.composer.relit(lights)
-        return self.composer.relit(lights[0])
+    def _relit(self, lights: Sequence[Lights]) -> Iterator[Any]:
+        return self.subject.relit(lights if isinstance(self.subject, People) else lights[0])
 
 
 def _as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[LightSetup, ...]:
@@ -157,39 +168,47 @@ def _as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple
     return tuple(with_room(as_in_photo(on_face(setup, face), even)) for setup in setups)
 
 
-Scenes = Iterator[tuple[str, LitScene]]  # each with the tag of its files
-Describe = Callable[[], dict[str, Any]]  # facts for the report
-
-
-def scenes_of(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
-    """Scenes of a photo or a stack, metadata of their images, and facts, which are known at the end."""
-    read = _scenes_of_stack if is_olat_stack(item.input_path) else _scenes_of_photo
-    return read(item, work)
-
-
-def scene_of_all(item: Item, work: Relight) -> LitScene:
-    """All chosen people of a photo, or a stack, in one scene."""
+def scenes_of(item: Item, work: Relight, together: bool) -> Iterator[Scene]:
+    """All chosen people of a photo in one image, or each face alone, the last first; or a stack."""
     if is_olat_stack(item.input_path):
-        return next(_scenes_of_stack(item, work)[0])[1]
+        yield _scene_of_stack(item, work)
+        return
+    lights_of = partial(lights_over_rig, rig=work.rig, sampling=work.sampling)
+    lights_of(_as_lit(work.setups, 0))  # maps are read before the photo, not beside it
     image, faces = _image_and_faces(item, work)
-    return _scene(item, image, list(faces)[::-1], work)
+    for number, people in enumerate([list(faces)[::-1]] if together else ([face] for face in faces)):
+        if not number:
+            _check_faces(item, people[-1].number, work)
+        by_size = sorted(people, key=lambda face: -face.fit.crop.side_px)
+        targets = [_target(item, face, image, work) for face in by_size]
+        fitted = [_fitted(item, image, face, work) for face in by_size]
+        scene = Scene(
+            setups=work.setups,
+            lights_of=lights_of,
+            metadata=_metadata(item, work),
+            people=people,
+            faces=tuple(face.number for face in by_size),
+            evens=tuple(person.even_brightness for person in fitted),
+            plate=plate_metadata(image.metadata),
+            subject=_subject(fitted, targets),
+        )
+        if work.composite == "face":
+            yield replace(scene, tag=people[0].tag)
+            continue
+        yield replace(
+            scene,
+            alpha=image.alpha if work.background.kind == "photo" else None,
+            behind=_backdrop(work, photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])),
+            identity=_identity_of(image.pixels, by_size[0]) if work.identity else None,
+        )
 
 
-def _scenes_of_photo(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
-    """All chosen people in one image, or each face alone."""
-    _over_rig(work)(_as_lit(work.setups, 0))  # maps are read before the photo, not beside it
-    image, faces = _image_and_faces(item, work)
-    facts: list[dict[str, Any]] = []
-
-    def scenes() -> Scenes:
-        parts = [list(faces)[::-1]] if work.composite == "photo" else ([face] for face in faces)
-        for some in parts:
-            if not facts:
-                _check_faces(item, some[-1].number, work)
-            yield "" if work.composite == "photo" else some[0].tag, _scene(item, image, some, work)
-            facts[:0] = [face.described() for face in some]
-
-    return scenes(), _metadata(item, work), lambda: facts_of(facts, work.photo)
+def _subject(people: Sequence[Person], targets: Sequence[Target]) -> Subject:
+    """People in their photo, or the face of the first alone."""
+    if targets[0].composite == "face":
+        return people[0].composed(targets[0])
+    each = [person.in_photo(target) for person, target in zip(people, targets, strict=True)]
+    return People(each, targets[0].background)
 
 
 def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, Iterator[FittedFace]]:
@@ -224,57 +243,42 @@ def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], 
     return lambda shown: round(float(np.linalg.norm(descriptor(shown) - own)), 3)
 
 
-def _scene(item: Item, image: LinearImage, faces: Sequence[FittedFace], work: Relight) -> LitScene:
-    """People of one photo in one image; the nearest first."""
-    by_size = sorted(faces, key=lambda face: -face.fit.crop.side_px)
-    people = [_composed(item, image, face, work) for face in by_size]
-    composer = people[0] if len(people) == 1 else GroupComposition(people)
-    numbers = tuple(face.number for face in by_size)
-    evens = tuple(one.even for one in people)
-    plate = plate_metadata(image.metadata)
-    scene = LitScene(composer, work.setups, _over_rig(work), numbers, evens, plate=plate)
-    if work.composite != "photo":
-        return scene
-    if work.identity:
-        scene = replace(scene, identity=_identity_of(image.pixels, by_size[0]))
-    camera = photo_camera(by_size[0].fit.crop, *image.pixels.shape[:2])
-    alpha = image.alpha if work.background.kind == "photo" else None
-    return replace(scene, alpha=alpha, behind=_backdrop(work, camera))
-
-
-def _over_rig(work: Relight) -> Callable[[tuple[LightSetup, ...]], Lights]:
-    return partial(lights_over_rig, rig=work.rig, sampling=work.sampling)
-
-
-def _composed(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> Composition:
-    """A person, fitted and with its reflectance read, in the pose and place that the options choose."""
-    models, photo, target = load_models_once(work.photo), image.pixels, _target(item, face, image, work)
+def _fitted(item: Item, image: LinearImage, face: FittedFace, work: Relight) -> Person:
+    """A person, fitted and with its reflectance read."""
+    models, photo = load_models_once(work.photo), image.pixels
     kind, alone = work.reflectance, work.network_alone
     with naming(item.input_path):
-        require_face(models.face, target.fit or face.fit, photo.shape[:2])
-        reflectance = reflectance_of(
-            models, face.head, kind, alone, prediction_bytes(), photo, face.steady, face.matte, work.white
+        require_face(models.face, _posed(face, work), photo.shape[:2])
+        person = person_of(
+            models, photo, face.head, kind, alone, face.matte, work.white, face.steady, prediction_bytes()
         )
-        balance = reflectance.balance if isinstance(reflectance, Field | PortraitField) else None
-        if balance is not None and balance.is_far and work.white == "photo" and face.steady is None:
+        if (
+            person.balance is not None
+            and person.balance.is_far
+            and work.white == "photo"
+            and face.steady is None
+        ):
             log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
-        person = FittedPerson(models, photo, face.head, reflectance, face.matte)
-        if target.composite == "photo" and face.matte is None:
+        if work.composite == "photo" and face.matte is None:
             face.see(person.segmentation)
-        return person.composed(target)
+        return person
+
+
+def _posed(face: FittedFace, work: Relight) -> FaceFit:
+    """The head in the pose of `--pose`."""
+    rotation = rotation_of(work.pose)
+    return face.fit if rotation is None else replace(face.fit, rotation=rotation)
 
 
 def _target(item: Item, face: FittedFace, image: LinearImage, work: Relight) -> Target:
-    """The head in the pose of `--pose`, composed as the options choose."""
-    rotation = rotation_of(work.pose)
-    posed = None if rotation is None else replace(face.fit, rotation=rotation)
+    """The pose and surroundings that the options choose."""
     if work.composite != "photo":
-        return Target(posed, "face")
+        return Target(None if work.pose is None else _posed(face, work), "face")
     size_px, in_shot = image.pixels.shape[:2], face.steady is not None
     matte = None if work.matte is None else read_matte(item, work.matte, size_px, in_shot)
     kind = work.background.kind
     alpha = None if kind == "photo" else image.alpha
-    return Target(posed, "photo", matte, alpha, kind if kind in ("photo", "none") else "given")
+    return Target(None, "photo", matte, alpha, kind if kind in ("photo", "none") else "given")
 
 
 def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
@@ -287,8 +291,8 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
     return metadata
 
 
-def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any], Describe]:
-    """A stack under its own lights, the metadata of its images, and facts of its fit."""
+def _scene_of_stack(item: Item, work: Relight) -> Scene:
+    """A stack under its own lights."""
     _check_stack(item, work)
     _check_faces(item, 0, work)
     header = read_olat_header(item.input_path)
@@ -299,20 +303,19 @@ def _scenes_of_stack(item: Item, work: Relight) -> tuple[Scenes, dict[str, Any],
         )
         log.warning(said, item.input_path, off_deg)
     lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
-    composer: Composer
+    subject: Subject
     behind = None
     if header.kind == "photo":
-        composer, behind, facts = _person_of_stack(item, header, work)
+        subject, behind, facts = _person_of_stack(item, header, work)
     elif work.photo_of_stack is not None:
         raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
     elif header.kind == "image":
-        composer, facts = StackImages(header, item.input_path), {}
+        subject, facts = StackImages(header, item.input_path), {}
     else:
-        composer, facts = _face_of_stack(item, header, work)
+        subject, facts = _face_of_stack(item, header, work)
     lit = work.setups if work.asked_for_room else tuple(replace(setup, room=0.0) for setup in work.setups)
-    scene = LitScene(composer, lit, lights_of, behind=behind)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
-    return iter([("", scene)]), dict(metadata), lambda: facts
+    return Scene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
 
 
 def _check_stack(item: Item, work: Relight) -> None:
@@ -341,7 +344,7 @@ def _check_stack(item: Item, work: Relight) -> None:
 def _person_of_stack(
     item: Item, header: StackHeader, work: Relight
 ) -> tuple[StackImages, Behind | None, dict[str, Any]]:
-    """The composer of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
+    """The images of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
     fit, face = face_in_stack(item, header, face_model(work.photo))
     size_px, stack = header.seen.shape, StackImages(header, item.input_path, face)
     if work.photo_of_stack is None:
@@ -357,8 +360,8 @@ def _person_of_stack(
     return on_photo, _backdrop(work, camera), fit_facts(fit)
 
 
-def _face_of_stack(item: Item, header: StackHeader, work: Relight) -> tuple[Composition, dict[str, Any]]:
-    """The composer of a stack of textures in the frame of its crop, and facts of its fit."""
+def _face_of_stack(item: Item, header: StackHeader, work: Relight) -> tuple[FaceAlone, dict[str, Any]]:
+    """The face of a stack of textures in the frame of its crop, and facts of its fit."""
     head = head_in_stack(item, header)
     model, textures = face_model(work.photo), StackTextures(item.input_path)
-    return Composition(model, None, head, Target(composite="face"), textures), fit_facts(head.fit)
+    return FaceAlone(model, head, textures), fit_facts(head.fit)

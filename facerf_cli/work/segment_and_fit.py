@@ -18,7 +18,7 @@ from facerf_cli.files.meshes import TexturedMesh, write_glb, write_obj
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import srgb_to_linear
-from facerf_cli.image.strips import filled
+from facerf_cli.image.strips import in_strips
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours
@@ -83,7 +83,7 @@ def _write_segment(
     height, width = found.matte.shape
     colours = PersonColours(image.pixels, found.matte)[:]
     with segments_canvas(path("_segment.exr"), (height, width)) as empty:
-        layers = {"person.A": found.matte, **filled(found.layers(), height, width, empty)}
+        layers = {"person.A": found.matte, **in_strips(found.layers, height, width, empty)}
         write_exr(path("_segment.exr"), colours, found.matte, layers, metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)
     write_display(path("_overlay.jpg"), _overlay(display, found, face), metadata=metadata)

@@ -1,8 +1,9 @@
-"""OLAT stacks as `relight` composes them: sums of their lights, in their frame or on their photo."""
+"""OLAT stacks that are relit: sums of their lights, in their frame or on their photo."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,10 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.files.olat_stack import StackHeader, stream_olats
 from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
-from facerf_cli.image.strips import Band, Layer, resized_rows
+from facerf_cli.image.strips import Resized, Rows, Scaled
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.composition import Relit, in_own_light
 from facerf_cli.relighting.field import weighted_sum
+from facerf_cli.relighting.subject import Relit, Request, Subject
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
@@ -38,8 +39,17 @@ class StackTextures:
 
 
 @dataclass(frozen=True, eq=False)
-class StackImages:
-    """Composes the images of a stack: of a face and its coverage, or of a photo's person over black.
+class _Ready:
+    """Sums [h, w, 3] of the lights; of a larger photo the change of its light [H, W, 3]."""
+
+    lit: Rows
+    is_change: bool
+    own: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class StackImages(Subject):
+    """The images of a stack: of a face and its coverage, or of a photo's person over black.
 
     A person is shown alone, or with `photo` [H, W, 3] in that photo. That may be larger than the stack: then
     the change of light is enlarged, and the photo keeps its detail. `keeps_background` shows the photo's own.
@@ -62,37 +72,51 @@ class StackImages:
         height, width = (self.header.seen if self.photo is None else self.photo).shape[:2]
         return height, width
 
+    @property
+    def keeps_photo(self) -> bool:  # type: ignore[override]
+        """True where the photo's own background stays behind the person."""
+        return self.photo is not None and self.keeps_background
+
+    @cached_property
+    def matte(self) -> np.ndarray:
+        """Coverage [H, W] of what the stack shows."""
+        return Resized(self.header.seen, self.size_px)[0 : self.size_px[0]]
+
+    @property
+    def person_matte(self) -> np.ndarray | None:
+        """The matte of a person."""
+        return None if self.face is None else self.matte
+
     def relit(self, lights: Lights) -> Iterator[Relit]:
         """Sums of the stack's lights."""
         textures = weighted_sum(stream_olats(self.path), lights.weights)
         return (Relit(texture, own=own) for texture, own in zip(textures, lights.owns, strict=True))
 
-    def bands(self, relit: Relit, ev: float, behind: Band | None) -> dict[str, Layer]:
-        """The person before the photo's background at `ev`, before another, or with alpha."""
-        (person, matte), photo, gain = self._person(relit), self.photo, np.float32(2.0**-ev)
-        if photo is None or (behind is None and not self.keeps_background):
-            return {"rgb": person, "A": matte}
-
-        def of(rows: slice) -> np.ndarray:
-            below = behind(rows) if behind else gain * photo[rows]
-            return np.asarray(below + matte(rows)[..., None] * (person(rows) - below))
-
-        return {"rgb": of}
-
-    def light_layer(self, relit: Relit) -> Band:
-        """The person under one of several lights, over black."""
-        person, matte = self._person(relit)
-        return lambda rows: person(rows) * matte(rows)[..., None]
-
-    def layers(self, names: Sequence[str], relit: Relit) -> dict[str, Layer]:
-        """The layer of normals, and a person's matte; raises UsageError for others."""
-        if other := [name for name in names if name != "normal"]:
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> _Ready:
+        """A sum in its frame; raises UsageError for layers other than normals."""
+        if other := [name for name in layers if name != "normal"]:
             raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
-        found: dict[str, Layer] = {} if self.face is None else {"person.A": self._matte()}
-        if names:
-            normals = self.header.normals
-            found["normal"] = normals if self.face is None else resized_rows(normals, self.size_px)
-        return found
+        lit, source = self._lit(relit), self.header.source
+        own = None if relit.own is None or self.photo is None else relit.own.numpy()
+        if self.photo is None or self.size_px == self.header.seen.shape:
+            return _Ready(lit, False, own)
+        return _Ready(Resized(lit / (source + _DARK * source.mean()), self.size_px), True, own)
+
+    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
+        """Some rows of the image, of lights over black, and of normals."""
+        matte, found = self.matte[rows][..., None], {}
+        if request.image is not None:
+            found["rgb"] = self._pixels(request.image, rows)
+            below = request.background
+            if below is None and self.keeps_photo:
+                assert self.photo is not None
+                below = Scaled(self.photo, np.float32(2.0**-request.ev))
+            if self.photo is not None and below is not None:
+                under = below[rows]
+                found["rgb"] = under + matte * (found["rgb"] - under)
+            for name in request.layers:
+                found[name] = self._normals[rows]
+        return found | {name: self._pixels(one, rows) * matte for name, one in request.lights.items()}
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule; a face alone is shown well, for it has no photo to compare with."""
@@ -103,21 +127,18 @@ class StackImages:
             return auto_exposure_ev(lit, seen)
         return anchored_exposure_ev(lit, self.header.source, self.face * seen, seen)
 
-    def _person(self, relit: Relit) -> tuple[Band, Band]:
-        """The person's own colours [H, W, 3], and its matte [H, W]."""
-        lit, photo, seen = self._lit(relit), self.photo, self.header.seen
-        if photo is None or self.size_px == seen.shape:
-            person: Band = lit.__getitem__
-        else:
-            source = self.header.source
-            change = resized_rows(lit / (source + _DARK * source.mean()), self.size_px)
+    def _pixels(self, relit: _Ready, rows: slice) -> np.ndarray:
+        """The person's own colours [h, W, 3]."""
+        pixels, photo = relit.lit[rows], self.photo
+        if photo is not None:
+            pixels = photo[rows] * pixels if relit.is_change else pixels
+            pixels = pixels if relit.own is None else pixels + relit.own * photo[rows]
+        return pixels
 
-            def person(rows: slice) -> np.ndarray:
-                return photo[rows] * change(rows)
-
-        if photo is not None and relit.own is not None:
-            person = in_own_light(person, photo, relit.own)
-        return person, self._matte()
+    @cached_property
+    def _normals(self) -> Rows:
+        normals = self.header.normals
+        return normals if self.face is None else Resized(normals, self.size_px)
 
     def _lit(self, relit: Relit) -> np.ndarray:
         """Colours [h, w, 3] that are not multiplied by the coverage; 0 where that is."""
@@ -126,9 +147,6 @@ class StackImages:
             return pixels
         share = self.header.seen[..., None]
         return np.divide(pixels, share, out=np.zeros_like(pixels), where=share > 1e-3)
-
-    def _matte(self) -> Band:
-        return resized_rows(self.header.seen, self.size_px)
 
 
 def face_in_stack(item: Item, header: StackHeader, model: MorphableModel) -> tuple[FaceFit, np.ndarray]:

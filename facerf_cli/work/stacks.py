@@ -23,11 +23,12 @@ from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
-from facerf_cli.image.strips import filled, resized
+from facerf_cli.image.strips import resized
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.pipeline import FittedPerson, predict_olat, reflectance_of
+from facerf_cli.person import Target, person_of
+from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.relighting.composition import Target
+from facerf_cli.relighting.subject import Request
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
@@ -120,30 +121,28 @@ def _of_person(
     )
     memory = prediction_bytes()
     with naming(item.input_path):
-        field = reflectance_of(
-            models, head, "portrait", work.network_alone, memory, photo, matte=matte, white=work.white
+        person = person_of(
+            models, photo, head, "portrait", work.network_alone, matte, work.white, memory_bytes=memory
         )
-    composition = FittedPerson(models, photo, head, field).composed(Target(alpha=alpha, background="none"))
-    size = composition.size_px
+    subject = person.composed(Target(alpha=alpha, background="none"))
 
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
-            relit = composition.relit(Lights.each(some))
-            layers = {str(number): composition.light_layer(one) for number, one in enumerate(relit)}
-            images = np.stack(list(filled(layers, *size).values()))
+            lights = {str(number): one for number, one in enumerate(subject.relit(Lights.each(some)))}
+            images = np.stack(list(subject.rendered(Request(lights=lights)).values()))
             batch = torch.from_numpy(images).permute(0, 3, 1, 2)
             scale = _tile_px(len(directions)) / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
             tiles.append(small.permute(0, 2, 3, 1).numpy())
             yield batch
 
-    first = next(composition.relit(Lights.each(directions[:1])))
-    normals = filled(composition.layers(("normal",), first), *size)["normal"]
+    first = next(subject.relit(Lights.each(directions[:1])))
+    normals = subject.rendered(Request(first, layers=("normal",)))["normal"]
     header = StackHeader(
         kind="photo",
         rotation=head.fit.rotation.numpy(),
         source=photo,
-        seen=composition.matte,
+        seen=subject.matte,
         normals=normals,
         fit=fit_to_arrays(head.fit),
         **_about(item, directions, work),

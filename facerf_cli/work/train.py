@@ -61,7 +61,7 @@ from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettin
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
-from facerf_cli.training.settings import TrainSettings
+from facerf_cli.training.settings import Stage, TrainSettings
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
 from facerf_cli.work.train_cost import say_cost
 from facerf_cli.work.train_networks import TINY_LIGHTS, StageNetworks
@@ -93,7 +93,7 @@ def run_training(options: TrainOptions) -> None:
             if first and not options.resume:
                 refuse_another_run(options.output)  # before hours of baking
             stage = _TrainedStage(options, StageNetworks(options, trained), networks)
-            objective: Objective = getattr(stage, options.stage.replace("-", "_"))()
+            objective = _OBJECTIVES[options.stage](stage)
         if first and not (options.resume and (options.output / CONFIG).exists()):
             write_config(options.output, options.typed, training, options.settings.seed)
         progress = TrainProgress(training, options.settings, first)
@@ -303,6 +303,18 @@ class _TrainedStage:
             "heads": f"{found} synthetic heads drawn from {drawn.credit}",
             "licence": f"MIT; the heads' shapes: {drawn.licence}",
         }
+
+
+_OBJECTIVES: dict[Stage, Callable[[_TrainedStage], Objective]] = {
+    "reflectance": _TrainedStage.reflectance,
+    "geometry": _TrainedStage.geometry,
+    "joint": _TrainedStage.joint,
+    "light-features": _TrainedStage.light_features,
+    "appearance-features": _TrainedStage.appearance_features,
+    "diffuse-sh": _TrainedStage.diffuse_sh,
+    "parsing": _TrainedStage.parsing,
+    "portrait": _TrainedStage.portrait,
+}
 
 
 def _cache_of(photos: Path, output: Path) -> Path:

@@ -18,10 +18,10 @@ from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, stream_
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.pipeline import FittedPerson, reflectance_of
+from facerf_cli.person import person_of
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.people import People
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
@@ -86,13 +86,10 @@ def of_photo(
     white: White | None = None,
 ) -> tuple[Basis, Plate]:
     """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
-    field = reflectance_of(models, head, "portrait", photo=photo, matte=matte, white=white)
-    assert isinstance(field, PortraitField)
-    composition = FittedPerson(models, photo, head, field).composed()
-    basis = basis_of_photo(models, photo, head, field, composition)
-    matte = composition.matte
-    background = photo - matte[..., None] * composition.own[:]
-    return basis, Plate(photo, matte, background, composition.even)
+    person = person_of(models, photo, head, matte=matte, white=white)
+    people = People([person.in_photo()])
+    basis = basis_of_photo(person, people)
+    return basis, Plate(photo, people.matte, photo - people.own_layer(), person.even_brightness)
 
 
 def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import re
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +14,12 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import read_olat_header, write_olat_stack
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.option import attributes_of
-from facerf_cli.relighting.composition import Composition, Relit
+from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.people import People
+from facerf_cli.relighting.subject import Subject
 from facerf_cli.synth.sky.skies import kind_of
 from facerf_cli.work.relight_options import Relight, parse_aov
 from tests.astronaut import PATH as PHOTO
@@ -77,7 +79,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
 def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("facerf_cli.work.plan._RELIT_HELD", 1 << 30)  # so that one frame fits
+    monkeypatch.setattr("facerf_cli.run.memory._RELIT_HELD", 1 << 30)  # so that one frame fits
     line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
     assert relight(given, tmp_path, *line) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
@@ -95,17 +97,18 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
     composite: str, lights: list[str], kept: int, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held: list[weakref.ref] = []
+    subject: Any = People if composite == "photo" else FaceAlone
 
-    def watched(self: Composition, lights: Lights) -> Iterator[Relit]:
+    def watched(self: Subject, lights: Any) -> Iterator[Any]:
         assert sum(one() is not None for one in held) <= kept
         for one in relit(self, lights):
-            held.append(weakref.ref(one.texture))
+            held.append(weakref.ref((one if composite == "face" else one[0]).texture))
             yield one
 
-    relit = Composition.relit
+    relit = subject.relit
 
-    monkeypatch.setattr("facerf_cli.work.plan._RELIT_HELD", 1 << 30)  # so that one light fits
-    monkeypatch.setattr(Composition, "relit", watched)
+    monkeypatch.setattr("facerf_cli.run.memory._RELIT_HELD", 1 << 30)  # so that one light fits
+    monkeypatch.setattr(subject, "relit", watched)
     assert relight(given, tmp_path, *lights, "--composite", composite) == 0
     assert len(held) > 2
 

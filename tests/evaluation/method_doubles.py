@@ -18,10 +18,9 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.pipeline import FittedPerson
+from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face
 from facerf_cli.raster.camera import Camera, project
-from facerf_cli.relighting.composition import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
 LIGHTS = torch.eye(3)
@@ -79,7 +78,7 @@ class Double(Method):
         reflectance = Unlit(head.face, self.gain)
         for row in lights.weights:
             light = RigLight(lights.directions, row)
-            yield FittedPerson(self.models, photo, head, reflectance).image(light, target).pixels
+            yield Person(self.models, photo, head, reflectance).image(light, target).pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ class Lambert:
         assert head.face.texture.shape == (3, 256, 256)
         for row in lights.weights:
             light = RigLight(lights.directions, row)
-            yield FittedPerson(self.models, photo, head, self).image(light, target).pixels
+            yield Person(self.models, photo, head, self).image(light, target).pixels
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         cosines = torch.einsum("mlc,l->mc", weights, directions[:, 2].clamp_min(0))

@@ -13,7 +13,6 @@ import pytest
 import torch
 from PIL import Image
 
-from facerf_cli import pipeline
 from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people, yale_b
@@ -31,7 +30,8 @@ from facerf_cli.evaluation.yale_b import (
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.pipeline import FittedPerson, fit_photo, head_of, reflectance_of
+from facerf_cli.person import Person
+from facerf_cli.pipeline import fit_photo, head_of, reflectance_of
 from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
@@ -152,9 +152,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
     monkeypatch.setattr(yale_b, "_CORE", (Flash(0, 0), Flash(-70, 0)))
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
-    monkeypatch.setattr(
-        pipeline.FittedPerson, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32))
-    )
+    monkeypatch.setattr(Person, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32)))
     monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
@@ -204,7 +202,7 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
     subject = YaleSubject(small, "yaleB07")
     photo = np.repeat(subject.image("win_left")[..., None], 3, -1)
     head = fit_photo(models, photo, someone().landmarks_px)
-    person = FittedPerson(models, photo, head, reflectance_of(models, head, "diffuse-sh"))
+    person = Person(models, photo, head, reflectance_of(models, head, "diffuse-sh"))
     directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()
     one = Relighting("environment", "win_left", "env_two_side")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from facerf_cli.errors import InputError
-from facerf_cli.image.strips import whole
 from facerf_cli.light.envmap import (
+    Backdrop,
     Sampling,
-    backdrop,
     ball,
     check_envmap,
     envmap_weights,
@@ -240,7 +239,7 @@ def test_directions_that_no_rig_surrounds_go_to_the_nearest_light(lights: list[l
 
 def seen(envmap: torch.Tensor, rotate_deg: float = 0.0, blur: float = 0.0) -> np.ndarray:
     camera = Camera(60.0, 60, 40, 30.0, 20.0)
-    return whole(backdrop(envmap, (40, 60), partial(rays_of_rows, camera), rotate_deg, blur), 40, 60)
+    return Backdrop(envmap, (40, 60), partial(rays_of_rows, camera), rotate_deg, blur)[0:40]
 
 
 def dot(direction: tuple[float, float, float]) -> torch.Tensor:
@@ -291,5 +290,5 @@ def test_rays_of_rows_are_those_of_the_whole_image() -> None:
 def test_rows_of_a_background_are_those_of_the_whole() -> None:
     camera = Camera(60.0, 60, 40, 30.0, 20.0)
     for blur in (0.0, 0.02, 0.1):
-        rows = backdrop(dot((0.0, 0.0, -1.0)), (40, 60), partial(rays_of_rows, camera), blur=blur)
-        np.testing.assert_allclose(rows(slice(8, 21)), whole(rows, 40, 60)[8:21], rtol=1e-6)
+        rows = Backdrop(dot((0.0, 0.0, -1.0)), (40, 60), partial(rays_of_rows, camera), blur=blur)
+        np.testing.assert_allclose(rows[8:21], rows[0:40][8:21], rtol=1e-6)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.image.strips import filled
+from facerf_cli.image.strips import in_strips
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait import segment as module
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
@@ -68,7 +68,7 @@ def test_layers_lie_where_the_network_saw_them(squares: list[Square], people: Pe
     assert found.matte.shape == (HEIGHT, WIDTH)
     assert found.layer("hair")[45, 160] > 0.9 and found.layer("skin")[85, 160] > 0.9
     assert found.layer("garment")[200, 160] > 0.9 and found.matte[200, 230] < 0.1
-    layers = filled(found.layers(), *found.matte.shape)
+    layers = in_strips(found.layers, *found.matte.shape)
     total = sum(layers[f"class.{name}"] for name in CLASSES[1:])
     assert np.abs(total - found.matte).max() < 1e-5
 
@@ -80,7 +80,7 @@ def test_a_given_matte_is_the_persons_and_its_classes_are_completed(
     matte[20:220, 70:250] = 0.5
     found = segment(people, photo(), FACE, matte)
     assert found.matte is matte
-    layers = filled(found.layers(), *matte.shape)
+    layers = in_strips(found.layers, *matte.shape)
     assert np.abs(sum(layers[f"class.{name}"] for name in CLASSES[1:]) - matte).max() < 1e-5
     seen, completed = layers["class.garment"][200, 160], layers["class.garment"][200, 80]
     assert seen == pytest.approx(0.5, abs=0.02) and completed == pytest.approx(0.5, abs=0.02)

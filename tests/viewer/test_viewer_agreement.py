@@ -8,6 +8,7 @@ import shlex
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,15 +24,16 @@ from facerf_cli.image.colour import (
     linear_to_srgb,
     most_exposure_ev,
 )
-from facerf_cli.image.strips import resized, whole
+from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.main import main
-from facerf_cli.pipeline import FittedPerson, find_for, head_of, reflectance_of
-from facerf_cli.relighting.composition import Composition, Relit
+from facerf_cli.person import Person
+from facerf_cli.pipeline import find_for, head_of, reflectance_of
 from facerf_cli.relighting.models import load_models
+from facerf_cli.relighting.people import People
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
@@ -50,26 +52,26 @@ MEAN_BETWEEN, PERCENTILE_95 = 3.0, 10.0  # between its lights
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    whole: Composition
+    whole: People
     text: str
 
-    def relit(self, directions: torch.Tensor, weights: torch.Tensor, room: float = 0.06) -> Relit:
+    def relit(self, directions: torch.Tensor, weights: torch.Tensor, room: float = 0.06) -> Any:
         """Under lights and what a room sends of them."""
         around, shares = far_samples(StudioLight())
         sent = room * shares[:, None] * weights.sum(0)
         lights = Lights(torch.cat([directions, around]), torch.cat([weights, sent])[None])
         return next(self.whole.relit(lights))
 
-    def truth(self, relit: Relit, ev: float) -> np.ndarray:
+    def truth(self, relit: Any, ev: float) -> np.ndarray:
         """The PNG of `facerf relight` [H, W, 3]."""
         gain = np.float32(2.0**ev)
         added = None
-        if relit.own is not None:
-            added = gain * whole(self.whole.light_layer(replace(relit, own=None)), *self.whole.size_px)
+        if relit[0].own is not None:
+            added = gain * self.whole.light_layer([replace(relit[0], own=None)])
         exposed = gain * self.whole.image(relit, ev).pixels
         return np.round(255 * encode_display(exposed, SOFT_VIEW, self.whole.matte, added))
 
-    def errors(self, found: np.ndarray, relit: Relit, ev: float) -> np.ndarray:
+    def errors(self, found: np.ndarray, relit: Any, ev: float) -> np.ndarray:
         """Of all values of the person."""
         return np.asarray(np.abs(self.truth(relit, ev) - found[..., :3])[self.whole.matte > 0.5])
 
@@ -86,7 +88,7 @@ def shown() -> Shown:
     assert isinstance(field, PortraitField)
     sun = [one for one in page_maps() if one.name == "sun"]
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), sun)
-    whole = FittedPerson(models, photo, head, field).composed()
+    whole = People([Person(models, photo, head, field).in_photo()])
     return Shown(whole, page("me.jpg", ["me.jpg"], document, ""))
 
 
@@ -137,7 +139,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Drawn]:
     return dict(zip(addresses, found, strict=True))
 
 
-def assert_agrees(found: np.ndarray, relit: Relit, ev: float) -> None:
+def assert_agrees(found: np.ndarray, relit: Any, ev: float) -> None:
     error = shown().errors(found, relit, ev)
     assert (shown().whole.matte > 0.5).mean() > 0.2
     assert error.mean() < MEAN and np.percentile(error, 99) <= PERCENTILE_99

@@ -9,8 +9,7 @@ import torch
 
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
-from facerf_cli.image.strips import filled, whole
-from facerf_cli.relighting.composition import Relit
+from facerf_cli.relighting.subject import Relit, Request
 from facerf_cli.work.stack_composers import StackImages
 
 SIDE = 4
@@ -37,24 +36,24 @@ def lit(radiance: float) -> Relit:
 
 
 def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
-    image = filled(StackImages(header(), Path(), header().seen).bands(lit(0.6), 0.0, None), SIDE, SIDE)
-    assert image["A"].mean() == 0.5
-    np.testing.assert_allclose(image["rgb"][:, :2], 0.6, rtol=1e-6)
+    image = StackImages(header(), Path(), header().seen).image(lit(0.6))
+    assert image.alpha is not None and image.alpha.mean() == 0.5
+    np.testing.assert_allclose(image.pixels[:, :2], 0.6, rtol=1e-6)
 
 
 def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_its_detail() -> None:
     photo = np.full((8, 8, 3), 0.2, np.float32)
     photo[0, 0] = 0.4  # a detail
-    image = filled(StackImages(header(), Path(), header().seen, photo).bands(lit(0.6), 1.0, None), 8, 8)
-    assert set(image) == {"rgb"}
-    assert image["rgb"][4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
-    assert image["rgb"][0, 0, 0] == pytest.approx(1.2, rel=2e-3)
-    np.testing.assert_allclose(image["rgb"][:, -1], photo[:, -1] / 2)  # the background, as it was at 1 EV
+    image = StackImages(header(), Path(), header().seen, photo).image(lit(0.6), 1.0)
+    assert image.alpha is None
+    assert image.pixels[4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
+    assert image.pixels[0, 0, 0] == pytest.approx(1.2, rel=2e-3)
+    np.testing.assert_allclose(image.pixels[:, -1], photo[:, -1] / 2)  # the background, as it was at 1 EV
 
 
 def test_layers_of_lights_add_up() -> None:
     composer = StackImages(header(), Path(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
-    one, other, both = (whole(composer.light_layer(lit(radiance)), 8, 8) for radiance in (0.2, 0.4, 0.6))
+    one, other, both = (composer.light_layer(lit(radiance)) for radiance in (0.2, 0.4, 0.6))
     np.testing.assert_allclose(one + other, both, rtol=1e-5)
 
 
@@ -63,20 +62,21 @@ def test_a_large_photo_is_composed_in_rows() -> None:
     photo = np.full((2048, 512, 3), 0.2, np.float32)
     composer = StackImages(header(), Path(), header().seen, photo)
     behind = np.full((2048, 512, 3), 3.0, np.float32)
-    for given in (None, behind.__getitem__):
-        image = composer.bands(lit(0.6), 1.0, given)["rgb"]
+    for given in (None, behind):
+        request = Request(lit(0.6), ev=1.0, background=given)
+        ready, whole = request.ready(composer), composer.rendered(request)["rgb"]
         tracemalloc.start()
-        middle = image(slice(1000, 1010))
+        middle = composer.render(ready, slice(1000, 1010))["rgb"]
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert middle.shape == (10, 512, 3) and peak < photo.nbytes / 10
-        np.testing.assert_allclose(middle, whole(image, 2048, 512)[1000:1010], rtol=1e-6)
-    np.testing.assert_allclose(whole(image, 2048, 512)[:, -1], 3.0)
+        np.testing.assert_allclose(middle, whole[1000:1010], rtol=1e-6)
+    np.testing.assert_allclose(whole[:, -1], 3.0)
 
 
 def test_exposure_and_layers() -> None:
     composer = StackImages(header(), Path(), header().seen)
     assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
-    assert set(composer.layers(("normal",), lit(1.0))) == {"person.A", "normal"}
+    assert set(composer.rendered(Request(lit(1.0), layers=("normal",)))) == {"rgb", "normal"}
     with pytest.raises(UsageError, match="--aov albedo"):
-        composer.layers(("albedo",), lit(1.0))
+        composer.rendered(Request(lit(1.0), layers=("albedo",)))

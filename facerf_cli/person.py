@@ -1,23 +1,22 @@
-"""A person of the Python API: fitted once, then relit at what the light costs."""
+"""The way of a photo: `fit` a person once, then relight it at what a light costs (docs/python.md)."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, overload
 
 import numpy as np
 import torch
-import trimesh
 from PIL import Image
 from torch import Tensor
-from trimesh.visual import TextureVisuals
 
 from facerf_cli import pipeline
-from facerf_cli.api.light import Array, Light, as_light, as_tensor, directions_of, linear_pixels, sums_of
 from facerf_cli.baselines import RelightKind
+from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.fit import fit_from_arrays, fit_to_arrays
+from facerf_cli.face.crop import check_in_photo, check_landmarks
+from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays, fit_to_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import floats, read_npz
@@ -25,22 +24,135 @@ from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import require_regular
-from facerf_cli.image.strips import covering, filled, whole
-from facerf_cli.light.envmap import backdrop, check_envmap
-from facerf_cli.light.sphere import rig_directions
+from facerf_cli.image.strips import covering, in_strips
+from facerf_cli.light.envmap import Backdrop, check_envmap
+from facerf_cli.light.light import Array, Light, as_light, as_tensor, directions_of, linear_pixels, sums_of
+from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.portrait.find import FaceBox, face_at
+from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
 from facerf_cli.relighting import White
-from facerf_cli.relighting.composition import FACE_LAYERS, PERSON_LAYERS, Composition, Relit, Target
-from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
+from facerf_cli.relighting.face_in_photo import FaceInPhoto
+from facerf_cli.relighting.field import MEMORY_BYTES, Field
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
-from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.work.plan import batches
+from facerf_cli.relighting.people import Background as Behind
+from facerf_cli.relighting.people import People
+from facerf_cli.relighting.person_in_photo import PERSON_LAYERS, PersonInPhoto
+from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame
+from facerf_cli.relighting.subject import RelitImage, Request, Subject
+from facerf_cli.relighting.white import Balance
+from facerf_cli.run.memory import batches
+
+if TYPE_CHECKING:
+    import trimesh
 
 Pose = tuple[float, float, float] | Tensor  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"] | Array | tuple[float, float, float]
 _LIGHTS_AT_ONCE = 8
+
+
+@overload
+def fit(models: Models, photo: Array, *choices: Any, **more: Any) -> "Person": ...
+@overload
+def fit(models: Models, photo: Sequence[Array], *choices: Any, **more: Any) -> "list[Person]": ...
+def fit(
+    models: Models,
+    photo: Array | Sequence[Array],
+    landmarks_px: Any = None,
+    geometry: Geometry | None = None,
+    reflectance: RelightKind = "portrait",
+    network_alone: bool = False,
+    matte: Any = None,
+    texture_side: int | None = None,
+    white: White | None = "photo",
+    face: FaceBox | None = None,
+) -> "Person | list[Person]":
+    """Fit a person of a photo, by default that with the largest face, once for all lights.
+
+    Args:
+        models: The networks and the face model, from `load_models`.
+        photo: Scene-linear [H, W, 3]; a list of photos gives a list of people.
+        landmarks_px: The face's 68 landmarks [68, 2] in the photo's pixels, in place of the detector's.
+        geometry: "landmarks", or "network": the Geometry Network regresses the head, without landmarks; by
+            default as the networks were trained.
+        reflectance: "portrait" relights the whole person, "field" the face and what is around it by the
+            face's light; "diffuse-sh", "specular-sh", "prt" are the paper's baselines.
+        network_alone: Leave out the correction by which the photo's own light gives the photo back.
+        matte: The person's share [H, W] of the photo, in place of the networks'.
+        texture_side: Side of the face's texture in texels; by default that of the networks' training.
+        white: Under even white light skin has the colours of the photo; or, of a photo in coloured light, the
+            "scene", those without that light; None: those of the networks.
+        face: The face, found in the photo before, in place of the largest one.
+
+    Of a list of photos landmarks and mattes are lists, too. Raises InputError where no face is found or the
+    fit fails.
+    """
+    one_of(RelightKind, "reflectance", reflectance)
+    if white is not None:
+        one_of(White, "white", white)
+    if geometry is not None:
+        one_of(Geometry, "geometry", geometry)
+    if texture_side is not None and not 16 <= texture_side <= LARGEST_TEXTURE:
+        raise ValueError(f"texture_side is {texture_side}, not 16 to {LARGEST_TEXTURE}")
+    if network_alone and reflectance not in ("field", "portrait"):
+        raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
+    if landmarks_px is not None and geometry == "network":
+        raise UsageError("geometry: 'network' uses no landmarks; leave one out")
+
+    def fitted(name: str, photo: Array, landmarks_px: Any, matte: Any) -> "Person":
+        pixels = linear_pixels(name, photo).detach().clone().numpy()
+        found = face
+        if landmarks_px is not None:
+            found = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
+        elif found is None:
+            chosen = geometry or models.default_geometry
+            found = pipeline.find_for(models.networks.people, chosen, pixels, name)[0]
+        if matte is not None:
+            matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
+            if matte.shape != pixels.shape[:2]:
+                raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
+        head = pipeline.head_of(models, pixels, found, models.sides(texture_side), matte)
+        person = person_of(models, pixels, head, reflectance, network_alone, matte, white)
+        return replace(person, tensors=isinstance(photo, Tensor))
+
+    if not isinstance(photo, Sequence):
+        return fitted("photo", photo, landmarks_px, matte)
+    more = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte))
+    return [fitted(f"photo {number}", *one) for number, one in enumerate(zip(photo, *more, strict=True))]
+
+
+@torch.no_grad()
+def person_of(
+    models: Models,
+    photo: np.ndarray | None,
+    head: Head,
+    kind: RelightKind = "portrait",
+    network_alone: bool = False,
+    matte: np.ndarray | None = None,
+    white: White | None = None,
+    steady: SteadyFrame | None = None,
+    memory_bytes: int = MEMORY_BYTES,
+) -> "Person":
+    """Read the reflectance of a fitted head.
+
+    Args:
+        models: The networks and the face model.
+        photo: Scene-linear [H, W, 3].
+        head: The head in it.
+        kind: The reflectance to read.
+        network_alone: Leave out the correction by the photo.
+        matte: The person's share [H, W] of the photo, if it is given.
+        white: Whose colours skin has under even white light; None: those of the networks.
+        steady: What is steadied by the frames around it, of a frame of a shot.
+        memory_bytes: Memory that a prediction may take.
+    """
+    found = pipeline.reflectance_of(
+        models, head, kind, network_alone, memory_bytes, photo, steady, matte, white
+    )
+    return Person(models, photo, head, found, matte, kind, network_alone, white=white)
 
 
 class PhotoCamera(NamedTuple):
@@ -55,16 +167,50 @@ class PhotoCamera(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Person(pipeline.FittedPerson):
-    """One person of a photo, as `facerf.fit` gives it; each light then costs what a light costs.
+class Target:
+    """The pose and the surroundings in which a relit head is shown.
 
-    Of a photo that was given as a tensor all arrays are tensors on the device of the models.
+    `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its
+    person relit, or the rendered face alone. A `matte` [H, W] in 0..1 says what is relit, by default all;
+    it is multiplied by the `alpha` [H, W] of the photo itself. Behind it stays the photo, or nothing, or
+    what is given with each light.
     """
 
+    fit: FaceFit | None = None
+    composite: Literal["photo", "face"] = "photo"
+    matte: np.ndarray | None = None
+    alpha: np.ndarray | None = None
+    background: Behind = "photo"
+
+
+AS_IN_PHOTO = Target()
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """One person of a photo, as `fit` gives it; each light then costs what a light costs.
+
+    Attributes:
+        models: The networks and the face model.
+        photo: Scene-linear [H, W, 3]; None: the face alone, in the frame of its crop.
+        head: The fitted face model, and the face's texture.
+        reflectance: The person under any lights.
+        given_matte: Share [H, W] of the photo, if it was given.
+        kind: Which reflectance it is.
+        network_alone: The networks' prediction without the photo's correction.
+        tensors: True of a photo that was given as a tensor: all arrays are tensors on the models' device.
+        white: Whose colours skin has under even white light.
+    """
+
+    models: Models
+    photo: np.ndarray | None
+    head: Head
+    reflectance: Reflectance
+    given_matte: np.ndarray | None = None
     kind: RelightKind = "portrait"
     network_alone: bool = False
     tensors: bool = False
-    white: White = "photo"
+    white: White | None = "photo"
 
     def __repr__(self) -> str:
         """A line for a notebook."""
@@ -97,13 +243,19 @@ class Person(pipeline.FittedPerson):
         lights = [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
         given = [pose, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
         with self._gradients(*given):
-            is_whole = not (alone or pose is not None) and self.kind in ("portrait", "field")
+            in_photo = not (alone or pose is not None)
+            known = [*FACE_LAYERS, *(PERSON_LAYERS if in_photo and self.kind == "portrait" else ())]
+            if isinstance(layers, str) or not set(layers) <= set(known):
+                raise ValueError(
+                    f"layers is {layers!r}, not a list of some of {', '.join(dict.fromkeys(known))}"
+                )
+            is_whole = in_photo and self.kind in ("portrait", "field")
             if not is_whole and any(one.own_rgb is not None for one in lights):
                 raise UsageError("Light.own(): is of the whole photo; leave out pose, alone and baselines")
-            if alone or pose is not None:
-                shown = self._faces(lights, pose, layers)
-            else:
+            if in_photo:
                 shown = self._photos(lights, background, layers)
+            else:
+                shown = self._faces(lights, pose, layers)
             images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
         found = images if layers else [one["image"] for one in images]
         return found if isinstance(light, Sequence) else found[0]
@@ -113,10 +265,9 @@ class Person(pipeline.FittedPerson):
 
         `lights` are unit directions [L, 3], or the size of a uniform rig, `facerf.rig(lights)`.
         """
-        layer, size = self._composition.light_layer, self._composition.size_px
+        people = self._people
         found = [
-            whole(layer(relit), *size)
-            for relit in _one_by_one(self._composition, Lights.each(directions_of(lights)))
+            people.light_layer(relit) for relit in _one_by_one(people, Lights.each(directions_of(lights)))
         ]
         return self._out(np.stack(found), lights)
 
@@ -153,13 +304,61 @@ class Person(pipeline.FittedPerson):
         linear, camera = linear_pixels("map", envmap).detach(), self._photo_camera
         check_envmap(linear)
         size = camera.height_px, camera.width_px
-        seen = backdrop(linear, size, partial(rays_of_rows, camera), rotate_deg, blur)
-        return self._out(whole(seen, *size), envmap)
+        seen = Backdrop(linear, size, partial(rays_of_rows, camera), rotate_deg, blur)
+        return self._out(seen[0 : size[0]], envmap)
+
+    @cached_property
+    def segmentation(self) -> Segmentation:
+        """Classes and matte of the person in the photo."""
+        assert self.photo is not None
+        if isinstance(self.reflectance, PortraitField):
+            return self.reflectance.person.segmentation
+        landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
+        people, matte, others = self.models.networks.people, self.given_matte, self.head.others
+        return segment(people, to_display(self.photo), landmarks_px, matte, others)
+
+    @property
+    def share(self) -> np.ndarray:
+        """The person's share [H, W] of the photo."""
+        return self.segmentation.matte if self.given_matte is None else self.given_matte
+
+    def composed(self, target: Target = AS_IN_PHOTO) -> Subject:
+        """Prepare images of the person in a pose, before a background, that differ by their light alone."""
+        if self.photo is None or target.composite == "face":
+            photo_px = None if self.photo is None else (self.photo.shape[0], self.photo.shape[1])
+            return FaceAlone(self.models.face, self.head, self.reflectance, target.fit, photo_px)
+        return People([self.in_photo(target)], target.background)
+
+    def in_photo(self, target: Target = AS_IN_PHOTO) -> PersonInPhoto | FaceInPhoto:
+        """Prepare the person in its photo; the target's matte says which part of it changes."""
+        assert self.photo is not None
+        matte = self.share
+        for part in (target.matte, target.alpha):
+            matte = matte if part is None else (matte * part).astype(np.float32, copy=False)
+        if isinstance(self.reflectance, PortraitField):
+            return PersonInPhoto(self.models.face, self.photo, self.head, self.reflectance, matte)
+        return FaceInPhoto(self.models.face, self.photo, self.head, self.reflectance, matte)
+
+    def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:
+        """The person under one light (paper, 'Relighting')."""
+        subject = self.composed(target)
+        return subject.image(next(subject.relit(Lights.of_rig(light))))
 
     @property
     def even(self) -> Light:
         """Even light from all around, under which the skin is as bright as in the photo."""
-        return self._composition.even * Light.around()
+        return self.even_brightness * Light.around()
+
+    @property
+    def even_brightness(self) -> float:
+        """Brightness of even light, from all around, under which the skin is as bright as in the photo."""
+        return 1.0 if self.balance is None else self.balance.even
+
+    @property
+    def balance(self) -> Balance | None:
+        """The balance of the person's white; the paper's baselines have none."""
+        reflectance = self.reflectance
+        return reflectance.balance if isinstance(reflectance, Field | PortraitField) else None
 
     @cached_property
     def light(self) -> Light:
@@ -174,7 +373,7 @@ class Person(pipeline.FittedPerson):
     @cached_property
     def classes(self) -> dict[str, Array]:
         """Share [H, W] of each class of the person (hair, skin, ...), which sum to the matte."""
-        layers = filled(self.segmentation.layers(), *self.share.shape)
+        layers = in_strips(self.segmentation.layers, *self.share.shape)
         return {name: self._out(layers[f"class.{name}"]) for name in CLASSES[1:]}
 
     @cached_property
@@ -206,12 +405,14 @@ class Person(pipeline.FittedPerson):
         return PhotoCamera(self._out(matrix), self._out(self.head.fit.head_to_camera))
 
     @property
-    def mesh(self) -> trimesh.Trimesh:
+    def mesh(self) -> "trimesh.Trimesh":
         """The fitted face with its texture, head frame, m: `.vertices` [V, 3], `.faces`, `.export(path)`."""
+        import trimesh  # takes as long as the rest of a relight's imports
+
         fit, (u, v) = self.head.fit, grid_uv().numpy().T
         texture = Image.fromarray(to_display(_by_pixel(self.head.face.texture).detach().numpy()))
         vertices = self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy()
-        visual = TextureVisuals(np.stack([u, 1 - v], -1), image=texture)
+        visual = trimesh.visual.TextureVisuals(np.stack([u, 1 - v], -1), image=texture)
         return trimesh.Trimesh(vertices, grid_triangles().numpy(), visual=visual, process=False)
 
     @property
@@ -243,7 +444,11 @@ class Person(pipeline.FittedPerson):
         arrays: dict[str, Any] = {"photo": self.photo, "cropped": self.head.cropped, "kind": self.kind}
         maps = {name: getattr(self.head.face, name) for name in FaceTexture.__dataclass_fields__}
         arrays |= {name: tensor.detach().numpy() for name, tensor in maps.items()}
-        arrays |= {"network_alone": self.network_alone, "white": self.white, **fit_to_arrays(self.head.fit)}
+        arrays |= {
+            "network_alone": self.network_alone,
+            "white": self.white or "",
+            **fit_to_arrays(self.head.fit),
+        }
         arrays |= {} if self.given_matte is None else {"matte": self.given_matte}
         with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -266,79 +471,71 @@ class Person(pipeline.FittedPerson):
             fit.vertices_camera(models.face)
             one_of(RelightKind, "kind", kind := str(arrays["kind"]))
             alone = bool(arrays["network_alone"])
-            one_of(White, "white", white := str(arrays.get("white", "photo")))
+            white = str(arrays.get("white", "photo")) or None
+            if white is not None:
+                one_of(White, "white", white)
         except (ValueError, TypeError, LookupError, OverflowError) as error:
             said = f"{path}: not a person that facerf wrote ({error}); fit the photo again"
             raise InputError(said) from None
         head = Head(cropped, fit, face)
-        return read_person(models, photo, head, kind, alone, matte, white=white)  # type: ignore[arg-type]
+        return person_of(models, photo, head, kind, alone, matte, white)  # type: ignore[arg-type]
 
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
     ) -> Iterator[Any]:
         """The photo under each light, as dicts of arrays; gradients reach the weights alone."""
-        composition, behind = self._composition, None
+        people, behind = self._people, None
         if not isinstance(background, str):
             pixels = np.array(background)[None, None] if isinstance(background, tuple) else background
-            linear = linear_pixels("background", pixels).detach().numpy()
-            behind = covering(linear, *composition.size_px).__getitem__
+            behind = covering(linear_pixels("background", pixels).detach().numpy(), *people.size_px)
         else:
             one_of(Literal["photo", "none"], "background", background)
-        cut_out = isinstance(background, str) and background == "none"
-        layer_of = composition.cut_out if cut_out else composition.light_layer
-        for part in batches(len(lights), composition.nbytes):
+        if straight := isinstance(background, str) and background == "none":
+            people = replace(people, background="none")
+        for part in batches(len(lights), people.nbytes):
             some = sums_of(lights[part])
             if some.directions.requires_grad:
                 raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
             with torch.no_grad():
-                relit = list(composition.relit(some))
+                relit = list(people.relit(some))
             each = Lights.each(some.directions, some.keys)
             for weights, own, one in zip(some.weights, some.owns, relit, strict=True):
-                bands = {"rgb": layer_of(one)} if cut_out else composition.bands(one, behind=behind)
-                arrays = self._with_layers(composition, one, layers, bands)
+                arrays = people.rendered(Request(one, layers=layers, background=behind))
                 image = torch.from_numpy(arrays.pop("rgb"))
                 if weights.requires_grad:
-                    image = _OfWeights.apply(weights, each, composition, layer_of, image)  # type: ignore[no-untyped-call]
+                    image = _OfWeights.apply(weights, each, people, image)  # type: ignore[no-untyped-call]
                 if own is not None and own.requires_grad:
-                    layer = torch.from_numpy(whole(composition.own_layer(cut_out), *composition.size_px))
-                    image = image + (own - own.detach()) * layer
-                if cut_out:
-                    image = torch.cat([image, torch.from_numpy(composition.matte)[..., None]], -1)
+                    layer = people.people[0].own[:] if straight else people.own_layer()
+                    image = image + (own - own.detach()) * torch.from_numpy(layer)
+                if straight:
+                    image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
                 yield {"image": image, **arrays}
 
     def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
         """The face alone under each light; gradients reach all that it is made of."""
         fit = self.head.fit
         posed = None if pose is None else replace(fit, rotation=_rotation(pose))
-        composition = self.composed(Target(posed, "face"))
-        view = composition.view
-        for part in batches(len(lights), composition.nbytes):
-            for one in composition.relit(sums_of(lights[part])):
-                image = torch.zeros(view.height_px, view.width_px, 4)
+        face = self.composed(Target(posed, "face"))
+        assert isinstance(face, FaceAlone)
+        view = face.view
+        for part in batches(len(lights), face.nbytes):
+            for one in face.relit(sums_of(lights[part])):
+                image = torch.zeros(*face.size_px, 4)
                 image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
-                yield {"image": image, **self._with_layers(composition, one, layers, {})}
-
-    @staticmethod
-    def _with_layers(
-        composition: Composition, relit: Relit, layers: Sequence[str], bands: dict[str, Any]
-    ) -> dict[str, Any]:
-        known = dict.fromkeys([*FACE_LAYERS, *(PERSON_LAYERS if composition.person else ())])
-        if isinstance(layers, str) or not set(layers) <= set(known):
-            raise ValueError(f"layers is {layers!r}, not a list of some of {', '.join(known)}")
-        wanted = composition.layers(layers, relit) if layers else {}
-        return filled({**bands, **wanted}, *composition.size_px)
+                arrays = face.rendered(Request(one, layers=layers))
+                yield {**arrays, "image": image}
 
     @cached_property
-    def _composition(self) -> Composition:
+    def _people(self) -> People:
         """The person in the photo, with all that does not depend on the light."""
         with torch.no_grad():
-            return self.composed()
+            return People([self.in_photo()])
 
     def _layer(self, name: str) -> Any:
         if name == "albedo" and self.kind != "portrait":
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
-        relit = next(_one_by_one(self._composition, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
-        return self._out(self._with_layers(self._composition, relit, [name], {})[name])
+        relit = next(_one_by_one(self._people, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
+        return self._out(self._people.rendered(Request(relit, layers=[name]))[name])
 
     @property
     def _photo_camera(self) -> Camera:
@@ -358,54 +555,31 @@ class Person(pipeline.FittedPerson):
         return values.detach().numpy() if isinstance(values, Tensor) else values
 
 
-def _one_by_one(composition: Composition, each: Lights) -> Iterator[Relit]:
+def _one_by_one(people: People, each: Lights) -> Iterator[Any]:
     """The person under each of L lights alone, some at a time."""
     with torch.no_grad():
         for first in range(0, len(each), _LIGHTS_AT_ONCE):
-            yield from composition.relit(each[first : first + _LIGHTS_AT_ONCE])
+            yield from people.relit(each[first : first + _LIGHTS_AT_ONCE])
 
 
 class _OfWeights(torch.autograd.Function):
     """An image [H, W, 3] as a function of the weights [L, 3] of lights [L, 3], in which it is linear."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, each: Lights, composition: Composition, *more: Any) -> Any:
-        """The image, which is composed already; `layer_of` gives that of each light."""
-        (ctx.layer_of, image), ctx.each, ctx.composition = more, each, composition
+    def forward(ctx: Any, weights: Tensor, each: Lights, people: People, image: Tensor) -> Tensor:
+        """The image, which is rendered already."""
+        ctx.each, ctx.people = each, people
         return image
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """Sum the gradient [H, W, 3] over the image of each light."""
-        images = (
-            torch.from_numpy(whole(ctx.layer_of(relit), *ctx.composition.size_px))
-            for relit in _one_by_one(ctx.composition, ctx.each)
-        )
-        return (
-            torch.stack([(slopes[0].cpu() * image).sum((0, 1)) for image in images]),
-            None,
-            None,
-            None,
-            None,
-        )
-
-
-def read_person(
-    models: Models,
-    photo: np.ndarray,
-    head: Head,
-    kind: RelightKind,
-    network_alone: bool,
-    matte: np.ndarray | None,
-    tensors: bool = False,
-    white: White = "photo",
-) -> Person:
-    """Read the reflectance of a head in its photo [H, W, 3]; the matte [H, W] is the person's, if given."""
-    with torch.no_grad():
-        found = pipeline.reflectance_of(
-            models, head, kind, network_alone, photo=photo, matte=matte, white=white
-        )
-    return Person(models, photo, head, found, matte, kind, network_alone, tensors, white)
+        people: People = ctx.people
+        sums = []
+        for relit in _one_by_one(people, ctx.each):
+            image = people.light_layer(relit) if people.keeps_photo else people.image(relit).pixels
+            sums.append((slopes[0].cpu() * torch.from_numpy(image)).sum((0, 1)))
+        return torch.stack(sums), None, None, None
 
 
 def one_of(choices: Any, name: str, value: str) -> None:

@@ -1,0 +1,162 @@
+"""A face alone, by its relit texture, in the pose of its photo or another (paper, 'Relighting')."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.baselines.base import Reflectance
+from facerf_cli.errors import UsageError
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.head import Head
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.view import FaceView, photo_camera, view_face
+from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.relighting.field import Field, near_texture, weighted_sums
+from facerf_cli.relighting.subject import Relit, Request, Subject
+
+FACE_LAYERS = ("normal", "position", "depth", "uv", "face")
+_FACE_ALPHA = "face.A"
+
+
+@dataclass(frozen=True, eq=False)
+class FaceAlone(Subject):
+    """A head in a pose, before nothing: in its photo's frame, or without one in its crop's.
+
+    Args:
+        model: The face model of the fit.
+        head: The head in its photo, which the reflectance is of.
+        reflectance: Textures of the face under lights; None where textures are given.
+        fit: The head's pose and shape as shown; None: as in the photo.
+        photo_px: Height and width of the photo.
+    """
+
+    model: MorphableModel
+    head: Head
+    reflectance: Reflectance | None = None
+    fit: FaceFit | None = None
+    photo_px: tuple[int, int] | None = None
+
+    @cached_property
+    def vertices_m(self) -> Tensor:
+        """The mesh [V, 3] as shown, camera space."""
+        return (self.fit or self.head.fit).vertices_camera(self.model)
+
+    @cached_property
+    def view(self) -> FaceView:
+        """The mesh in the frame."""
+        crop = (self.fit or self.head.fit).crop
+        if self.photo_px is None:
+            crop = Crop(0.0, 0.0, float(crop.size_px), crop.size_px)
+        size_px = self.photo_px or (crop.size_px, crop.size_px)
+        return view_face(self.vertices_m, photo_camera(crop, *size_px), crop.side_px)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Height and width of the frame."""
+        return self.view.height_px, self.view.width_px
+
+    @cached_property
+    def matte(self) -> np.ndarray:
+        """Share [H, W] of the face, with a soft border."""
+        return self.view.full(self.view.mask)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of one texture."""
+        return self.head.face.texture.nbytes
+
+    def relit(self, lights: Lights) -> Iterator[Relit]:
+        """Relight the face by each sum of lights."""
+        assert self.reflectance is not None
+        turn = None if self.fit is None else self.head.fit.turn_to(self.fit.rotation)
+        return relit_faces(self.reflectance, lights, self.vertices_m, self.head, turn)
+
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> Relit:
+        """The same, since textures are rendered as they are; raises UsageError for layers of whole people."""
+        for name in layers:
+            if name not in FACE_LAYERS:
+                raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
+        return relit
+
+    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
+        """Some rows of the image, not multiplied by the mask, of lights over black, and of layers."""
+        view, inside = self.view, self.view.rows_inside(rows)
+        found = {}
+        if request.image is not None:
+            found["rgb"] = view.placed(view.render(request.image.texture, inside), rows)
+        for name in request.layers:
+            found |= face_layer(view, name, rows)
+        for name, light in request.lights.items():
+            shown = view.render(light.texture, inside) * view.mask[inside][..., None]
+            found[name] = view.placed(shown, rows)
+        return found
+
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+        """The exposure in EV, by a rule, of the face's texture."""
+        return exposure_of_face(self.head, relit, rule)
+
+
+def relit_faces(
+    reflectance: Reflectance,
+    lights: Lights,
+    vertices_m: Tensor,
+    head: Head,
+    turn: Tensor | None = None,
+    changes: Callable[[Tensor], Tensor] | None = None,
+) -> Iterator[Relit]:
+    """Relight a face by sums of lights (paper, 'Relighting').
+
+    Args:
+        reflectance: Textures of the face under far lights.
+        lights: M sums of far and near lights, camera space.
+        vertices_m: The mesh [V, 3] as shown, camera space.
+        head: The head in its photo.
+        turn: Rotation [3, 3] from the photo's pose to that shown.
+        changes: Gives of textures [L, 3, T, T] the change of light around the face [L, 3, s, s]. Of the
+            field, which is linear in light, it is summed over the lights; the models that the paper compares
+            with are not linear where they are clamped.
+    """
+    side, near = head.face.texture.shape[-1], lights.around(vertices_m.mean(0))
+    found: Iterable[tuple[Tensor, Tensor | None]]
+    if changes and isinstance(reflectance, Field):
+        olats = reflectance.olats(lights.directions, turn)
+        found = zip(*weighted_sums(olats, lights.weights, lambda olats: olats, changes), strict=True)
+    else:
+        textures = reflectance.relit(lights.directions, lights.weights, turn)
+        found = ((x, changes(x[None])[0] if changes else None) for x in textures)
+    extra = [near_texture(reflectance, points, vertices_m, side, turn) for points, _ in near]
+    around = [changes(one[None])[0] if changes else None for one in extra]
+    for number, (own, (texture, change)) in enumerate(zip(lights.owns, found, strict=True)):
+        for one, of_one, (_, rgb) in zip(extra, around, near, strict=True):
+            weight = rgb[number][:, None, None]
+            texture = texture + weight * one
+            change = None if change is None or of_one is None else change + weight * of_one
+        yield Relit(texture, change, own=own)
+
+
+def exposure_of_face(head: Head, relit: Relit, rule: ExposureRule) -> float:
+    """The exposure in EV, by a rule, of a relit texture, over that of the photo."""
+    own = torch.zeros(3) if relit.own is None else relit.own.detach()
+    source = head.face.texture
+    textures = relit.texture + own[:, None, None] * source, source
+    lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
+    seen = head.face.visible.numpy()
+    return chosen_exposure_ev(rule, lit, plate, seen, seen)
+
+
+def face_layer(view: FaceView, name: str, rows: slice) -> dict[str, np.ndarray]:
+    """Some rows [h, W, C] of one of `FACE_LAYERS` in the photo's frame, by its name in a file."""
+    inside = view.rows_inside(rows)
+    if name == "face":
+        return {_FACE_ALPHA: view.placed(view.mask[inside], rows)}
+    if name == "uv":
+        return {name: view.placed(view.uv[inside], rows)}
+    surface = view.surface(inside)
+    values = {"normal": surface[..., :3], "position": surface[..., 3:], "depth": -surface[..., 5:]}[name]
+    return {name: view.placed(values, rows)}

@@ -1,0 +1,290 @@
+"""The whole person of a portrait field, relit in its photo at the photo's own resolution.
+
+Of the field's views the narrower lies over the wider one, and fades toward its border. In the face the neural
+field's texture has the photo's detail (`photo_detail.py`); the rest has its grain (`grain.py`).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from facerf_cli.errors import UsageError
+from facerf_cli.face.head import Head
+from facerf_cli.face.landmarks import display_ev
+from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.view import photo_camera, view_face
+from facerf_cli.image.colour import ExposureRule
+from facerf_cli.light.studio_points import Lights
+from facerf_cli.portrait.matte import PersonColours
+from facerf_cli.portrait.parse import UncoveredRows
+from facerf_cli.raster.texture import smoothstep
+from facerf_cli.relighting.cast_shadows import CastShadow, cast_shadow
+from facerf_cli.relighting.enlarged import Enlarged, ViewLight, ViewRows
+from facerf_cli.relighting.eyes import Eyes
+from facerf_cli.relighting.face_alone import FACE_LAYERS, face_layer
+from facerf_cli.relighting.field import near_texture
+from facerf_cli.relighting.grain import Grain, GrainRows
+from facerf_cli.relighting.photo_detail import DetailRows, PhotoDetail, RelitDetail
+from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.rims import Rims, from_behind
+from facerf_cli.relighting.subject import Relit
+from facerf_cli.relighting.surface import Surface
+from facerf_cli.run.threads import both
+
+PERSON_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes")
+T = TypeVar("T")
+Read = Callable[[np.ndarray, slice, slice], np.ndarray]  # of pixels [h, w, 3], their rows and columns
+COLOURS = ("albedo", "specular")  # layers that are radiance
+_NO_GRAIN = ("hair", "eyes", "lips", "mouth")  # its blur would mix their colours with the skin's
+_LEAST_MOUTH = 0.12  # share of lips and mouth in a pixel from which on it has none
+_LIPS = 0.7  # cosine to the face's front from which on lips keep no light from the teeth
+_LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
+
+
+@dataclass(frozen=True, eq=False)
+class PersonRows:
+    """What no light changes in some rows of the photo, and in those around them that grain reaches.
+
+    `weights` [h, w] are those of the narrower views over the widest, the last of `views`.
+    """
+
+    grain: GrainRows
+    views: list[ViewRows]
+    weights: list[np.ndarray]
+    inside: slice  # of the face's window
+    detail: DetailRows | None
+    face_share: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PersonLight:
+    """A person under one sum of lights, ready to be rendered by rows."""
+
+    views: list[ViewLight]
+    detail: RelitDetail
+    from_behind: bool
+    mirrored: list[np.ndarray]
+    layers: dict[str, list[Tensor]]
+    keys: list[tuple["PersonLight | None", CastShadow]]  # each light alone; None: it is all of this light
+    own: Tensor | None
+
+
+class PersonInPhoto:
+    """A person in its photo [H, W, 3]; `matte` [H, W] is the share that is relit."""
+
+    def __init__(
+        self, model: MorphableModel, photo: np.ndarray, head: Head, field: PortraitField, matte: np.ndarray
+    ) -> None:
+        self.size_px = photo.shape[0], photo.shape[1]
+        self.photo, self._field, self._head = photo, field, head
+        self.matte, self.own = matte, PersonColours(photo, matte)
+        self.vertices_m = head.fit.vertices_camera(model)
+        crop = head.fit.crop
+        self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
+        segmentation, ev = field.person.segmentation, display_ev(self.own.small)
+        self._bare_face = UncoveredRows(segmentation.classes, self.size_px)
+        self._views = [Enlarged(view, self.size_px, ev) for view in field.views]
+        self._detail = PhotoDetail(head.face, self.view, self.own)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the person under one sum of lights."""
+        return 2 * self._head.face.texture.nbytes + sum(15 * view.own.nbytes for view in self._views)
+
+    def share(self, rows: slice) -> np.ndarray:
+        """Share [h, W] of the whole person in rows of the photo."""
+        return np.minimum(self.matte[rows], self._field.person.segmentation.matte[rows])
+
+    def relit(self, lights: Lights) -> Iterator[Relit]:
+        """Relight the person by each sum of lights (paper, 'Relighting'); one prediction serves all.
+
+        Of light from behind the face's field knows nothing.
+        """
+        field, owns = self._field, lights.owns
+        lights, keys = lights.with_keys_alone()
+        directions, weights = lights.directions, lights.weights
+        middle_m, side = self.vertices_m.mean(0), self._head.face.texture.shape[-1]
+        near = lights.around(middle_m)
+        lit, _ = both(lambda: field.lit(directions, weights, near), lambda: self._finish)
+        forward = self._head.fit.rotation[:, 2]
+
+        def arriving(toward: Tensor, weights: Tensor) -> Tensor:
+            """Weights of all light on the face, then of what of it falls into the mouth."""
+            front = weights * (1 - from_behind(toward))[..., None]
+            return torch.cat([front, front * _into_mouth(toward, forward)[..., None]])
+
+        textures = field.field.relit(directions, arriving(directions, weights))
+        for points, rgb in near:
+            texture = near_texture(field.field, points, self.vertices_m, side)
+            textures = textures + arriving(-points.toward, rgb)[..., None, None] * texture
+        textures, mouths = textures.chunk(2)
+        mirrored = field.views[0].mirrored(lights, middle_m)
+        blended = field.blended(textures, lit[0])
+        every = [
+            Relit(blended[at], None, tuple(view[at] for view in lit), mirrored[at], mouths[at])
+            for at in range(len(blended))
+        ]
+        for number, own in enumerate(owns):
+            cast = []
+            for key in (one for one in keys if one.number == number):
+                light = near[key.samples.start][0] if key.is_near else directions[key.samples].detach()
+                cast.append((every[key.alone], cast_shadow(field.views[0], light)))
+            yield replace(every[number], own=own, keys=tuple(cast))
+
+    @cached_property
+    def _finish(self) -> tuple[Grain, Eyes]:
+        """Detail of the photo without its light, and the eyes."""
+        hair, eyes, lips, mouth = (self._field.person.segmentation.layer(name) for name in _NO_GRAIN)
+        plain = (1 - hair - eyes).clip(0) * (1 - (lips + mouth) / _LEAST_MOUTH).clip(0)
+        grain = Grain(self._flat, (self.matte > 0) * plain, self._views[0].pixel_px, self._sharpened)
+        return grain, Eyes(self.own, self._field.person.eyes, self.size_px)
+
+    @cached_property
+    def _rims(self) -> Rims:
+        person = self._field.person
+        return Rims(person.segmentation.matte, person.square.side_px / person.sides)
+
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> PersonLight:
+        """What is relit, with all that does not depend on rows; raises UsageError for an unknown layer."""
+        assert relit.mirrored is not None
+        maps = {}
+        for name in layers:
+            if name in ("albedo", "normal", "shadow", "specular"):
+                lit = zip(self._views, relit.views, strict=True)
+                maps[name] = [view.layer_maps(name, light) for view, light in lit]
+            elif name not in (*PERSON_LAYERS, *FACE_LAYERS):
+                raise UsageError(f"--aov {name}: is no layer; give {', '.join(PERSON_LAYERS)}")
+        return PersonLight(
+            views=[view.ready(light) for view, light in zip(self._views, relit.views, strict=True)],
+            detail=self._detail.ready(relit.texture, relit.mouth),
+            mirrored=self._finish[1].ready(relit.mirrored),
+            from_behind=any(bool(light.behind.any()) for light in relit.views),
+            layers=maps,
+            keys=[
+                (None if one.texture is relit.texture else self.ready(one), shadow)
+                for one, shadow in relit.keys
+            ],
+            own=relit.own,
+        )
+
+    def observe(self, rows: slice) -> PersonRows:
+        """What no light changes in rows of the photo."""
+        grain = self._finish[0].observe(rows)
+        wide, inside = grain.wide, self.view.rows_inside(grain.wide)
+        pixels = self.own[wide].clip(min=0)
+        widest = slice(0, self.size_px[1])
+        views, weights = [self._views[-1].observe(pixels, wide, widest)], list[np.ndarray]()
+        for view in reversed(self._views[:-1]):
+            columns, weight = view.weight(wide)
+            if weight.any():
+                views.insert(0, view.observe(pixels[:, columns], wide, columns))
+                weights.insert(0, weight)
+        detail, share = None, np.zeros(0, np.float32)
+        if inside.start < inside.stop:
+            detail = self._detail.observe(inside)
+            bare = self._bare_face[self.view.in_photo(inside)][:, self.view.window[1]]
+            share = self.view.mask[inside].numpy() * bare
+        return PersonRows(grain, views, weights, inside, detail, share)
+
+    def pixels(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
+        """Pixels [h, W, 3] of observed rows, without the photo's own light."""
+        by_maps = pixels = self._by_maps(relit, seen)
+        for alone, shadow in relit.keys:
+            change = self._change(shadow, seen.grain.rows)
+            if (change != 1).any():
+                pixels = pixels + (by_maps if alone is None else self._by_maps(alone, seen)) * (change - 1)
+        return self._finish[1].lit(pixels, relit.mirrored, seen.grain.rows)
+
+    def _change(self, shadow: CastShadow, rows: slice) -> np.ndarray:
+        """Factor [h, W, 1] of a light's image in some rows, by its shadow in the narrower view."""
+        columns, weight = self._views[0].weight(rows)
+        factor = np.ones((len(weight), self.size_px[1], 1), np.float32)
+        if weight.any():
+            factor[:, columns, 0] += weight * (self._views[0].change(shadow, rows, columns) - 1)
+        return factor
+
+    def _by_maps(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
+        """Pixels [h, W, 3] without what only the photo's pixels show: shadows' edges, and eyes."""
+        rims = self._rims if relit.from_behind else None
+        used = self._used(relit.views, seen)
+        shown = [view.radiance(light, rows, rims) for view, light, rows in used]
+        person, behind = np.split(_joined(shown, seen), [3], -1)
+        if seen.detail is not None:  # the field of the face knows no hair around it
+            rows, columns = self.view.rows_of(seen.inside, seen.grain.wide), self.view.window[1]
+            part, detail = person[rows, columns], self._detail.pixels(relit.detail, seen.detail, seen.inside)
+            part += seen.face_share[..., None] * (detail - part)
+        return self._finish[0].given(person + behind if behind.size else person, seen.grain)
+
+    def layer(self, name: str, relit: PersonLight, seen: PersonRows) -> dict[str, np.ndarray]:
+        """A layer [h, W, C] of observed rows, by the names that it has in a file.
+
+        albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
+        shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
+        shares. All are 0 off the person, whose share is the matte: colours are multiplied by it, as layers of
+        lights are.
+        """
+        rows = seen.grain.rows
+        if name == "classes":
+            return self._field.person.segmentation.layers(rows)
+        if name not in PERSON_LAYERS:
+            return face_layer(self.view, name, rows)
+        if name in relit.layers:
+            used = self._used(relit.layers[name], seen)
+            values = _joined([view.layer(name, maps, one) for view, maps, one in used], seen)[seen.grain.own]
+        else:
+            values = self._surface.depth_m(rows) if name == "depth" else self._surface.position_m(rows)
+        share = self.matte[rows][..., None]
+        values = values * (share if name in COLOURS else share > _LEAST)
+        if name == "normal":
+            values = values / np.maximum(np.linalg.norm(values, axis=-1, keepdims=True), 1e-6)
+        return {name: values}
+
+    def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
+        """The exposure in EV of the relit person, by a rule."""
+        own = torch.zeros(3) if relit.own is None else relit.own.detach()
+        return self._views[0].exposure_ev(relit.views[0], own, rule)
+
+    @cached_property
+    def _surface(self) -> Surface:
+        return Surface(self._field.person, self.size_px)
+
+    def _used(self, values: Sequence[T], seen: PersonRows) -> Iterator[tuple[Enlarged, T, ViewRows]]:
+        """The views that are seen in rows, each with its value."""
+        first = len(self._views) - len(seen.views)
+        return zip(self._views[first:], values[first:], seen.views, strict=True)
+
+    def _flat(self, rows: slice) -> np.ndarray:
+        return self._read(rows, [view.flat for view in self._views])
+
+    def _sharpened(self, rows: slice) -> np.ndarray:
+        return self._read(rows, [view.sharpened for view in self._views])
+
+    def _read(self, rows: slice, reads: Sequence[Read]) -> np.ndarray:
+        """Values [h, W, C] of rows of the photo that each view reads; the widest lies below."""
+        pixels = self.own[rows].clip(min=0)
+        found = reads[-1](pixels, rows, slice(0, pixels.shape[1]))
+        for view, read in reversed(list(zip(self._views[:-1], reads[:-1], strict=True))):
+            columns, weight = view.weight(rows)
+            if weight.any():
+                part = found[:, columns]
+                part += weight[..., None] * (read(pixels[:, columns], rows, columns) - part)
+        return found
+
+
+def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
+    """Share [...] of lights from directions [..., 3] that falls between lips; the face looks `forward`."""
+    return smoothstep(directions @ forward / _LIPS)
+
+
+def _joined(shown: Sequence[np.ndarray], seen: PersonRows) -> np.ndarray:
+    """Values [h, W, C] of what each view shows; the widest, the last, lies below."""
+    found = shown[-1]
+    for values, rows, weight in reversed(list(zip(shown[:-1], seen.views[:-1], seen.weights, strict=True))):
+        part = found[:, rows.columns]
+        part += weight[..., None] * (values - part)
+    return found

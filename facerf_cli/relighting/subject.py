@@ -1,0 +1,144 @@
+"""What can be relit: people in a photo, a face alone, an OLAT stack; and the one loop that renders it.
+
+A subject is relit at the resolution of its maps, once for all sums of lights, and rendered at that of its
+frame, some rows at a time. Both are linear in light: layers of single lights add up.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from facerf_cli.image.colour import ExposureRule
+from facerf_cli.image.strips import Empty, Rows, in_strips, new_array
+from facerf_cli.relighting.cast_shadows import CastShadow
+from facerf_cli.relighting.portrait_field import PortraitLight
+
+
+@dataclass(frozen=True, eq=False)
+class Relit:
+    """A person under one sum of lights, at the resolution of its maps; linear radiance.
+
+    Attributes:
+        texture: The face [3, T, T].
+        change: Of a `FaceInPhoto` the change of light around the face [3, s, s].
+        views: Of a `PersonInPhoto` its light in each square.
+        mirrored: Of a `PersonInPhoto` what its eyes mirror [N, 3, s, s].
+        mouth: Of a `PersonInPhoto` the face [3, T, T] in what falls into its mouth.
+        own: Share [3] of the photo's own light, which joins the sum.
+        keys: Of a `PersonInPhoto` key lights alone, and the shadow that each casts.
+    """
+
+    texture: Tensor
+    change: Tensor | None = None
+    views: tuple[PortraitLight, ...] = ()
+    mirrored: Tensor | None = None
+    mouth: Tensor | None = None
+    own: Tensor | None = None
+    keys: "tuple[tuple[Relit, CastShadow], ...]" = ()
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """Texture and light of the views, in which images are linear."""
+        around = [] if self.change is None else [self.change]
+        return [self.texture, *around, *(maps for view in self.views for maps in view.tensors)]
+
+
+@dataclass(frozen=True, eq=False)
+class Request:
+    """What to render of a subject.
+
+    Attributes:
+        image: The sum of lights of the image "rgb" [H, W, 3]; None leaves the image out.
+        lights: Sums of lights of layers [H, W, 3] over black, by name.
+        layers: Names of further layers, under the image's light.
+        ev: Exposure in EV at which the photo's background keeps its look.
+        background: Image [H, W, 3] behind the subject; None: the photo, or nothing.
+    """
+
+    image: Any = None
+    lights: Mapping[str, Any] = field(default_factory=dict)
+    layers: Sequence[str] = ()
+    ev: float = 0.0
+    background: Rows | None = None
+
+    def ready(self, subject: "Subject") -> "Request":
+        """The same with all that does not depend on rows computed."""
+        image = None if self.image is None else subject.ready(self.image, self.layers)
+        return replace(
+            self, image=image, lights={name: subject.ready(one) for name, one in self.lights.items()}
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RelitImage:
+    """An image [H, W, 3], scene-linear, not multiplied by alpha [H, W], which images without gaps lack."""
+
+    pixels: np.ndarray
+    alpha: np.ndarray | None = None
+
+
+class Subject(ABC):
+    """What can be relit in a frame."""
+
+    keeps_photo = False  # True where the photo's own background stays behind it
+
+    @property
+    @abstractmethod
+    def size_px(self) -> tuple[int, int]:
+        """Height and width of the frame."""
+
+    @property
+    @abstractmethod
+    def matte(self) -> np.ndarray:
+        """Share [H, W] of the frame that is relit."""
+
+    @property
+    def person_matte(self) -> np.ndarray | None:
+        """The matte of a photo's person, which images hold as a layer; None of a face alone."""
+        return None
+
+    @property
+    @abstractmethod
+    def nbytes(self) -> int:
+        """Bytes of the subject under one sum of lights."""
+
+    @abstractmethod
+    def relit(self, lights: Any) -> Iterator[Any]:
+        """Relight the subject by M sums of lights at once; one prediction serves all."""
+
+    @abstractmethod
+    def ready(self, relit: Any, layers: Sequence[str] = ()) -> Any:
+        """What `relit` gave, made ready to be rendered by rows, and with it layers."""
+
+    @abstractmethod
+    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
+        """Some rows [h, W, ...] of all that is asked; the request is `Request.ready`."""
+
+    @abstractmethod
+    def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
+        """The exposure in EV of the subject under one sum of lights, by a rule."""
+
+    def rendered(self, request: Request, empty: Empty = new_array) -> dict[str, np.ndarray]:
+        """All rows of what is asked; `empty` makes the array of a layer, by its name and shape.
+
+        Raises UsageError for layers that this subject lacks.
+        """
+        return in_strips(partial(self.render, request.ready(self)), *self.size_px, empty)
+
+    def image(self, relit: Any, ev: float = 0.0, background: Rows | None = None) -> RelitImage:
+        """The image under one sum of lights."""
+        pixels = self.rendered(Request(relit, ev=ev, background=background))["rgb"]
+        return RelitImage(pixels, self.alpha(background))
+
+    def alpha(self, background: Rows | None = None) -> np.ndarray | None:
+        """The matte where nothing is behind the subject, else None."""
+        return self.matte if background is None and not self.keeps_photo else None
+
+    def light_layer(self, relit: Any) -> np.ndarray:
+        """The subject [H, W, 3] under one of several lights, over black."""
+        return self.rendered(Request(lights={"": relit}))[""]
