@@ -19,7 +19,7 @@ from facerf_cli.relighting.person_in_photo import COLOURS, PersonInPhoto
 from facerf_cli.relighting.subject import Relit, Request, Subject
 
 Background = Literal["photo", "none", "given"]
-_BLACK, _ONE, _TINY = np.float32(0), np.float32(1), 1e-6
+_BLACK, _TINY = np.float32(0), 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +134,10 @@ def _over(below: Any, present: Sequence[_Present], pixels: Sequence[np.ndarray])
 
 def _alpha(present: Sequence[_Present]) -> np.ndarray:
     """Share [h, W, 1] of all people."""
-    left: Any = _ONE
+    found: Any = _BLACK
     for one in present:
-        left = left * (1 - one.share)
-    return 1 - left
+        found = found + one.share * (1 - found)
+    return np.asarray(found)
 
 
 def _pixels(
