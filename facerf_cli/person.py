@@ -509,7 +509,8 @@ class Person:
                     image = image + (own - own.detach()) * torch.from_numpy(layer)
                 if straight:
                     image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
-                yield {"image": image, **arrays}
+                found = {"person.A": people.matte, **arrays} if layers else arrays
+                yield {"image": image, **found}
 
     def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
         """The face alone under each light; gradients reach all that it is made of."""
@@ -523,7 +524,8 @@ class Person:
                 image = torch.zeros(*face.size_px, 4)
                 image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
                 arrays = face.rendered(Request(one, layers=layers))
-                yield {**arrays, "image": image}
+                del arrays["rgb"]
+                yield {"image": image, **arrays}
 
     @cached_property
     def _people(self) -> People:

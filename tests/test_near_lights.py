@@ -12,6 +12,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.person import Person, Target
 from facerf_cli.pipeline import reflectance_of
+from facerf_cli.relighting.people import People
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.subject import Subject
 from tests import astronaut
@@ -41,7 +42,8 @@ class Shown:
     def reached_by(self, light: StudioLight) -> Tensor:
         """Share [S, S] of a near light that arrives."""
         lights = near(light)
-        around = lights.around(self.people.vertices_m.mean(0))
+        assert isinstance(self.people, People)
+        around = lights.around(self.people.people[0].vertices_m.mean(0))
         return self.field.views[0].lit(lights.directions, lights.weights, around).reached[0, 0]
 
 
