@@ -38,7 +38,7 @@ from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, reflectanc
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.face_in_photo import FaceInPhoto
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.training.losses import load_features
 
 TURNS_DEG = (0, 120)  # of each map
@@ -112,7 +112,7 @@ def estimates(
     photo = read_image(path).pixels
     landmarks_px = find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px
     head = fit_photo(models, photo, landmarks_px)
-    people = People([FaceInPhoto(models.face, photo, head, reflectance_of(models, head))])
+    people = PeopleInPhoto([FaceInPhoto(models.face, photo, head, reflectance_of(models, head))])
     weights = torch.stack([light.weights for light in lights])
     for light, (relit,) in zip(lights, people.relit(Lights(RIG, weights)), strict=True):
         face = replace(head.face, texture=relit.texture)

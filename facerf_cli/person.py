@@ -38,11 +38,11 @@ from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
 from facerf_cli.relighting.face_in_photo import FaceInPhoto
 from facerf_cli.relighting.field import MEMORY_BYTES, Field
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
-from facerf_cli.relighting.people import Background as Behind
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import Background as Behind
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.person_in_photo import PERSON_LAYERS, PersonInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame
-from facerf_cli.relighting.subject import RelitImage, Request, Subject
+from facerf_cli.relighting.relightable import Relightable, RelitImage, RenderRequest
 from facerf_cli.relighting.white import Balance
 from facerf_cli.run.memory import batches
 
@@ -322,12 +322,12 @@ class Person:
         """The person's share [H, W] of the photo."""
         return self.segmentation.matte if self.given_matte is None else self.given_matte
 
-    def composed(self, target: Target = AS_IN_PHOTO) -> Subject:
+    def composed(self, target: Target = AS_IN_PHOTO) -> Relightable:
         """Prepare images of the person in a pose, before a background, that differ by their light alone."""
         if self.photo is None or target.composite == "face":
             photo_px = None if self.photo is None else (self.photo.shape[0], self.photo.shape[1])
             return FaceAlone(self.models.face, self.head, self.reflectance, target.fit, photo_px)
-        return People([self.in_photo(target)], target.background)
+        return PeopleInPhoto([self.in_photo(target)], target.background)
 
     def in_photo(self, target: Target = AS_IN_PHOTO) -> PersonInPhoto | FaceInPhoto:
         """Prepare the person in its photo; the target's matte says which part of it changes."""
@@ -500,7 +500,7 @@ class Person:
                 relit = list(people.relit(some))
             each = Lights.each(some.directions, some.keys)
             for weights, own, one in zip(some.weights, some.owns, relit, strict=True):
-                arrays = people.rendered(Request(one, layers=layers, background=behind))
+                arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
                 image = torch.from_numpy(arrays.pop("rgb"))
                 if weights.requires_grad:
                     image = _OfWeights.apply(weights, each, people, image)  # type: ignore[no-untyped-call]
@@ -523,21 +523,21 @@ class Person:
             for one in face.relit(sums_of(lights[part])):
                 image = torch.zeros(*face.size_px, 4)
                 image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
-                arrays = face.rendered(Request(one, layers=layers))
+                arrays = face.rendered(RenderRequest(one, layers=layers))
                 del arrays["rgb"]
                 yield {"image": image, **arrays}
 
     @cached_property
-    def _people(self) -> People:
+    def _people(self) -> PeopleInPhoto:
         """The person in the photo, with all that does not depend on the light."""
         with torch.no_grad():
-            return People([self.in_photo()])
+            return PeopleInPhoto([self.in_photo()])
 
     def _layer(self, name: str) -> Any:
         if name == "albedo" and self.kind != "portrait":
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
         relit = next(_one_by_one(self._people, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
-        return self._out(self._people.rendered(Request(relit, layers=[name]))[name])
+        return self._out(self._people.rendered(RenderRequest(relit, layers=[name]))[name])
 
     @property
     def _photo_camera(self) -> Camera:
@@ -557,7 +557,7 @@ class Person:
         return values.detach().numpy() if isinstance(values, Tensor) else values
 
 
-def _one_by_one(people: People, each: Lights) -> Iterator[Any]:
+def _one_by_one(people: PeopleInPhoto, each: Lights) -> Iterator[Any]:
     """The person under each of L lights alone, some at a time."""
     with torch.no_grad():
         for first in range(0, len(each), _LIGHTS_AT_ONCE):
@@ -568,7 +568,7 @@ class _OfWeights(torch.autograd.Function):
     """An image [H, W, 3] as a function of the weights [L, 3] of lights [L, 3], in which it is linear."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, each: Lights, people: People, image: Tensor) -> Tensor:
+    def forward(ctx: Any, weights: Tensor, each: Lights, people: PeopleInPhoto, image: Tensor) -> Tensor:
         """The image, which is rendered already."""
         ctx.each, ctx.people = each, people
         return image
@@ -576,7 +576,7 @@ class _OfWeights(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """Sum the gradient [H, W, 3] over the image of each light."""
-        people: People = ctx.people
+        people: PeopleInPhoto = ctx.people
         sums = []
         for relit in _one_by_one(people, ctx.each):
             image = people.light_layer(relit) if people.keeps_photo else people.image(relit).pixels

@@ -14,7 +14,7 @@ from facerf_cli.light.studio_points import KeyLight, Lights, far_samples
 from facerf_cli.person import Target
 from facerf_cli.portrait.proxy import OFF_M, Proxy, ProxyMaps
 from facerf_cli.relighting.cast_shadows import CastShadow, change, visibility
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from tests import astronaut
 
 SIDE, WIDE_M = 96, 0.2  # of a floor, that faces the camera
@@ -109,13 +109,13 @@ def test_key_lights_are_singled_out() -> None:
 
 
 @pytest.fixture(scope="module")
-def people() -> People:
+def people() -> PeopleInPhoto:
     found = astronaut.person().composed(Target(background="none"))
-    assert isinstance(found, People)
+    assert isinstance(found, PeopleInPhoto)
     return found
 
 
-def test_shadows_act_on_bare_skin_alone(people: People) -> None:
+def test_shadows_act_on_bare_skin_alone(people: PeopleInPhoto) -> None:
     """Elsewhere, and where the coarse visibility does not change, the image is that of the maps."""
     direction = azel_to_direction(45.0, 30.0)[None]
     ((relit,),) = people.relit(Lights.each(direction, (slice(0, 1),)))
@@ -129,7 +129,7 @@ def test_shadows_act_on_bare_skin_alone(people: People) -> None:
     assert fine.min() >= 0
 
 
-def test_layers_of_lights_add_up(people: People) -> None:
+def test_layers_of_lights_add_up(people: PeopleInPhoto) -> None:
     directions = torch.cat([azel_to_direction(45.0, 30.0)[None], azel_to_direction(-80.0, 10.0)[None]])
     weights = torch.tensor([[1.0, 0.0], [0.0, 0.1], [1.0, 0.1]])[..., None].expand(-1, -1, 3)
     relit = people.relit(Lights(directions, weights, keys=(slice(0, 1), slice(1, 2))))

@@ -21,9 +21,9 @@ from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_d
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
 from facerf_cli.relighting.face_in_photo import FaceInPhoto, Surround
-from facerf_cli.relighting.people import Background, People
+from facerf_cli.relighting.people_in_photo import Background, PeopleInPhoto
 from facerf_cli.relighting.photo_detail import PhotoDetail
-from facerf_cli.relighting.subject import Relit, RelitImage
+from facerf_cli.relighting.relightable import Relit, RelitImage
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)
@@ -114,7 +114,7 @@ def compose(
 ) -> np.ndarray:
     """The photo with the scene's face relit."""
     face = in_photo(photo, source, seen, matte, crop)
-    return People([face]).image([Relit(relit, face.surround.changes(relit[None])[0])]).pixels
+    return PeopleInPhoto([face]).image([Relit(relit, face.surround.changes(relit[None])[0])]).pixels
 
 
 def detailed(detail: PhotoDetail, texture: Tensor, rows: slice) -> np.ndarray:
@@ -170,7 +170,7 @@ def in_half(background: Background, ev: float, behind: np.ndarray | None = None)
     matte[:, 200:] = 1
     face, relit = in_photo(photo, source, seen, matte), scene().lit(OTHER)
     lit = [Relit(relit, face.surround.changes(relit[None])[0])]
-    return People([face], background).image(lit, ev, behind)
+    return PeopleInPhoto([face], background).image(lit, ev, behind)
 
 
 def test_the_photos_background_looks_as_it_was_at_any_exposure() -> None:

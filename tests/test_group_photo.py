@@ -13,8 +13,8 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import LinearImage
 from facerf_cli.portrait.find import FaceBox
-from facerf_cli.relighting.people import People
-from facerf_cli.relighting.subject import Request
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run import memory
 from facerf_cli.run.memory import batches
 from facerf_cli.work import photos
@@ -77,19 +77,19 @@ class Plain:
 
 def group(background: Any = "photo") -> Any:
     left, right = Plain(slice(0, 2), 1.0), Plain(slice(3, 5), 0.5)
-    return People([left, right], background)  # type: ignore[list-item]
+    return PeopleInPhoto([left, right], background)  # type: ignore[list-item]
 
 
 def test_each_person_is_relit_and_the_background_is_the_photos() -> None:
     people = group()
-    image = people.rendered(Request([2.0, 8.0], ev=1.0))
+    image = people.rendered(RenderRequest([2.0, 8.0], ev=1.0))
     assert set(image) == {"rgb"} and people.alpha() is None
     np.testing.assert_allclose(image["rgb"][0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
 
 
 def test_alpha_holds_all_people() -> None:
     people = group("none")
-    pixels, alpha = people.rendered(Request([2.0, 8.0]))["rgb"], people.alpha()
+    pixels, alpha = people.rendered(RenderRequest([2.0, 8.0]))["rgb"], people.alpha()
     np.testing.assert_allclose(alpha[0], [1, 1, 0, 0.5, 0.5, 0])
     np.testing.assert_allclose((pixels * alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
     assert pixels[0, 3, 0] == 8  # not premultiplied
@@ -104,8 +104,8 @@ def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
 def test_layers_hold_all_people() -> None:
     """Shares and colours add up, before others and the background; no depth lies between two people."""
     far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
-    people = People([far, near, faint])  # type: ignore[list-item]
-    layers = people.rendered(Request([2.0, 8.0, 4.0], layers=["all"]))
+    people = PeopleInPhoto([far, near, faint])  # type: ignore[list-item]
+    layers = people.rendered(RenderRequest([2.0, 8.0, 4.0], layers=["all"]))
     for shares in (people.matte, layers["class.skin"]):
         np.testing.assert_allclose(shares[0], [1, 1, 1, 1, 0.6, 0])
     np.testing.assert_allclose(layers["depth"][0, :, 0], [2, 2, 2, 8, 8, 0])
@@ -157,8 +157,8 @@ def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
             drawn.append(rows.start)
             return rows
 
-    people = People([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
-    request = Request((0.2, 0.8), {"key": (0.2, 0.8)}).ready(people)
+    people = PeopleInPhoto([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
+    request = RenderRequest((0.2, 0.8), {"key": (0.2, 0.8)}).ready(people)
     rows = [people.render(request, slice(row, row + 1)) for row in range(SIZE[0])]
     assert drawn == [2, 3]
     for name in ("rgb", "key"):

@@ -12,9 +12,9 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.person import Person, Target
 from facerf_cli.pipeline import reflectance_of
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.relighting.subject import Subject
+from facerf_cli.relighting.relightable import Relightable
 from tests import astronaut
 
 TARGET = Target(background="none")
@@ -42,7 +42,7 @@ class Shown:
     def reached_by(self, light: StudioLight) -> Tensor:
         """Share [S, S] of a near light that arrives."""
         lights = near(light)
-        assert isinstance(self.people, People)
+        assert isinstance(self.people, PeopleInPhoto)
         around = lights.around(self.people.people[0].vertices_m.mean(0))
         return self.field.views[0].lit(lights.directions, lights.weights, around).reached[0, 0]
 
@@ -51,7 +51,7 @@ def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
     return Lights(*DARK, lights, torch.tensor(rgb).expand(1, len(lights), 3))
 
 
-def over_black(people: Subject, lights: Lights) -> np.ndarray:
+def over_black(people: Relightable, lights: Lights) -> np.ndarray:
     return people.light_layer(next(people.relit(lights)))
 
 

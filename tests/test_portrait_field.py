@@ -25,10 +25,10 @@ from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView, maps_of
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.relighting.source_light import source_light
-from facerf_cli.relighting.subject import Request
 from tests import astronaut
 
 NAMES = ("albedo", "specular", "normal", "position", "depth", "shadow")
@@ -232,14 +232,14 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     people = person.composed()
     relit = next(people.relit(Lights.of_rig(lamp(40, 30))))
     names = (*NAMES, "classes", "face", "uv")
-    layers = people.rendered(Request(relit, layers=names))
+    layers = people.rendered(RenderRequest(relit, layers=names))
     assert {"rgb", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
     for name, layer in layers.items():
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
         assert name in ("normal", "position") or layer.min() >= 0
     face_alone = replace(person, photo=None).composed()
     with pytest.raises(UsageError, match="--aov albedo"):
-        face_alone.rendered(Request(relit[0], layers=("albedo",)))
+        face_alone.rendered(RenderRequest(relit[0], layers=("albedo",)))
 
 
 def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
@@ -249,13 +249,13 @@ def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
     alpha = np.ones(photo.shape[:2], np.float32)
     alpha[:, : photo.shape[1] // 2] = 0
     people = person.composed(Target(alpha=alpha))
-    request = Request(next(people.relit(Lights.of_rig(lamp(40, 30)))), layers=NAMES)
+    request = RenderRequest(next(people.relit(Lights.of_rig(lamp(40, 30)))), layers=NAMES)
     cut, matte = people.rendered(request), people.matte
     assert ((matte > 0.02) & (matte < 0.9)).sum() > 100
-    assert isinstance(people, People)
+    assert isinstance(people, PeopleInPhoto)
     whole = copy(people.people[0])
     whole.matte = np.ones_like(alpha)  # of the same colours
-    all_over = People([whole]).rendered(request)
+    all_over = PeopleInPhoto([whole]).rendered(request)
     for name in NAMES:
         share = matte[..., None]
         expected = all_over[name] * (share if name in ("albedo", "specular") else share > 0.02)
@@ -285,7 +285,7 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
     def shown() -> list[np.ndarray]:
         people = person.composed()
         relit = next(people.relit(Lights.of_rig(lights)))
-        return list(people.rendered(Request(relit, layers=names)).values())
+        return list(people.rendered(RenderRequest(relit, layers=names)).values())
 
     at_once = shown()
     monkeypatch.setattr("facerf_cli.image.strips.STRIP_PX", 1)

@@ -29,7 +29,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Target
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.subject import Relit
+from facerf_cli.relighting.relightable import Relit
 
 LAMBERT = "lambert"  # the source's texture under the cosine of the light: the least a method must beat
 COMPOSITE = "composite"  # the first method's face back in its photo, with its detail

@@ -34,7 +34,7 @@ _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 @dataclass(frozen=True, eq=False)
 class ViewRows:
-    """What no light changes in some rows and columns of the photo.
+    """Values in some rows and columns of the photo that no light changes.
 
     Attributes:
         grid: Places [h, w, 2] in the maps where the pixels find their like, in -1..1.
@@ -95,7 +95,7 @@ class Enlarged:
         return columns, ((1 - away) / _FEATHER).clamp(0, 1).numpy()
 
     def observe(self, pixels: np.ndarray, rows: slice, columns: slice) -> ViewRows:
-        """What no light changes in pixels [h, w, 3] of the photo."""
+        """Read pixels [h, w, 3] of the photo, as far as no light changes them."""
         grid, unit = self._grid(rows, columns), self._view.person.exposure
         grid = places(self._colours, self._trust, grid, torch.from_numpy(pixels), unit)
         wide = _enlarged(torch.cat([self._albedo_maps, self._hair]), grid)

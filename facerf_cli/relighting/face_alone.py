@@ -18,14 +18,14 @@ from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
-from facerf_cli.relighting.subject import Relit, Request, Subject
+from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 
 FACE_LAYERS = ("normal", "position", "depth", "uv", "face")
 _FACE_ALPHA = "face.A"
 
 
 @dataclass(frozen=True, eq=False)
-class FaceAlone(Subject):
+class FaceAlone(Relightable):
     """A head in a pose, before nothing: in its photo's frame, or without one in its crop's.
 
     Args:
@@ -84,7 +84,7 @@ class FaceAlone(Subject):
                 raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
         return relit
 
-    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
+    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
         """Some rows of the image, not multiplied by the mask, of lights over black, and of layers."""
         view, inside = self.view, self.view.rows_inside(rows)
         found = {}

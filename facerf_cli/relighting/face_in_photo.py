@@ -27,7 +27,7 @@ from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.face_alone import FACE_LAYERS, exposure_of_face, face_layer, relit_faces
 from facerf_cli.relighting.photo_detail import DARK, TINY, DetailRows, PhotoDetail, RelitDetail
-from facerf_cli.relighting.subject import Relit
+from facerf_cli.relighting.relightable import Relit
 
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light
 _SURROUND_PX = 64  # pixels along a crop there
@@ -38,7 +38,9 @@ _UPRIGHT = 0.4  # of a step up or down, as a share of a step aside: above and be
 
 
 @dataclass(frozen=True, eq=False)
-class _Ready:
+class FaceLight:
+    """A face under one sum of lights, ready to be rendered by rows."""
+
     change: Tensor
     detail: RelitDetail
     own: Tensor | None
@@ -80,20 +82,20 @@ class FaceInPhoto:
         changes = self.surround.changes
         return relit_faces(self._reflectance, lights, self.vertices_m, self._head, changes=changes)
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> _Ready:
-        """What is relit, with all that does not depend on rows; raises UsageError for layers of people."""
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> FaceLight:
+        """Compute all that does not depend on rows; raises UsageError for layers of people."""
         for name in layers:
             if name not in FACE_LAYERS:
                 raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
         assert relit.change is not None
-        return _Ready(relit.change, self._detail.ready(relit.texture), relit.own)
+        return FaceLight(relit.change, self._detail.ready(relit.texture), relit.own)
 
     def observe(self, rows: slice) -> tuple[slice, DetailRows | None]:
-        """What no light changes in rows of the photo."""
+        """Read rows of the photo, as far as no light changes them."""
         inside = self.view.rows_inside(rows)
         return rows, self._detail.observe(inside) if inside.start < inside.stop else None
 
-    def pixels(self, relit: _Ready, seen: tuple[slice, DetailRows | None]) -> np.ndarray:
+    def pixels(self, relit: FaceLight, seen: tuple[slice, DetailRows | None]) -> np.ndarray:
         """Pixels [h, W, 3] of observed rows, without the photo's own light."""
         rows, detail = seen
         found = self.surround.over_photo(self.own, relit.change, rows)
@@ -104,7 +106,9 @@ class FaceInPhoto:
             part += share * (self._detail.pixels(relit.detail, detail, inside) - part)
         return found
 
-    def layer(self, name: str, relit: _Ready, seen: tuple[slice, DetailRows | None]) -> dict[str, np.ndarray]:
+    def layer(
+        self, name: str, relit: FaceLight, seen: tuple[slice, DetailRows | None]
+    ) -> dict[str, np.ndarray]:
         """A layer [h, W, C] of observed rows."""
         return face_layer(self.view, name, seen[0])
 

@@ -107,7 +107,7 @@ class Grain:
         return wide, slice(start - wide.start, stop - wide.start)
 
     def observe(self, rows: slice) -> GrainRows:
-        """What no light changes in rows of the photo."""
+        """Read the person in rows of the photo, and in those around them."""
         wide, own = self._around(rows, self._margin)
         inside = self._inside[wide]
         return GrainRows(rows, wide, own, inside, self._reached(inside))

@@ -31,8 +31,8 @@ from facerf_cli.relighting.field import near_texture
 from facerf_cli.relighting.grain import Grain, GrainRows
 from facerf_cli.relighting.photo_detail import DetailRows, PhotoDetail, RelitDetail
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.relightable import Relit
 from facerf_cli.relighting.rims import Rims, from_behind
-from facerf_cli.relighting.subject import Relit
 from facerf_cli.relighting.surface import Surface
 from facerf_cli.run.threads import both
 
@@ -48,7 +48,7 @@ _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tai
 
 @dataclass(frozen=True, eq=False)
 class PersonRows:
-    """What no light changes in some rows of the photo, and in those around them that grain reaches.
+    """Values in some rows of the photo, and in those around them that grain reaches, that no light changes.
 
     `weights` [h, w] are those of the narrower views over the widest, the last of `views`.
     """
@@ -150,7 +150,7 @@ class PersonInPhoto:
         return Rims(person.segmentation.matte, person.square.side_px / person.sides)
 
     def ready(self, relit: Relit, layers: Sequence[str] = ()) -> PersonLight:
-        """What is relit, with all that does not depend on rows; raises UsageError for an unknown layer."""
+        """Compute all that does not depend on rows; raises UsageError for an unknown layer."""
         assert relit.mirrored is not None
         maps = {}
         for name in layers:
@@ -173,7 +173,7 @@ class PersonInPhoto:
         )
 
     def observe(self, rows: slice) -> PersonRows:
-        """What no light changes in rows of the photo."""
+        """Read rows of the photo, as far as no light changes them."""
         grain = self._finish[0].observe(rows)
         wide, inside = grain.wide, self.view.rows_inside(grain.wide)
         pixels = self.own[wide].clip(min=0)

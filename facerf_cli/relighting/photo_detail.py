@@ -36,7 +36,10 @@ _OWN_SIDE = 128  # texels of their mask; finer ones take seconds to draw
 
 @dataclass(frozen=True, eq=False)
 class DetailRows:
-    """What no light changes in some rows [h, w] of the window: pixels, what multiplies R and k, own share."""
+    """Values in some rows [h, w] of the window that no light changes.
+
+    They are the pixels, factors of R and of k, and the share that stays the photo's.
+    """
 
     pixels: np.ndarray
     gain: np.ndarray
@@ -71,7 +74,7 @@ class PhotoDetail:
         self._source, self._photo = torch.cat([face.texture, own[None]]), photo
 
     def observe(self, inside: slice) -> DetailRows:
-        """What the photo shows in rows of the window."""
+        """Read rows of the window."""
         floor = self.floor
         pixels = self._photo[self._view.in_photo(inside)][:, self._view.window[1]].clip(min=0)
         source, own = np.split(self._view.render(self._source, inside).numpy(), [3], -1)

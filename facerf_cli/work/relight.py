@@ -16,7 +16,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import most_exposure_ev
 from facerf_cli.image.strips import Empty, rows_of
-from facerf_cli.relighting.subject import Request
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
@@ -25,7 +25,7 @@ from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import facts_of, load_models_once
 from facerf_cli.work.plan import beside_people, image_canvas
 from facerf_cli.work.relight_options import Relight
-from facerf_cli.work.relight_scenes import Scene, scenes_of
+from facerf_cli.work.relight_scenes import LitScene, scenes_of
 from facerf_cli.work.sequence import view_of
 from facerf_cli.work.shots import shot_of
 
@@ -75,7 +75,7 @@ def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
 
 def _write_setups(
     item: Item,
-    scene: Scene,
+    scene: LitScene,
     work: Relight,
     shared_ev: Mapping[str, float] | None,
 ) -> dict[Path, dict[str, float]]:
@@ -127,7 +127,7 @@ def _options(work: Relight) -> str:
 
 
 def _rendered(
-    scene: Scene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
+    scene: LitScene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
@@ -141,8 +141,9 @@ def _rendered(
     for part in parts or [slice(0)]:
         each = scene.relit_by_each(setup, part) if lit.names else ()
         lights = dict(zip(lit.names[part], each, strict=True))
-        arrays |= subject.rendered(Request(None if arrays else relit, lights, work.aov, ev, behind), empty)
-        del lights  # before others are relit
+        request = RenderRequest(None if arrays else relit, lights, work.aov, ev, behind)
+        arrays |= subject.rendered(request, empty)
+        del lights, request  # before others are relit
     pixels, alpha = arrays.pop("rgb"), subject.alpha(behind)
     matte = subject.person_matte
     layers = arrays if matte is None else {"person.A": matte, **arrays}
@@ -182,7 +183,7 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    scene: Scene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
+    scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(rule := work.exposure_rule, float):

@@ -25,8 +25,8 @@ from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.person import Person, Target, person_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.face_alone import FaceAlone
-from facerf_cli.relighting.people import People
-from facerf_cli.relighting.subject import Subject
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import (
@@ -108,7 +108,7 @@ def _fixed(choice: BackgroundChoice, camera: Camera) -> np.ndarray | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class LitScene:
     """People of a photo in one image, a face alone, or a stack; the lights of setups, and what is behind.
 
     Attributes:
@@ -127,7 +127,7 @@ class Scene:
         facts: Of a stack's fit, for the report.
     """
 
-    subject: Subject
+    subject: Relightable
     setups: tuple[LightSetup, ...]
     lights_of: Callable[[tuple[LightSetup, ...]], Lights]
     metadata: Mapping[str, Any]
@@ -160,7 +160,7 @@ class Scene:
         return [_as_lit(setups, *one) for one in zip(self.faces, self.evens, strict=True)]
 
     def _relit(self, lights: Sequence[Lights]) -> Iterator[Any]:
-        return self.subject.relit(lights if isinstance(self.subject, People) else lights[0])
+        return self.subject.relit(lights if isinstance(self.subject, PeopleInPhoto) else lights[0])
 
 
 def _as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[LightSetup, ...]:
@@ -168,7 +168,7 @@ def _as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple
     return tuple(with_room(as_in_photo(on_face(setup, face), even)) for setup in setups)
 
 
-def scenes_of(item: Item, work: Relight, together: bool) -> Iterator[Scene]:
+def scenes_of(item: Item, work: Relight, together: bool) -> Iterator[LitScene]:
     """All chosen people of a photo in one image, or each face alone, the last first; or a stack."""
     if is_olat_stack(item.input_path):
         yield _scene_of_stack(item, work)
@@ -182,7 +182,7 @@ def scenes_of(item: Item, work: Relight, together: bool) -> Iterator[Scene]:
         by_size = sorted(people, key=lambda face: -face.fit.crop.side_px)
         targets = [_target(item, face, image, work) for face in by_size]
         fitted = [_fitted(item, image, face, work) for face in by_size]
-        scene = Scene(
+        scene = LitScene(
             setups=work.setups,
             lights_of=lights_of,
             metadata=_metadata(item, work),
@@ -203,12 +203,12 @@ def scenes_of(item: Item, work: Relight, together: bool) -> Iterator[Scene]:
         )
 
 
-def _subject(people: Sequence[Person], targets: Sequence[Target]) -> Subject:
-    """People in their photo, or the face of the first alone."""
+def _subject(people: Sequence[Person], targets: Sequence[Target]) -> Relightable:
+    """PeopleInPhoto in their photo, or the face of the first alone."""
     if targets[0].composite == "face":
         return people[0].composed(targets[0])
     each = [person.in_photo(target) for person, target in zip(people, targets, strict=True)]
-    return People(each, targets[0].background)
+    return PeopleInPhoto(each, targets[0].background)
 
 
 def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, Iterator[FittedFace]]:
@@ -291,7 +291,7 @@ def _metadata(item: Item, work: Relight) -> dict[str, str | int]:
     return metadata
 
 
-def _scene_of_stack(item: Item, work: Relight) -> Scene:
+def _scene_of_stack(item: Item, work: Relight) -> LitScene:
     """A stack under its own lights."""
     _check_stack(item, work)
     _check_faces(item, 0, work)
@@ -303,7 +303,7 @@ def _scene_of_stack(item: Item, work: Relight) -> Scene:
         )
         log.warning(said, item.input_path, off_deg)
     lights_of = partial(lights_over_stack, directions=own, sampling=work.sampling)
-    subject: Subject
+    subject: Relightable
     behind = None
     if header.kind == "photo":
         subject, behind, facts = _person_of_stack(item, header, work)
@@ -315,7 +315,7 @@ def _scene_of_stack(item: Item, work: Relight) -> Scene:
         subject, facts = _face_of_stack(item, header, work)
     lit = work.setups if work.asked_for_room else tuple(replace(setup, room=0.0) for setup in work.setups)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
-    return Scene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
+    return LitScene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
 
 
 def _check_stack(item: Item, work: Relight) -> None:

@@ -22,7 +22,7 @@ from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exp
 from facerf_cli.image.strips import Resized, Rows, Scaled
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.field import weighted_sum
-from facerf_cli.relighting.subject import Relit, Request, Subject
+from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
@@ -39,7 +39,7 @@ class StackTextures:
 
 
 @dataclass(frozen=True, eq=False)
-class _Ready:
+class StackLight:
     """Sums [h, w, 3] of the lights; of a larger photo the change of its light [H, W, 3]."""
 
     lit: Rows
@@ -48,7 +48,7 @@ class _Ready:
 
 
 @dataclass(frozen=True, eq=False)
-class StackImages(Subject):
+class StackImages(Relightable):
     """The images of a stack: of a face and its coverage, or of a photo's person over black.
 
     A person is shown alone, or with `photo` [H, W, 3] in that photo. That may be larger than the stack: then
@@ -92,17 +92,17 @@ class StackImages(Subject):
         textures = weighted_sum(stream_olats(self.path), lights.weights)
         return (Relit(texture, own=own) for texture, own in zip(textures, lights.owns, strict=True))
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> _Ready:
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> StackLight:
         """A sum in its frame; raises UsageError for layers other than normals."""
         if other := [name for name in layers if name != "normal"]:
             raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
         lit, source = self._lit(relit), self.header.source
         own = None if relit.own is None or self.photo is None else relit.own.numpy()
         if self.photo is None or self.size_px == self.header.seen.shape:
-            return _Ready(lit, False, own)
-        return _Ready(Resized(lit / (source + _DARK * source.mean()), self.size_px), True, own)
+            return StackLight(lit, False, own)
+        return StackLight(Resized(lit / (source + _DARK * source.mean()), self.size_px), True, own)
 
-    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
+    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
         """Some rows of the image, of lights over black, and of normals."""
         matte, found = self.matte[rows][..., None], {}
         if request.image is not None:
@@ -127,7 +127,7 @@ class StackImages(Subject):
             return auto_exposure_ev(lit, seen)
         return anchored_exposure_ev(lit, self.header.source, self.face * seen, seen)
 
-    def _pixels(self, relit: _Ready, rows: slice) -> np.ndarray:
+    def _pixels(self, relit: StackLight, rows: slice) -> np.ndarray:
         """The person's own colours [h, W, 3]."""
         pixels, photo = relit.lit[rows], self.photo
         if photo is not None:

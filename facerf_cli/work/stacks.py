@@ -28,7 +28,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Target, person_of
 from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
-from facerf_cli.relighting.subject import Request
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
@@ -129,7 +129,7 @@ def _of_person(
     def olats() -> Iterator[Tensor]:
         for some in torch.split(directions, _LIGHTS_AT_ONCE):
             lights = {str(number): one for number, one in enumerate(subject.relit(Lights.each(some)))}
-            images = np.stack(list(subject.rendered(Request(lights=lights)).values()))
+            images = np.stack(list(subject.rendered(RenderRequest(lights=lights)).values()))
             batch = torch.from_numpy(images).permute(0, 3, 1, 2)
             scale = _tile_px(len(directions)) / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
@@ -137,7 +137,7 @@ def _of_person(
             yield batch
 
     first = next(subject.relit(Lights.each(directions[:1])))
-    normals = subject.rendered(Request(first, layers=("normal",)))["normal"]
+    normals = subject.rendered(RenderRequest(first, layers=("normal",)))["normal"]
     header = StackHeader(
         kind="photo",
         rotation=head.fit.rotation.numpy(),

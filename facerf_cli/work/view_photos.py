@@ -21,7 +21,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.person import person_of
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
@@ -87,7 +87,7 @@ def of_photo(
 ) -> tuple[Basis, Plate]:
     """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
     person = person_of(models, photo, head, matte=matte, white=white)
-    people = People([person.in_photo()])
+    people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
     return basis, Plate(photo, people.matte, photo - people.own_layer(), person.even_brightness)
 

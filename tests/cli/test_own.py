@@ -14,7 +14,7 @@ from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb
 from facerf_cli.light.entries import OWN, LitImage, lit_images
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Target
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import lights_over_rig, with_room
 from tests import astronaut
@@ -126,7 +126,7 @@ def test_two_people_in_their_own_light_are_the_photo() -> None:
     photo, person = astronaut.photo(), astronaut.person()
     height, width = photo.shape[:2]
     left = np.clip((width / 2 - np.arange(width)) / 40 + 0.5, 0, 1).astype(np.float32)[None].repeat(height, 0)
-    both = People([person.in_photo(Target(matte=side)) for side in (left, 1 - left)])
+    both = PeopleInPhoto([person.in_photo(Target(matte=side)) for side in (left, 1 - left)])
     dark = Lights(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own=torch.ones(1, 3))
     (relit,) = both.relit([dark, dark])
     assert np.abs(both.image(relit).pixels - photo).max() < 1e-5

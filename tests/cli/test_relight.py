@@ -18,8 +18,8 @@ from facerf_cli.main import main
 from facerf_cli.option import attributes_of
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field
-from facerf_cli.relighting.people import People
-from facerf_cli.relighting.subject import Subject
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.synth.sky.skies import kind_of
 from facerf_cli.work.relight_options import Relight, parse_aov
 from tests.astronaut import PATH as PHOTO
@@ -97,9 +97,9 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
     composite: str, lights: list[str], kept: int, given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held: list[weakref.ref] = []
-    subject: Any = People if composite == "photo" else FaceAlone
+    subject: Any = PeopleInPhoto if composite == "photo" else FaceAlone
 
-    def watched(self: Subject, lights: Any) -> Iterator[Any]:
+    def watched(self: Relightable, lights: Any) -> Iterator[Any]:
         assert sum(one() is not None for one in held) <= kept
         for one in relit(self, lights):
             held.append(weakref.ref((one if composite == "face" else one[0]).texture))

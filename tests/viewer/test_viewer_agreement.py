@@ -33,7 +33,7 @@ from facerf_cli.main import main
 from facerf_cli.person import Person
 from facerf_cli.pipeline import find_for, head_of, reflectance_of
 from facerf_cli.relighting.models import load_models
-from facerf_cli.relighting.people import People
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
@@ -52,7 +52,7 @@ MEAN_BETWEEN, PERCENTILE_95 = 3.0, 10.0  # between its lights
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    whole: People
+    whole: PeopleInPhoto
     text: str
 
     def relit(self, directions: torch.Tensor, weights: torch.Tensor, room: float = 0.06) -> Any:
@@ -88,7 +88,7 @@ def shown() -> Shown:
     assert isinstance(field, PortraitField)
     sun = [one for one in page_maps() if one.name == "sun"]
     document = packed(basis, plate, head_place(head.fit.crop, plate.matte), sun)
-    whole = People([Person(models, photo, head, field).in_photo()])
+    whole = PeopleInPhoto([Person(models, photo, head, field).in_photo()])
     return Shown(whole, page("me.jpg", ["me.jpg"], document, ""))
 
 
@@ -240,7 +240,7 @@ def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path)
     ):
         size = image.pixels.shape[:2]
         assert size == (320, 320)
-        lit = replace(relit, own=torch.full((3,), own)) if own else relit
+        lit = [replace(relit[0], own=torch.full((3,), own))] if own else relit
         error = np.abs(resized(shown().truth(lit, 0.0), *size) - image.pixels[..., :3])
         assert error[resized(shown().whole.matte, *size) > 0.99].mean() < MEAN_BETWEEN
 

@@ -9,7 +9,7 @@ import torch
 
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
-from facerf_cli.relighting.subject import Relit, Request
+from facerf_cli.relighting.relightable import Relit, RenderRequest
 from facerf_cli.work.stack_composers import StackImages
 
 SIDE = 4
@@ -63,7 +63,7 @@ def test_a_large_photo_is_composed_in_rows() -> None:
     composer = StackImages(header(), Path(), header().seen, photo)
     behind = np.full((2048, 512, 3), 3.0, np.float32)
     for given in (None, behind):
-        request = Request(lit(0.6), ev=1.0, background=given)
+        request = RenderRequest(lit(0.6), ev=1.0, background=given)
         ready, whole = request.ready(composer), composer.rendered(request)["rgb"]
         tracemalloc.start()
         middle = composer.render(ready, slice(1000, 1010))["rgb"]
@@ -77,6 +77,6 @@ def test_a_large_photo_is_composed_in_rows() -> None:
 def test_exposure_and_layers() -> None:
     composer = StackImages(header(), Path(), header().seen)
     assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
-    assert set(composer.rendered(Request(lit(1.0), layers=("normal",)))) == {"rgb", "normal"}
+    assert set(composer.rendered(RenderRequest(lit(1.0), layers=("normal",)))) == {"rgb", "normal"}
     with pytest.raises(UsageError, match="--aov albedo"):
-        composer.rendered(Request(lit(1.0), layers=("albedo",)))
+        composer.rendered(RenderRequest(lit(1.0), layers=("albedo",)))

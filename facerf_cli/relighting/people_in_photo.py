@@ -16,7 +16,7 @@ from facerf_cli.image.strips import in_strips
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.face_in_photo import FaceInPhoto
 from facerf_cli.relighting.person_in_photo import COLOURS, PersonInPhoto
-from facerf_cli.relighting.subject import Relit, Request, Subject
+from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 
 Background = Literal["photo", "none", "given"]
 _BLACK, _TINY = np.float32(0), 1e-6
@@ -32,7 +32,7 @@ class _Present:
 
 
 @dataclass(frozen=True, eq=False)
-class People(Subject):
+class PeopleInPhoto(Relightable):
     """People of one photo, the nearest first, before the photo's background, nothing, or another image."""
 
     people: Sequence[PersonInPhoto | FaceInPhoto]
@@ -71,14 +71,14 @@ class People(Subject):
         return zip(*(person.relit(own) for person, own in zip(self.people, each, strict=True)), strict=True)
 
     def ready(self, relit: Sequence[Relit], layers: Sequence[str] = ()) -> list[Any]:
-        """What is relit of each person, with all that does not depend on rows."""
+        """Compute all that does not depend on rows, of each person."""
         return [person.ready(one, layers) for person, one in zip(self.people, relit, strict=True)]
 
     def exposure_ev(self, relit: Sequence[Relit], rule: ExposureRule) -> float:
         """The exposure in EV of the first person, by a rule."""
         return self.people[0].exposure_ev(relit[0], rule)
 
-    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
+    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
         """Some rows of the image, of the people under lights over black, and of layers.
 
         Positions are in each person's own camera.
@@ -111,7 +111,7 @@ class People(Subject):
         return _over(_BLACK, present, [one.person.own[rows] for one in present])
 
     def _image(
-        self, request: Request, present: Sequence[_Present], seen: Sequence[Any], rows: slice
+        self, request: RenderRequest, present: Sequence[_Present], seen: Sequence[Any], rows: slice
     ) -> np.ndarray:
         pixels = _pixels(present, request.image, seen, rows)
         if request.background is not None:
@@ -126,7 +126,7 @@ class People(Subject):
 
 
 def _over(below: Any, present: Sequence[_Present], pixels: Sequence[np.ndarray]) -> np.ndarray:
-    """People, the nearest first, with pixels [h, W, 3] of each, laid over what is below."""
+    """PeopleInPhoto, the nearest first, with pixels [h, W, 3] of each, laid over what is below."""
     for one, own in zip(present, pixels, strict=True):
         below = below + one.share * (own - below)
     return np.asarray(below)

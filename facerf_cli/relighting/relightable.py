@@ -1,6 +1,6 @@
-"""What can be relit: people in a photo, a face alone, an OLAT stack; and the one loop that renders it.
+"""The interface of all that can be relit: people in a photo, a face alone, an OLAT stack.
 
-A subject is relit at the resolution of its maps, once for all sums of lights, and rendered at that of its
+It is relit at the resolution of its maps, once for all sums of lights, and rendered at that of its
 frame, some rows at a time. Both are linear in light: layers of single lights add up.
 """
 
@@ -49,8 +49,8 @@ class Relit:
 
 
 @dataclass(frozen=True, eq=False)
-class Request:
-    """What to render of a subject.
+class RenderRequest:
+    """Images and layers to render of a subject.
 
     Attributes:
         image: The sum of lights of the image "rgb" [H, W, 3]; None leaves the image out.
@@ -66,7 +66,7 @@ class Request:
     ev: float = 0.0
     background: Rows | None = None
 
-    def ready(self, subject: "Subject") -> "Request":
+    def ready(self, subject: "Relightable") -> "RenderRequest":
         """The same with all that does not depend on rows computed."""
         image = None if self.image is None else subject.ready(self.image, self.layers)
         return replace(
@@ -82,8 +82,8 @@ class RelitImage:
     alpha: np.ndarray | None = None
 
 
-class Subject(ABC):
-    """What can be relit in a frame."""
+class Relightable(ABC):
+    """A subject that can be relit in a frame."""
 
     keeps_photo = False  # True where the photo's own background stays behind it
 
@@ -113,17 +113,17 @@ class Subject(ABC):
 
     @abstractmethod
     def ready(self, relit: Any, layers: Sequence[str] = ()) -> Any:
-        """What `relit` gave, made ready to be rendered by rows, and with it layers."""
+        """Make what `relit` gave ready to be rendered by rows, and layers with it."""
 
     @abstractmethod
-    def render(self, request: Request, rows: slice) -> dict[str, np.ndarray]:
-        """Some rows [h, W, ...] of all that is asked; the request is `Request.ready`."""
+    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
+        """Some rows [h, W, ...] of all that is asked; the request is `RenderRequest.ready`."""
 
     @abstractmethod
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
         """The exposure in EV of the subject under one sum of lights, by a rule."""
 
-    def rendered(self, request: Request, empty: Empty = new_array) -> dict[str, np.ndarray]:
+    def rendered(self, request: RenderRequest, empty: Empty = new_array) -> dict[str, np.ndarray]:
         """All rows of what is asked; `empty` makes the array of a layer, by its name and shape.
 
         Raises UsageError for layers that this subject lacks.
@@ -132,7 +132,7 @@ class Subject(ABC):
 
     def image(self, relit: Any, ev: float = 0.0, background: Rows | None = None) -> RelitImage:
         """The image under one sum of lights."""
-        pixels = self.rendered(Request(relit, ev=ev, background=background))["rgb"]
+        pixels = self.rendered(RenderRequest(relit, ev=ev, background=background))["rgb"]
         return RelitImage(pixels, self.alpha(background))
 
     def alpha(self, background: Rows | None = None) -> np.ndarray | None:
@@ -141,4 +141,4 @@ class Subject(ABC):
 
     def light_layer(self, relit: Any) -> np.ndarray:
         """The subject [H, W, 3] under one of several lights, over black."""
-        return self.rendered(Request(lights={"": relit}))[""]
+        return self.rendered(RenderRequest(lights={"": relit}))[""]
