@@ -126,7 +126,7 @@ class PeopleInPhoto(Relightable):
 
 
 def _over(below: Any, present: Sequence[_Present], pixels: Sequence[np.ndarray]) -> np.ndarray:
-    """PeopleInPhoto, the nearest first, with pixels [h, W, 3] of each, laid over what is below."""
+    """People, the nearest first, with pixels [h, W, 3] of each, laid over what is below."""
     for one, own in zip(present, pixels, strict=True):
         below = below + one.share * (own - below)
     return np.asarray(below)

@@ -204,7 +204,7 @@ def scenes_of(item: Item, work: Relight, together: bool) -> Iterator[LitScene]:
 
 
 def _subject(people: Sequence[Person], targets: Sequence[Target]) -> Relightable:
-    """PeopleInPhoto in their photo, or the face of the first alone."""
+    """People in their photo, or the face of the first alone."""
     if targets[0].composite == "face":
         return people[0].composed(targets[0])
     each = [person.in_photo(target) for person, target in zip(people, targets, strict=True)]
