@@ -21,7 +21,7 @@ def test_what_the_key_does_not_reach_becomes_as_the_skin_around_and_keeps_its_fr
     albedo, key = plain(), WHOLE.clone()
     key[SPOT] = 0
     albedo[:, *SPOT] *= torch.tensor([0.8, 0.6, 0.5])[:, None, None]
-    found = albedo * without_baked_in(albedo, plain() * key.clamp_min(0.05), WHOLE, key)
+    found = albedo * without_baked_in(albedo, plain() * key.clamp_min(0.05), WHOLE, key, 1.0)
     middle = found[:, 104:112, 104:112]  # of which no pixel is near the border
     wanted = plain()[:, 104:112, 104:112].mean((1, 2))
     torch.testing.assert_close(middle.mean((1, 2)), wanted, rtol=0.03, atol=0)
@@ -33,11 +33,11 @@ def test_what_is_brighter_and_whiter_than_the_skin_around_is_glare() -> None:
     albedo, photo = plain(), plain()
     photo[:, *SPOT] += 0.15
     albedo[:, *SPOT] += 0.05
-    found = albedo * without_baked_in(albedo, photo, WHOLE, WHOLE)
+    found = albedo * without_baked_in(albedo, photo, WHOLE, WHOLE, 1.0)
     torch.testing.assert_close(found[:, 109, 109], SKIN, rtol=0.08, atol=0)
 
 
-def test_bright_skin_of_its_colour_grey_photos_and_what_is_no_skin_stay_and_all_without_a_key() -> None:
+def test_bright_skin_of_its_colour_grey_photos_and_what_is_no_skin_stay_and_all_in_soft_light() -> None:
     one = torch.ones(3, SIDE, SIDE)
     lit, white = plain(), plain()
     lit[:, *SPOT] *= 1.6
@@ -45,10 +45,10 @@ def test_bright_skin_of_its_colour_grey_photos_and_what_is_no_skin_stay_and_all_
     grey = white.mean(0).expand(3, -1, -1)
     part, unlit = WHOLE.clone(), WHOLE.clone()
     part[SPOT], unlit[SPOT] = 0.5, 0
-    for photo, skin, key in (
-        (lit, WHOLE, WHOLE),
-        (grey, WHOLE, WHOLE),
-        (white, part, unlit),
-        (white, WHOLE, 0 * WHOLE),
+    for photo, skin, key, share in (
+        (lit, WHOLE, WHOLE, 1.0),
+        (grey, WHOLE, WHOLE, 1.0),
+        (white, part, unlit, 1.0),
+        (white, WHOLE, WHOLE, 0.4),
     ):
-        torch.testing.assert_close(without_baked_in(photo, photo, skin, key), one, rtol=0, atol=1e-4)
+        torch.testing.assert_close(without_baked_in(photo, photo, skin, key, share), one, rtol=0, atol=1e-4)

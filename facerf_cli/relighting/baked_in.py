@@ -15,6 +15,7 @@ from facerf_cli.raster.texture import blurred, blurred_within, smoothstep
 _FINE, _NEAR, _AROUND = 1 / 224, 1 / 28, 1 / 10  # standard deviations of blurs, in sides
 _SURE = (0.6, 0.9)  # share of skin from which on a pixel counts, and counts whole
 _BRIGHT = 0.9  # quantile of the key on skin
+_HARD = (0.5, 0.8)  # share of the key, up to which light is soft, and from which on it is hard
 _LIT = (0.2, 0.6)  # key over that, up to which skin lies in shade, and from which on it does not
 _WHITER = (0.02, 0.1)  # share of added white from which on skin glares, and surely does
 _BRIGHTER = (0.0, 0.2)  # log of its brightness over that around, likewise
@@ -23,18 +24,19 @@ _MOST = 1.5  # log of a factor
 _TINY = 1e-6
 
 
-def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor) -> Tensor:
+def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor, share: float) -> Tensor:
     """Factors [3, S, S] of an albedo [3, S, S], where skin then has neither shade nor glare of the photo.
 
     The photo [3, S, S] is scene-linear, `skin` [S, S] the share of bare skin; `key` [S, S] is what the
-    photo's key light does to a white surface there.
+    photo's key light does to a white surface there, `share` what it is of the photo's light: in soft light
+    albedo has neither.
     """
     sure, skin = skin > _SURE[1], _ramp(skin, _SURE)
     if not sure.any():
         return torch.ones_like(albedo)
     side = photo.shape[-1]
     shade = 1 - _ramp(key / torch.quantile(key[sure], _BRIGHT).clamp_min(_TINY), _LIT)
-    baked = torch.maximum(shade, _glare(photo, skin * (1 - shade)))
+    baked = _ramp(torch.tensor(share), _HARD) * torch.maximum(shade, _glare(photo, skin * (1 - shade)))
     logs = albedo.clamp_min(1e-4).log()
     coarse = blurred_within(logs, skin, _FINE * side)
     plain = (skin * (1 - baked)) ** 4

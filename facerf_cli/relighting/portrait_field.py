@@ -34,7 +34,7 @@ from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.rims import from_behind
 from facerf_cli.relighting.shade import without_colour_of_shade
-from facerf_cli.relighting.source_light import SourceLight
+from facerf_cli.relighting.source_light import SourceLight, share_of_lamp
 from facerf_cli.relighting.white import BARE, Balance
 from facerf_cli.run.threads import in_threads
 
@@ -122,16 +122,16 @@ class PortraitView:
         found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
         return found if source is None else found._corrected(source)
 
-    def _without_baked_in(self, key: Tensor) -> "PortraitView":
+    def _without_baked_in(self, key: Tensor, share: float) -> "PortraitView":
         """The view without shade and glare of the photo in its albedo, by the shading [S, S] of the key.
 
-        Where that is 0 all over, there is no key, and all stays.
+        `share` is that of the key in the photo's light.
         """
         person = self.person
         bare = person.classes[BARE].sum(0)
         others = blurred(1 - bare[None], _APART * person.image.shape[-1])[0]
         skin = bare * (1 - 4 * others).clamp_min(0)
-        return self._with_albedo(without_baked_in(self.maps.albedo[0], person.image, skin, key))
+        return self._with_albedo(without_baked_in(self.maps.albedo[0], person.image, skin, key, share))
 
     def _with_albedo(self, gains: Tensor) -> "PortraitView":
         """The view whose albedo is multiplied by gains [3, S, S]."""
@@ -148,7 +148,7 @@ class PortraitView:
         explained = torch.einsum("lc,lcij->cij", weights, olats)
         shown, found = ((image * skin).sum((1, 2), True) for image in (self.person.image, explained))
         exposure = shown / found.clamp_min(1e-6)  # white, as the photo's light leaves it
-        plain = replace(self, exposure=exposure)._without_baked_in(shade[0] * used[0])
+        plain = replace(self, exposure=exposure)._without_baked_in(shade[0], share_of_lamp(source.light))
         olats = plain.maps.albedo * shade[:, None] + glow[:, None]
         correction = Correction.of(self.person.image / exposure, olats, weights, 1 - self.person.classes[0])
         return replace(plain, correction=correction)

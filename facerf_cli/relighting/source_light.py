@@ -55,7 +55,7 @@ def source_light(models: Models, face: FaceTexture, held: RigLight | None = None
     explained = weighted_sum([lamp, frame.around], light.weights[None])[0]
     skin = small.visible * region_mask("skin", small.texture.shape[-1])
     key = lamp[0].mean(0) / even.mean(0).clamp_min(_TINY)
-    plain = without_baked_in(even, small.texture, skin, key)
+    plain = without_baked_in(even, small.texture, skin, key, share_of_lamp(light))
     quotient = Quotient.of(small.texture, explained, small.visible, plain)
     return SourceLight(light, quotient, quotient.corrected(frame.around).mean(0))
 
