@@ -14,6 +14,7 @@ from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.raster.texture import blurred
 from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
 from facerf_cli.relighting.enlarged import Enlarged
+from facerf_cli.relighting.portrait_field import PortraitLight
 from tests import astronaut
 
 SIDE, SCALE = 48, 5  # pixels of the maps, and of the photo along each of them
@@ -119,14 +120,15 @@ def test_no_light_of_a_hand_is_on_the_cloth_behind_it(glossy: bool) -> None:
     )
     flat = torch.ones(1, 3, size, size)
     maps = view.maps._replace(gain=flat, bias=0 * flat)
-    lit = torch.zeros(15, size, size)
-    rows = slice(3 if glossy else 0, 6 if glossy else 3)
-    lit[rows] = blurred(mixed(share, 0.5, 2)[None], 1.0)
-    lit[rows, :, :20] *= 2
+    lit = blurred(mixed(share, 0.5, 2).expand(3, -1, -1), 1.0)
+    lit[..., :20] *= 2
+    parts = (0 * lit, lit) if glossy else (lit, 0 * lit)
+    light = PortraitLight(*parts, reached=lit, behind=torch.zeros(6, size, size))
     both = skin(side_px + 20, 1)[:side_px], distance(side_px + 20, 1)[:side_px].numpy()
     photo = mixed(both[0], DARK, BRIGHT)[..., None].expand(-1, -1, 3).numpy().copy()
-    enlarged = Enlarged(replace(view, person=person, maps=maps), photo)
-    relit = luminance(enlarged.relit(lit, 0.0, None)(photo, slice(0, side_px), slice(0, side_px + 20)))
+    enlarged = Enlarged(replace(view, person=person, maps=maps), photo.shape[:2], 0.0)
+    seen = enlarged.observe(photo, slice(0, side_px), slice(0, side_px + 20))
+    relit = luminance(enlarged.radiance(enlarged.ready(light), seen, None))
     cloth, far = (both[1] < -BESIDE) & (both[1] > -FAR), (both[1] < -FAR) & (both[1] > -3 * FAR)
     assert np.abs(np.diff(relit, axis=1))[:, 30:50].max() < 0.15 * relit[far].mean()
     assert np.abs(relit[cloth] / relit[far].mean() - 1).max() < 0.15
