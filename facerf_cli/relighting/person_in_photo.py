@@ -19,6 +19,7 @@ from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule
+from facerf_cli.image.strips import in_strips
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.parse import UncoveredRows
@@ -139,10 +140,15 @@ class PersonInPhoto:
     @cached_property
     def _finish(self) -> tuple[Grain, Eyes]:
         """Detail of the photo without its light, and the eyes."""
-        hair, eyes, lips, mouth = (self._field.person.segmentation.layer(name) for name in _NO_GRAIN)
-        plain = (1 - hair - eyes).clip(0) * (1 - (lips + mouth) / _LEAST_MOUTH).clip(0)
-        grain = Grain(self._flat, (self.matte > 0) * plain, self._views[0].pixel_px, self._sharpened)
+        share = in_strips(self._grained, *self.size_px)["share"]
+        grain = Grain(self._flat, share, self._views[0].pixel_px, self._sharpened)
         return grain, Eyes(self.own, self._field.person.eyes, self.size_px)
+
+    def _grained(self, rows: slice) -> dict[str, np.ndarray]:
+        """Share [h, W] of the person that has grain, in rows of the photo."""
+        hair, eyes, lips, mouth = (self._field.person.segmentation.layer(name, rows) for name in _NO_GRAIN)
+        plain = (1 - hair - eyes).clip(0) * (1 - (lips + mouth) / _LEAST_MOUTH).clip(0)
+        return {"share": (self.matte[rows] > 0) * plain}
 
     @cached_property
     def _rims(self) -> Rims:
