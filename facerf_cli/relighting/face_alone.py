@@ -79,9 +79,7 @@ class FaceAlone(Relightable):
 
     def ready(self, relit: Relit, layers: Sequence[str] = ()) -> Relit:
         """The same, since textures are rendered as they are; raises UsageError for layers of whole people."""
-        for name in layers:
-            if name not in FACE_LAYERS:
-                raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
+        require_face_layers(layers)
         return relit
 
     def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
@@ -148,6 +146,13 @@ def exposure_of_face(head: Head, relit: Relit, rule: ExposureRule) -> float:
     lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
     seen = head.face.visible.numpy()
     return chosen_exposure_ev(rule, lit, plate, seen, seen)
+
+
+def require_face_layers(names: Sequence[str]) -> None:
+    """Raise UsageError for layers of whole people."""
+    for name in names:
+        if name not in FACE_LAYERS:
+            raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
 
 
 def face_layer(view: FaceView, name: str, rows: slice) -> dict[str, np.ndarray]:

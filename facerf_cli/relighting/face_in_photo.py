@@ -14,7 +14,6 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
 from facerf_cli.baselines.base import Reflectance
-from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
@@ -25,7 +24,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
-from facerf_cli.relighting.face_alone import FACE_LAYERS, exposure_of_face, face_layer, relit_faces
+from facerf_cli.relighting.face_alone import exposure_of_face, face_layer, relit_faces, require_face_layers
 from facerf_cli.relighting.photo_detail import DARK, TINY, DetailRows, PhotoDetail, RelitDetail
 from facerf_cli.relighting.relightable import Relit
 
@@ -84,9 +83,7 @@ class FaceInPhoto:
 
     def ready(self, relit: Relit, layers: Sequence[str] = ()) -> FaceLight:
         """Compute all that does not depend on rows; raises UsageError for layers of people."""
-        for name in layers:
-            if name not in FACE_LAYERS:
-                raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
+        require_face_layers(layers)
         assert relit.change is not None
         return FaceLight(relit.change, self._detail.ready(relit.texture), relit.own)
 

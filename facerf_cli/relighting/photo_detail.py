@@ -63,7 +63,7 @@ class PhotoDetail:
     """
 
     def __init__(self, face: FaceTexture, view: FaceView, photo: Rows) -> None:
-        self._view, self._texture = view, face.texture
+        self._view = view
         masks = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS])[None]
         masks = F.interpolate(masks, face.texture.shape[1:], mode="bilinear", align_corners=False)[0]
         own, self._mouth = masks.amax(0), masks[_OWN_REGIONS.index("mouth")]
