@@ -8,8 +8,8 @@ import typer
 from facerf_cli.cli.options import is_default, was_given
 from facerf_cli.errors import UsageError
 from facerf_cli.option import flag
+from facerf_cli.training.options import PaceOptions, TrainOptions
 from facerf_cli.training.settings import KINDS, TrainSettings
-from facerf_cli.work.train_options import PaceOptions, TrainOptions
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
 _PEOPLE_STAGES = ("parsing", "portrait")  # which draw whole synthetic people
@@ -62,7 +62,7 @@ def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> N
     of_file = (context.find_root().default_map or {}).get("train", {})
     tables = {name: table for name, table in of_file.items() if name in KINDS}
     training = pace.of_run(options, tables)
-    from facerf_cli.work.train import run_training
+    from facerf_cli.training.run import run_training
 
     run_training(replace(options, training=training, typed=_typed(context, options, training)))
 

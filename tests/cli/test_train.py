@@ -21,9 +21,9 @@ from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import seen_path
+from facerf_cli.training.options import TrainOptions
 from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
 from facerf_cli.work import train as train_work
-from facerf_cli.work.train_options import TrainOptions
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.network.test_own_forms import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset

@@ -22,7 +22,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from facerf_cli.training.run_folder import begin, save_state
 from facerf_cli.training.settings import PRESETS, Preset
-from facerf_cli.work.train_cost import checkpoint_bytes
+from facerf_cli.training.stage_networks import checkpoint_bytes
 from tests.dataset.dataset_fixture import write_small_dataset
 
 SIDE = 32

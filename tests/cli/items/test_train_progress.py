@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from facerf_cli.batch.settings import Settings
+from facerf_cli.training.run import TrainProgress
 from facerf_cli.training.settings import TrainSettings
-from facerf_cli.work.train import TrainProgress
 
 
 def row(step: int, seconds: float) -> dict[str, Any]:

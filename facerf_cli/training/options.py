@@ -4,14 +4,13 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.option import DATA, LENGTH, LOSSES, RUN, SPEED, option
 from facerf_cli.training.config_file import with_tables
 from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
-from facerf_cli.work.photo_options import Geometry
 
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 _DEFAULT_TIME = "2h"
@@ -119,7 +118,7 @@ class TrainOptions:
     )
     without_normals: bool = option(False, panel=LOSSES)
     mean_face: bool = option(False, panel=LOSSES)
-    geometry: Geometry = option("network", panel=LOSSES)
+    geometry: Literal["landmarks", "network"] = option("network", panel=LOSSES)
     workers: int | None = option(
         None, shown_default="1 on a CPU of more than one core, 4 on a GPU", least=0, panel=SPEED
     )

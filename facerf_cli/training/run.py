@@ -57,15 +57,14 @@ from facerf_cli.training.joint import JointObjective, JointSettings
 from facerf_cli.training.light_features import AppearanceObjective, LightFeaturesObjective
 from facerf_cli.training.loop import Start, train
 from facerf_cli.training.objective import Objective
+from facerf_cli.training.options import TrainOptions
 from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettings
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import Stage, TrainSettings
+from facerf_cli.training.stage_networks import TINY_LIGHTS, StageNetworks, say_cost
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
-from facerf_cli.work.train_cost import say_cost
-from facerf_cli.work.train_networks import TINY_LIGHTS, StageNetworks
-from facerf_cli.work.train_options import TrainOptions
 
 _WORKERS_ON_GPU = 4
 _SMOOTH = 0.95  # of the moving average of the losses
