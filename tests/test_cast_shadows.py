@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.light import Light, sums_of
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import KeyLight, Lights, far_samples
 from facerf_cli.person import Target
@@ -136,3 +137,19 @@ def test_layers_of_lights_add_up(people: PeopleInPhoto) -> None:
     key, fill, both = map(people.light_layer, relit)
     assert fill.max() > 0.02
     np.testing.assert_allclose(both, key + fill, atol=1e-5 * both.max())
+
+
+def test_a_bright_texel_of_a_map_casts_the_shadow_of_a_single_light(people: PeopleInPhoto) -> None:
+    envmap = np.full((64, 128, 3), 0.02, np.float32)
+    envmap[21, 47] = 300.0
+    u, v = 47.5 / 128, 21.5 / 64
+    single = Light.single(180 - 360 * u + 15, 90 - 180 * v)
+    of_map = Light.from_envmap(envmap, rotate_deg=15, lights=6)
+    shadows = []
+    for light in (of_map, single):
+        sharp, soft = (
+            people.light_layer(next(people.relit(sums_of([one])))) for one in (light, replace(light, keys=()))
+        )
+        shadows.append((sharp - soft) / light.weights[-1])
+    assert abs(shadows[1]).max() > 0.05
+    np.testing.assert_allclose(shadows[0], shadows[1], atol=2e-3 * abs(shadows[1]).max())

@@ -36,7 +36,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         of_map, estimate = facerf.Light.from_envmap, facerf.Person.estimate_light
-        few = lambda envmap, rotate_deg=0.0, lights=24: of_map(envmap, rotate_deg, lights)  # noqa: E731
+        few = lambda envmap, rotate_deg=0.0, lights=24, **more: of_map(envmap, rotate_deg, lights, **more)  # noqa: E731
         patch.setattr(facerf.Light, "from_envmap", staticmethod(few))
         patch.setattr(facerf.Person, "estimate_light", lambda person: estimate(person, lights=24))
         for block in blocks:

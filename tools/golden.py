@@ -60,6 +60,7 @@ def write_inputs(out: Path, checkout: Path) -> None:
         (out / folder).mkdir()
     for path in sorted((checkout / "examples/maps").glob("s*.exr")):
         shutil.copy(path, out / "maps")
+    shutil.copy(checkout / "examples/maps/low_sun.exr", out / "sun.exr")
     photo.save(out / "truths/photo_light_70_20.png")
     frames = [whole.crop((110 + 2 * i, 10, 334 + 2 * i, 202)) for i in range(3)]
     with av.open(str(out / "film.mov"), "w") as container:

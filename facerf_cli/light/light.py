@@ -12,6 +12,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.map_keys import MapKeys, without_keys
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
 
@@ -59,15 +60,22 @@ class Light:
         return Light(nothing, nothing, rgb if isinstance(rgb, Tensor) else np.array(rgb, np.float32))
 
     @staticmethod
-    def from_envmap(envmap: Array, rotate_deg: float = 0.0, lights: int = 150) -> "Light":
+    def from_envmap(envmap: Array, rotate_deg: float = 0.0, lights: int = 150, keys: bool = True) -> "Light":
         """A lat-long map [H, 2 H, 3] as a rig of lights; `rotate_deg` is added to every azimuth.
 
-        Raises InputError for an array that is not such a map.
+        With `keys` a sun of the map follows as a single light. Raises InputError for an array that is not
+        such a map.
         """
-        linear, directions = linear_pixels("map", envmap), rig_directions(lights)
+        linear = linear_pixels("map", envmap)
         check_envmap(linear)
-        weights = envmap_weights(linear, directions, rotate_deg)
-        return Light(directions.numpy(), weights if isinstance(envmap, Tensor) else weights.numpy())
+        found = without_keys(linear) if keys else MapKeys.none(linear)
+        directions, suns = rig_directions(lights), found.turned(rotate_deg)
+        weights = torch.cat([envmap_weights(found.rest, directions, rotate_deg), suns.weights])
+        return Light(
+            torch.cat([directions, suns.directions]).numpy(),
+            weights if isinstance(envmap, Tensor) else weights.numpy(),
+            keys=tuple(range(len(directions), len(weights))),
+        )
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
         """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from itertools import accumulate, groupby, pairwise
@@ -16,6 +16,7 @@ from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import ball, lights_around, rotated_weights
 from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.map_keys import MapKeys, without_keys
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.synth.sky.skies import draw_sky
@@ -28,6 +29,7 @@ from facerf_cli.work.photos import directions_of, face_model
 _DRAWN_WIDTH_PX = 512  # of a procedural map
 _LIGHT_WIDTH_PX = 512  # of the map of a photo's light
 _BALL_PX = 256
+FarLight = tuple[int, Tensor, Tensor]  # its setup, directions [n, 3] and rgb weights [n, 3]
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -68,37 +70,37 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
 
 
 def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
-    """The lights of M setups: maps integrated over the rig's lights, and single lights."""
+    """The lights of M setups: maps integrated over the rig's lights, their keys, and single lights."""
     single = single_lights(setups)
     if not _maps_of(setups):
         return single
     maps = (tuple(light for light in setup.lights if light.envmap is not None) for setup in setups)
-    every, of_maps = _maps_over_rig(tuple(LightSetup("", lights=lights) for lights in maps), rig, sampling)
-    directions, weights = torch.cat([every, single.directions]), torch.cat([of_maps, single.weights], 1)
-    keys = tuple(slice(len(every) + key.start, len(every) + key.stop) for key in single.keys)
-    return replace(single, directions=directions, weights=weights, keys=keys)
+    of_maps = _maps_over_rig(tuple(LightSetup("", lights=lights) for lights in maps), rig, sampling)
+    return _with_far(single, of_maps)
 
 
 @lru_cache(maxsize=1)
-def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> tuple[Tensor, Tensor]:
-    """Directions [L, 3] of a rig, and their weights [M, L, 3] under the maps of M setups."""
+def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
+    """The maps of M setups over a rig's lights, and their keys, which the paper's sampling does not know."""
     directions = directions_of(rig)
-    return directions, _map_weights(setups, directions, sampling)
+    weights, keys = _map_weights(setups, directions, sampling, with_keys=sampling != "paper")
+    return _with_far(_far(len(setups), keys), Lights(directions, weights))
+
+
+def _with_far(lights: Lights, others: Lights) -> Lights:
+    """Lights with the far ones of others before their own."""
+    first = len(others.directions)
+    return replace(
+        lights,
+        directions=torch.cat([others.directions, lights.directions]),
+        weights=torch.cat([others.weights, lights.weights], 1),
+        keys=others.keys + tuple(slice(first + key.start, first + key.stop) for key in lights.keys),
+    )
 
 
 def single_lights(setups: Sequence[LightSetup]) -> Lights:
     """The lights of M setups without their maps; at least one far light, if dark, and each near one once."""
-    directions, weights = [torch.tensor([[0.0, 0.0, 1.0]])], [torch.zeros(len(setups), 1, 3)]
-    for row, towards, rgb in _far_lights(setups):
-        directions.append(towards)
-        weights.append(torch.zeros(len(setups), len(towards), 3))
-        weights[-1][row] = rgb
-    some = slice(len(directions) > 1, None)
-    ends = [0, *accumulate(map(len, directions[some]))]
-    keys = tuple(
-        slice(*at) for at, toward in zip(pairwise(ends), directions[some], strict=True) if is_narrow(toward)
-    )
-    far = Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), own=own_weights(setups), keys=keys)
+    far = replace(_far(len(setups), _far_lights(setups)), own=own_weights(setups))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -112,6 +114,21 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
     for row, light, rgb in near:
         near_weights[row, lights.index(light)] += rgb
     return replace(far, near=lights, near_weights=near_weights)
+
+
+def _far(count: int, lights: Iterable[FarLight]) -> Lights:
+    """Far lights of so many setups; at least one, if dark."""
+    directions, weights = [torch.tensor([[0.0, 0.0, 1.0]])], [torch.zeros(count, 1, 3)]
+    for row, towards, rgb in lights:
+        directions.append(towards)
+        weights.append(torch.zeros(count, len(towards), 3))
+        weights[-1][row] = rgb
+    some = slice(len(directions) > 1, None)
+    ends = [0, *accumulate(map(len, directions[some]))]
+    keys = tuple(
+        slice(*at) for at, toward in zip(pairwise(ends), directions[some], strict=True) if is_narrow(toward)
+    )
+    return Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), keys=keys)
 
 
 def own_weights(setups: Sequence[LightSetup]) -> Tensor | None:
@@ -155,7 +172,7 @@ def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
 
 def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Lights:
     """The lights of M setups by a stack's own [L, 3]; single lights are shared by those around."""
-    weights = _map_weights(setups, directions, sampling)
+    weights, _ = _map_weights(setups, directions, sampling, with_keys=False)
     for row, towards, rgb in _far_lights(setups):
         index, share = lights_around(towards, directions)
         weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
@@ -169,8 +186,7 @@ def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
     return math.degrees(math.acos(min(1.0, *cosines))) if cosines else 0.0
 
 
-def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """For each far light its setup, directions [n, 3] and rgb weights [n, 3]."""
+def _far_lights(setups: Sequence[LightSetup]) -> Iterator[FarLight]:
     for row, setup in enumerate(setups):
         for light in setup.lights:
             if light.azel_deg is not None or light.is_around:
@@ -178,18 +194,25 @@ def _far_lights(setups: Sequence[LightSetup]) -> Iterator[tuple[int, Tensor, Ten
                 yield row, towards, shares[:, None] * intensity_of(light)
 
 
-def _map_weights(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Tensor:
-    """[M, L, 3], zero for setups without a map; a map is read once for all its rotations."""
-    weights = torch.zeros(len(setups), len(directions), 3)
+def _map_weights(
+    setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling, with_keys: bool
+) -> tuple[Tensor, list[FarLight]]:
+    """[M, L, 3], zero for setups without a map, and keys apart; a map is read once for all its rotations."""
+    weights, keys = torch.zeros(len(setups), len(directions), 3), list[FarLight]()
     maps = [(row, light) for row, setup in enumerate(setups) for light in setup.lights if light.envmap]
-    for envmap, group in groupby(maps, lambda one: one[1].envmap):
+    for source, group in groupby(maps, lambda one: one[1].envmap):
         rows, lights = zip(*group, strict=True)
-        assert envmap is not None
+        assert source is not None
+        found = (without_keys if with_keys else MapKeys.none)(read_map(source))
+        for row, light in zip(rows, lights, strict=True):
+            turned = found.turned(light.rotate_deg)
+            rgb = turned.weights * intensity_of(light)
+            keys += [(row, *key) for key in zip(turned.directions[:, None], rgb[:, None], strict=True)]
         angles = [light.rotate_deg for light in lights]
-        of_map = rotated_weights(read_map(envmap), directions, angles, sampling)
+        of_map = rotated_weights(found.rest, directions, angles, sampling)
         colours = torch.stack([intensity_of(light) for light in lights])
         weights.index_add_(0, torch.tensor(rows), of_map * colours[:, None])
-    return weights
+    return weights, keys
 
 
 def write_balls(
