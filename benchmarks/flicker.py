@@ -45,7 +45,7 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.person import Person
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
-from facerf_cli.relighting.sequence import Follower, ShotView
+from facerf_cli.relighting.sequence import Follower, SteadyShot
 from tools.talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 
 PATCH = 1 / 64  # of the side
@@ -65,15 +65,15 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 
 def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
     """Relight the frames as `facerf relight FILM` does."""
-    view = shot_view(models, frames)
-    return [relit(models, frames[n], view.head(n), view.steady(n)) for n in range(len(frames))]
+    windows = map(steady_shot(models, frames).window, range(len(frames)))
+    return [relit(models, frame, one.head, one) for frame, one in zip(frames, windows, strict=True)]
 
 
-def shot_view(models: Models, frames: list[np.ndarray]) -> ShotView:
-    """The view of a shot, its face followed."""
+def steady_shot(models: Models, frames: list[np.ndarray]) -> SteadyShot:
+    """A shot whose face was followed."""
     follower = Follower(models.networks.people, "largest")
     sightings = [follower.see(to_display(frame)) for frame in frames]
-    return ShotView(models, models.sides(), frames.__getitem__, sightings)
+    return SteadyShot(models, frames, sightings, models.sides())
 
 
 def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | None = None) -> np.ndarray:
@@ -206,7 +206,7 @@ def warped_errors(
 def measure_film(path: Path, count: int, models: Models) -> None:
     """Print the warped errors of a film."""
     frames = frames_of(path, count)
-    view = shot_view(models, frames)
+    view = steady_shot(models, frames)
     mattes = [view.segmentation(n).matte for n in range(len(frames))]
     source = [shown(frame) for frame in frames]
     films = {"the source itself": source}

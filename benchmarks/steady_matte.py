@@ -20,7 +20,7 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.portrait.segment import segment
 from facerf_cli.relighting.models import load_models
-from facerf_cli.relighting.sequence import Follower, ShotView
+from facerf_cli.relighting.sequence import Follower, SteadyShot
 
 PART_PX = 32
 LEAST_PX = 8  # of outline in a part that counts
@@ -39,7 +39,7 @@ def main() -> None:
         frames = frames_of(path, options.frames)
         shown = [to_display(frame) for frame in frames]
         follower = Follower(people, "largest")
-        view = ShotView(models, models.sides(), frames.__getitem__, [follower.see(one) for one in shown])
+        view = SteadyShot(models, frames, [follower.see(one) for one in shown], models.sides())
         numbers = range(len(frames))
         alone = [detect_faces(people, one)[0].landmarks_px for one in shown]
         ways = {

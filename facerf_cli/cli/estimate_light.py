@@ -11,7 +11,7 @@ from facerf_cli.cli.options import FramesArgument
 from facerf_cli.errors import UsageError
 from facerf_cli.option import LIGHT, option
 from facerf_cli.work.photo_options import LightOptions
-from facerf_cli.work.shots import ShotOptions, collect_frames, whole_shots
+from facerf_cli.work.shots import ShotOptions, Shots, collect_frames, whole_shots
 from facerf_cli.work.verbs import LARGEST_MAP_PX, MOST_ORDER, FileOrFolder, PhotoWork, Written, refuse_odd
 
 
@@ -42,7 +42,7 @@ class EstimateLight(PhotoWork, LightOptions):
                 "a film or --sequence: its light is that of the field; leave out --refine, "
                 "--reflectance and --matte"
             )
-        return replace(self, shots=shots).run_on(whole_shots(items, shots), batch)
+        return replace(self, shots=Shots(shots)).run_on(whole_shots(items, shots), batch)
 
     def prepare(self) -> None:
         """Load the network whose features are compared."""
@@ -55,7 +55,7 @@ class EstimateLight(PhotoWork, LightOptions):
         """Estimate the light of every chosen face, or that of a shot."""
         from facerf_cli.work.light_of_photo import write_lights, write_shot_light
 
-        for shot in self.shots:
+        for shot in self.shots.all:
             if item.output_base == shot.base:
                 return write_shot_light(shot, item, self, self.width_px, self.sh_order)
         return write_lights(item, self, self.width_px, self.sh_order)

@@ -20,7 +20,7 @@ from facerf_cli.option import Without
 from facerf_cli.work.light_setups import LightSetup, LightSources
 from facerf_cli.work.output_options import NEEDS, STDOUT, check_stdout, format_of_file
 from facerf_cli.work.relight_options import Relight
-from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, collect_frames, film_output
+from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
 
 
 def relight(
@@ -81,7 +81,7 @@ def relight(
     if work.photo_of_stack is not None and not _holds_a_stack(items):
         raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
-    work = replace(work.with_leaders(items), shots=taken)
+    work = replace(work.with_leaders(items), shots=Shots(taken))
     work.refuse_meeting(items)
     images = [path for item in items for path in work.outputs_of(item)]
     balls = [path for setup in work.maps if work.ball for path in _balls_of(setup, work, output)]

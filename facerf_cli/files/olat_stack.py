@@ -26,9 +26,8 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.read import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
-from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, write_parts
+from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, writing
 from facerf_cli.image.colour import REC709_CHROMATICITIES
-from facerf_cli.image.strips import Band
 from facerf_cli.run import memory
 from facerf_cli.run.logs import one_line
 
@@ -76,27 +75,30 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
     it. So this thread alone compresses; and what a prediction has filled is given back first, since fresh
     memory costs nothing until it is touched.
     """
-    beyond: list[int] = []
-
-    def bands() -> Iterator[Band]:
-        for batch in olats:
-            memory.give_back()
-            yield from map(band, batch.permute(0, 2, 3, 1).cpu().numpy())
-        # Last, since it may be summed as the lights arrive.
-        yield band(np.concatenate([header.source, header.seen[..., None], header.normals], -1))
-
-    def band(part: np.ndarray) -> Band:
-        data, count = half_floats(path, part)
-        beyond.append(count)
-        return data.__getitem__
-
-    threads = oiio.get_int_attribute("exr_threads")
+    beyond, threads = 0, oiio.get_int_attribute("exr_threads")
     oiio.attribute("exr_threads", -1)
     try:
-        write_parts(path, _specs(header), bands())
+        with writing(path, _specs(header)) as file:
+            for part in _parts(header, olats):
+                data, count = half_floats(path, part)
+                beyond += count
+                for rows in file.next_part():
+                    file.write(rows, data[rows])
     finally:
         oiio.attribute("exr_threads", threads)
-    warn_of_clamped(path, sum(beyond))
+    warn_of_clamped(path, beyond)
+
+
+def _parts(header: StackHeader, olats: Iterable[Tensor]) -> Iterator[np.ndarray]:
+    """The lights [H, W, 3], and the source, last, since it may be summed as the lights arrive."""
+    count = 0
+    for batch in olats:
+        count += len(batch)
+        memory.give_back()
+        yield from batch.permute(0, 2, 3, 1).cpu().numpy()
+    if count != len(header.directions):
+        raise ValueError(f"{count} lights, not {len(header.directions)}")
+    yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
 
 
 def write_olat_npz(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:

@@ -6,9 +6,9 @@ that tools which want four channels find four.
 
 import logging
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -36,7 +36,7 @@ from facerf_cli.image.colour import (
     from_linear_rec709,
     rgb_to_xyz,
 )
-from facerf_cli.image.strips import Band, Rows, rows_of, strips
+from facerf_cli.image.strips import Rows, rows_of, strips
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
@@ -81,8 +81,7 @@ def write_exr(
     G, B in half. Each name before the dot is a part, or with `single` all are channels of one. Values beyond
     the range of half floats (65504) are clamped with a warning.
     """
-    parts = _exr_parts(pixels, alpha, layers or {})
-    specs, beyond = [], []
+    parts, specs = _exr_parts(pixels, alpha, layers or {}), []
     for part in parts:
         spec = new_spec((*pixels.shape[:2], len(part.channels)), part.kind)
         spec.channelnames = tuple(part.channels)
@@ -97,25 +96,6 @@ def write_exr(
         else:  # the same in all parts, as OpenEXR requires
             spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
         specs.append(spec)
-
-    def band(part: _ExrPart, rows: slice) -> np.ndarray:
-        values = np.dstack(
-            [
-                from_linear_rec709(rows_of(image, rows).astype(np.float32, copy=False), space)
-                if is_colour
-                else rows_of(image, rows)
-                for image, is_colour in part.images
-            ]
-        )
-        if part is parts[0] and alpha is not None:
-            values[..., :3] *= values[..., 3:]
-        if part.kind == "float" and np.isfinite(values).all():
-            return values.astype(np.float32, copy=False)
-        data, count = half_floats(path, values)
-        beyond.append(count)
-        return data
-
-    bands: list[Band] = [partial(band, part) for part in parts]
     if single:
         one = oiio.ImageSpec(specs[0])
         one.nchannels = sum(spec.nchannels for spec in specs)
@@ -124,10 +104,25 @@ def write_exr(
         one.format = oiio.TypeDesc(oiio.FLOAT)
         one.erase_attribute("name")
         specs = [one]
-        bands = [lambda rows: np.dstack([band(part, rows).astype(np.float32, copy=False) for part in parts])]
-    write_parts(path, specs, bands, metadata)
-    warn_of_clamped(path, sum(beyond))
-    return sum(beyond)
+    beyond = 0
+    with writing(path, specs, metadata) as file:
+        for together in [parts] if single else [[part] for part in parts]:
+            for rows in file.next_part():
+                written = []
+                for part in together:
+                    values = part.rows(rows, space)
+                    if part is parts[0] and alpha is not None:
+                        values[..., :3] *= values[..., 3:]
+                    if part.kind == "float":
+                        _require_finite(path, values)
+                        written.append(values.astype(np.float32, copy=False))
+                    else:
+                        data, count = half_floats(path, values)
+                        written.append(data)
+                        beyond += count
+                file.write(rows, np.concatenate(written, -1))
+    warn_of_clamped(path, beyond)
+    return beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +134,16 @@ class _ExrPart:
     is_data: bool  # no colours: it has no colour space
     channels: list[str]
     images: list[tuple[np.ndarray, bool]]  # and whether they are colours, to convert
+
+    def rows(self, rows: slice, space: ColourSpace) -> np.ndarray:
+        """Some rows [h, W, C] of all channels, colours in a space."""
+        found = []
+        for image, is_colour in self.images:
+            values = rows_of(image, rows)
+            if is_colour:
+                values = from_linear_rec709(values.astype(np.float32, copy=False), space)
+            found.append(values)
+        return np.dstack(found)
 
 
 def _exr_parts(
@@ -197,21 +202,19 @@ def write_tiff(
 
     The colour must not be premultiplied, and is not in the file.
     """
-
-    def values(rows: slice) -> np.ndarray:
-        colour = from_linear_rec709(rows_of(pixels, rows), space)
-        _require_finite(path, colour)
-        return np.dstack([colour] if alpha is None else [colour, rows_of(alpha, rows)]).astype(
-            np.float32, copy=False
-        )
-
     spec = new_spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
     spec.attribute("compression", "zip")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if space.is_linear:
         profile = np.frombuffer(linear_profile(space), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
-    write_parts(path, [spec], [values], metadata)
+    with writing(path, [spec], metadata) as file:
+        for rows in file.next_part():
+            values = from_linear_rec709(rows_of(pixels, rows), space)
+            _require_finite(path, values)
+            if alpha is not None:
+                values = np.dstack([values, rows_of(alpha, rows)])
+            file.write(rows, values.astype(np.float32, copy=False))
 
 
 def linear_profile(space: ColourSpace) -> bytes:
@@ -262,18 +265,6 @@ def write_display(
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
-
-    def values(rows: slice) -> np.ndarray:
-        seen, opaque = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
-        _require_finite(path, seen)
-        if opaque is not None and jpeg:
-            seen = seen * opaque[..., None]
-        gain = np.float32(2.0**chosen_ev)
-        exposed = np.nan_to_num(seen * gain)
-        more = None if added is None else added[rows] * gain
-        data = encode_display(exposed, view, None if share is None else rows_of(share, rows), more)
-        return data if opaque is None or jpeg else np.dstack([data, opaque.astype(np.float32)])
-
     spec = new_spec((*pixels.shape[:2], 3 if alpha is None or jpeg else 4), f"uint{8 if jpeg else bits}")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     if view.is_srgb:
@@ -281,7 +272,19 @@ def write_display(
     spec.attribute("CompressionQuality", quality)
     spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
-    write_parts(path, [spec], [values], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
+    gain = np.float32(2.0**chosen_ev)
+    with writing(path, [spec], {"facerf:exposure_ev": chosen_ev, **(metadata or {})}) as file:
+        for rows in file.next_part():
+            seen, opaque = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
+            _require_finite(path, seen)
+            if opaque is not None and jpeg:
+                seen = seen * opaque[..., None]
+            more = None if added is None else added[rows] * gain
+            kept = None if share is None else rows_of(share, rows)
+            data = encode_display(np.nan_to_num(seen * gain), view, kept, more)
+            if opaque is not None and not jpeg:
+                data = np.dstack([data, opaque.astype(np.float32)])
+            file.write(rows, data)
     return chosen_ev
 
 
@@ -292,29 +295,53 @@ def new_spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
     return spec
 
 
-def write_parts(
-    path: Path, specs: Sequence[oiio.ImageSpec], bands: Iterable[Band], metadata: Attributes | None = None
-) -> None:
-    """Write the parts of an image atomically, with its metadata in the first one's header and as XMP.
+class PartsFile:
+    """The parts of an image file, which are written one after the other, in strips of rows."""
 
-    A band gives rows [h, W, C] of its part; they are written in strips as they come.
-    """
-    for name, value in (metadata or {}).items():
-        set_attribute(specs[0], name, value)
-    with atomic_path(path) as temporary:
+    def __init__(self, path: Path, temporary: Path, specs: Sequence[oiio.ImageSpec]) -> None:
         stream = oiio.ImageOutput.create(utf8_path(temporary))
         if stream is None:
             oiio_error()
             raise UsageError(f"{path}: not the suffix of an image format; use .exr, .png or .jpg")
-        name = str(temporary)
-        good = stream.open(name, tuple(specs)) if len(specs) > 1 else stream.open(name, specs[0])
-        for number, (band, spec) in enumerate(zip(bands, specs, strict=True)):
-            good = good and (number == 0 or stream.open(name, spec, "AppendSubimage"))
-            for rows in strips((spec.height, spec.width)) if good else ():
-                good = good and stream.write_scanlines(
-                    rows.start, rows.stop, 0, np.ascontiguousarray(band(rows))
-                )
-        message = oiio_error(stream)
-        if not (stream.close() and good):
-            raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
+        self._path, self._name, self._specs, self._stream = path, str(temporary), specs, stream
+        self._begun = 0
+        self._check(self._stream.open(self._name, tuple(specs) if len(specs) > 1 else specs[0]))
+
+    def next_part(self) -> Iterator[slice]:
+        """Begin the next part, and yield the rows of each of its strips."""
+        spec = self._specs[self._begun]
+        if self._begun:
+            self._check(self._stream.open(self._name, spec, "AppendSubimage"))
+        self._begun += 1
+        return strips((spec.height, spec.width))
+
+    def write(self, rows: slice, values: np.ndarray) -> None:
+        """Write some rows [h, W, C]."""
+        contiguous = np.ascontiguousarray(values)
+        self._check(self._stream.write_scanlines(rows.start, rows.stop, 0, contiguous))
+
+    def close(self) -> None:
+        """Finish the file, whose parts are all written."""
+        assert self._begun == len(self._specs)
+        self._check(self._stream.close())
+
+    def _check(self, good: bool) -> None:
+        if not good:
+            message = oiio_error(self._stream)
+            self._stream.close()
+            message = message or oiio_error(self._stream)
+            raise FacerfError(f"{self._path}: cannot write: {one_line(message)}")
+
+
+@contextmanager
+def writing(
+    path: Path, specs: Sequence[oiio.ImageSpec], metadata: Attributes | None = None
+) -> Iterator[PartsFile]:
+    """Write the parts of an image atomically, with its metadata in the first one's header and as XMP."""
+    for name, value in (metadata or {}).items():
+        set_attribute(specs[0], name, value)
+    with atomic_path(path) as temporary:
+        file = PartsFile(path, temporary, specs)
+        yield file
+        file.close()
         embed_xmp(temporary, metadata or {})

@@ -22,7 +22,6 @@ _HALF_MAX = float(np.finfo(np.float16).max)
 _MULTIPLE = 32  # rows: EXR files are compressed by 16 or 32 at a time
 
 
-Band = Callable[[slice], np.ndarray]  # gives some rows [h, W, ...] of an image
 Empty = Callable[[str, tuple[int, ...]], np.ndarray]  # makes the array of a layer, by its name and shape
 
 
@@ -67,8 +66,8 @@ def in_strips(
     """Arrays [H, W, ...] of what `render` gives of rows [h, W, ...], by name: the one loop over strips."""
     found: dict[str, np.ndarray] = {}
     beyond, at_once = 0, max(1, min(_AT_ONCE, memory.left_bytes() // _BUDGET))
-    rendered = in_threads(lambda rows: (rows, render(rows)), strips((height_px, width_px)), at_once)
-    for rows, parts in rendered:
+    every = list(strips((height_px, width_px)))
+    for rows, parts in zip(every, in_threads(render, every, at_once), strict=True):
         for name, values in parts.items():
             if name not in found:
                 found[name] = empty(name, (height_px, *values.shape[1:]))

@@ -58,7 +58,7 @@ class PeopleInPhoto(Relightable):
         """Share [H, W] of the photo that is relit."""
         if len(self.people) == 1:
             return self.people[0].matte
-        return in_strips(lambda rows: {"": _alpha(self._present(rows))[..., 0]}, *self.size_px)[""]
+        return in_strips(self._shares, *self.size_px)["alpha"]
 
     @property
     def person_matte(self) -> np.ndarray:
@@ -96,7 +96,7 @@ class PeopleInPhoto(Relightable):
 
     def own_layer(self) -> np.ndarray:
         """The people [H, W, 3] as photographed, over black."""
-        return in_strips(lambda rows: {"own": self._own(self._present(rows), rows)}, *self.size_px)["own"]
+        return in_strips(self._as_photographed, *self.size_px)["own"]
 
     def _present(self, rows: slice) -> list[_Present]:
         """The people in some rows: the first, and of a crowd few others."""
@@ -106,6 +106,12 @@ class PeopleInPhoto(Relightable):
             if (share := person.share(rows)).any():
                 found.append(_Present(number, person, share[..., None]))
         return found
+
+    def _shares(self, rows: slice) -> dict[str, np.ndarray]:
+        return {"alpha": _alpha(self._present(rows))[..., 0]}
+
+    def _as_photographed(self, rows: slice) -> dict[str, np.ndarray]:
+        return {"own": self._own(self._present(rows), rows)}
 
     def _own(self, present: Sequence[_Present], rows: slice) -> np.ndarray:
         return _over(_BLACK, present, [one.person.own[rows] for one in present])

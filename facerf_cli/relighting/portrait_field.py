@@ -83,10 +83,11 @@ class PortraitLight:
 class SteadyFrame:
     """A person in one frame of a shot, steadied by the frames around it, and the light held over the shot.
 
-    `portrait` is for the portrait field alone: the person in each view, and their maps. `balance` is that of
-    the shot.
+    `head` is without what covers its skin. `portrait` is for the portrait field alone: the person in each
+    view, and their maps. `balance` is that of the shot.
     """
 
+    head: Head
     light: RigLight
     segmentation: Segmentation
     portrait: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()

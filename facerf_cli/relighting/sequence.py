@@ -9,8 +9,9 @@ a pixel takes part in the mean as far as the image there looks as it does in the
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_batch, fit_landmarks, trust_inside
-from facerf_cli.face.head import FaceTexture, Head, unwrap_face
+from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
@@ -50,25 +51,30 @@ _TIMES = 3.0  # of the largest change around it
 _REACH = 3  # frames on each side
 
 
-class CutFinder:
-    """Cuts of a film of `count` frames; `show` gives a frame, sRGB uint8 [H, W, 3], by number."""
+def with_cuts(
+    show: Callable[[int], np.ndarray], first: int, count: int
+) -> Iterator[tuple[int, np.ndarray, bool]]:
+    """Yield frames of a film of `count` from `first` on: number, image, and True where a new shot begins.
 
-    def __init__(self, count: int, show: Callable[[int], np.ndarray]) -> None:
-        self._count = count
-        self._small = lru_cache(2)(lambda frame: thumbnail(show(frame)))
-        self._change = lru_cache(4 * _REACH)(self._changed)
-
-    def is_cut(self, frame: int) -> bool:
-        """Tell if a new shot begins with a frame."""
-        if frame == 0:
-            return False
-        around = range(max(1, frame - _REACH), min(self._count, frame + _REACH + 1))
-        changes = {one: self._change(one) for one in around}
-        return stands_out(changes.pop(frame), list(changes.values()))
-
-    def _changed(self, frame: int) -> float:
-        before, now = self._small(frame - 1), self._small(frame)
-        return float(np.abs(now - before).mean())
+    `show` gives a frame, sRGB uint8 [H, W, 3], by number; it is called once for each, in order.
+    """
+    ahead: dict[int, np.ndarray] = {}
+    changes: dict[int, float] = {}
+    before: np.ndarray | None = None
+    for number in range(max(0, first - _REACH - 1), count + _REACH):
+        if number < count:
+            image = show(number)
+            now = thumbnail(image)
+            if before is not None:
+                changes[number] = float(np.abs(now - before).mean())
+            before = now
+            if number >= first:
+                ahead[number] = image
+        if (frame := number - _REACH) >= first:
+            around = [
+                changes[one] for one in range(frame - _REACH, number + 1) if one in changes and one != frame
+            ]
+            yield frame, ahead.pop(frame), frame > 0 and stands_out(changes[frame], around)
 
 
 def stands_out(change: float, around: Sequence[float]) -> bool:
@@ -261,93 +267,93 @@ def identity_of(
     return fits.alpha.mean(0).float()
 
 
-def fit_frame(
-    model: MorphableModel, alpha: Tensor, landmarks_px: np.ndarray, shape: tuple[int, int], crop_px: int
-) -> FaceFit:
-    """Fit pose and expression of a person alpha [Ki] to the landmarks [68, 2] of a frame of shape [H, W]."""
-    crop = from_landmarks(landmarks_px, crop_px)
-    inside = crop.to_crop(landmarks_px)
-    person = _of_one_person(model, tuple(alpha.tolist()))
-    fit = fit_landmarks(person, inside, crop, trust=trust_inside(inside, crop, *shape))
-    return replace(fit, model=model.name, alpha=alpha)
+class OnePerson:
+    """One identity alpha [Ki], whose pose and expression are fitted to frames of a size (height, width)."""
 
+    def __init__(self, model: MorphableModel, alpha: Tensor, size_px: tuple[int, int], crop_px: int) -> None:
+        self._alpha, self._size_px, self._crop_px = alpha, size_px, crop_px
+        mean = model.vertices(alpha[None], torch.zeros(1, len(model.expression)))[0]
+        self._name = model.name
+        self._model = replace(model, name="one person", mean=mean, identity=model.identity[:0], head=None)
 
-@cache
-def _of_one_person(model: MorphableModel, alpha: tuple[float, ...]) -> MorphableModel:
-    """The face model with one identity only; kept, since the fit keeps what it derives from a model."""
-    mean = model.vertices(torch.tensor([alpha]), torch.zeros(1, len(model.expression)))[0]
-    return replace(model, name=f"{model.name}-person", mean=mean, identity=model.identity[:0], head=None)
+    def fit(self, landmarks_px: np.ndarray) -> FaceFit:
+        """Fit pose and expression to landmarks [68, 2] of a frame."""
+        crop = from_landmarks(landmarks_px, self._crop_px)
+        inside = crop.to_crop(landmarks_px)
+        fit = fit_landmarks(self._model, inside, crop, trust=trust_inside(inside, crop, *self._size_px))
+        return replace(fit, model=self._name, alpha=self._alpha)
 
 
 KEY_FRAMES = 5  # from which the light is estimated
-_KEPT = 2 * (2 * MAPS_REACH + 1)  # frames of which something is kept
 _UNIT = ("normals", "strands")  # maps of unit vectors
 
 
-class ShotView:
-    """A person through a shot, whose face was sighted in some frames.
+class Numbered(Protocol):
+    """Arrays by the number of their frame, such as a list."""
 
-    `read` gives frames [H, W, 3], scene-linear, by number; `given`, if not None, the person's matte [H, W],
-    which is black in frames without the person.
+    def __getitem__(self, number: int, /) -> np.ndarray:
+        """The array of a frame."""
+
+
+@dataclass(eq=False)
+class _Seen:
+    """Classes [C, h, w] that a frame shows alone, its small image, and the rest once it is asked for."""
+
+    classes: Tensor
+    small: Tensor
+    segmentation: Segmentation | None = None
+    views: list[tuple[SeenPerson, PortraitMaps]] | None = None
+
+
+class SteadyShot:
+    """A person through the frames of a shot, each steadied by those around it.
+
+    What frames see is kept for those around the last one that was asked for: in order each is looked at once.
+
+    Args:
+        models: The face model and the networks.
+        frames: Scene-linear [H, W, 3], all of one size.
+        sightings: The face in each of them.
+        sides: Those of texture and crop.
+        mattes: The person's [H, W], if given; black in frames without the person.
+        white: Whose colours skin has under even white light; None: those of the networks.
     """
 
     def __init__(
         self,
         models: Models,
-        sides: Sides,
-        read: Callable[[int], np.ndarray],
+        frames: Numbered,
         sightings: Sequence[Sighting | None],
-        given: Callable[[int], np.ndarray] | None = None,
+        sides: Sides,
+        mattes: Numbered | None = None,
+        white: White | None = None,
     ) -> None:
-        self._models, self._sides, self._read, self._given = models, sides, read, given
+        self._models, self._frames, self._mattes = models, frames, mattes
+        self._sides, self._white = sides, white
         self._path = path_of(sightings)  # [N, 68, 2], NaN where the face is lost
         self._sighted = [frame for frame, seen in enumerate(sightings) if seen]
         self._shown = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
-        self._display = lru_cache(2)(lambda frame: to_display(read(frame)))
-        self._classes = lru_cache(_KEPT)(self._look)
-        self.head: Callable[[int], Head] = lru_cache(_KEPT)(self._seen_head)  # without what covers its skin
-        self.segmentation: Callable[[int], Segmentation] = lru_cache(_KEPT)(self._segmentation)
-        self._balance = lru_cache(1)(self._balance_of)
-        self._people = lru_cache(_KEPT)(self._seen_people)
-        self._maps = lru_cache(_KEPT)(
-            lambda frame: [maps_of(models.networks.portrait, person) for person in self._people(frame)]
-        )
+        self._near: dict[int, _Seen] = {}
 
-    def _seen_head(self, frame: int) -> Head:
-        model, fit, photo = self._models.face, self._fit(frame), self._read(frame)
-        cropped = fit.crop.apply(photo)
-        head = Head(cropped, fit, unwrap_face(model, fit, cropped, self._sides.texture, photo.shape))
-        height, width = photo.shape[:2]
-        classes = self.segmentation(frame).classes
-        try:
-            return head.without(model, uncovered_in(classes, (height, width), fit.crop))
-        except InputError:  # all of it is covered: in this frame something passes before it
-            return head
-
-    def steady(self, frame: int, portrait: bool = True, white: White | None = None) -> SteadyFrame:
+    def window(self, frame: int, portrait: bool = True) -> SteadyFrame:
         """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
-        views: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()
-        if portrait and self._shows(frame):
-            views = tuple(zip(self._people(frame), self._steady_maps(frame), strict=True))
-        balance = None if white is None else self._balance(white)
-        return SteadyFrame(self.light, self.segmentation(frame), views, balance)
+        light, balance = self.light, self._balance  # from other frames, before those around this one
+        self._keep_near(frame)
+        views = self._steady_views(frame) if portrait and self._shows(frame) else ()
+        head = self._key_heads.get(frame) or self._head(frame)
+        return SteadyFrame(head, light, self._segmentation(frame), views, balance)
 
-    def _shows(self, frame: int) -> bool:
-        return self._given is None or bool(self._given(frame).any())
+    def segmentation(self, frame: int) -> Segmentation:
+        """The person of a frame, from the classes of those around it."""
+        self._keep_near(frame)
+        return self._segmentation(frame)
 
-    @cached_property
-    def light(self) -> RigLight:
-        """The light of the shot, from key frames together."""
-        return light_of_frames(self._models, self._key_faces)
-
-    def _balance_of(self, white: White) -> Balance:
-        """The balance of the shot, from key frames together."""
-        faces = self._key_faces
-        return balance_of(white, [(one, source_light(self._models, one, self.light).even) for one in faces])
-
-    @property
-    def _key_faces(self) -> list[FaceTexture]:
-        return [self.head(frame).face for frame in self.key_frames]
+    def landmarks_px(self, frame: int) -> np.ndarray:
+        """Smoothed landmarks [68, 2] of a frame; raises InputError where the face is lost."""
+        if frame not in self._shown:
+            raise InputError(f"frame {frame}: the face is lost, in more frames than are bridged")
+        found: np.ndarray = self._path[frame]
+        return found
 
     @cached_property
     def key_frames(self) -> list[int]:
@@ -361,30 +367,57 @@ class ShotView:
         return [frame for frame in keys if self._shows(frame)] or keys
 
     @property
-    def middle_first(self) -> list[int]:
-        """The key frames, that of the middle first."""
-        keys = self.key_frames
-        middle = keys[len(keys) // 2]
-        return [middle, *(key for key in keys if key != middle)]
+    def middle(self) -> int:
+        """The key frame of the middle."""
+        return self.key_frames[len(self.key_frames) // 2]
+
+    @property
+    def other_heads(self) -> list[Head]:
+        """The heads of the other key frames."""
+        return [head for frame, head in self._key_heads.items() if frame != self.middle]
 
     @cached_property
-    def _identity(self) -> Tensor:
-        shape = self._read(self._sighted[0]).shape
+    def light(self) -> RigLight:
+        """The light of the shot, from key frames together."""
+        return light_of_frames(self._models, [head.face for head in self._key_heads.values()])
+
+    @cached_property
+    def _balance(self) -> Balance | None:
+        """The balance of the shot, from key frames together."""
+        if self._white is None:
+            return None
+        faces = [head.face for head in self._key_heads.values()]
+        evens = [source_light(self._models, one, self.light).even for one in faces]
+        return balance_of(self._white, list(zip(faces, evens, strict=True)))
+
+    @cached_property
+    def _key_heads(self) -> dict[int, Head]:
+        heads = {}
+        for frame in self.key_frames:
+            self._keep_near(frame)
+            heads[frame] = self._head(frame)
+        return heads
+
+    @cached_property
+    def _person(self) -> OnePerson:
+        size_px, crop_px = self._frames[self._sighted[0]].shape[:2], self._sides.crop_px
         places = [self._path[frame] for frame in self._sighted]
-        return identity_of(self._models.face, places, (shape[0], shape[1]), self._sides.crop_px)
+        alpha = identity_of(self._models.face, places, size_px, crop_px)
+        return OnePerson(self._models.face, alpha, size_px, crop_px)
 
-    def landmarks_px(self, frame: int) -> np.ndarray:
-        """Smoothed landmarks [68, 2] of a frame; raises InputError where the face is lost."""
-        if frame not in self._shown:
-            raise InputError(f"frame {frame}: the face is lost, in more frames than are bridged")
-        found: np.ndarray = self._path[frame]
-        return found
+    @cached_property
+    def _wide(self) -> tuple[float, float, float] | None:
+        """Place and side of the wider square in the middle of the shot, in sides of the head's square."""
+        fit = self._person.fit(self.landmarks_px(self.middle))
+        head = portrait_square(fit.crop.to_photo(fit.landmarks_px.numpy()))
+        wide = wider_square(head, self._segmentation(self.middle).matte)
+        if wide is None:
+            return None
+        offsets = wide.x0_px - head.x0_px, wide.y0_px - head.y0_px
+        return offsets[0] / head.side_px, offsets[1] / head.side_px, wide.side_px / head.side_px
 
-    def _fit(self, frame: int) -> FaceFit:
-        landmarks_px = self.landmarks_px(frame)
-        height, width = self._read(frame).shape[:2]
-        size = height, width
-        return fit_frame(self._models.face, self._identity, landmarks_px, size, self._sides.crop_px)
+    def _shows(self, frame: int) -> bool:
+        return self._mattes is None or bool(self._mattes[frame].any())
 
     def _around(self, frame: int) -> list[int]:
         """The frame and its neighbours that show the face, without those beyond a frame where it is lost."""
@@ -396,76 +429,89 @@ class ShotView:
                 at += step
         return sorted(found)
 
-    def _look(self, frame: int) -> tuple[Tensor, Tensor]:
-        """Classes of a frame alone, and the small image that they were seen in."""
-        image = self._display(frame)
-        small = small_image(image)
-        people, landmarks_px = self._models.networks.people, self.landmarks_px(frame)
-        if self._given is not None:
-            return parsed(people.parsing, image, landmarks_px, small), small
-        return seen_classes(people, image, landmarks_px, small), small
+    def _keep_near(self, frame: int) -> None:
+        """Let go what only frames far from this one need; its neighbours need their own neighbours."""
+        reach = 2 * MAPS_REACH
+        self._near = {one: seen for one, seen in self._near.items() if abs(one - frame) <= reach}
+
+    def _seen(self, frame: int) -> _Seen:
+        """Look at a frame alone, once."""
+        if frame not in self._near:
+            people, landmarks_px = self._models.networks.people, self.landmarks_px(frame)
+            image = to_display(self._frames[frame])
+            small = small_image(image)
+            if self._mattes is not None:
+                classes = parsed(people.parsing, image, landmarks_px, small)
+            else:
+                classes = seen_classes(people, image, landmarks_px, small)
+            self._near[frame] = _Seen(classes, small)
+        return self._near[frame]
 
     def _segmentation(self, frame: int) -> Segmentation:
-        around = self._around(frame)
-        classes, images = zip(*(self._classes(one) for one in around), strict=True)
-        own = around.index(frame)
-        mean = steadied(classes, images, own)
-        mean = mean / mean.sum(0).clamp_min(1e-6)
-        if self._given is not None:
-            return within_matte(mean, self._given(frame))
-        return segmentation_of(mean, self._display(frame), self.landmarks_px(frame))
+        seen = self._seen(frame)
+        if seen.segmentation is None:
+            around = self._around(frame)
+            near = [self._seen(one) for one in around]
+            mean = steadied([one.classes for one in near], [one.small for one in near], around.index(frame))
+            mean = mean / mean.sum(0).clamp_min(1e-6)
+            if self._mattes is not None:
+                seen.segmentation = within_matte(mean, self._mattes[frame])
+            else:
+                image = to_display(self._frames[frame])
+                seen.segmentation = segmentation_of(mean, image, self.landmarks_px(frame))
+        return seen.segmentation
 
-    @cached_property
-    def _wide(self) -> tuple[float, float, float] | None:
-        """Place and side of the wider square in the middle of the shot, in sides of the head's square."""
-        frame = self.middle_first[0]
-        fit = self._fit(frame)
-        head = portrait_square(fit.crop.to_photo(fit.landmarks_px.numpy()))
-        wide = wider_square(head, self.segmentation(frame).matte)
-        if wide is None:
-            return None
-        offsets = wide.x0_px - head.x0_px, wide.y0_px - head.y0_px
-        return offsets[0] / head.side_px, offsets[1] / head.side_px, wide.side_px / head.side_px
+    def _head(self, frame: int) -> Head:
+        """The head of a frame, without what covers its skin."""
+        model, fit, photo = self._models.face, self._person.fit(self.landmarks_px(frame)), self._frames[frame]
+        cropped = fit.crop.apply(photo)
+        head = Head(cropped, fit, unwrap_face(model, fit, cropped, self._sides.texture, photo.shape))
+        height, width = photo.shape[:2]
+        classes = self._segmentation(frame).classes
+        try:
+            return head.without(model, uncovered_in(classes, (height, width), fit.crop))
+        except InputError:  # all of it is covered: in this frame something passes before it
+            return head
 
-    def _seen_people(self, frame: int) -> list[SeenPerson]:
-        """The person of a frame around the head and, if it needs it, in a wider one that follows the head."""
-        fit, segmentation = self._fit(frame), self.segmentation(frame)
-        people, model, photo = self._models.networks.people, self._models.face, self._read(frame)
-        person = look_at_person(people, model, photo, fit, segmentation=segmentation)
-        if self._wide is None:
-            return [person]
-        x, y, side = (part * person.square.side_px for part in self._wide)
-        head = person.square
-        return [person, person.within(Crop(head.x0_px + x, head.y0_px + y, side, head.size_px), photo)]
+    def _views(self, frame: int) -> list[tuple[SeenPerson, PortraitMaps]]:
+        """The person around the head and, if it needs it, in a wider square that follows the head."""
+        seen = self._seen(frame)
+        if seen.views is None:
+            networks, photo = self._models.networks, self._frames[frame]
+            fit, segmentation = self._person.fit(self.landmarks_px(frame)), self._segmentation(frame)
+            person = look_at_person(networks.people, self._models.face, photo, fit, segmentation=segmentation)
+            people = [person]
+            if self._wide is not None:
+                head = person.square
+                x, y, side = (part * head.side_px for part in self._wide)
+                people.append(person.within(Crop(head.x0_px + x, head.y0_px + y, side, head.size_px), photo))
+            seen.views = [(one, maps_of(networks.portrait, one)) for one in people]
+        return seen.views
 
-    def _steady_maps(self, frame: int) -> list[PortraitMaps]:
-        """Maps of a frame, averaged with its neighbours' in the squares, which follow the head."""
+    def _steady_views(self, frame: int) -> tuple[tuple[SeenPerson, PortraitMaps], ...]:
+        """The person of a frame, and maps averaged with its neighbours', since squares follow the head."""
         around = [one for one in self._around(frame) if self._shows(one)]
-        people, maps = [self._people(one) for one in around], [self._maps(one) for one in around]
+        views = zip(*(self._views(one) for one in around), strict=True)
         middle = around.index(frame)
-        return [
-            _steadied_maps([frames[view] for frames in maps], [frames[view] for frames in people], middle)
-            for view in range(len(people[0]))
-        ]
+        return tuple((near[middle][0], _steadied_maps(near, middle)) for near in views)
 
 
-def _steadied_maps(maps: Sequence[PortraitMaps], people: Sequence[SeenPerson], middle: int) -> PortraitMaps:
+def _steadied_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int) -> PortraitMaps:
     """Maps of the middle one of some frames, averaged with the others'."""
-    images = [_encoded(person) for person in people]
+    images = [_encoded(person) for person, _ in near]
     halves = [F.avg_pool2d(image[None], 2)[0] for image in images]
-
-    def mean(name: str) -> Tensor:
-        layers = [getattr(one, name)[0] for one in maps]
+    means: dict[str, Tensor] = {}
+    for name in PortraitMaps._fields:
+        if name == "albedo":
+            continue
+        layers = [getattr(maps, name)[0] for _, maps in near]
         if name == "gain":
             layers = [layer.log() for layer in layers]
-        seen = images if layers[0].shape[-1] == images[0].shape[-1] else halves
-        found = steadied(layers, seen, middle)
+        found = steadied(layers, images if layers[0].shape[-1] == images[0].shape[-1] else halves, middle)
         if name in _UNIT:
             found = F.normalize(found, dim=0)
-        return (found.exp() if name == "gain" else found)[None]
-
-    means = {name: mean(name) for name in PortraitMaps._fields if name != "albedo"}
-    person = people[middle]
+        means[name] = (found.exp() if name == "gain" else found)[None]
+    person = near[middle][0]
     albedo = person.image[None] / person.exposure * means["gain"] + means["bias"]
     return PortraitMaps(albedo=albedo, **means)
 

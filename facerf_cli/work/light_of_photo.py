@@ -45,7 +45,7 @@ from facerf_cli.work.photos import (
     read_photo,
     write_each,
 )
-from facerf_cli.work.sequence import frame_with_face, takes_with_face, view_of
+from facerf_cli.work.sequence import OpenShot
 from facerf_cli.work.shots import Shot
 
 TILE_PX = 256
@@ -108,15 +108,14 @@ def write_shot_light(
     """
     tags: list[str] = []
     facts: list[dict[str, Any]] = []
-    for take in takes_with_face(shot):
-        view = view_of(shot, take.start, options.photo)
-        number, *others = view.middle_first
-        image, face = frame_with_face(shot, number, options.photo, portrait=False)
+    followed = OpenShot(shot, options.photo)
+    for frames in followed.track.takes_with_face:
+        take = followed.take_of(frames.start)
+        image, face = followed.fitted(take.middle, portrait=False)
         face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
-        more = [view.head(frame) for frame in others]
-        found = _write(item, image, face, options, width_px, sh_order, more)
+        found = _write(item, image, face, options, width_px, sh_order, take.other_heads)
         tags.append(face.tag)
-        facts.append(found | {"frames": view.key_frames})
+        facts.append(found | {"frames": take.key_frames})
     return tags, (facts[0] if len(facts) == 1 else {"takes": facts}) | facts_of_networks(options.photo)
 
 

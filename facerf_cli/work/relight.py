@@ -26,8 +26,7 @@ from facerf_cli.work.photos import facts_of, load_models_once
 from facerf_cli.work.plan import beside_people, image_canvas
 from facerf_cli.work.relight_options import Relight
 from facerf_cli.work.relight_scenes import LitScene, scenes_of
-from facerf_cli.work.sequence import view_of
-from facerf_cli.work.shots import shot_of
+from facerf_cli.work.sequence import open_at
 
 log = logging.getLogger(LOGGER_NAME)
 _digest_once = lru_cache(maxsize=256)(file_sha256)
@@ -52,25 +51,26 @@ def relight_item(item: Item, work: Relight) -> Outcome:
 
 def _leader_of(item: Item, work: Relight) -> Item | None:
     """The photo whose exposure an item shares; of a shot a frame of its middle."""
-    place = shot_of(work.shots, item)
+    place = open_at(work.shots, item, work.photo, work.white)
     if place is None:
         return work.leader_of(item)
-    return place[0].frames[view_of(*place, work.photo).middle_first[0]]
+    shot, number = place
+    return shot.shot.frames[shot.take_of(number).middle]
 
 
 def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
     """The exposures of an item's group; None where it has none, or is the one that it has them of."""
     leader = _leader_of(item, work)
-    return None if leader is None or leader == item else _exposures_of(leader, work)
-
-
-@lru_cache(maxsize=4)
-def _exposures_of(leader: Item, work: Relight) -> dict[str, float]:
-    """Exposures of a photo or stack that others share; found once a process."""
-    if isinstance(work.exposure_rule, float):
-        return dict.fromkeys((setup.name for setup in work.setups), work.exposure_rule)
-    scene = next(scenes_of(leader, work, together=True))
-    return _exposures_ev(scene, batches(len(scene.setups), scene.subject.nbytes), scene.relit, work)
+    if leader is None or leader == item:
+        return None
+    known = work.exposures_of_leaders.setdefault(leader.output_base, {})
+    if not {setup.name for setup in work.setups} <= set(known):
+        if isinstance(work.exposure_rule, float):
+            return dict.fromkeys((setup.name for setup in work.setups), work.exposure_rule)
+        scene = next(scenes_of(leader, work, together=True))
+        parts = batches(len(scene.setups), scene.subject.nbytes)
+        known |= _exposures_ev(scene, parts, scene.relit, work)
+    return known
 
 
 def _write_setups(
@@ -118,12 +118,8 @@ def _made_by(setup: LightSetup, work: Relight) -> dict[str, str]:
     served = load_models_once(work.photo).networks.served()
     networks = {name: {**file, "file": Path(file["file"]).name} for name, file in served.items()}
     lights = json_line(recipe_of(setup, _digest_once))
-    return {"facerf:lights": lights, "facerf:options": _options(work), "facerf:networks": json_line(networks)}
-
-
-@lru_cache(maxsize=4)
-def _options(work: Relight) -> str:
-    return json_line(recipe_of(work, _digest_once))
+    options = json_line(recipe_of(work, _digest_once))
+    return {"facerf:lights": lights, "facerf:options": options, "facerf:networks": json_line(networks)}
 
 
 def _rendered(

@@ -49,7 +49,7 @@ from facerf_cli.work.photo_options import (
 )
 from facerf_cli.work.shots import (
     FilmOutput,
-    Shot,
+    Shots,
     film_rate,
     recipe_of_shots,
 )
@@ -204,7 +204,10 @@ class Relight:
     asked_for_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --composite photo
     asked_for_room: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --room; a stack has none else
     leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
-    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
+    shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
+    exposures_of_leaders: dict[Path, dict[str, float]] = field(
+        default_factory=dict, metadata=NOT_IN_RECIPE, compare=False
+    )  # by place and setup, as far as this process knows them
 
     def checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> Self:
         """These options with the setups, and with what depends on other options; raises UsageError."""
@@ -323,7 +326,7 @@ class Relight:
         shared = recipe_of(self, digest_of)
         if self.leaders:
             shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
-        shared |= recipe_of_shots(self.shots, digest_of)
+        shared |= recipe_of_shots(self.shots.all, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
 
@@ -343,7 +346,7 @@ class Relight:
         uses = networks_of([self.reflectance]).union(*(light.networks for light in lights))
         prepare_photos(self.photo, uses, with_networks=not dry_run)
         if not dry_run:
-            follow_all(self.shots, self.photo)
+            follow_all(self.shots.all, self.photo)
         elif lights:
             return self
         setups = readable(self.setups)

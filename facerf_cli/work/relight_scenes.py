@@ -60,8 +60,7 @@ from facerf_cli.work.plan import (
     require_face,
 )
 from facerf_cli.work.relight_options import BackgroundChoice, Relight
-from facerf_cli.work.sequence import frame_with_face
-from facerf_cli.work.shots import shot_of
+from facerf_cli.work.sequence import open_at
 from facerf_cli.work.stack_composers import (
     StackImages,
     StackTextures,
@@ -216,8 +215,9 @@ def _image_and_faces(item: Item, work: Relight) -> tuple[LinearImage, Iterator[F
 
     Those of a frame of a shot are steadied by the frames around it.
     """
-    if place := shot_of(work.shots, item):
-        image, face = frame_with_face(*place, work.photo, work.reflectance == "portrait", work.white)
+    if place := open_at(work.shots, item, work.photo, work.white):
+        shot, number = place
+        image, face = shot.fitted(number, work.reflectance == "portrait")
         return image, iter([face])
     image = read_photo(item, work.photo)
     return image, fit_each(item, image, work.photo, together=work.composite == "photo")

@@ -1,7 +1,6 @@
 """Files of one photo: its person cut out (`segment`), its fitted face (`fit-geometry`)."""
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +39,8 @@ from facerf_cli.work.photos import (
     write_each,
 )
 from facerf_cli.work.plan import KEPT_OF_SEGMENTS_PX, segments_canvas
-from facerf_cli.work.sequence import segmented_frame
-from facerf_cli.work.shots import Shot, shot_of
+from facerf_cli.work.sequence import open_at
+from facerf_cli.work.shots import Shots
 
 _SHOWN = 0.55  # share of the class's colour in the overlay
 _OVERLAY_PX = 1600  # largest side of the overlay
@@ -50,15 +49,14 @@ _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
 _HUES = np.array([0.07, 0.6, 0.5, 0.95, 0.9, 0.78, 0.7, 0.33, 0.14, 0.45, 0.85, 0.62, 0.25])
 
 
-def write_segments(
-    item: Item, options: PhotoOptions, shots: Sequence[Shot] = ()
-) -> tuple[list[str], dict[str, Any]]:
+def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[list[str], dict[str, Any]]:
     """Segment and write each chosen person of a photo; their tags, and facts for the report.
 
     The person of a frame of a shot is steadied by the frames around it.
     """
-    if place := shot_of(shots, item):
-        image, face, found = segmented_frame(*place, options)
+    if place := open_at(shots, item, options):
+        shot, number = place
+        image, face, found = shot.segmented(number)
         _write_segment(item, "", image, to_display(image.pixels), face, found)
         return [""], facts_of_networks(options)
     image = read_photo(item, options, KEPT_OF_SEGMENTS_PX)

@@ -5,7 +5,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -49,7 +49,7 @@ class ShotOptions:
     no_cuts: bool = option(False, panel=BATCH)
 
 
-@dataclass(frozen=True, eq=False)  # as a key of caches by identity: it has thousands of frames
+@dataclass(frozen=True, eq=False)
 class Shot:
     """Frames of one person, in order: of a film, or images."""
 
@@ -63,10 +63,18 @@ class Shot:
         """The file of the face's landmarks in each frame."""
         return self.base.with_name(f"{self.base.name}_track.jsonl")
 
-    @cached_property
-    def numbers(self) -> dict[Path, int]:
-        """Number of each frame, from 0, by its place in the output folder."""
-        return {item.output_base: number for number, item in enumerate(self.frames)}
+
+class Shots:
+    """The shots of a run, and the one whose frames this process works through, held open (`open_at`)."""
+
+    def __init__(self, shots: Sequence[Shot] = ()) -> None:
+        self.all = tuple(shots)
+        self.places = {item.output_base: (shot, n) for shot in shots for n, item in enumerate(shot.frames)}
+        self.opened: Any = None
+
+    def __reduce__(self) -> tuple[type["Shots"], tuple[tuple[Shot, ...]]]:
+        """Send the shots to another process, which opens its own."""
+        return Shots, (self.all,)
 
 
 def collect_frames(
@@ -124,14 +132,6 @@ def _of_images(photos: Sequence[Item]) -> list[Shot]:
         groups.setdefault(place.with_name(stem), []).append((int(number), item.name, item))
     shots = ((stem.name, [item for *_, item in sorted(group)]) for stem, group in groups.items())
     return [Shot(frames[0].output_base.with_name(name), tuple(frames)) for name, frames in shots]
-
-
-def shot_of(shots: Sequence[Shot], item: Item) -> tuple[Shot, int] | None:
-    """The shot of an item, and its number there; None for a photo alone."""
-    for shot in shots:
-        if item.output_base in shot.numbers:
-            return shot, shot.numbers[item.output_base]
-    return None
 
 
 def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:

@@ -26,7 +26,7 @@ from facerf_cli.work.photo_options import (
     parse_pose,
     white_option,
 )
-from facerf_cli.work.shots import FRAMES_IN_A_ROW, Shot, ShotOptions, collect_frames, recipe_of_shots
+from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, recipe_of_shots
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class PhotoWork:
     """A verb that writes files for each chosen face of a photo."""
 
     photo: PhotoOptions
-    shots: tuple[Shot, ...] = field(default=(), metadata=NOT_IN_RECIPE)
+    shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
     verb: ClassVar[str]
 
@@ -106,7 +106,7 @@ class PhotoWork:
             return work.run_on(items, batch)
         items, shots = collect_frames(inputs, wanted, batch, work.photo)
         batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1)
-        return replace(work, shots=shots).run_on(items, batch)
+        return replace(work, shots=Shots(shots)).run_on(items, batch)
 
     def run_on(self, items: Sequence[Item], batch: BatchOptions) -> int:
         """Process items; return the exit code."""
@@ -124,7 +124,7 @@ class PhotoWork:
             prepare_photos(self.photo, self.networks, with_networks=not batch.dry_run)
             if not batch.dry_run:
                 self.prepare()
-                follow_all(self.shots, self.photo)
+                follow_all(self.shots.all, self.photo)
 
         settings = self.photo.settings
         return run_items(self.verb, items, self, self.outputs_of, batch, settings, self.recipes_of, prepare)
@@ -139,7 +139,7 @@ class PhotoWork:
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of all outputs."""
-        return [recipe_of(self, digest_of) | recipe_of_shots(self.shots, digest_of)]
+        return [recipe_of(self, digest_of) | recipe_of_shots(self.shots.all, digest_of)]
 
     def __call__(self, item: Item) -> Outcome:
         """Write the files of an item."""

@@ -17,9 +17,8 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
-from facerf_cli.work import relight_scenes
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.sequence import ShotFrames
+from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.shots import ShotOptions, collect_frames
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 
@@ -102,16 +101,16 @@ def test_an_interrupted_film_goes_on_where_it_was(
 ) -> None:
     out, made = tmp_path / "relit.mp4", []
     line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
-    frame_with_face = relight_scenes.frame_with_face
+    fitted = OpenShot.fitted
 
-    def counted(shot: Any, number: int, *rest: Any) -> Any:
+    def counted(shot: OpenShot, number: int, *rest: Any) -> Any:
         if len(made) == 1:
             made.append("stop")
             raise KeyboardInterrupt
         made.append(number)
-        return frame_with_face(shot, number, *rest)
+        return fitted(shot, number, *rest)
 
-    monkeypatch.setattr(relight_scenes, "frame_with_face", counted)
+    monkeypatch.setattr(OpenShot, "fitted", counted)
     assert facerf(given, *line) == 130
     assert not out.exists() and made == [0, "stop"]
     assert facerf(given, *line) == 0

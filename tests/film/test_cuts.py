@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from skimage.data import astronaut, coffee
 
-from facerf_cli.relighting.sequence import CutFinder, takes, thumbnail
+from facerf_cli.relighting.sequence import takes, thumbnail, with_cuts
 
 ONE, OTHER = astronaut()[:300, :400], coffee()[:300, :400]
 
 
 def cuts_of(frames: Sequence[np.ndarray]) -> list[int]:
-    finder = CutFinder(len(frames), frames.__getitem__)
-    return [number for number in range(len(frames)) if finder.is_cut(number)]
+    return [number for number, _, cut in with_cuts(frames.__getitem__, 0, len(frames)) if cut]
 
 
 def noisy(image: np.ndarray, seed: int) -> np.ndarray:
@@ -55,11 +54,13 @@ def test_frames_are_shown_once_in_order() -> None:
 
     def show(number: int) -> np.ndarray:
         shown.append(number)
-        return ONE
+        return np.full((12, 16, 3), number, np.uint8)
 
-    finder = CutFinder(20, show)
-    assert not any(finder.is_cut(number) for number in range(20))
-    assert shown == list(range(20))
+    found = list(with_cuts(show, 8, 20))
+    assert [(number, int(image[0, 0, 0]), cut) for number, image, cut in found] == [
+        (number, number, False) for number in range(8, 20)
+    ]
+    assert shown == list(range(4, 20))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import torch
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project, rotation_to_pose
-from facerf_cli.relighting.sequence import fit_frame, identity_of, spread_over
+from facerf_cli.relighting.sequence import OnePerson, identity_of, spread_over
 
 SIZE = (180, 240)
 YAWS = (-12.0, -4.0, 3.0, 11.0)
@@ -33,7 +33,8 @@ def frames_of_a_head(strength: float = 0.4) -> list[np.ndarray]:
 def test_one_identity_and_the_pose_of_each_frame() -> None:
     model, frames = load_face_model("builtin"), frames_of_a_head()
     alpha = identity_of(model, frames, SIZE, 128)
-    fits = [fit_frame(model, alpha, frame, SIZE, 128) for frame in frames]
+    person = OnePerson(model, alpha, SIZE, 128)
+    fits = [person.fit(frame) for frame in frames]
     for fit, yaw in zip(fits, YAWS, strict=True):
         torch.testing.assert_close(fit.alpha, alpha, rtol=0, atol=0)
         assert abs(rotation_to_pose(fit.rotation)[0] - yaw) < 2.5  # the crop's camera sees it a little aside
@@ -45,8 +46,9 @@ def test_one_identity_and_the_pose_of_each_frame() -> None:
 
 def test_a_known_identity_explains_the_landmarks() -> None:
     model, frames = load_face_model("builtin"), frames_of_a_head(2.0)
+    person = OnePerson(model, drawn_identity(2.0), SIZE, 128)
     for frame in frames:
-        fit = fit_frame(model, drawn_identity(2.0), frame, SIZE, 128)
+        fit = person.fit(frame)
         found = project(model.landmarks(fit.vertices_camera(model)[None])[0], fit.camera)[17:]
         apart_px = (found - fit.landmarks_px[17:]).norm(dim=1).mean()
         assert apart_px < 0.35  # of 128; the crop's perspective is not quite the camera's

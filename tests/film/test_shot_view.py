@@ -12,7 +12,7 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.relighting import sequence as shot_view
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides
-from facerf_cli.relighting.sequence import KEY_FRAMES, LONGEST_GAP, ShotView, Sighting
+from facerf_cli.relighting.sequence import KEY_FRAMES, LONGEST_GAP, Sighting, SteadyShot
 from tests.film.test_follow import face_of
 
 FRAMES = 60
@@ -31,7 +31,7 @@ class Watched:
             shot_view, "segmentation_of", lambda classes, photo, small: SimpleNamespace(classes=classes)
         )
 
-    def read(self, number: int) -> np.ndarray:
+    def __getitem__(self, number: int, /) -> np.ndarray:
         photo = np.full((6, 8, 3), float(number), np.float32)
         self.held.append(weakref.ref(photo))
         return photo
@@ -46,9 +46,9 @@ class Watched:
         return classes
 
 
-def view_of(watched: Watched, sightings: list[Sighting | None]) -> ShotView:
-    return ShotView(
-        cast(Models, SimpleNamespace(networks=SHIPPED_NETWORKS)), Sides(64, 128), watched.read, sightings
+def view_of(watched: Watched, sightings: list[Sighting | None]) -> SteadyShot:
+    return SteadyShot(
+        cast(Models, SimpleNamespace(networks=SHIPPED_NETWORKS)), watched, sightings, Sides(64, 128)
     )
 
 
@@ -56,7 +56,7 @@ def seen(count: int) -> list[Sighting | None]:
     return [Sighting(face_of(40, 50), 0.01) for _ in range(count)]
 
 
-def first_class(view: ShotView, frame: int) -> float:
+def first_class(view: SteadyShot, frame: int) -> float:
     """The mean number of the frames that a frame's classes are averaged over."""
     return float(view.segmentation(frame).classes[0].mean()) * 1000
 
@@ -90,4 +90,4 @@ def test_key_frames_are_those_that_show_the_face(monkeypatch: pytest.MonkeyPatch
     sightings[14:17] = [None] * 3  # bridged, but not to be trusted
     view = view_of(Watched(monkeypatch), sightings)
     assert len(view.key_frames) == KEY_FRAMES and not set(view.key_frames) & {14, 15, 16}
-    assert view.middle_first[0] == view.key_frames[2] and sorted(view.middle_first) == view.key_frames
+    assert view.middle == view.key_frames[2]
