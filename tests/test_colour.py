@@ -30,10 +30,26 @@ ORACLE_NAMES = {
 }
 
 
-def test_primaries_are_those_of_colour_science() -> None:
+def test_primaries_luminance_and_curves_are_those_of_colour_science() -> None:
     for space, name in {**ORACLE_NAMES, ours.ADOBE_RGB: "Adobe RGB (1998)"}.items():
         known = oracle.RGB_COLOURSPACES[name]
         assert space.chromaticities == (*known.primaries.ravel(), *known.whitepoint)
+    y = oracle.RGB_COLOURSPACES["ITU-R BT.709"].matrix_RGB_to_XYZ[1]
+    np.testing.assert_allclose(ours.luminance(RGB), RGB @ y, atol=2e-4)  # the standard prints four digits
+    np.testing.assert_allclose(ours.srgb_to_linear(ENCODED), oracle.models.eotf_sRGB(ENCODED), atol=1e-6)
+    np.testing.assert_allclose(
+        ours.linear_to_srgb(ENCODED), oracle.models.eotf_inverse_sRGB(ENCODED), atol=1e-6
+    )
+    bt2020 = ours.REC2020.decode(ENCODED)  # type: ignore[misc]
+    expected = oracle.models.oetf_inverse_BT2020(ENCODED, is_12_bits_system=True)
+    np.testing.assert_allclose(bt2020, expected, atol=2e-4)  # its alpha is the rounded 1.0993
+    adobe = ours.ADOBE_RGB.decode(ENCODED)  # type: ignore[misc]
+    expected = oracle.RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding(ENCODED)
+    np.testing.assert_allclose(adobe, expected, atol=1e-6)
+    prophoto = ours.PROPHOTO.decode(ENCODED)  # type: ignore[misc]
+    np.testing.assert_allclose(prophoto, oracle.models.cctf_decoding_ROMMRGB(ENCODED), atol=1e-6)
+    film = ours.CINEON.decode(ENCODED)  # type: ignore[misc]
+    np.testing.assert_allclose(film, oracle.models.log_decoding_Cineon(ENCODED), rtol=1e-4, atol=1e-6)
 
 
 def test_usual_images_do_not_import_colour_science() -> None:
@@ -69,35 +85,10 @@ def test_matrices_are_colour_science_s(space: ours.ColourSpace) -> None:
     np.testing.assert_allclose(ours.matrix_to_rec709(space.chromaticities), expected, atol=2e-6)
 
 
-def test_luminance_is_colour_science_s() -> None:
-    y = oracle.RGB_COLOURSPACES["ITU-R BT.709"].matrix_RGB_to_XYZ[1]
-    np.testing.assert_allclose(ours.luminance(RGB), RGB @ y, atol=2e-4)  # the standard prints four digits
-
-
 @pytest.mark.parametrize("space", ORACLE_NAMES, ids=lambda space: space.name)
 def test_white_stays_white(space: ours.ColourSpace) -> None:
     white = ours.to_linear_rec709(np.ones((1, 1, 3), np.float32), space)
     np.testing.assert_allclose(white, 1, atol=1e-6)
-
-
-def test_curves_are_colour_science_s() -> None:
-    np.testing.assert_allclose(ours.srgb_to_linear(ENCODED), oracle.models.eotf_sRGB(ENCODED), atol=1e-6)
-    np.testing.assert_allclose(
-        ours.linear_to_srgb(ENCODED), oracle.models.eotf_inverse_sRGB(ENCODED), atol=1e-6
-    )
-    bt2020 = ours.REC2020.decode(ENCODED)  # type: ignore[misc]
-    expected = oracle.models.oetf_inverse_BT2020(ENCODED, is_12_bits_system=True)
-    np.testing.assert_allclose(bt2020, expected, atol=2e-4)  # its alpha is the rounded 1.0993
-    adobe = ours.ADOBE_RGB.decode(ENCODED)  # type: ignore[misc]
-    expected = oracle.RGB_COLOURSPACES["Adobe RGB (1998)"].cctf_decoding(ENCODED)
-    np.testing.assert_allclose(adobe, expected, atol=1e-6)
-
-
-def test_curves_of_prophoto_and_of_film_are_colour_science_s() -> None:
-    prophoto = ours.PROPHOTO.decode(ENCODED)  # type: ignore[misc]
-    np.testing.assert_allclose(prophoto, oracle.models.cctf_decoding_ROMMRGB(ENCODED), atol=1e-6)
-    film = ours.CINEON.decode(ENCODED)  # type: ignore[misc]
-    np.testing.assert_allclose(film, oracle.models.log_decoding_Cineon(ENCODED), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["linear", "ACEScg", "ACES2065-1", "lin_rec2020", "ACEScct", "lin_adobergb"])
@@ -111,9 +102,12 @@ def test_from_linear_rec709_is_the_way_back(name: str) -> None:
             np.testing.assert_allclose(ours.from_linear_rec709(RGB, space), expected, atol=2e-3)
 
 
-def test_a_curve_has_no_way_back() -> None:
+def test_a_curve_has_no_way_back_and_srgb_has_one_beyond_the_gamut() -> None:
     with pytest.raises(ValueError, match="sRGB is not linear"):
         ours.from_linear_rec709(RGB, ours.SRGB)
+    np.testing.assert_allclose(ours.srgb_to_linear(ours.linear_to_srgb(RGB)), RGB, rtol=2e-6, atol=1e-6)
+    tall = np.random.default_rng(2).random((700, 500, 3)).astype(np.float32)
+    np.testing.assert_array_equal(ours.in_blocks(ours.srgb_to_linear, tall), ours.srgb_to_linear(tall))
 
 
 def test_the_shoulder_meets_the_plain_curve_with_its_slope_and_never_reaches_1() -> None:
@@ -145,19 +139,6 @@ def test_the_soft_view_keeps_hues_and_mixes_white_into_what_it_bends() -> None:
         assert kept == pytest.approx(1 / (1 + 0.3 * (high - bent)), rel=1e-5)
     grey = np.linspace(0, 5, 60, dtype=np.float32)[:, None].repeat(3, 1)
     np.testing.assert_allclose(ours.softened(grey), ours.shoulder(grey), rtol=1e-6)
-
-
-def test_views_by_name() -> None:
-    grey = np.full((2, 3, 3), 0.18, np.float32)
-    plain = ours.linear_to_srgb(grey)
-    for name in ("none", "soft", "Un-tone-mapped", "un-TONE-mapped"):
-        np.testing.assert_allclose(ours.encode_display(grey, ours.named_view(name)), plain, atol=2e-4)
-    aces = ours.encode_display(grey, ours.named_view("aces"))
-    # ACES 2 shows 18 % grey at 10 nits of 100.
-    np.testing.assert_allclose(ours.srgb_to_linear(aces), 0.1, atol=0.01)
-    assert all(ours.named_view(name).is_srgb for name in ("none", "soft", "aces", "Un-tone-mapped"))
-    with pytest.raises(UsageError, match=r"unknown view 'nope' \(known: none, soft, aces, ACES 2"):
-        ours.named_view("nope")
 
 
 MATRIX = "0.6954522414,0.1406786965,0.1638690622,0, 0.0447945634,0.8596711185,0.0955343182,0, "
@@ -231,10 +212,6 @@ def test_a_file_that_is_no_configuration(tmp_path: Path) -> None:
             look_up("Show", str(tmp_path / "bad.ocio"))
 
 
-def test_srgb_there_and_back_beyond_the_gamut() -> None:
-    np.testing.assert_allclose(ours.srgb_to_linear(ours.linear_to_srgb(RGB)), RGB, rtol=2e-6, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     "name", ["ACES2065-1", "ACEScg", "lin_rec2020", "lin_p3d65", "sRGB", "Display P3", "linear", "Adobe RGB"]
 )
@@ -246,27 +223,29 @@ def test_openColorIO_agrees(name: str) -> None:
     np.testing.assert_allclose(here, through_ocio, atol=3e-5)
 
 
-def test_a_space_that_only_openColorIO_knows() -> None:
+def test_spaces_and_views_are_named_by_their_beginning_in_any_spelling() -> None:
     pixels = np.full((2, 3, 3), 0.4135884, np.float32)  # ACEScct's code value of 0.18
     grey = ours.to_linear_rec709(pixels, ours.named_space("acescct"))
     np.testing.assert_allclose(grey, 0.18, rtol=2e-4)
-
-
-def test_spelling_does_not_matter() -> None:
     assert ours.named_space("lin_rec709") is ours.named_space("Linear Rec.709 (sRGB)") is ours.LINEAR
     assert ours.named_space("DISPLAY-P3") is ours.DISPLAY_P3 and ours.named_space("rec 2020") is ours.REC2020
-
-
-def test_blocks_make_no_seams() -> None:
-    tall = np.random.default_rng(2).random((700, 500, 3)).astype(np.float32)
-    np.testing.assert_array_equal(ours.in_blocks(ours.srgb_to_linear, tall), ours.srgb_to_linear(tall))
-
-
-def test_an_unknown_name_lists_similar_ones() -> None:
     with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(similar names: ACEScg"):
         ours.named_space("ACEScgg")
     with pytest.raises(UsageError, match=r"known: linear Rec\.709, sRGB"):
         ours.named_space("qqqqq")
+    assert ours.named_view("un-tone").name == "Un-tone-mapped"
+    with pytest.raises(UsageError, match="unknown view 'Z'"):
+        ours.named_view("Z")
+    grey = np.full((2, 3, 3), 0.18, np.float32)
+    plain = ours.linear_to_srgb(grey)
+    for name in ("none", "soft", "Un-tone-mapped", "un-TONE-mapped"):
+        np.testing.assert_allclose(ours.encode_display(grey, ours.named_view(name)), plain, atol=2e-4)
+    aces = ours.encode_display(grey, ours.named_view("aces"))
+    # ACES 2 shows 18 % grey at 10 nits of 100.
+    np.testing.assert_allclose(ours.srgb_to_linear(aces), 0.1, atol=0.01)
+    assert all(ours.named_view(name).is_srgb for name in ("none", "soft", "aces", "Un-tone-mapped"))
+    with pytest.raises(UsageError, match=r"unknown view 'nope' \(known: none, soft, aces, ACES 2"):
+        ours.named_view("nope")
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])
@@ -299,7 +278,10 @@ def test_the_anchored_exposure_keeps_the_order_and_ratio_of_six_skins() -> None:
     assert ratios == pytest.approx(np.ones(6), rel=0.005)  # exposures have two decimals
 
 
-def test_a_light_from_behind_burns_the_person_by_one_ev_at_most() -> None:
+def test_rules_of_exposure_bound_what_light_from_behind_does() -> None:
+    plate, relit, mask = np.full((8, 8, 3), 0.1), np.full((8, 8, 3), 0.2), np.ones((8, 8))
+    assert ours.chosen_exposure_ev("auto", relit, plate, mask, mask) == -1.0
+    assert ours.chosen_exposure_ev("face", relit, plate, mask, mask) == 2.0
     plate, relit = np.full((20, 20, 3), 0.3), np.full((20, 20, 3), 0.001)
     relit[:, :2] = 1.0  # the rim
     face, person = np.zeros((20, 20)), np.ones((20, 20))
@@ -308,16 +290,7 @@ def test_a_light_from_behind_burns_the_person_by_one_ev_at_most() -> None:
     assert ours.anchored_exposure_ev(relit, plate, face) == pytest.approx(np.log2(300), abs=0.01)
     assert ours.anchored_exposure_ev(relit, 10 * plate, face, person) == pytest.approx(np.log2(6), abs=0.01)
     assert ours.anchored_exposure_ev(relit * 0, plate, face, person) == 0
-
-
-def test_rules_of_exposure() -> None:
-    plate, relit, mask = np.full((8, 8, 3), 0.1), np.full((8, 8, 3), 0.2), np.ones((8, 8))
-    assert ours.chosen_exposure_ev("auto", relit, plate, mask, mask) == -1.0
-    assert ours.chosen_exposure_ev("face", relit, plate, mask, mask) == 2.0
-
-
-def test_a_light_that_hardly_reaches_the_face_is_not_made_hundreds_of_times_as_bright() -> None:
-    """A face that looks into a light of strength 1 needs 0 EV; twice the light, half of that."""
+    # A face that looks into a light of strength 1 needs 0 EV; twice the light, half of that.
     assert ours.most_exposure_ev("auto", 1.0) == 3.0
     assert ours.most_exposure_ev("auto", 4.0) == 1.0
     assert ours.most_exposure_ev("auto", 0.0) == math.inf == ours.most_exposure_ev("face", 1.0)
@@ -332,9 +305,3 @@ def test_one_broken_pixel_sets_no_mean_and_ordinary_photos_stay() -> None:
     assert limited.dtype == np.float32 and abs(limited.mean() / photo.mean() - 1) < 0.01
     assert (limited == broken)[broken < 1].all()
     assert (ours.without_fireflies(photo * 1000) == photo * 1000).all()  # in other units
-
-
-def test_a_view_is_named_by_its_beginning() -> None:
-    assert ours.named_view("un-tone").name == "Un-tone-mapped"
-    with pytest.raises(UsageError, match="unknown view 'Z'"):
-        ours.named_view("Z")

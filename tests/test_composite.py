@@ -132,20 +132,12 @@ def inside_face() -> np.ndarray:
     return view().full(view().mask) > 0.5
 
 
-def test_own_light_gives_the_photo_back() -> None:
+def test_own_light_gives_the_photo_back_and_a_texture_equal_to_the_source_changes_nothing() -> None:
     photo, source, seen = unwrapped()
     result = compose(photo, source, scene().lit(OWN), seen)
     assert psnr_db(result, photo, inside_face()) > 30
-
-
-def test_relit_texture_equal_to_the_source_changes_nothing() -> None:
-    photo, source, seen = unwrapped()
     result = compose(photo, source, source, seen)
     np.testing.assert_allclose(result, photo, atol=2e-5)
-
-
-def test_other_light_comes_out_as_if_rendered() -> None:
-    photo, source, seen = unwrapped()
     result = compose(photo, source, scene().lit(OTHER), seen)
     truth = scene().image(OTHER)
     drawn = view().full(view().render(scene().lit(OTHER)))
@@ -173,15 +165,12 @@ def in_half(background: Background, ev: float, behind: np.ndarray | None = None)
     return PeopleInPhoto([face], background).image(lit, ev, behind)
 
 
-def test_the_photos_background_looks_as_it_was_at_any_exposure() -> None:
+def test_the_photos_background_looks_as_it_was_and_a_matte_says_what_may_change() -> None:
     photo, _, _ = unwrapped()
     for ev in (0.0, 2.0):
         image = in_half("photo", ev)
         np.testing.assert_allclose(image.pixels[:, :200] * 2**ev, photo[:, :200], rtol=1e-6)
         np.testing.assert_allclose(image.pixels[:, 200:], in_half("photo", 0.0).pixels[:, 200:], atol=1e-5)
-
-
-def test_other_backgrounds() -> None:
     person = in_half("photo", 0.0).pixels[:, 200:]
     nothing = in_half("none", 0.0)
     assert nothing.alpha is not None
@@ -192,9 +181,6 @@ def test_other_backgrounds() -> None:
     assert given.alpha is None
     np.testing.assert_array_equal(given.pixels[:, :200], behind[:, :200])
     np.testing.assert_allclose(given.pixels[:, 200:], person, atol=1e-5)
-
-
-def test_a_matte_says_what_may_change() -> None:
     photo, source, seen = unwrapped()
     matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
     matte[:, 200:] = 1
@@ -256,6 +242,13 @@ def test_a_dark_source_is_rendered_and_not_multiplied() -> None:
     photo = shown + np.float32(1e-3)  # noise of the photo over the texture
     relit = detailed(PhotoDetail(face, screen, photo), torch.full((3, 32, 32), 0.3), slice(0, 32))
     np.testing.assert_allclose(relit, 0.3, atol=0.02)  # the quotient would be 300
+    source = torch.full((3, 32, 32), 0.4)
+    source[:, 16:19, 22:25] = torch.tensor([0.02, 0.016, 0.012])[:, None, None]  # hair on a cheek
+    face, screen, shown = flat_face(source)
+    photo = shown.copy()
+    photo[17, 23] = 0.02, 0.013, 0.0  # a camera's black in one channel
+    relit = detailed(PhotoDetail(face, screen, photo), torch.full((3, 32, 32), 0.4), slice(0, 32))[17, 23]
+    assert relit[2] > 0.4 * relit[0]  # the quotient would be yellow: 0
 
 
 def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
@@ -275,16 +268,6 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
     assert detailed(detail, one_sided, rows).min() >= 0
 
 
-def test_the_colour_of_dark_pixels_is_not_multiplied() -> None:
-    source = torch.full((3, 32, 32), 0.4)
-    source[:, 16:19, 22:25] = torch.tensor([0.02, 0.016, 0.012])[:, None, None]  # hair on a cheek
-    face, screen, shown = flat_face(source)
-    photo = shown.copy()
-    photo[17, 23] = 0.02, 0.013, 0.0  # a camera's black in one channel
-    relit = detailed(PhotoDetail(face, screen, photo), torch.full((3, 32, 32), 0.4), slice(0, 32))[17, 23]
-    assert relit[2] > 0.4 * relit[0]  # the quotient would be yellow: 0
-
-
 def test_eyes_keep_their_detail() -> None:
     source = torch.full((3, 128, 128), 0.4)
     eyes = region_mask("eyes", 128) > 0.99
@@ -294,21 +277,15 @@ def test_eyes_keep_their_detail() -> None:
     np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
 
 
-def test_mask_lies_on_the_face_and_ends_softly() -> None:
+def test_the_mask_lies_on_the_face_that_both_cameras_see() -> None:
     mask = view().full(view().mask)
     covered = view().full(view().coverage) > 0
     assert (mask[~covered] == 0).all()
     steps = np.hypot(*np.gradient(mask))
     assert np.percentile(steps[mask > 0], 99.9) < 0.3 and steps.max() < 0.5
-
-
-def test_photo_camera_sees_what_the_crop_camera_sees() -> None:
     camera = photo_camera(CROP, HEIGHT_PX, WIDTH_PX)
     in_crop = project(scene().vertices, CROP.camera).numpy()
     np.testing.assert_allclose(project(scene().vertices, camera).numpy(), CROP.to_photo(in_crop), atol=1e-2)
-
-
-def test_a_face_half_outside_its_photo() -> None:
     crop = Crop(-100.0, -60.0, 219.0, 160)
     photo = np.full((120, 90, 3), 0.5, np.float32)
     _, source, seen = unwrapped()

@@ -50,15 +50,12 @@ def tracked(pattern: str) -> set[str]:
     return {path.relative_to(ROOT).as_posix() for path in ROOT.glob(pattern) if path.is_file()}
 
 
-def test_the_wheel_has_all_of_the_package_and_nothing_else(wheel: zipfile.ZipFile) -> None:
+def test_the_wheel_has_all_of_the_package_and_its_documents(wheel: zipfile.ZipFile) -> None:
     package = {name for name in tracked("facerf_cli/**/*") if "__pycache__" not in name}
     information = f"facerf-{__version__}.dist-info/"
     rest = {name for name in wheel.namelist() if not name.startswith((information, DATA))}
     assert rest == package and "facerf_cli/py.typed" in rest and "facerf_cli/assets/NOTICE" in rest
     assert Path(str(wheel.filename)).stat().st_size < LIMIT_MIB * 2**20
-
-
-def test_the_wheel_has_man_pages_completion_and_documents(wheel: zipfile.ZipFile) -> None:
     shared = {name.removeprefix(f"{DATA}/share/") for name in wheel.namelist() if name.startswith(DATA)}
     assert shared == (
         {f"man/man1/{Path(name).name}" for name in tracked("man/*.1")}
@@ -118,9 +115,6 @@ def test_the_installed_wheel_runs_away_from_its_source(built: Path, wheel: zipfi
 def test_completion_files_are_in_step_with_typer() -> None:
     held = {path.name: path.read_text() for path in (ROOT / "completions").iterdir()}
     assert held == manual.scripts(), "run `make completions`"
-
-
-def test_zsh_reads_the_command_from_the_first_line() -> None:
     assert (ROOT / "completions/_facerf").read_text().startswith("#compdef facerf\n")
 
 

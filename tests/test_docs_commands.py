@@ -23,6 +23,7 @@ from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from facerf_cli.network.features import VggFeatures
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.kinds import Patch
 from tests.training.joint_dataset import write_joint_dataset
 
 ROOT = Path(__file__).parents[1]
@@ -80,9 +81,7 @@ def place(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "count"), [("training.md", 6), ("clusters.md", 13)])
-def test_every_line_of_the_page_runs(
-    page: str, count: int, place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_line_of_the_page_runs(page: str, count: int, place: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(place)
     environment = {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_COUNT": "1"}
     for name, value in environment.items():

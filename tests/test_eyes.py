@@ -41,17 +41,11 @@ def test_a_light_is_seen_where_the_cornea_faces_half_way_to_it(azimuth: float, e
     assert float(-down) == pytest.approx(float(half[1]), abs=0.04)
 
 
-def test_a_light_behind_the_head_is_not_seen() -> None:
+def test_a_light_behind_the_head_or_all_around_is_not_mirrored() -> None:
     assert image_of(180, 0).max() == 0 and image_of(0, 0).max() > 0.5
     assert mirrored_in_cornea(torch.zeros(0, 3), torch.zeros(1, 0, 3), torch.zeros(0)).abs().max() == 0
-
-
-def test_light_from_all_around_is_not_mirrored() -> None:
     around, _ = far_samples(StudioLight())
     assert mirrored_in_cornea(around, torch.ones(1, len(around), 3), torch.ones(len(around))).max() == 0
-
-
-def test_a_light_is_seen_alike_whatever_else_shines() -> None:
     lamps = torch.cat(
         [azel_to_direction(20.0, 10.0)[None], rig_directions(24), azel_to_direction(24.0, 10.0)[None]]
     )
@@ -71,7 +65,7 @@ def lit(photo: np.ndarray, relit: np.ndarray, mirrored: Tensor, rows: slice = sl
     return seen.lit(relit[rows].copy(), seen.ready(mirrored), rows)
 
 
-def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
+def test_the_photos_catchlight_gives_way_and_a_lid_keeps_its_light() -> None:
     photo = DARK.copy()
     photo[14:17, 15:18] = 3.0
     relit, mirrored = 2 * photo, image_of(40, 0)
@@ -82,10 +76,7 @@ def test_the_photos_catchlight_gives_way_to_the_new_lights() -> None:
     rows = slice(17, 21)
     part = lit(photo, relit, mirrored[None], rows)
     assert np.array_equal(part, found[rows])
-
-
-def test_a_lid_before_the_iris_keeps_its_light() -> None:
-    """It is brighter than the iris, as a catchlight is, and mirrors nothing."""
+    # It is brighter than the iris, as a catchlight is, and mirrors nothing.
     photo = DARK.copy()
     photo[24:] = 0.5
     mirrored = torch.ones(1, 3, 64, 64)
@@ -109,7 +100,7 @@ def relit(photo: np.ndarray, mirrored: torch.Tensor) -> np.ndarray:
 NOTHING = torch.zeros(3, 64, 64)
 
 
-def test_a_catchlight_is_filled_by_the_colours_at_its_distance_from_the_middle() -> None:
+def test_a_catchlight_is_filled_by_the_colours_around_it() -> None:
     """It lies half over the pupil; the white of the eye, which is as bright, stays."""
     photo = eye()
     shining = photo.copy()
@@ -120,16 +111,9 @@ def test_a_catchlight_is_filled_by_the_colours_at_its_distance_from_the_middle()
     np.testing.assert_allclose(filled[..., 1] / filled[..., 0], 0.65, atol=0.16)  # brown, as all of it
     white = photo.min(-1) > 0.5
     assert np.array_equal(relit(shining, NOTHING)[white], photo[white])
-
-
-def test_what_is_black_in_the_photo_gets_no_brighter() -> None:
-    photo = eye()
     photo[13:17, 18:21] = [1, 1, 0]
     dim = np.full_like(photo, 0.1)
     assert lit(photo, dim, NOTHING[None]).max() <= 0.1
-
-
-def test_a_catchlight_that_touches_the_white_of_the_eye_goes() -> None:
     photo = eye()
     photo[16:19, 24:28] = 1.4
     photo[16:19, 28:31] = 0.75  # over the border
@@ -145,24 +129,18 @@ def test_the_outline_of_an_iris_is_found_where_the_photo_shows_it(
     np.testing.assert_allclose(circle, IRIS[0] + [*shift, 10 * (size - 1)], atol=0.6)
 
 
-def test_a_lights_image_is_as_blurred_as_the_photo() -> None:
+def test_images_of_lights_are_as_blurred_as_the_photo_and_add_up() -> None:
     sharp, soft = (gaussian_filter(eye(), (sigma, sigma, 0)) for sigma in (0.5, 2))
     light = [(relit(photo, image_of(20, 0)) - relit(photo, NOTHING))[..., 0] for photo in (sharp, soft)]
     assert light[1].max() < 0.5 * light[0].max()
     assert light[1].sum() == pytest.approx(light[0].sum(), rel=0.05)
     assert blur_px(luminance(soft), 10) == pytest.approx(2, rel=0.25)
-
-
-def test_images_of_lights_in_eyes_add_up() -> None:
     photo, one, two = eye(), image_of(20, 10), image_of(-30, 0)
     photo[13:17, 18:21] = 1
     apart = relit(photo, one) + relit(photo, two) - relit(photo, NOTHING)
     np.testing.assert_allclose(relit(photo, one + two), apart, rtol=1e-5, atol=1e-6)
     assert apart.min() >= 0
-
-
-def test_the_samples_of_a_soft_light_join() -> None:
-    """They are 7 degrees apart; a map's light fills its cell of the rig."""
+    # They are 7 degrees apart; a map's light fills its cell of the rig.
     sizes = {}
     for name, light in (("one", azel_to_direction(0, 0)[None]), ("cell", nearest_of_rig())):
         sizes[name] = float((mirrored_in_cornea(light, torch.ones(1, 1, 3), torch.ones(1))[0, 0] > 0.1).sum())
@@ -190,7 +168,7 @@ def test_light_that_arrives_from_near_and_far() -> None:
     assert math.isclose(float(weights[0, :, 0].sum()), 3.0, rel_tol=1e-3)
 
 
-def test_the_nose_keeps_a_light_from_the_eye_behind_it() -> None:
+def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_is() -> None:
     lights = torch.stack([azel_to_direction(azimuth, 10.0) for azimuth in (-75.0, 0.0, 75.0)])
     seen = astronaut.field().views[0].mirrored(Lights.each(lights), torch.zeros(3)).amax((2, 3, 4))
     alone = mirrored_in_cornea(lights, Lights.each(lights).weights, torch.ones(3)).amax((1, 2, 3))
@@ -198,9 +176,6 @@ def test_the_nose_keeps_a_light_from_the_eye_behind_it() -> None:
     assert left[1] > 0.8 and right[1] > 0.8
     assert left[0] > 0.5 and right[2] > 0.5
     assert right[0] < 0.05 and left[2] < 0.05  # each from the other's side
-
-
-def test_each_eye_mirrors_a_near_light_where_it_sees_it() -> None:
     near = StudioLight(at_m=(0.0, 0.1, 0.3), rgb=(1.0, 1.0, 1.0))
     lights = Lights(torch.zeros(0, 3), torch.zeros(1, 0, 3), (near,), torch.ones(1, 1, 3))
     at, view = 2 * (torch.arange(64) + 0.5) / 64 - 1, astronaut.field().views[0]

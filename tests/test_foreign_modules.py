@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from facerf_cli.files.apart import arrays_apart
+from tests.kinds import Folders, Patch
 
 STRANGERS = ("json", "numpy", "torch", "multiprocessing", "signal")
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
     """A working directory with modules that leave a mark when they are imported."""
     for name in STRANGERS:
         mark = f"open({str(tmp_path / f'{name}.imported')!r}, 'w')\nraise SystemExit('a stranger')\n"
@@ -63,9 +64,7 @@ def test_a_reader_in_its_own_process_imports_none(folder: Path) -> None:
     ],
     ids=" ".join,
 )
-def test_workers_import_none(
-    folder: Path, workers: tuple[str, str], tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_workers_import_none(folder: Path, workers: tuple[str, str], tmp_path_factory: Folders) -> None:
     script = tmp_path_factory.mktemp("bin") / "facerf"
     ended = run(script, "segment", "a.png", "b.png", "-o", "out", *workers)
     assert ended.returncode == 1 and ended.stderr.count("a.png") and ended.stderr.count("b.png"), ended.stderr

@@ -83,7 +83,9 @@ def test_of_the_weights_of_a_light(person: facerf.Person, light: facerf.Light, s
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
 
 
-def test_of_the_weights_of_lights_in_a_list(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
+def test_of_the_weights_of_lights_in_a_list_and_of_the_pixels_of_a_map(
+    person: facerf.Person, light: facerf.Light, loss: Loss
+) -> None:
     def both(weights: Tensor) -> Tensor:
         one, two = facerf.Light(light.directions, weights), facerf.Light.single(40, 10)
         first, second = person.relight([one, two + 2 * one])
@@ -92,8 +94,6 @@ def test_of_the_weights_of_lights_in_a_list(person: facerf.Person, light: facerf
     found, expected = compared(both, torch.as_tensor(light.weights), 0.1)
     assert found == pytest.approx(expected, rel=LINEAR)
 
-
-def test_of_the_pixels_of_a_map(person: facerf.Person, loss: Loss) -> None:
     def lit(envmap: Tensor) -> Tensor:
         return loss(person.relight(facerf.Light.from_envmap(envmap, lights=6), alone=True))
 
@@ -101,14 +101,13 @@ def test_of_the_pixels_of_a_map(person: facerf.Person, loss: Loss) -> None:
     assert abs(expected) > 0.1 and found == pytest.approx(expected, rel=LINEAR)
 
 
-def test_of_the_pose(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
+def test_of_the_pose_and_of_lights_that_do_not_shine_yet(
+    person: facerf.Person, light: facerf.Light, loss: Loss
+) -> None:
     along = torch.eye(3)
     pairs = [compared(lambda x: loss(person.relight(light, pose=x)), POSE, 0.1, axis) for axis in along]
     found, expected = torch.tensor(pairs).T
     assert expected.norm() > 10 and (found - expected).norm() < SMOOTH * expected.norm()
-
-
-def test_of_lights_that_do_not_shine_yet(person: facerf.Person, light: facerf.Light) -> None:
     field, weights = person.reflectance, torch.zeros(1, 3, 3, requires_grad=True)
     field.relit(torch.as_tensor(light.directions), weights).sum().backward()
     assert weights.grad is not None and (weights.grad[0].abs().sum(1) > 0).all()

@@ -80,29 +80,20 @@ def group(background: Any = "photo") -> Any:
     return PeopleInPhoto([left, right], background)  # type: ignore[list-item]
 
 
-def test_each_person_is_relit_and_the_background_is_the_photos() -> None:
+def test_each_person_is_relit_over_the_photo_and_alpha_and_layers_hold_all() -> None:
     people = group()
     image = people.rendered(RenderRequest([2.0, 8.0], ev=1.0))
     assert set(image) == {"rgb"} and people.alpha() is None
     np.testing.assert_allclose(image["rgb"][0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
-
-
-def test_alpha_holds_all_people() -> None:
     people = group("none")
     pixels, alpha = people.rendered(RenderRequest([2.0, 8.0]))["rgb"], people.alpha()
     np.testing.assert_allclose(alpha[0], [1, 1, 0, 0.5, 0.5, 0])
     np.testing.assert_allclose((pixels * alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
     assert pixels[0, 3, 0] == 8  # not premultiplied
-
-
-def test_layers_of_lights_add_up_to_the_image_over_black() -> None:
     people = group()
     one, other, both = (people.light_layer(lit) for lit in ([1.0, 3.0], [1.0, 5.0], [2.0, 8.0]))
     np.testing.assert_allclose(one + other, both)
-
-
-def test_layers_hold_all_people() -> None:
-    """Shares and colours add up, before others and the background; no depth lies between two people."""
+    # Shares and colours add up, before others and the background; no depth lies between two people.
     far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
     people = PeopleInPhoto([far, near, faint])  # type: ignore[list-item]
     layers = people.rendered(RenderRequest([2.0, 8.0, 4.0], layers=["all"]))
@@ -112,9 +103,6 @@ def test_layers_hold_all_people() -> None:
     np.testing.assert_allclose(
         layers["albedo"][0, :, 2], [2, 0.4 * 4 + 0.6 * 2, 2, 0.6 * 8 + 0.4 * 2, 0.6 * 8, 0]
     )
-
-
-def test_the_exposure_is_the_first_ones() -> None:
     assert group().exposure_ev([2.0, 8.0], "auto") == 2.0
 
 

@@ -19,6 +19,7 @@ from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.run.logs import progress_bar
+from tests.kinds import Patch, Said
 
 ROOT = Path(main.__file__).parents[1]
 ERRORS: dict[str, BaseException] = {
@@ -31,11 +32,10 @@ ERRORS: dict[str, BaseException] = {
 }
 seen: list[Settings] = []
 Verb = Callable[..., int]
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
-def verb(monkeypatch: pytest.MonkeyPatch) -> Iterator[Verb]:
+def verb(monkeypatch: Patch) -> Iterator[Verb]:
     """Runs a line with one more verb, `probe`, that notes its settings and raises what it is told."""
 
     def probe(context: typer.Context, kind: str = "", pose: str = "") -> None:
@@ -55,22 +55,19 @@ def verb(monkeypatch: pytest.MonkeyPatch) -> Iterator[Verb]:
     ("bug", 1, "unexpected ZeroDivisionError: by zero (rerun with -v for the traceback)"),
     ("stop", 130, "interrupted"), ("system", 1, "/there: Permission denied"),
 ])  # fmt: skip
-def test_an_error_is_one_line_and_a_code(
-    verb: Verb, capsys: Capture, kind: str, code: int, text: str
-) -> None:
+def test_an_error_is_one_line_and_a_code(verb: Verb, capsys: Said, kind: str, code: int, text: str) -> None:
     assert verb("probe", "--kind", kind) == code
     assert capsys.readouterr() == ("", f"facerf: error: {text}\n")
 
 
-def test_the_traceback_is_there_for_who_asks(verb: Verb, capsys: Capture) -> None:
+def test_the_traceback_is_there_for_who_asks_and_logs_may_be_json(verb: Verb, capsys: Said) -> None:
     assert verb("probe", "--kind", "bug", "-v") == 1
     assert "Traceback (most recent call last)" in capsys.readouterr().err
-
-
-def test_log_as_json(verb: Verb, capsys: Capture) -> None:
     assert verb("--log-json", "probe", "--kind", "input") == 1
     row = json.loads(capsys.readouterr().err)
     assert row["level"] == "error" and row["message"] == "a.png: is bad" and "time" in row
+    assert verb("probe", "--pose", "-20,5,0") == 0
+    assert capsys.readouterr().out == "-20,5,0\n"
 
 
 @pytest.mark.parametrize("line", [
@@ -79,7 +76,7 @@ def test_log_as_json(verb: Verb, capsys: Capture) -> None:
     ["--seed", "7", "probe", "-q", "--device=cpu", "--checkpoint=a.st"],
 ])  # fmt: skip
 def test_global_options_stand_anywhere(
-    verb: Verb, line: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    verb: Verb, line: list[str], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(main.USES, "probe", frozenset({"diffuse_sh"}))
@@ -88,36 +85,17 @@ def test_global_options_stand_anywhere(
     assert seen[-1] == Settings(-1, False, "cpu", (Path("a.st"),), seed=7)
 
 
-def test_nothing_is_moved_from_behind_two_dashes() -> None:
+def test_every_global_option_is_known_to_the_mover_and_none_is_moved_from_behind_two_dashes() -> None:
     line = ["probe", "--seed", "1", "--", "-v", "--seed"]
     assert main.global_options_first(line) == ["--seed", "1", "probe", "--", "-v", "--seed"]
-
-
-def test_an_option_may_have_a_negative_value(verb: Verb, capsys: Capture) -> None:
-    assert verb("probe", "--pose", "-20,5,0") == 0
-    assert capsys.readouterr().out == "-20,5,0\n"
-
-
-def test_every_global_option_is_known_to_the_mover() -> None:
     command = typer.main.get_command(main.app)
     names = {name for option in command.params for name in option.opts} - {"--help", "-h"}
     completion = {"--install-completion", "--show-completion"}
     assert names - completion == main.FLAGS | main.VALUED
 
 
-@pytest.mark.parametrize("line", [
-    ["nonsense"], ["--nonsense"], ["doctor", "--nonsense"], ["--seed", "x", "doctor"],
-    ["--device", "abacus", "doctor"], ["-v", "-q", "doctor"], ["--seed"], ["-v"], ["doctor", "extra"],
-    ["relight", "a.png", "-o", "out", "--light", "1,2", "--background-blur", "nan"],
-])  # fmt: skip
-def test_a_wrong_line_is_one_line_and_code_2(capsys: Capture, line: list[str]) -> None:
-    assert main.main(line) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and err.startswith("facerf: error: ") and err.count("\n") == 1
-
-
 @pytest.mark.usefixtures("fresh_command_line")
-def test_version_and_help(capsys: Capture) -> None:
+def test_version_and_help(capsys: Said) -> None:
     assert main.main(["--version"]) == 0
     assert capsys.readouterr().out == f"facerf {__version__}\n"
     for line in ([], ["--help"], ["-h"], ["doctor", "-h"]):
@@ -231,9 +209,7 @@ def test_shell_completion(shell: str, words: str, offered: str) -> None:
     assert offered in result.stdout and result.stderr == ""
 
 
-def test_ctrl_c_outside_of_a_verb_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
+def test_ctrl_c_outside_of_a_verb_is_one_line(monkeypatch: Patch, capsys: Said) -> None:
     def pressed(line: object) -> list[str]:
         raise KeyboardInterrupt
 
@@ -248,7 +224,7 @@ def test_ctrl_c_outside_of_a_verb_is_one_line(
     ({"folder": "/d" * 2048}, "working folder: its path is longer than 4096 bytes"),
 ])  # fmt: skip
 def test_what_libraries_fail_on_is_one_line(
-    verb: Verb, capsys: Capture, monkeypatch: pytest.MonkeyPatch, change: dict[str, str], said: str
+    verb: Verb, capsys: Said, monkeypatch: Patch, change: dict[str, str], said: str
 ) -> None:
     if folder := change.pop("folder", None):
         monkeypatch.setattr(main.os, "getcwd", lambda: folder)
@@ -260,9 +236,7 @@ def test_what_libraries_fail_on_is_one_line(
     assert said in line
 
 
-def test_a_signal_ends_the_process_without_what_libraries_say_at_its_end(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_signal_ends_the_process_without_what_libraries_say_at_its_end(monkeypatch: Patch) -> None:
     def ended_by_a_signal(line: list[str]) -> int:
         sys.exit(143)
 

@@ -17,6 +17,7 @@ from facerf_cli.face.morphable import MAX_ARRAYS, load_face_model
 from facerf_cli.files.read import read_image
 from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
 from facerf_cli.run import memory
+from tests.kinds import Patch
 
 HEIGHT, WIDTH = 30, 50
 
@@ -32,9 +33,7 @@ def image(path: Path, channels: list[str], kind: str = "half") -> Path:
     return path
 
 
-def test_a_limit_is_a_share_of_the_machine_and_of_its_container(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_a_limit_is_a_share_of_the_machine_and_of_its_container(monkeypatch: Patch, tmp_path: Path) -> None:
     sizes = {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 1 << 20}
     monkeypatch.setattr(memory, "os", SimpleNamespace(sysconf=sizes.get))
     monkeypatch.setattr(memory, "_CGROUP", tmp_path / "memory.max")
@@ -45,7 +44,7 @@ def test_a_limit_is_a_share_of_the_machine_and_of_its_container(
     assert memory.default_limit() == 512 << 20
 
 
-def test_a_refusal_names_what_is_needed_and_what_is_allowed() -> None:
+def test_a_refusal_names_what_is_needed_and_counts_what_is_held() -> None:
     memory.set_limit(1 << 30)
     memory.require("a.exr", 1 << 30, "crop it")
     with pytest.raises(InputError) as refused:
@@ -53,9 +52,6 @@ def test_a_refusal_names_what_is_needed_and_what_is_allowed() -> None:
     assert str(refused.value) == (
         "a.exr: needs 1.01 GB of memory, and 1.00 GB are allowed; give --memory 1.01 or crop it"
     )
-
-
-def test_what_is_held_counts_with_what_is_asked_for() -> None:
     memory.set_limit(1 << 30)
     with memory.holding(1 << 29):
         assert memory.left_bytes() == 1 << 29
@@ -115,20 +111,17 @@ def bomb(path: Path, members: int, bytes_each: int) -> Path:
     return path
 
 
-def test_the_arrays_of_a_file_count_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arrays_of_a_file_count_together_and_many_are_refused(tmp_path: Path, monkeypatch: Patch) -> None:
     path = bomb(tmp_path / "a.npz", 8, 1 << 20)
     monkeypatch.setattr(zipfile.ZipExtFile, "read", _read_little(zipfile.ZipExtFile.read))
     monkeypatch.setattr(morphable, "_MAX_BYTES", 7 << 20)
     with pytest.raises(InputError, match=r"a\.npz: not a facerf face model .*too large"):
         load_face_model(path)
-
-
-def test_a_file_of_many_arrays_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"it holds {MAX_ARRAYS + 1} arrays; at most {MAX_ARRAYS}"):
         load_face_model(bomb(tmp_path / "a.npz", MAX_ARRAYS + 1, 1 << 16))
 
 
-def test_a_fit_is_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fit_is_small(tmp_path: Path, monkeypatch: Patch) -> None:
     path = bomb(tmp_path / "fit.npz", 1, 1 << 20)
     monkeypatch.setattr(zipfile.ZipExtFile, "read", _read_little(zipfile.ZipExtFile.read))
     with pytest.raises(InputError, match=r"fit\.npz: not a fit .*too large"):

@@ -74,46 +74,42 @@ def test_figures_are_those_of_the_reference_scorer(
     assert ssim(*colours, yale.MASK) == pytest.approx(found["ssim"])
 
 
-def test_figures_are_those_of_the_slow_twins(images: Images) -> None:
+def test_figures_are_those_of_the_slow_twins_and_of_training(images: Images) -> None:
     assert best_scale(*images) == pytest.approx(slow.best_scale(*images), rel=1e-6)
     assert si_mse(*images) == pytest.approx(slow.si_mse(*images), rel=1e-9)
     assert mse(*images) == pytest.approx(slow.mse(*images), rel=1e-9)
     assert ssim(*images) == pytest.approx(slow.ssim(*images), rel=1e-6)
     assert psnr(*images) == pytest.approx(-10 * np.log10(mse(*images)))
-
-
-def test_si_mse_is_that_of_training(images: Images) -> None:
     planes = [torch.from_numpy(image).double().permute(2, 0, 1)[None, None] for image in images[:2]]
     expected = training_si_mse(*planes, torch.from_numpy(images[2])[None, None])
     assert si_mse(*images) == pytest.approx(expected.item(), rel=1e-9)
 
 
-def test_si_mse_and_ssim_ignore_the_scale_of_the_prediction(images: Images) -> None:
+def test_scales_are_ignored_and_never_negative(images: Images) -> None:
     prediction, truth, mask = images
     for metric in (si_mse, si_mse_clipped, ssim):
         assert metric(7 * prediction, truth, mask) == pytest.approx(metric(prediction, truth, mask), rel=1e-5)
     assert mse(7 * prediction, truth, mask) > 1.5 * mse(prediction, truth, mask)
-
-
-def test_a_scale_is_never_negative(images: Images) -> None:
     _, truth, mask = images
     for prediction in (-truth, 0 * truth):
         assert best_scale(prediction, truth, mask) == 0
         assert np.isfinite(ssim(prediction, truth, mask))
 
 
-def test_pixels_outside_the_mask_do_not_count(images: Images) -> None:
+def test_pixels_outside_the_mask_do_not_count_and_equal_images_are_equal(images: Images) -> None:
     prediction, truth, mask = images
     wild = np.where(mask[..., None] > 0, prediction, np.float32(50))
     for metric in (best_scale, si_mse, si_mse_clipped, mse, psnr, ssim):
         assert metric(wild, truth, mask) == metric(prediction, truth, mask)
-
-
-def test_equal_images(images: Images) -> None:
     _, truth, mask = images
     assert si_mse(truth, truth, mask) == pytest.approx(0, abs=1e-15)
     assert ssim(truth, truth, mask) == pytest.approx(1)
     assert psnr(truth, truth, mask) == pytest.approx(PSNR_HIGHEST_DB)
+    prediction, truth, mask = images
+    with pytest.raises(ValueError, match="empty"):
+        si_mse(prediction, truth, 0 * mask)
+    with pytest.raises(ValueError, match=r"\(14, 18, 3\)"):
+        mse(prediction[:, 1:], truth, mask)
 
 
 def test_a_clipped_highlight_of_the_truth_counts_less() -> None:
@@ -125,24 +121,11 @@ def test_a_clipped_highlight_of_the_truth_counts_less() -> None:
     assert si_mse_clipped(truth, truth, mask) > 0  # the prediction is not clipped
 
 
-def test_an_empty_mask_and_other_sizes_are_refused(images: Images) -> None:
-    prediction, truth, mask = images
-    with pytest.raises(ValueError, match="empty"):
-        si_mse(prediction, truth, 0 * mask)
-    with pytest.raises(ValueError, match=r"\(14, 18, 3\)"):
-        mse(prediction[:, 1:], truth, mask)
-
-
 @pytest.mark.parametrize("angle_deg", [0, 1e-5, 0.01, 30, 90, 179.9, 180])
 def test_angles_between_lights(angle_deg: float) -> None:
     angle = np.radians(angle_deg)
     turned = 3 * np.array([np.cos(angle), 0, np.sin(angle)])
     assert light_error_deg(turned, np.array([0.2, 0, 0])) == pytest.approx(angle_deg, rel=1e-6, abs=1e-9)
-
-
-def test_a_light_without_a_direction_has_no_angle() -> None:
-    with pytest.raises(ValueError, match="no angle"):
-        light_error_deg(np.zeros(3), np.array([0, 0, 1.0]))
 
 
 def test_ita_of_known_colours() -> None:
@@ -157,7 +140,7 @@ def test_ita_of_known_colours() -> None:
     assert [tone_of(x) for x in (55.1, 55, 0, -30, -90)] == ["very light", "light", "brown", "dark", "dark"]
 
 
-def test_tone_drift_uses_only_the_skin() -> None:
+def test_tone_drift_uses_only_the_skin_and_no_light_has_no_angle() -> None:
     albedo = np.array([0.45, 0.30, 0.22])
     truth = np.broadcast_to(0.3 * albedo, (6, 8, 3)).copy()
     skin = np.zeros((6, 8))
@@ -169,6 +152,8 @@ def test_tone_drift_uses_only_the_skin() -> None:
     assert tone_drift_deg(truth, truth, 0 * skin, albedo) is None
     grey = np.broadcast_to(truth.mean(-1, keepdims=True), truth.shape)
     assert tone_drift_deg(truth, grey, skin, albedo) is None
+    with pytest.raises(ValueError, match="no angle"):
+        light_error_deg(np.zeros(3), np.array([0, 0, 1.0]))
 
 
 @pytest.mark.parametrize(
@@ -179,7 +164,7 @@ def test_tones_are_the_published_classes(ita: float, tone: str) -> None:
     assert tone_of(ita) == tone
 
 
-def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
+def test_interval_is_as_wide_as_that_of_the_groups_means_and_one_group_has_none() -> None:
     random = np.random.default_rng(0)
     groups = random.normal(size=40)
     interval = mean_interval((g, groups[g] + 0.01 * random.normal()) for g in range(40) for _ in range(50))
@@ -187,9 +172,6 @@ def test_interval_is_as_wide_as_that_of_the_groups_means() -> None:
     half = 1.96 * groups.std() / math.sqrt(40)
     np.testing.assert_allclose(interval.high - interval.low, 2 * half, rtol=0.1)
     assert interval.low < interval.mean < interval.high
-
-
-def test_one_group_has_no_interval() -> None:
     interval = mean_interval([("a", 1.0), ("a", 3.0)])
     assert interval is not None and interval.mean == 2 and math.isnan(interval.low)
     assert mean_interval([]) is None

@@ -60,12 +60,19 @@ def person() -> Shown:
     return Shown()
 
 
-def test_lights_add_up(person: Shown) -> None:
+def test_lights_add_up_at_any_distance_and_none_inside_the_head_reaches_the_face(person: Shown) -> None:
     both, key, rim = (person.image(*lights) for lights in ((KEY, RIM), (KEY,), (RIM,)))
     assert key.max() > 0.1 and rim.max() > 0.1
     np.testing.assert_allclose(both, key + rim, atol=1e-3 * both.max())
     doubled = person.image(KEY, rgb=(2.0, 0.5, 0.0))
     np.testing.assert_allclose(doubled, key * (2, 0.5, 0), atol=1e-3 * doubled.max())
+    skin = person.field.person.segmentation.layer("skin")[:] > 0.9
+    means = [person.image(StudioLight(at_m=(0.0, 0.0, z)))[skin].mean() for z in (1.0, 4.0)]
+    assert means[0] == pytest.approx(
+        means[1], rel=0.1
+    )  # the nose is nearer than the centre, the ears farther
+    skin = person.field.person.classes[1] > 0.95
+    assert person.reached_by(StudioLight(at_m=(0.0, 0.1, -0.12)))[skin].mean() < 0.2
 
 
 @pytest.mark.parametrize("azimuth_deg", [40.0, 150.0])
@@ -109,14 +116,6 @@ def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Shown)
     torch.testing.assert_close(lit.shading[0, 0][reached], wanted[reached], rtol=2e-3, atol=1e-4)
 
 
-def test_the_intensity_at_the_face_does_not_depend_on_the_distance(person: Shown) -> None:
-    skin = person.field.person.segmentation.layer("skin")[:] > 0.9
-    means = [person.image(StudioLight(at_m=(0.0, 0.0, z)))[skin].mean() for z in (1.0, 4.0)]
-    assert means[0] == pytest.approx(
-        means[1], rel=0.1
-    )  # the nose is nearer than the centre, the ears farther
-
-
 @pytest.mark.parametrize("is_near", [True, False], ids=["at", "from"])
 def test_large_lights_cast_soft_shadows(person: Shown, is_near: bool) -> None:
     """The slopes of the shadows on the skin are lower, the larger the light; the skin's share is the same."""
@@ -134,11 +133,6 @@ def test_large_lights_cast_soft_shadows(person: Shown, is_near: bool) -> None:
     assert slopes[1] < 0.8 * slopes[0] and slopes[2] < 0.85 * slopes[1]
     means = [float(x[skin].mean()) for x in found]
     assert means == pytest.approx([means[0]] * 3, abs=0.05)
-
-
-def test_a_light_inside_the_head_does_not_reach_the_face(person: Shown) -> None:
-    skin = person.field.person.classes[1] > 0.95
-    assert person.reached_by(StudioLight(at_m=(0.0, 0.1, -0.12)))[skin].mean() < 0.2
 
 
 @pytest.mark.parametrize("kind", ["field", "diffuse-sh"])

@@ -50,7 +50,7 @@ def test_relit_by_its_own_light_the_photo_comes_back(models: Models, head: Head)
     assert error(corrected) < 0.7 * error(own)
 
 
-def test_light_is_read_inside_the_face_and_off_the_eyes(head: Head) -> None:
+def test_light_is_read_inside_a_face_that_is_seen_and_off_the_eyes(head: Head) -> None:
     """The paper's M_t; with the eyes on demand."""
     mask = photo_evidence(head.face).mask
     kept = photo_evidence(head.face, keep_eyes=True).mask
@@ -58,9 +58,6 @@ def test_light_is_read_inside_the_face_and_off_the_eyes(head: Head) -> None:
     assert not (mask & eyes).any() and (kept & eyes).sum() > 0.9 * eyes.sum()
     assert torch.equal(mask & ~eyes, kept & ~eyes)
     assert not (mask & ~inside).any() and mask.sum() > 0.5 * inside.sum()
-
-
-def test_a_face_that_is_hardly_seen_has_no_light_to_read(head: Head) -> None:
     face, sliver = head.face, torch.zeros_like(head.face.visible)
     sliver[:, 60] = 1
     with pytest.raises(InputError, match="too little of the face"):
@@ -108,10 +105,27 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     assert columns[1] > columns[0] + 10  # yaw > 0 turns the nose to the image's right
 
 
-def test_the_light_of_the_photo_explains_it(models: Models, head: Head) -> None:
+def test_the_light_of_the_photo_explains_it_and_a_mask_that_hides_nothing_changes_nothing(
+    models: Models, head: Head
+) -> None:
     estimate = estimate_light(models, head, rig=rig_directions(60))
     assert estimate.light.weights.shape == (60, 3) and (estimate.light.weights >= 0).all()
     assert estimate.evidence.residual(estimate.explained) < 0.25
+    whole = np.ones(head.cropped.shape[:2], np.float32)
+    assert torch.equal(head.without(models.face, whole).face.texture, head.face.texture)
+    whole[: len(whole) // 2] = 0
+    assert head.without(models.face, whole).face.visible.sum() < 0.8 * head.face.visible.sum()
+    network = WritesDown()
+    blue = replace(head.face, texture=head.face.texture * torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1))
+    unknown = replace(models.with_networks(reflectance=network), source_colours=None)
+    list(predict_olat(unknown, replace(head, face=blue), rig_directions(4), network_alone=True))
+    assert torch.equal(network.encoded[0], blue.texture[None])
+    size, unit = (512, 512), 1 << 20
+    memory.set_limit(64 * unit)
+    require_face(models.face, head.fit, size)
+    memory.set_limit(34 * unit)
+    with pytest.raises(InputError, match=r"a face of \d+ x \d+ pixels: needs .* of memory.*smaller photo"):
+        require_face(models.face, head.fit, size)
 
 
 def test_a_face_is_encoded_once_and_sees_lights_as_in_one_batch(
@@ -124,13 +138,6 @@ def test_a_face_is_encoded_once_and_sees_lights_as_in_one_batch(
     apart = torch.cat([next(field.olats(light[None])) for light in rig])
     assert len(faces) == 1
     torch.testing.assert_close(apart, torch.cat(list(Field(models, head.face).olats(rig))))
-
-
-def test_a_mask_that_hides_nothing_changes_nothing(models: Models, head: Head) -> None:
-    whole = np.ones(head.cropped.shape[:2], np.float32)
-    assert torch.equal(head.without(models.face, whole).face.texture, head.face.texture)
-    whole[: len(whole) // 2] = 0
-    assert head.without(models.face, whole).face.visible.sum() < 0.8 * head.face.visible.sum()
 
 
 class WritesDown(nn.Module):
@@ -185,14 +192,6 @@ def test_a_field_that_is_corrected_sees_no_coloured_shade(models: Models, head: 
     assert seen[1] < 0.6 * seen[0]
 
 
-def test_without_colours_of_training_no_cast_is_removed(models: Models, head: Head) -> None:
-    network = WritesDown()
-    blue = replace(head.face, texture=head.face.texture * torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1))
-    unknown = replace(models.with_networks(reflectance=network), source_colours=None)
-    list(predict_olat(unknown, replace(head, face=blue), rig_directions(4), network_alone=True))
-    assert torch.equal(network.encoded[0], blue.texture[None])
-
-
 def test_features_see_the_exposure_of_their_training(models: Models, head: Head) -> None:
     """Whatever the photo's brightness, S_f and V_f see a face whose mean is `MEAN_RADIANCE`."""
     seen: list[Tensor] = []
@@ -215,15 +214,6 @@ def test_sums_of_lights_do_not_depend_on_how_they_are_batched() -> None:
     olats, weights = torch.rand(7, 3, 4, 5, generator=generator), torch.rand(2, 7, 3, generator=generator)
     whole = torch.einsum("mlc,lcij->mcij", weights, olats)
     torch.testing.assert_close(weighted_sum(torch.split(olats, 3), weights), whole)
-
-
-def test_a_face_beyond_the_budget_is_refused(models: Models, head: Head) -> None:
-    size, unit = (512, 512), 1 << 20
-    memory.set_limit(64 * unit)
-    require_face(models.face, head.fit, size)
-    memory.set_limit(34 * unit)
-    with pytest.raises(InputError, match=r"a face of \d+ x \d+ pixels: needs .* of memory.*smaller photo"):
-        require_face(models.face, head.fit, size)
 
 
 def test_a_broken_pixel_in_the_face_changes_little_of_its_light(models: Models) -> None:

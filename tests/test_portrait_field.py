@@ -106,7 +106,7 @@ def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more
     assert (maps.bias.mean(1, keepdim=True) > own + 1e-6).any() == may_be_more
 
 
-def test_the_bias_has_the_photos_colours(field: PortraitField) -> None:
+def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: PortraitField) -> None:
     """A bias of its own colour would bleach lips."""
     view = field.views[0]
     own, bias = view.person.image / view.person.exposure * view.maps.gain[0], view.maps.bias[0]
@@ -114,10 +114,7 @@ def test_the_bias_has_the_photos_colours(field: PortraitField) -> None:
     shown, found = (colour[:, bright] / colour[:, bright].mean(0) for colour in (own, bias))
     assert shown.std(1).max() > 0.1
     torch.testing.assert_close(found, shown, atol=0.05, rtol=0)
-
-
-def test_a_nearly_black_neck_has_the_colour_of_the_skin(field: PortraitField) -> None:
-    """The few values that a dark neck has are saturated; with gain and bias it would glow."""
+    # The few values that a dark neck has are saturated; with gain and bias it would glow.
     rig, person = rig_directions(48), field.person
     inputs = person.inputs(rig, person.visibility(rig))
     image, classes = inputs.image.clone(), inputs.classes.clone()
@@ -130,6 +127,17 @@ def test_a_nearly_black_neck_has_the_colour_of_the_skin(field: PortraitField) ->
     skin = (maps.albedo[0] * classes[0, class_index("skin")]).sum((1, 2))
     found = maps.bias[0, :, neck].mean((1, 2))
     torch.testing.assert_close(found / found.mean(), skin / skin.mean(), atol=0.15, rtol=0)
+    # A dark, saturated neck beside a lit chin becomes no orange neck under a light from below.
+    inputs = person.inputs(rig, person.visibility(rig))
+    neck = inputs.classes[:, [class_index("neck")]]
+    cast_on_neck = torch.tensor([0.15, 0.06, 0.03])[:, None, None] * neck + 1 - neck
+    maps = maps_of(
+        SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, image=inputs.image * cast_on_neck)))
+    )
+    skin = inputs.classes[0, class_index("skin")] > 0.95
+    on_neck, on_face = (maps.albedo[0][:, mask].mean(1) for mask in (neck[0, 0] > 0.95, skin))
+    colour = (on_neck / on_neck.mean()) / (on_face / on_face.mean())
+    assert colour[2] > 0.7  # of the photo: 0.38 where the face has 1
 
 
 def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: PortraitField) -> None:
@@ -148,21 +156,6 @@ def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: Port
     assert colour.min() > 0.6  # of the photo: 0.43
 
 
-def test_the_neck_is_skin_whose_shade_has_no_colour(field: PortraitField) -> None:
-    """A dark, saturated neck beside a lit chin becomes no orange neck under a light from below."""
-    rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
-    neck = inputs.classes[:, [class_index("neck")]]
-    cast_on_neck = torch.tensor([0.15, 0.06, 0.03])[:, None, None] * neck + 1 - neck
-    maps = maps_of(
-        SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, image=inputs.image * cast_on_neck)))
-    )
-    skin = inputs.classes[0, class_index("skin")] > 0.95
-    on_neck, on_face = (maps.albedo[0][:, mask].mean(1) for mask in (neck[0, 0] > 0.95, skin))
-    colour = (on_neck / on_neck.mean()) / (on_face / on_face.mean())
-    assert colour[2] > 0.7  # of the photo: 0.38 where the face has 1
-
-
 def test_the_person_is_as_white_as_the_photos_light_leaves_them(field: PortraitField) -> None:
     """Half of the photo's blue light doubles the blue of all that the view shows under white light."""
     view, own = field.views[0], source_light(astronaut.models(), field.field.face)
@@ -178,7 +171,7 @@ def halves_of(side: int) -> tuple[slice, slice]:
     return slice(0, side // 2), slice(side // 2, side)
 
 
-def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
+def test_left_and_right_are_treated_alike_and_without_light_all_is_black(field: PortraitField) -> None:
     rig = rig_directions(48)
     given = field.person.inputs(rig, field.person.visibility(rig))
     seen, in_mirror = (
@@ -187,9 +180,18 @@ def test_left_and_right_are_treated_alike(field: PortraitField) -> None:
     light, everywhere = azel_to_direction(50, 20)[None, None], torch.ones(1, 1, *seen.gain.shape[-2:])
     one, two = (maps.olats(light, everywhere) for maps in (seen, in_mirror.mirrored()))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3)  # rounding, through some 40 layers
+    lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
+    for view, one in zip(field.views, lit, strict=True):
+        assert one.shading.shape == (2, *view.person.image.shape)
+        assert max(float(maps.abs().max()) for maps in one.tensors) == 0
+    light, turn = lamp(20), torch.eye(3)
+    turned = field.relit(light.directions, light.weights[None], turn)
+    torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))
+    as_seen = field.relit(light.directions, light.weights[None])
+    assert (as_seen - turned).abs().mean() > 1e-3
 
 
-def test_a_lamp_lights_the_side_that_it_is_on(
+def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
     photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     """Hair, neck and garment, too: halves of the person beside the head's middle."""
@@ -204,10 +206,6 @@ def test_a_lamp_lights_the_side_that_it_is_on(
         on_left = region & (columns < middle - 15)
         assert right[on_right].mean() > 1.3 * left[on_right].mean()
         assert left[on_left].mean() > 1.3 * right[on_left].mean()
-
-
-def test_a_lamp_behind_leaves_the_face_dark(photo: np.ndarray, person: Person, field: PortraitField) -> None:
-    target = Target(background="none")
     behind, ahead = (person.image(lamp(azimuth, 10), target).pixels for azimuth in (180, 0))
     skin = field.person.segmentation.layer("skin")[:] > 0.9
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
@@ -342,18 +340,3 @@ def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:
     matte[40:] = 1
     largest = wider_square(head, matte)
     assert largest is not None and largest.side_px == pytest.approx(140) and largest.y0_px == 30
-
-
-def test_without_light_all_is_black(field: PortraitField) -> None:
-    lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
-    for view, one in zip(field.views, lit, strict=True):
-        assert one.shading.shape == (2, *view.person.image.shape)
-        assert max(float(maps.abs().max()) for maps in one.tensors) == 0
-
-
-def test_a_turned_head_is_the_fields(field: PortraitField) -> None:
-    light, turn = lamp(20), torch.eye(3)
-    turned = field.relit(light.directions, light.weights[None], turn)
-    torch.testing.assert_close(turned, field.field.relit(light.directions, light.weights[None], turn))
-    as_seen = field.relit(light.directions, light.weights[None])
-    assert (as_seen - turned).abs().mean() > 1e-3

@@ -105,15 +105,7 @@ def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: 
     np.testing.assert_allclose(facerf.read_image(written), relit, rtol=2e-3, atol=1e-4)
 
 
-def test_vertices_are_seen_where_the_landmarks_are(page: dict[str, Any]) -> None:
-    one, pixels = page["person"], np.pad(page["pixels"], ((0, 0), (0, 1)))
-    shown = one.models.face.landmarks(torch.from_numpy(pixels[None]).float())[0, :, :2].numpy()
-    inner = slice(17, 68)  # the contour's landmarks slide
-    size_px = from_landmarks(one.landmarks, 1).side_px
-    assert np.linalg.norm(shown[inner] - one.landmarks[inner], axis=1).mean() < 0.02 * size_px
-
-
-def test_lights_add_up(page: dict[str, Any]) -> None:
+def test_lights_add_up_and_a_white_map_of_one_gives_the_face_its_brightness(page: dict[str, Any]) -> None:
     one, rim = page["person"], facerf.Light.single(-70, 0, (1, 0.1, 0.1))
     first, second, both = one.relight([KEY, rim, sum([KEY, 2 * rim])], background="none")
     scale = both[..., :3].mean()
@@ -124,10 +116,7 @@ def test_lights_add_up(page: dict[str, Any]) -> None:
     weighed = (page["images"] * of_rig.weights[:, None, None]).sum(0)
     cut = one.relight(of_rig, background="none")
     np.testing.assert_allclose(weighed, cut[..., :3] * cut[..., 3:], atol=1e-3 * scale, rtol=1e-3)
-
-
-def test_a_white_map_of_one_gives_the_face_as_bright_as_its_photo(page: dict[str, Any]) -> None:
-    """Output is absolute in the light and relative to the photo's exposure (docs/design.md)."""
+    # Output is absolute in the light and relative to the photo's exposure (docs/design.md).
     head = page["person"].head
     white = facerf.Light.from_envmap(np.ones((32, 64, 3), np.float32), lights=60)
     own = head.face.texture.numpy()[:, head.face.visible.numpy() > 0.9].mean()
@@ -135,6 +124,11 @@ def test_a_white_map_of_one_gives_the_face_as_bright_as_its_photo(page: dict[str
     of_face = alone[alone[..., 3] > 0.9][:, :3].mean()
     assert abs(of_face / own - 1) < 0.1
     np.testing.assert_allclose(brighter[..., :3], 3 * alone[..., :3], rtol=1e-3, atol=1e-4)
+    one, pixels = page["person"], np.pad(page["pixels"], ((0, 0), (0, 1)))
+    shown = one.models.face.landmarks(torch.from_numpy(pixels[None]).float())[0, :, :2].numpy()
+    inner = slice(17, 68)  # the contour's landmarks slide
+    size_px = from_landmarks(one.landmarks, 1).side_px
+    assert np.linalg.norm(shown[inner] - one.landmarks[inner], axis=1).mean() < 0.02 * size_px
 
 
 def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -164,7 +158,9 @@ def test_a_list_of_photos_gives_a_list_of_people(person: facerf.Person) -> None:
         facerf.fit(astronaut.models(), [photos[0], np.full_like(photos[0], 0.3)])
 
 
-def test_a_person_comes_back_from_its_file(person: facerf.Person, tmp_path: Path) -> None:
+def test_a_person_comes_back_from_its_file_whose_keys_are_in_the_docs(
+    person: facerf.Person, tmp_path: Path
+) -> None:
     matte = np.zeros(astronaut.photo().shape[:2], np.float32)
     matte[:350] = 1
     kept = replace(person, given_matte=matte)
@@ -172,9 +168,6 @@ def test_a_person_comes_back_from_its_file(person: facerf.Person, tmp_path: Path
     again = facerf.Person.load(astronaut.models(), tmp_path / "person.npz")
     np.testing.assert_allclose(again.relight(KEY), kept.relight(KEY), atol=1e-5)
     np.testing.assert_array_equal(again.matte, matte)
-
-
-def test_every_key_of_its_file_is_in_the_docs(person: facerf.Person, tmp_path: Path) -> None:
     replace(person, given_matte=person.share).save(tmp_path / "person.npz")
     documented = set(re.findall(r"`(\w+)`", (ROOT / "docs/formats.md").read_text()))
     with np.load(tmp_path / "person.npz", allow_pickle=False) as file:

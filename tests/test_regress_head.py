@@ -35,7 +35,9 @@ def landmarks_px() -> np.ndarray:
     return project(turned + torch.tensor([0.0, 0.0, -1.2]), crop_camera(300)).double().numpy()
 
 
-def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: np.ndarray) -> None:
+def test_the_networks_start_leads_to_the_same_fit_and_a_blank_photo_spoils_none(
+    models: Models, landmarks_px: np.ndarray
+) -> None:
     torch.manual_seed(0)
     network = GeometryNetwork(GeometryNetworkSettings(identity=3, expression=2)).eval()
     seeing = models.with_networks(geometry=network)
@@ -47,11 +49,6 @@ def test_the_networks_start_leads_to_the_same_fit(models: Models, landmarks_px: 
     assert warm.error_iod == pytest.approx(cold.error_iod, abs=5e-4)
     moved_m = warm.vertices_camera(models.face) - cold.vertices_camera(models.face)
     assert moved_m.norm(dim=-1).max() < 2e-3
-
-
-def test_the_default_network_on_a_blank_photo_does_not_spoil_the_fit(
-    models: Models, landmarks_px: np.ndarray
-) -> None:
     assert fit_photo(models, PHOTO, landmarks_px, SIDES).fit.error_iod < 0.02
 
 
@@ -93,16 +90,13 @@ def test_one_forward_pass_gives_the_head(models: Models) -> None:
     assert math.isnan(head.fit.error_iod) and head.fit.quality == "unknown"
 
 
-def test_another_network_gives_another_head(models: Models) -> None:
+def test_another_network_or_face_model_gives_its_own_head(models: Models) -> None:
     """A fit to landmarks would undo the difference."""
     one, other = (
         regress_photo(models.with_networks(geometry=Knows(yaw)), PHOTO, BOX, SIDES).fit for yaw in (0.0, 20.0)
     )
     assert (one.rotation - other.rotation).abs().max() > 0.3
-
-
-def test_another_face_model_gets_the_same_surface(models: Models) -> None:
-    """The regressed coefficients are the built-in model's; vertices are matched by least squares."""
+    # The regressed coefficients are the built-in model's; vertices are matched by least squares.
     network, face = Knows(15.0), models.face
     twice = replace(face, name="other", identity=2 * face.identity[:20], expression=face.expression[:12])
     other = replace(models.with_networks(geometry=network), face=twice)

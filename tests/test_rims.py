@@ -29,7 +29,7 @@ def test_the_integral_along_the_outlines_normal_stays(width_px: float) -> None:
     assert offsets_px[1].abs().max() < 1e-3 and brightness.min() >= 0
 
 
-def test_a_rim_is_thinner_and_brighter() -> None:
+def test_a_rim_is_thinner_and_brighter_and_nothing_changes_far_from_it() -> None:
     offsets_px, brightness = half_plane().at(slice(10, 11), slice(EDGE_PX, SIZE_PX[1]))
     inside_px = torch.arange(SIZE_PX[1] - EDGE_PX) + 0.5
     before = torch.exp(-inside_px / 16)
@@ -37,9 +37,6 @@ def test_a_rim_is_thinner_and_brighter() -> None:
     assert after[0] > 1.7 * before[0]
     half = [int((line > line[0] / 2).sum()) for line in (before, after)]
     assert half[1] < 0.7 * half[0]
-
-
-def test_far_from_the_outline_and_at_the_frames_border_nothing_changes() -> None:
     far = slice(EDGE_PX + round(FACE_PX / 4), SIZE_PX[1])
     whole = Rims(np.ones(SIZE_PX, np.float32), FACE_PX).at(slice(0, SIZE_PX[0]), slice(0, SIZE_PX[1]))
     for offsets_px, brightness in (half_plane().at(slice(0, SIZE_PX[0]), far), whole):

@@ -14,6 +14,7 @@ from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
 from facerf_cli.image.strips import block_means, box_means, enlarged, in_strips, strips
 from facerf_cli.portrait.matte import PersonColours, lifted, shrunk
+from tests.kinds import Patch
 from tests.oracles.person_colours import slow_person_colours
 
 HEIGHT, WIDTH = 150, 70
@@ -21,17 +22,14 @@ DRAW = np.random.default_rng(4)
 
 
 @pytest.fixture(autouse=True)
-def _small_strips(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small_strips(monkeypatch: Patch) -> None:
     monkeypatch.setattr(module, "STRIP_PX", 64 * WIDTH)
 
 
-def test_strips_cover_all_rows_once() -> None:
+def test_strips_cover_all_rows_once_and_means_are_those_of_their_pixels() -> None:
     parts = list(strips((HEIGHT, WIDTH, 3)))
     assert [row for part in parts for row in range(HEIGHT)[part]] == list(range(HEIGHT))
     assert [part.start for part in parts] == [0, 64, 128]
-
-
-def test_means_of_boxes_and_blocks_are_those_of_their_pixels() -> None:
     image = DRAW.integers(0, 256, (23, 17, 3), dtype=np.uint8)
     found = box_means(image.astype(np.float32), 2)
     padded = np.pad(image, ((2, 2), (2, 2), (0, 0)), mode="edge")
@@ -41,12 +39,19 @@ def test_means_of_boxes_and_blocks_are_those_of_their_pixels() -> None:
     )
     blocks = block_means(image, 4)
     assert blocks.shape == (5, 4, 3) and blocks[3, 1] == pytest.approx(image[12:16, 4:8].mean((0, 1)))
+    maps = DRAW.random((4, 31, 17), np.float32)
+    wide = F.interpolate(torch.from_numpy(maps)[None], (HEIGHT, WIDTH), mode="bilinear")[0].numpy()
+    np.testing.assert_allclose(enlarged(maps, (HEIGHT, WIDTH)), wide, atol=2e-6)
+    np.testing.assert_allclose(enlarged(maps, (HEIGHT, WIDTH), slice(40, 61)), wide[:, 40:61], atol=2e-6)
+    image = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
+    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
+    small = F.interpolate(planes, (41, 23), mode="area")[0].permute(1, 2, 0).numpy()
+    np.testing.assert_allclose(shrunk(image, (41, 23)), small, atol=1e-6)
+    np.testing.assert_allclose(shrunk(image[..., 0], (41, 23)), small[..., 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.png", "a.jpg", "a.tif"])
-def test_files_are_written_by_strips_as_by_one(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_written_by_strips_as_by_one(name: str, tmp_path: Path, monkeypatch: Patch) -> None:
     pixels = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
     alpha, normals = DRAW.random((HEIGHT, WIDTH), np.float32), DRAW.random((HEIGHT, WIDTH, 3), np.float32)
 
@@ -77,7 +82,7 @@ def test_files_are_written_by_strips_as_by_one(
         )
 
 
-def test_a_read_does_not_depend_on_strips(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_read_does_not_depend_on_strips(tmp_path: Path, monkeypatch: Patch) -> None:
     write_display(
         tmp_path / "a.png", DRAW.random((HEIGHT, WIDTH, 3), np.float32), 0.0, DRAW.random((HEIGHT, WIDTH))
     )
@@ -106,22 +111,8 @@ def test_layers_are_rendered_strip_by_strip(tmp_path: Path) -> None:
     np.testing.assert_allclose(found["bright"][:, 0], (1e3 * np.arange(HEIGHT)).clip(max=65504), rtol=1e-3)
 
 
-def test_maps_are_enlarged_and_shrunk_as_by_torch() -> None:
-    maps = DRAW.random((4, 31, 17), np.float32)
-    wide = F.interpolate(torch.from_numpy(maps)[None], (HEIGHT, WIDTH), mode="bilinear")[0].numpy()
-    np.testing.assert_allclose(enlarged(maps, (HEIGHT, WIDTH)), wide, atol=2e-6)
-    np.testing.assert_allclose(enlarged(maps, (HEIGHT, WIDTH), slice(40, 61)), wide[:, 40:61], atol=2e-6)
-    image = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
-    planes = torch.from_numpy(image).permute(2, 0, 1)[None]
-    small = F.interpolate(planes, (41, 23), mode="area")[0].permute(1, 2, 0).numpy()
-    np.testing.assert_allclose(shrunk(image, (41, 23)), small, atol=1e-6)
-    np.testing.assert_allclose(shrunk(image[..., 0], (41, 23)), small[..., 0], atol=1e-6)
-
-
 @pytest.mark.parametrize("most_px", [1024, 60])
-def test_colours_of_a_person_are_those_of_the_whole_image(
-    most_px: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_colours_of_a_person_are_those_of_the_whole_image(most_px: int, monkeypatch: Patch) -> None:
     monkeypatch.setattr("facerf_cli.portrait.matte._COLOURS_PX", most_px)
     photo = DRAW.random((HEIGHT, WIDTH, 3), np.float32)
     matte = (DRAW.random((HEIGHT, WIDTH), np.float32) * 3 - 1).clip(0, 1)
@@ -130,7 +121,7 @@ def test_colours_of_a_person_are_those_of_the_whole_image(
     assert (colours[33:40] == colours[:][33:40]).all()
 
 
-def test_a_matte_is_enlarged_by_strips_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_matte_is_enlarged_by_strips_as_at_once(monkeypatch: Patch) -> None:
     photo = DRAW.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     rough, guide = DRAW.random((30, 14), np.float32), DRAW.random((30, 14, 3), np.float32)
     found = lifted(rough, guide, photo)

@@ -42,7 +42,7 @@ def card(depth_m: float, low: float, high: float) -> torch.Tensor:
     return torch.tensor(corners) * depth_m
 
 
-def test_no_depth_lies_between_two_surfaces(surface: Surface) -> None:
+def test_depth_and_positions_lie_on_the_surfaces_row_by_row(surface: Surface) -> None:
     """Neither where one hides the other nor beyond them: hair goes on with the head, cloth with the body."""
     depth_m = surface.depth_m(ROWS)[..., 0]
     near, far = (np.abs(depth_m - known) < 1e-3 for known in (HEAD_M, BODY_M))
@@ -50,13 +50,7 @@ def test_no_depth_lies_between_two_surfaces(surface: Surface) -> None:
     row_of_edge = round(photo_camera(CROP, *SIZE).cy_px + 0.05 * photo_camera(CROP, *SIZE).focal_px)
     assert near[:row_of_edge, 140:160].all() and far[row_of_edge:, 140:160].all()  # the cards
     assert near[:112, 200:280].all() and far[128:, 200:280].all()  # beyond them, by classes
-
-
-def test_a_position_is_seen_at_its_own_pixel(surface: Surface) -> None:
     places_px = project(torch.from_numpy(surface.position_m(ROWS)), photo_camera(CROP, *SIZE))
     x, y = np.meshgrid(*(np.arange(length) + PIXEL_CENTRE for length in SIZE[::-1]))
     np.testing.assert_allclose(places_px, np.stack([x, y], -1), atol=1e-3)
-
-
-def test_rows_are_those_of_the_whole(surface: Surface) -> None:
     np.testing.assert_allclose(surface.depth_m(slice(64, 96)), surface.depth_m(ROWS)[64:96], atol=1e-6)

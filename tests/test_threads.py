@@ -35,7 +35,7 @@ def test_results_come_in_order_from_threads_that_each_compute_alone() -> None:
     assert count() == torch.get_num_threads() == 3
 
 
-def test_few_results_wait_and_an_error_comes_in_its_place() -> None:
+def test_few_results_wait_and_operations_take_one_thread() -> None:
     made: list[int] = []
 
     def work(number: int) -> int:
@@ -46,9 +46,6 @@ def test_few_results_wait_and_an_error_comes_in_its_place() -> None:
     assert next(found) == 0 and max(made) < 5
     with pytest.raises(ZeroDivisionError):
         list(found)
-
-
-def test_operations_take_one_thread_and_pieces_of_work_all_of_them() -> None:
     module.compute_apart()
     module.compute_apart()
     assert torch.get_num_threads() == 1 and count() == 3

@@ -35,14 +35,11 @@ def balance(white: White, light: Tensor, **given: Tensor) -> Balance:
     return Balance.of(white, **(found | given))
 
 
-def test_skin_gets_the_chromaticity_of_the_photo_and_keeps_its_luminance() -> None:
+def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white() -> None:
     gain = balance("photo", WARM).gain
     white = PALE * CAST * gain
     torch.testing.assert_close(white / white[1], PALE * WARM / (PALE * WARM)[1], rtol=1e-4, atol=0)
     assert luminance(white.numpy()) == pytest.approx(float(luminance((PALE * CAST).numpy())), rel=1e-4)
-
-
-def test_a_scene_far_from_white_leaves_skin_the_nearest_colour_of_skin() -> None:
     found = balance("scene", ORANGE)
     assert found.is_far and balance("photo", ORANGE).is_far
     white = PALE * CAST * found.gain  # the cast skin is none, so its nearest one is taken
@@ -54,15 +51,13 @@ def test_a_scene_far_from_white_leaves_skin_the_nearest_colour_of_skin() -> None
     torch.testing.assert_close(
         found.light, (ORANGE * PALE / white / ORANGE[1] * white[1] / PALE[1])[::2].log()
     )
-
-
-def test_a_balanced_photo_has_its_own_white_in_its_scene_too() -> None:
     found = balance("scene", torch.ones(3))
     assert not found.is_far and found.light.abs().max() < 0.02
     torch.testing.assert_close(found.gain, balance("photo", torch.ones(3)).gain, rtol=0.02, atol=0)
+    assert error("photo") < 0.03 < 0.3 < error("scene")
 
 
-def test_few_pixels_of_skin_and_grey_photos_change_nothing() -> None:
+def test_few_grey_clipped_or_black_pixels_of_skin_change_nothing() -> None:
     few = torch.zeros(SIZE)
     few.flatten()[:499] = 1
     grey = of_colour(torch.full((3,), 0.5))
@@ -70,9 +65,6 @@ def test_few_pixels_of_skin_and_grey_photos_change_nothing() -> None:
         assert found.gain.tolist() == [1, 1, 1] and found.light.tolist() == [0, 0] and not found.is_far
     few.flatten()[499] = 1
     assert balance("photo", WARM, skin=few).gain.tolist() != [1, 1, 1]
-
-
-def test_clipped_and_black_skin_has_no_colour_of_its_own() -> None:
     clean = of_colour(PALE * WARM)
     clean[0] *= torch.linspace(0.8, 1.2, SIZE[1])  # so that a median tells what it is over
     spoilt = clean.clone()
@@ -121,11 +113,7 @@ def error(white: White | None) -> float:
     return float((found - photo).norm())
 
 
-def test_skin_keeps_the_photos_white_and_loses_the_light_of_the_scene() -> None:
-    assert error("photo") < 0.03 < 0.3 < error("scene")
-
-
-def test_the_whole_person_has_the_same_white() -> None:
+def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
     photo = astronaut.photo() * ORANGE.numpy()
     skin, shirt = {}, {}
     for white in ("photo", "scene"):
@@ -139,9 +127,6 @@ def test_the_whole_person_has_the_same_white() -> None:
         taken = (part["photo"] / part["scene"]).log()
         light = [float(taken[k] - taken[1]) for k in (0, 2)]
         assert light[0] > 0.3 and light[1] < -0.3
-
-
-def test_the_faces_own_field_has_the_same_white_in_every_light() -> None:
     light = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
     shown = [
         next(predict_olat(astronaut.models(), astronaut.head(), light, white=white, network_alone=alone))

@@ -16,6 +16,7 @@ from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sh import cosine_lobe, sh_basis
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.raster.texture import normal_map
+from tests.kinds import Log, Patch
 
 SMALL = TransferSettings(order=4, side=32, lights=80, light_samples=2, bounce_samples=4, blur_texels=0.5)
 
@@ -50,7 +51,7 @@ def test_where_nothing_shadows_it_is_lamberts(vertices: Tensor, transfer: Tensor
     assert torch.allclose(found[forehead], wanted[forehead], atol=0.03)
 
 
-def test_the_nose_shadows_what_is_under_it(vertices: Tensor, transfer: Tensor) -> None:
+def test_the_nose_shadows_what_is_under_it_and_bounces_add_light(vertices: Tensor, transfer: Tensor) -> None:
     normals = normal_map(vertices, grid_triangles(), SMALL.side)
     lobe = torch.cat([torch.full((2 * k + 1,), cosine_lobe(k) / math.pi) for k in range(SMALL.order + 1)])
     shadowless = (sh_basis(normals.permute(1, 2, 0), SMALL.order) * lobe).permute(2, 0, 1)
@@ -58,9 +59,6 @@ def test_the_nose_shadows_what_is_under_it(vertices: Tensor, transfer: Tensor) -
     share = lit(white(transfer), 0, 70) / lit(plain, 0, 70).clamp_min(0.05)
     assert float(share[:8, 26:38].mean()) > 0.9  # forehead
     assert float(share[38:41, 29:35].mean()) < 0.6  # lip below the nose
-
-
-def test_the_bounce_adds_light_where_the_face_sees_itself(transfer: Tensor) -> None:
     direct, bounce = transfer
     assert float(bounce[0].min()) >= 0
     assert 0.005 < float(bounce[0].mean() / direct[0].mean()) < 0.3
@@ -76,9 +74,7 @@ def test_lights_that_turn_with_the_head_change_nothing(transfer: Tensor) -> None
     assert not torch.allclose(face.relit(rig, weights, turn), wanted, atol=0.01)
 
 
-def test_a_second_run_does_not_bake(
-    vertices: Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_run_does_not_bake(vertices: Tensor, tmp_path: Path, monkeypatch: Patch) -> None:
     first = baked.baked_transfer(vertices, SMALL, tmp_path)
     with monkeypatch.context() as patch:
         patch.setattr(baked, "bake_transfer", None)  # to call it would fail
@@ -90,7 +86,7 @@ def test_a_second_run_does_not_bake(
 
 
 def test_a_damaged_file_is_baked_again(
-    vertices: Tensor, transfer: Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    vertices: Tensor, transfer: Tensor, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(baked, "bake_transfer", lambda *_: transfer)
     baked.baked_transfer(vertices, SMALL, tmp_path)
@@ -104,9 +100,7 @@ def test_a_damaged_file_is_baked_again(
         assert len(path.read_bytes()) == len(whole)
 
 
-def test_a_cache_that_cannot_be_written_is_a_warning(
-    vertices: Tensor, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_cache_that_cannot_be_written_is_a_warning(vertices: Tensor, tmp_path: Path, caplog: Log) -> None:
     (tmp_path / "file").write_text("not a folder")
     caplog.set_level("WARNING")
     assert baked.baked_transfer(vertices, SMALL, tmp_path / "file").isfinite().all()

@@ -33,19 +33,20 @@ def turn_of(yaw_deg: float) -> Tensor:
     return torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
 
 
-def test_diffuse_is_irradiance_over_pi() -> None:
+def test_diffuse_is_irradiance_over_pi_and_light_from_everywhere_mirrored_whole() -> None:
     surface, light = ball(), RigLight(rig_directions(40), torch.rand(40, 3))
     coefficients = rig_coefficients(light, 2)
     found = diffuse_transfer(surface.normals) @ coefficients
     wanted = irradiance(surface.normals.permute(1, 2, 0), coefficients) / math.pi
     assert torch.allclose(found, wanted, atol=1e-5)
-
-
-def test_light_from_everywhere_is_mirrored_whole() -> None:
     rig = rig_directions(150)
     relit = shiny(ball(), albedo=0.4, gloss=0.1).relit(rig, torch.full((1, 150, 3), 4 / 150))
     assert relit.shape == (1, 3, T, T)
     assert torch.allclose(relit, torch.full_like(relit, 0.5), atol=0.01)
+    broad, sharp = specular_sh._blinn_phong(30.0, 8), specular_sh._blinn_phong(1000.0, 8)
+    assert broad[0] == pytest.approx(1) and sharp[0] == pytest.approx(1)
+    assert all(b < s < 1 for b, s in zip(broad[1:], sharp[1:], strict=True))
+    assert list(broad) == sorted(broad, reverse=True)
 
 
 @pytest.mark.parametrize("azel_deg", [(40.0, 0.0), (-30.0, 50.0), (0.0, 0.0)])
@@ -57,14 +58,7 @@ def test_the_highlight_is_where_a_mirror_shows_the_light(azel_deg: tuple[float, 
     assert float(brightest @ half) > math.cos(math.radians(4))
 
 
-def test_a_sharper_lobe_keeps_more_of_every_degree() -> None:
-    broad, sharp = specular_sh._blinn_phong(30.0, 8), specular_sh._blinn_phong(1000.0, 8)
-    assert broad[0] == pytest.approx(1) and sharp[0] == pytest.approx(1)
-    assert all(b < s < 1 for b, s in zip(broad[1:], sharp[1:], strict=True))
-    assert list(broad) == sorted(broad, reverse=True)
-
-
-def test_a_ball_that_turns_about_its_middle_looks_as_before() -> None:
+def test_a_ball_that_turns_looks_as_before_and_mirrors_follow_the_camera() -> None:
     """Its texels turn with it: the one that now shows a normal is another."""
     surface, turn = ball(), turn_of(25)
     rig, weights = rig_directions(60), torch.rand(1, 60, 3)
@@ -74,9 +68,6 @@ def test_a_ball_that_turns_about_its_middle_looks_as_before() -> None:
     wanted = shiny(FaceSurface(normals, positions, surface.centre_m)).relit(rig, weights)[0]
     assert torch.allclose(turned, wanted, atol=1e-5)
     assert not torch.allclose(turned, shiny(surface).relit(rig, weights)[0], atol=0.01)
-
-
-def test_the_mirror_follows_the_camera() -> None:
     surface = ball(centre_m=-0.3)
     near, far = surface.views(None), ball(centre_m=-1000.0).views(None)
     assert not torch.allclose(near, far, atol=0.05)

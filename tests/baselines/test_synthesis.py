@@ -57,43 +57,27 @@ def error_of(found: synthesis.Solution, parts: tuple, given: tuple[Tensor, Tenso
     return float((remade - truth).norm() / truth.norm())
 
 
-def test_what_the_priors_made_comes_back() -> None:
+def test_what_the_priors_made_comes_back_in_spite_of_hair_trust_and_brightness() -> None:
     parts, given, radiance = drawn()
     scene = Scene(radiance, torch.ones(T * T), *given)
     assert (
         error_of(solve(scene, *parts, SolveSettings(evidence=1e6, steps=25)), parts, given, radiance) < 0.01
     )
-
-
-def test_hair_over_a_part_of_it_hardly_matters() -> None:
-    parts, given, radiance = drawn()
     covered = radiance.clone()
     covered[:, : T * T // 8] = 0.01
     settings = SolveSettings(evidence=1e6, steps=25)
     found = solve(Scene(covered, torch.ones(T * T), *given), *parts, settings)
     assert error_of(found, parts, given, radiance) < 0.03
-
-
-def test_texels_without_trust_are_left_out() -> None:
-    parts, given, radiance = drawn()
     trust = torch.ones(T * T)
     trust[:20] = 0
     spoilt = radiance.clone()
     spoilt[:, :20] = torch.nan
     found = solve(Scene(spoilt, trust, *given), *parts, SolveSettings(evidence=1e6, steps=25))
     assert error_of(found, parts, given, radiance) < 0.01
-
-
-def test_a_brighter_photo_is_the_same_face_in_more_light() -> None:
-    parts, given, radiance = drawn()
     once = solve(Scene(radiance, torch.ones(T * T), *given), *parts)
     twice = solve(Scene(2 * radiance, torch.ones(T * T), *given), *parts)
     assert torch.allclose(once.albedo, twice.albedo, atol=1e-4)
     assert torch.allclose(2 * once.light, twice.light, rtol=1e-3, atol=1e-3)
-
-
-def test_a_black_photo_has_no_light() -> None:
-    parts, given, radiance = drawn()
     found = solve(Scene(0 * radiance, torch.ones(T * T), *given), *parts)
     assert not found.light.any() and not found.albedo.any()
 
@@ -155,14 +139,11 @@ def test_all_of_the_detail_is_the_true_albedo_where_it_is_bright() -> None:
     assert torch.allclose(half - guess, 0.5 * (whole.log() - guess), atol=1e-5)
 
 
-def test_no_albedo_is_above_one() -> None:
+def test_no_albedo_is_above_one_and_a_black_photo_no_trouble() -> None:
     guess = torch.full((3, TEXELS, TEXELS), 0.5).log()
     black = torch.zeros_like(guess)
     found = with_detail(guess, face_of(black + 7), black + 1, black, 1.0)
     assert float(found.max()) <= 0
     assert shrunk(found).shape == (3, SIDE, SIDE)
-
-
-def test_a_black_photo_is_no_trouble() -> None:
     guess, black = torch.full((3, TEXELS, TEXELS), 0.5).log(), torch.zeros(3, TEXELS, TEXELS)
     assert with_detail(guess, face_of(black), black, black, 0.5).isfinite().all()

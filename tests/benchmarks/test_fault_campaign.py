@@ -15,6 +15,7 @@ from benchmarks.faults import children
 from benchmarks.faults.children import damaged, lay_out, outcome_of, run_door
 from benchmarks.faults.doors import DOORS, Door
 from facerf_cli.errors import InputError
+from tests.kinds import Patch, Said
 
 ROOT = Path(__file__).parents[2]
 CORPUS = ROOT / "tests" / "corpus"
@@ -60,7 +61,7 @@ def _trip(path: Path) -> None:
         raise InputError("")
 
 
-def test_the_net_catches_what_it_should(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_net_catches_what_it_should_and_a_seed_says_the_case(monkeypatch: Patch) -> None:
     kinds = (b"fine", b"crash", b"refused", b"hang", b"uncaught", b"greedy", b"long")
     door = Door(lambda: {"a": b""}, _trip)
     monkeypatch.setitem(DOORS, "toy", door)
@@ -71,18 +72,13 @@ def test_the_net_catches_what_it_should(monkeypatch: pytest.MonkeyPatch) -> None
     wanted = ["accepted", "crash", "refused", "hang", "uncaught", "uncaught", "uncaught"]
     assert [ended.outcome for ended in ends] == wanted
     assert "SIGKILL" in ends[1].said and "KeyError" in ends[4].said and "MemoryError" in ends[5].said
-
-
-def test_a_seed_says_the_case() -> None:
     door = DOORS["light JSON"]
     assert damaged(door, "light JSON", 1, 5) == damaged(door, "light JSON", 1, 5)
     assert damaged(door, "light JSON", 1, 5) != damaged(door, "light JSON", 2, 5)
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_script_has_help(
-    script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_script_has_help(script: str, monkeypatch: Patch, capsys: Said) -> None:
     monkeypatch.setattr(sys, "argv", [script, "--help"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(f"benchmarks.faults.{script}", run_name="__main__")

@@ -14,6 +14,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from _common import ROOT, best_s, required
 from held_out_heads import RelitTexture, drift_of, groups, print_tables
 
+from tests.kinds import Patch, Said
+
 PAGES = "\n".join(page.read_text() for page in (*(ROOT / "docs").glob("*.md"), ROOT / "MODEL_CARD.md"))
 
 
@@ -28,9 +30,7 @@ def test_no_figure_rests_on_a_script_that_is_gone() -> None:
 
 
 @pytest.mark.parametrize("script", sorted(path.stem for path in (ROOT / "benchmarks").glob("[a-z]*.py")))
-def test_every_script_imports_and_has_help(
-    script: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_script_imports_and_has_help(script: str, monkeypatch: Patch, capsys: Said) -> None:
     module = importlib.import_module(script)
     monkeypatch.setattr(sys, "argv", [f"{script}.py", "--help"])
     with pytest.raises(SystemExit) as end:
@@ -61,7 +61,7 @@ DATA = {
 
 @pytest.mark.parametrize("script", DATA)
 def test_a_script_without_its_data_says_so_and_succeeds(
-    script: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    script: str, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     module = importlib.import_module(script)
     for name in {"YALE_B", "WHOLE_YALE_B", "ICT_FACEKIT", "SHARED"} & vars(module).keys():
@@ -75,12 +75,14 @@ def test_a_script_without_its_data_says_so_and_succeeds(
     assert line.startswith(f"{script}: skipped: needs ") and line.endswith(f"; give {DATA[script]}")
 
 
-def test_a_script_without_data_runs_to_its_end(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_script_without_data_runs_to_its_end_and_ways_take_turns(monkeypatch: Patch, capsys: Said) -> None:
     monkeypatch.setattr(sys, "argv", ["colour_charts.py", "--images", "1"])
     importlib.import_module("colour_charts").main()
     assert capsys.readouterr().out
+    calls: list[str] = []
+    seconds, results = best_s({"a": lambda: calls.append("a"), "b": lambda: len(calls)}, 3)
+    assert calls == ["a"] * 3 and results == {"a": None, "b": 3}
+    assert all(0 <= value < 1 for value in seconds.values())
 
 
 def test_a_wrong_path_is_an_error_and_a_missing_default_is_not(tmp_path: Path) -> None:
@@ -90,13 +92,6 @@ def test_a_wrong_path_is_an_error_and_a_missing_default_is_not(tmp_path: Path) -
         required(None, "a bank", "--bank", tmp_path / "absent")
     assert end.value.code == 0
     assert required(None, "a bank", "--bank", tmp_path) == tmp_path
-
-
-def test_ways_take_turns() -> None:
-    calls: list[str] = []
-    seconds, results = best_s({"a": lambda: calls.append("a"), "b": lambda: len(calls)}, 3)
-    assert calls == ["a"] * 3 and results == {"a": None, "b": 3}
-    assert all(0 <= value < 1 for value in seconds.values())
 
 
 def test_drift_is_of_the_relit_skin_not_of_its_exposure() -> None:
@@ -112,7 +107,7 @@ def test_drift_is_of_the_relit_skin_not_of_its_exposure() -> None:
     assert drift_of(truth, truth.mean(0, keepdim=True).expand(3, -1, -1), weight, albedo) is None
 
 
-def test_tables_of_held_out_heads(capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_of_held_out_heads(capsys: Said) -> None:
     textures = [
         RelitTexture(head, same, angle_deg, tone, error, error, 2 * error, drift_deg)
         for head in (1, 2)

@@ -52,7 +52,7 @@ def with_error(clip: Clip, factor: np.ndarray) -> np.ndarray:
     return np.asarray(linear_to_srgb(((srgb_to_linear(clip.truth) + 0.02) * factor - 0.02).clip(0, 1)))
 
 
-def test_an_error_that_moves_with_the_head_is_no_flicker() -> None:
+def test_jumps_are_flicker_and_drifts_and_errors_that_move_are_none() -> None:
     clip = moving_clip()
     x = np.arange(SIDE)[None].repeat(SIDE, 0)
     stain = np.stack([1 + 0.2 * np.sin((x - n) / 3) for n in range(FRAMES)])[..., None]
@@ -61,9 +61,6 @@ def test_an_error_that_moves_with_the_head_is_no_flicker() -> None:
     assert flicker(images, clip.truth, clip) < 1e-4
     known = np.isfinite(clip.from_the_middle(clip.truth[clip.middle]))
     np.testing.assert_allclose(steady_twin(images, clip)[known], images[known], atol=1e-6)
-
-
-def test_jumps_count_and_drifts_do_not() -> None:
     clip, time = moving_clip(), np.arange(FRAMES)[:, None, None, None]
     drift = np.exp(0.02 * time + 0.005 * time**2)
     assert flicker(with_error(clip, drift), clip.truth, clip) < 1e-4

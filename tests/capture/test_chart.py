@@ -52,15 +52,12 @@ def test_a_camera_is_undone_and_luminance_stays() -> None:
     assert luminance(fit.matrix @ greys) == pytest.approx(luminance(greys))
 
 
-def test_light_that_falls_off_is_taken_off() -> None:
+def test_light_that_falls_off_is_taken_off_and_greys_stay_exact() -> None:
     light = np.exp(centres() @ [0.07, -0.05])
     fit = fit_colours(published_colours() @ CAMERA.T * light[:, None])
     np.testing.assert_allclose(fit.light / fit.light[0], light / light[0], rtol=1e-3)
     np.testing.assert_allclose(fit.matrix, kept_luminance(CAMERA), atol=2e-3)
     assert fit.delta_e_after.mean() < 0.05
-
-
-def test_greys_stay_exact_where_the_others_do_not_fit() -> None:
     noisy = published_colours() * np.exp(0.2 * np.random.default_rng(1).standard_normal((24, 3)))
     matrix, level = neutral_matrix(noisy, published_colours())
     greys, wanted = noisy[GREYS].sum(0), published_colours()[GREYS].sum(0)
@@ -94,16 +91,13 @@ def test_importing_colour_science_changes_nothing_and_nothing_is_printed_at_the_
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_middles_are_sampled() -> None:
+def test_the_middles_are_sampled_and_noise_and_clipping_counted() -> None:
     patches = sample(chart_image(noise=0.0, exposure=1.0), CORNERS)
     np.testing.assert_allclose(patches.colours, published_colours(), atol=1e-6)
     assert patches.counts.min() > 150 and patches.noise.max() < 1e-6 and not patches.at_white.any()
     careless = CORNERS + np.array([[4, -4], [-4, 4], [4, 4], [-4, -4]])
     patches = sample(chart_image(noise=0.0, exposure=1.0), careless)
     np.testing.assert_allclose(patches.colours, published_colours(), atol=1e-6)
-
-
-def test_noise_and_clipping_are_counted() -> None:
     patches = sample(chart_image(noise=0.02, exposure=1.13).clip(max=1), CORNERS)
     grey = 1.13 * published_colours()[19, 1]
     assert patches.noise[19] == pytest.approx(0.02 * np.sqrt(grey + 0.01), rel=0.15)

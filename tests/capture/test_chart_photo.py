@@ -46,7 +46,7 @@ def delta_e(chart: ChartCorrection) -> float:
     return float(chart.record["delta_e_2000"]["after"]["mean"])
 
 
-def test_a_camera_with_noise_and_uneven_light_is_undone(tmp_path: Path) -> None:
+def test_a_camera_with_noise_is_undone_and_lamps_of_one_colour_change_nothing(tmp_path: Path) -> None:
     image = chart_image(matrix=CAMERA, light=(1.2, 0.8), noise=0.01)
     chart = correction(tmp_path, image)
     before, after = (chart.record["delta_e_2000"][when] for when in ("before", "after"))
@@ -54,6 +54,13 @@ def test_a_camera_with_noise_and_uneven_light_is_undone(tmp_path: Path) -> None:
     assert after["mean"] < 0.5 and after["max"] < 1.5 < 5 < before["mean"]
     assert chart.record["light_span"] == pytest.approx(1.25, abs=0.05)
     assert chart.record["cameras"] == ["C0", "C1"]
+    # A camera that was calibrated by the lamps sees the chart in their colour; frames lose it first.
+    tinted = [{**light, "intensity": [3, 2, 1]} for light in GOOD["lights"]]
+    for name, lights, tint in (("white", WHITE, [1, 1, 1]), ("tinted", tinted, [3, 2, 1])):
+        stage = capture(tmp_path / name, lights=lights)
+        write_exr(tmp_path / f"{name}.exr", chart_image(matrix=CAMERA, noise=0.0) * np.float32(tint) + LEVEL)
+        chart = next(read_charts(stage, str(tmp_path / f"{name}.exr"), [CORNERS]))
+        np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=5e-3)
 
 
 @pytest.mark.parametrize("turn", [1, 2])
@@ -61,16 +68,6 @@ def test_corners_begin_anywhere_and_go_either_way(tmp_path: Path, turn: int) -> 
     corners = four_turns(CORNERS)[turn][:: -1 if turn % 2 else 1]
     chart = correction(tmp_path, chart_image(matrix=CAMERA), corners)
     assert chart.record["corners_px"] == CORNERS.tolist() and delta_e(chart) < 0.5
-
-
-def test_lamps_of_one_colour_change_nothing(tmp_path: Path) -> None:
-    """A camera that was calibrated by the lamps sees the chart in their colour; frames lose it first."""
-    tinted = [{**light, "intensity": [3, 2, 1]} for light in GOOD["lights"]]
-    for name, lights, tint in (("white", WHITE, [1, 1, 1]), ("tinted", tinted, [3, 2, 1])):
-        stage = capture(tmp_path / name, lights=lights)
-        write_exr(tmp_path / f"{name}.exr", chart_image(matrix=CAMERA, noise=0.0) * np.float32(tint) + LEVEL)
-        chart = next(read_charts(stage, str(tmp_path / f"{name}.exr"), [CORNERS]))
-        np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=5e-3)
 
 
 def test_a_chart_for_each_camera(tmp_path: Path) -> None:
@@ -131,7 +128,7 @@ def test_what_is_implausible_is_refused_in_a_line(tmp_path: Path, name: str) -> 
     assert "chart.exr: " in str(raised.value) and "\n" not in str(raised.value)
 
 
-def test_a_white_of_eight_bits_is_clipped(tmp_path: Path) -> None:
+def test_a_white_is_clipped_of_eight_bits_and_not_of_floats(tmp_path: Path) -> None:
     write_display(tmp_path / "chart.png", chart_image(exposure=1.3))
     stage = capture(tmp_path, colour_space="sRGB", black_level=0.0)
     with pytest.raises(InputError, match="of the chart's patches are clipped"):
@@ -139,9 +136,6 @@ def test_a_white_of_eight_bits_is_clipped(tmp_path: Path) -> None:
     write_display(tmp_path / "chart.png", chart_image(matrix=CAMERA, exposure=0.8))
     chart = next(read_charts(stage, str(tmp_path / "chart.png"), [CORNERS]))
     np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.03)
-
-
-def test_a_white_of_floats_that_is_one_is_not_clipped(tmp_path: Path) -> None:
     image = chart_image(noise=0.0)
     assert (
         correction(tmp_path, image * np.float32((1 - LEVEL) / image.max())).record["delta_e_2000"]["after"][

@@ -125,7 +125,7 @@ def test_a_list_that_is_of_other_images_is_said(tmp_path: Path) -> None:
     assert noted(stage, "line 1") and stage["lights"][0]["direction"] is None
 
 
-def test_headers_that_differ_leave_the_colour_space_open(tmp_path: Path) -> None:
+def test_headers_that_differ_leave_the_colour_space_open_and_known_primaries_name_it(tmp_path: Path) -> None:
     folder = stage_at(tmp_path, form="s{}/cam{}/L{}.png")
     png = "{subject}/{camera}/{light}.png"
     assert draft_stage(folder, SUFFIXES, png)["colour_space"] == "sRGB"
@@ -137,6 +137,12 @@ def test_headers_that_differ_leave_the_colour_space_open(tmp_path: Path) -> None
         assert stream.open(str(path), spec) and stream.write_image(np.zeros((6, 8, 3), np.uint16))
         stream.close()
     stage = draft_stage(folder, SUFFIXES, png)
+    assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
+    assert ACESCG.chromaticities is not None
+    stage = draft_stage(with_primaries(tmp_path / "known", ACESCG.chromaticities), SUFFIXES, FOLDERS)
+    assert stage["colour_space"] == "ACEScg" and noted(stage, "ACEScg, from the headers")
+    camera_s = (0.78, 0.31, 0.22, 0.88, 0.09, -0.08, 0.3127, 0.329)
+    stage = draft_stage(with_primaries(tmp_path / "unknown", camera_s), SUFFIXES, FOLDERS)
     assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
 
 
@@ -151,15 +157,6 @@ def with_primaries(folder: Path, chromaticities: tuple[float, ...]) -> Path:
         assert stream.open(str(path), spec) and stream.write_image(np.zeros((6, 8, 3), np.float32))
         stream.close()
     return folder
-
-
-def test_known_primaries_name_the_colour_space(tmp_path: Path) -> None:
-    assert ACESCG.chromaticities is not None
-    stage = draft_stage(with_primaries(tmp_path / "known", ACESCG.chromaticities), SUFFIXES, FOLDERS)
-    assert stage["colour_space"] == "ACEScg" and noted(stage, "ACEScg, from the headers")
-    camera_s = (0.78, 0.31, 0.22, 0.88, 0.09, -0.08, 0.3127, 0.329)
-    stage = draft_stage(with_primaries(tmp_path / "unknown", camera_s), SUFFIXES, FOLDERS)
-    assert stage["colour_space"] is None and noted(stage, "fill in: colour_space")
 
 
 def test_faults_of_the_files_are_noted(tmp_path: Path) -> None:
@@ -283,14 +280,11 @@ def listed(folder: Path, text: str) -> Path:
     return folder / "lights.lp"
 
 
-def test_an_lp_file_is_read_by_the_images_names(tmp_path: Path) -> None:
+def test_lists_are_read_by_the_images_names_or_by_order(tmp_path: Path) -> None:
     path = listed(tmp_path, "3\r\nC:\\rti\\a 1.jpg 0 0 2\r\nrti/L2.jpg 0.6 0 .8\r\nL9.jpg 1 0 0\r\n")
     lights = read_light_list(path)
     assert [name for name, _ in lights] == ["C:\\rti\\a 1.jpg", "rti/L2.jpg", "L9.jpg"]
     assert match_lights(lights, ["L1", "L2"], {"a 1": "L1"}) == {"L1": [0, 0, 1], "L2": [0.6, 0, 0.8]}
-
-
-def test_a_list_without_names_goes_by_order(tmp_path: Path) -> None:
     lights = read_light_list(listed(tmp_path, "# x y z\n\n0 0 1\n0, 1, 0\n-1e0 0 0\n"))
     expected = {"2": [0, 0, 1], "10": [0, 1, 0], "11": [-1, 0, 0]}
     assert match_lights(lights, ["2", "10", "11"], {}) == expected

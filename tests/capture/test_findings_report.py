@@ -18,32 +18,17 @@ def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> st
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
-def test_no_findings_print_nothing() -> None:
+def test_a_report_counts_what_is_alike_and_begins_with_what_stops_a_subject() -> None:
     assert shown([]) == ""
-
-
-def test_what_stops_a_subject_comes_first_and_warnings_last() -> None:
     text = shown([WARNS, *FIELDS, STOPS])
     assert text.index("subject stopped", text.index("0001/C0")) < text.index("0000/C0/L000")
     assert text.index("0000/C0/L002") < text.index("the head moves")
     assert "are mirrored [left] to right" in text  # brackets are no markup
-
-
-def test_a_log_file_is_no_narrow_terminal() -> None:
     assert "the lights are mirrored [left] to right" in shown([STOPS], width=60)
-
-
-def test_strict_stops_subjects_whatever_it_is() -> None:
     assert "warning" not in shown([WARNS, *FIELDS, STOPS], strict=True)
     assert "left out" not in shown(FIELDS, strict=True)
-
-
-def test_many_alike_are_counted() -> None:
     text = shown(FIELDS)
     assert "0000/C0/L002" in text and "L003" not in text and "(and 6 more like it)" in text
-
-
-def test_the_summary_counts_what_follows() -> None:
     assert (
         summary([WARNS, *FIELDS, STOPS])
         == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"

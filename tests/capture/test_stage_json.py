@@ -44,29 +44,23 @@ def capture_at(folder: Path, pixels: np.ndarray | None = None, **changes: Any) -
     return folder
 
 
-def test_cameras_become_designs(tmp_path: Path) -> None:
+def test_cameras_become_designs_of_three_rows_or_four(tmp_path: Path) -> None:
     camera = read_capture(capture_at(tmp_path)).cameras["C0"]
     points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0.1, 0, 1.0]])
     expected = [[33, 30], [33 + 25, 30], [33, 30 - 25], [33 + 50, 30]]  # x right, y up, z toward the camera
     assert np.abs(camera.project(points).numpy() - expected).max() < 1e-5
     in_camera = points.double() @ camera.rotation.mT + camera.translation_m
     assert (in_camera[:, 2] < 0).all() and torch.linalg.det(camera.rotation) == pytest.approx(1)
-
-
-def test_a_pose_of_four_rows_is_the_same(tmp_path: Path) -> None:
     four = [{**GOOD["cameras"][0], "world_to_camera": [*FACING, [0, 0, 0, 1]]}]
     here = read_capture(capture_at(tmp_path, cameras=four)).cameras["C0"]
     there = read_capture(capture_at(tmp_path)).cameras["C0"]
     assert torch.equal(here.rotation, there.rotation) and torch.equal(here.translation_m, there.translation_m)
 
 
-def test_black_level_and_intensity_go(tmp_path: Path) -> None:
+def test_black_level_intensity_and_colour_space_are_those_of_the_description(tmp_path: Path) -> None:
     capture = read_capture(capture_at(tmp_path))
     assert capture.frame("0000", "C0", 0)[5, 5] == pytest.approx([2, 1, 0.5])
     assert capture.frame("0000", "C0", 1)[5, 5] == pytest.approx([2, 2, 2])
-
-
-def test_the_named_colour_space_is_believed_over_the_file(tmp_path: Path) -> None:
     capture = read_capture(capture_at(tmp_path, colour_space="ACEScg", black_level=0))
     space = named_space("ACEScg")
     assert space.chromaticities is not None

@@ -34,12 +34,15 @@ def test_other_names_are_no_flashes(name: str) -> None:
     assert Flash.named(name) is None
 
 
-def test_azimuth_has_the_opposite_sign_of_ours() -> None:
+def test_azimuth_has_the_opposite_sign_and_a_face_fills_the_image_at_a_metre() -> None:
     flash = Flash(35, -20)  # from the viewer's left and below
     assert flash.direction[0] < 0 and flash.direction[1] < 0 < flash.direction[2]
     np.testing.assert_allclose(flash.direction, azel_to_direction(-35.0, -20.0).numpy(), atol=1e-6)
     np.testing.assert_allclose(Flash(0, 90).direction, [0, 1, 0], atol=1e-12)
     assert Flash(-60, 0).angle_deg == pytest.approx(60)
+    camera = guess_camera()
+    across_px = 0.089 * camera.focal_px[0]  # the outer corners of the eyes, a metre away
+    assert 0.4 * camera.width_px < across_px < 0.6 * camera.width_px
 
 
 def test_what_is_there(folder: Path) -> None:
@@ -166,12 +169,6 @@ def test_a_stage_may_name_its_ambient_images(tmp_path: Path) -> None:
         read_capture(capture_at(tmp_path, ambient="dark.exr"))
     with pytest.raises(UsageError, match="names no 'ambient'"):
         read_capture(capture_at(tmp_path), ReadSettings(subtract_ambient=True))
-
-
-def test_a_metre_before_the_camera_a_face_fills_the_image() -> None:
-    camera = guess_camera()
-    across_px = 0.089 * camera.focal_px[0]  # the outer corners of the eyes, a metre away
-    assert 0.4 * camera.width_px < across_px < 0.6 * camera.width_px
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs ../shared/data/extended_yale_b")

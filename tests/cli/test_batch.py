@@ -1,6 +1,5 @@
 """The contract of every verb that walks folders (docs/design.md), with a verb that only copies bytes."""
 
-import json
 import os
 import signal
 import subprocess
@@ -9,46 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.batch.inputs import Item, collect_items
-from facerf_cli.batch.made_from import Recipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items
-from facerf_cli.batch.settings import Settings
-from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.atomic import atomic_path
-from facerf_cli.run.logs import configure_logging
+from facerf_cli.errors import FacerfError, UsageError
+from tests.cli.folders import rows
+from tests.cli.toy_batch import run
+from tests.kinds import Said
 from tests.processes import wait_until
-
-
-def outputs_of(item: Item) -> list[Path]:
-    return [item.output("_copy.bin")]
-
-
-def copy(item: Item) -> Outcome:
-    data = item.input_path.read_bytes()
-    if data == b"bad":
-        raise InputError(f"{item.input_path}: is bad;\n try another")
-    if data == b"bug":
-        raise RuntimeError("a bug")
-    if data == b"stop":
-        raise FacerfError("the checkpoint is broken")
-    if data == b"die":
-        os._exit(9)
-    (path,) = outputs_of(item)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
-    return Outcome([path], {"bytes": len(data), "ratio": float("nan")})
-
-
-def run(inputs: list[Path | str], output: Path, recipe: Recipe | None = None, **options: object) -> int:
-    configure_logging()
-    texts = [str(entry) for entry in inputs]
-    chosen = BatchOptions(output, **options)  # type: ignore[arg-type]
-    items = collect_items(texts, output)
-    return run_items("copy", items, copy, outputs_of, chosen, Settings(), lambda digest_of: [recipe or {}])
-
-
-def rows(output: Path) -> dict[str, dict]:
-    return {row["item"]: row for row in map(json.loads, (output / "report.jsonl").read_text().splitlines())}
 
 
 @pytest.fixture
@@ -69,16 +33,19 @@ def test_a_name_that_is_not_utf8_is_in_the_report(tmp_path: Path) -> None:
     assert rows(tmp_path / "out")["a\udcff"]["status"] == "failed"
 
 
-def test_nothing_to_work_on(tmp_path: Path) -> None:
+def test_nothing_to_work_on_and_an_output_folder_that_cannot_be(tmp_path: Path, photos: Path) -> None:
+    (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match="no inputs found"):
-        run([tmp_path], tmp_path / "out")
+        run([tmp_path / "empty"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+    (tmp_path / "file").touch()
+    for folder in (tmp_path / "file", tmp_path / "file" / "out"):
+        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; give another"):
+            run([photos], folder)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_a_bad_item_does_not_harm_the_others(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture, jobs: int
-) -> None:
+def test_a_bad_item_does_not_harm_the_others(photos: Path, tmp_path: Path, capsys: Said, jobs: int) -> None:
     (photos / "b.jpg").write_bytes(b"bad")
     (photos / "Z.EXR").write_bytes(b"bug")
     out = tmp_path / "out"
@@ -119,7 +86,7 @@ def test_finished_items_are_skipped_and_keep_their_row(photos: Path, tmp_path: P
     assert (out / "a_copy.bin").read_bytes() == b"a.png"
 
 
-def test_dry_run_writes_nothing(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_dry_run_writes_nothing(photos: Path, tmp_path: Path, capsys: Said) -> None:
     assert run([photos / "b.jpg"], tmp_path / "out", dry_run=True) == 0
     assert capsys.readouterr().out == f"{photos / 'b.jpg'} -> {tmp_path / 'out' / 'b_copy.bin'}\n"
     assert not (tmp_path / "out").exists()
@@ -132,34 +99,21 @@ def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, jobs: i
         run([photos], tmp_path / "out", jobs=jobs)
 
 
-def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: Said) -> None:
     (photos / "Z.EXR").write_bytes(b"die")
     assert run([photos], tmp_path / "out", jobs=2) == 1
     assert "Z.EXR: its process died" in capsys.readouterr().err
 
 
-def test_an_output_folder_that_cannot_be(photos: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    for folder in (tmp_path / "file", tmp_path / "file" / "out"):
-        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; give another"):
-            run([photos], folder)
-
-
-def test_half_a_line_in_an_old_report_is_passed_over(photos: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    run([photos], out)
-    with (out / "report.jsonl").open("a") as stream:
-        stream.write('{"verb": "copy", "it')
-    assert run([photos], out) == 0
-    assert len(rows(out)) == 5
-
-
-def test_other_verbs_rows_stay(photos: Path, tmp_path: Path) -> None:
+def test_old_reports_keep_the_rows_of_other_verbs_and_lose_half_lines(photos: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     (out / "report.jsonl").write_text('{"verb": "other", "item": "elsewhere"}\n')
     run([photos], out)
-    assert "elsewhere" in rows(out)
+    with (out / "report.jsonl").open("a") as stream:
+        stream.write('{"verb": "copy", "it')
+    assert run([photos], out) == 0
+    assert len(rows(out)) == 6 and "elsewhere" in rows(out)
 
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}

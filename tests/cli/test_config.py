@@ -1,11 +1,11 @@
 """Defaults of options from a TOML file."""
 
-import re
 from pathlib import Path
 
 import pytest
 
 from facerf_cli.main import main
+from tests.kinds import Patch, Said
 
 CONFIG = """
 [global]
@@ -27,7 +27,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def test_the_file_gives_defaults_and_the_command_line_comes_first(
-    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+    config: Path, tmp_path: Path, capsys: Said
 ) -> None:
     (tmp_path / "a.png").touch()
     line = ["relight", str(tmp_path / "a.png"), "-o", str(tmp_path / "out")]
@@ -39,9 +39,7 @@ def test_the_file_gives_defaults_and_the_command_line_comes_first(
     assert not (tmp_path / "out").exists()
 
 
-def test_config_shows_what_is_in_force_and_from_where(
-    config: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_config_shows_what_is_in_force_and_from_where(config: Path, capsys: Said, monkeypatch: Patch) -> None:
     monkeypatch.setenv("FACERF_CONFIG", str(config))
     assert main(["config"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -55,35 +53,3 @@ def test_config_shows_what_is_in_force_and_from_where(
     monkeypatch.delenv("FACERF_CONFIG")
     assert main(["config"]) == 0
     assert "no configuration file" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("[relight]\nexpo = 1", r"\[relight\] expo: no such option; see `facerf relight --help`"),
-        ("[global]\nversion = true", r"\[global\] version: no such option; see `facerf --help`"),
-        ("[relighting]\n", r"\[relighting\] is no verb"),
-        ("[evaluate.olat]\nx = 1", "see `facerf evaluate olat --help`"),
-        ("relight = 5", "relight is no table"),
-        ("[relight", "not TOML"),
-        ("a = " + "[" * 5000, "not TOML"),
-        ("#" * (1 << 20), "larger than 1 MiB"),
-        ("[global]\nseed = -1", "--seed"),
-        ("[relight]\noverwrite = 'x'", "--overwrite"),
-    ],
-)
-def test_a_wrong_file_is_one_line(
-    text: str, says: str, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    (tmp_path / "c.toml").write_text(text + "\n")
-    line = ["relight", "a.png", "-o", str(tmp_path / "out"), "--config", str(tmp_path / "c.toml")]
-    assert main(line) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "Traceback" not in error
-    assert re.search(says, error), error
-
-
-def test_no_file(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert main(["config", "--config", str(tmp_path / "none.toml")]) == 2
-    assert "no such file" in capsys.readouterr().err
-    assert main(["config", "relighting"]) == 2

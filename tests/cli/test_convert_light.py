@@ -14,8 +14,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_uv, rig_directions
 from facerf_cli.main import main
-
-Capture = pytest.CaptureFixture[str]
+from tests.kinds import Said
 
 
 def a_map(folder: Path, height: int = 32) -> Path:
@@ -72,7 +71,17 @@ def test_a_smaller_map_keeps_the_power(tmp_path: Path) -> None:
     torch.testing.assert_close(small, envmap_weights(pixels(source), rig).sum(0), rtol=2e-3, atol=0)
 
 
-def test_harmonics_as_json_and_maps(tmp_path: Path, capsys: Capture) -> None:
+def test_one_form_to_a_file_and_another_rig(tmp_path: Path) -> None:
+    write_light(tmp_path / "a.json", LightRecord(rig_directions(), torch.full((150, 3), 4 / 150)))
+    assert convert(tmp_path / "a.json", tmp_path / "sky.EXR", "--to", "latlong", "--width", "32") == 0
+    assert pixels(tmp_path / "sky.EXR").shape == (16, 32, 3)
+    assert convert(tmp_path / "a.json", tmp_path, "--to", "json", "--lights", "40") == 0
+    record = read_light(tmp_path / "a_rig.json")
+    assert len(record.directions) == 40
+    torch.testing.assert_close(record.weights, torch.full((40, 3), 0.1), rtol=0.15, atol=0)
+
+
+def test_harmonics_as_json_and_maps(tmp_path: Path, capsys: Said) -> None:
     assert convert(a_map(tmp_path), tmp_path, "--to", "sh") == 0
     of_map = read_light(tmp_path / "spot_sh.json").sh
     assert of_map is not None and of_map.convention == CONVENTION and len(of_map.coefficients) == 9
@@ -88,7 +97,7 @@ def test_harmonics_as_json_and_maps(tmp_path: Path, capsys: Capture) -> None:
     assert float(brightest_light @ front) > math.cos(math.radians(15))
 
 
-def test_a_map_of_harmonics_can_shine(tmp_path: Path, capsys: Capture) -> None:
+def test_a_map_of_harmonics_can_shine(tmp_path: Path, capsys: Said) -> None:
     assert convert(a_map(tmp_path), tmp_path, "--to", "sh") == 0
     assert convert(tmp_path / "spot_sh.json", tmp_path, "--to", "latlong", "--to", "json") == 0
     assert float(pixels(tmp_path / "spot_sh_latlong.exr").min()) >= 0
@@ -101,44 +110,7 @@ def test_a_map_of_harmonics_can_shine(tmp_path: Path, capsys: Capture) -> None:
     assert float(error) < 0.05
 
 
-def test_one_form_to_a_file(tmp_path: Path, capsys: Capture) -> None:
-    write_light(tmp_path / "a.json", LightRecord(rig_directions(), torch.full((150, 3), 4 / 150)))
-    assert convert(tmp_path / "a.json", tmp_path / "sky.EXR", "--to", "latlong", "--width", "32") == 0
-    assert pixels(tmp_path / "sky.EXR").shape == (16, 32, 3)
-    both = ["--to", "latlong", "--to", "blender"]
-    for line, said in ((["--to", "json"], "or a file as .json"), (both, "is one file")):
-        assert convert(tmp_path / "a.json", tmp_path / "b.exr", *line) == 2
-        assert said in capsys.readouterr().err
-    assert convert(tmp_path / "a.json", tmp_path / "a.json", "--to", "json") == 2
-
-
-def test_another_rig(tmp_path: Path) -> None:
-    write_light(tmp_path / "a.json", LightRecord(rig_directions(), torch.full((150, 3), 4 / 150)))
-    assert convert(tmp_path / "a.json", tmp_path, "--to", "json", "--lights", "40") == 0
-    record = read_light(tmp_path / "a_rig.json")
-    assert len(record.directions) == 40
-    torch.testing.assert_close(record.weights, torch.full((40, 3), 0.1), rtol=0.15, atol=0)
-
-
-@pytest.mark.parametrize(
-    "line, complaint",
-    [
-        (["--to", "dpr"], "--to dpr: no such form; give one of latlong, json"),
-        (["--to", "latlong", "--width", "33"], "even number"),
-        (["--to", "sh", "--width", "64"], "--width is for --to latlong, blender, mitsuba"),
-        (["--to", "blender", "--to", "latlong", "--order", "3"], "--order is for --to json, sh"),
-        (["--to", "sh", "--lights", "40"], "--lights is for --to json"),
-        (["--to", "sh", "--signed"], "--signed is for"),
-        (["--to", "json", "--lights", "many"], "--lights"),
-        ([], "--to"),
-    ],
-)
-def test_wrong_calls_exit_2(line: list[str], complaint: str, tmp_path: Path, capsys: Capture) -> None:
-    assert convert(a_map(tmp_path), tmp_path / "out", *line) == 2
-    assert complaint in capsys.readouterr().err
-
-
-def test_bad_lights_are_a_line_each_and_the_others_go_on(tmp_path: Path, capsys: Capture) -> None:
+def test_bad_lights_are_a_line_each_and_the_others_go_on(tmp_path: Path, capsys: Said) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
     a_map(folder)

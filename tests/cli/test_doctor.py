@@ -13,6 +13,7 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.work import doctor_facts as doctor
 from facerf_cli.work.installed import EXTRAS, MISSING
+from tests.kinds import Patch, Said
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,9 +26,7 @@ def checkpoint(tmp_path: Path) -> Path:
     return path
 
 
-def test_one_screen_with_versions_licences_and_configuration(
-    checkpoint: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_screen_with_versions_licences_and_configuration(checkpoint: Path, capsys: Said) -> None:
     assert main(["doctor", "--device", "cpu", "--checkpoint", str(checkpoint)]) == 0
     out = capsys.readouterr().out
     assert len(out.splitlines()) <= 31 and max(map(len, out.splitlines())) <= 100
@@ -38,9 +37,7 @@ def test_one_screen_with_versions_licences_and_configuration(
     assert "{" not in words and "None" not in words
 
 
-def test_the_screen_leaves_nested_provenance_to_json(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_screen_has_what_matters_and_json_all(tmp_path: Path, capsys: Said, checkpoint: Path) -> None:
     path = tmp_path / "trained.safetensors"
     facts = {
         "licence": "MIT",
@@ -53,9 +50,6 @@ def test_the_screen_leaves_nested_provenance_to_json(
     assert "9 heads" in words and "7 heads" not in words and "{" not in words
     assert main(["doctor", "--json", "--checkpoint", str(path)]) == 0
     assert json.loads(capsys.readouterr().out)["assets"]["checkpoint"]["started_from"]["heads"] == "7 heads"
-
-
-def test_the_same_as_json(checkpoint: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--json", "--checkpoint", str(checkpoint)]) == 0
     facts = json.loads(capsys.readouterr().out)
     served = facts["networks"]["reflectance"]
@@ -65,7 +59,7 @@ def test_the_same_as_json(checkpoint: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.fixture
-def lacking(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+def lacking(monkeypatch: Patch) -> set[str]:
     """Packages that seem not to be installed, in what seems to be this version's metadata."""
     absent: set[str] = set()
 
@@ -83,32 +77,22 @@ def lacking(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return absent
 
 
-def test_an_extra_that_is_not_there_is_named_with_its_command(
-    lacking: set[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_extras_and_packages_that_lack_are_named_with_their_commands(lacking: set[str], capsys: Said) -> None:
     lacking |= {"mitsuba", "ruff"}
     assert main(["doctor"]) == 0
     out = capsys.readouterr().out
     assert "synth        not installed; pip install 'facerf[synth]' adds `--renderer" in out
     assert "ray          ray 1.2, for `--ray`, on clusters" in out and "ruff" not in out
     assert len(out.splitlines()) <= 31
-
-
-def test_a_package_that_is_needed_is_named_with_its_command(
-    lacking: set[str], capsys: pytest.CaptureFixture[str]
-) -> None:
     lacking.add("torch")
     assert main(["doctor"]) == 1
     words = " ".join(capsys.readouterr().out.split())
     assert "torch MISSING" in words and "to add what is missing: pip install 'torch>=2.5'" in words
-
-
-def test_every_extra_for_users_has_its_use() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(EXTRAS) == set(extras) - {"dev"}
 
 
-def test_what_is_missing_or_broken_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_missing_or_broken_fails(tmp_path: Path, capsys: Said, monkeypatch: Patch) -> None:
     assert main(["doctor", "--checkpoint", str(tmp_path / "gone.safetensors")]) == 1
     assert "MISSING" in capsys.readouterr().out
     save_file({}, tmp_path / "list.safetensors", {"format": "facerf-checkpoint-1", "facerf": "[]"})
@@ -118,11 +102,6 @@ def test_what_is_missing_or_broken_fails(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["doctor", "--checkpoint", str(tmp_path / "text.safetensors")]) == 1
     assert "not a facerf checkpoint" in " ".join(capsys.readouterr().out.split())
     assert doctor._face_model(tmp_path / "text.safetensors")["name"].startswith(MISSING)
-
-
-def test_an_ocio_configuration_that_is_not_there(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     monkeypatch.setenv("OCIO", "/nowhere/config.ocio")
     assert main(["doctor"]) == 1
     assert "$OCIO is '/nowhere/config.ocio'" in capsys.readouterr().err

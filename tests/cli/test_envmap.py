@@ -11,11 +11,10 @@ from facerf_cli.main import main
 from facerf_cli.synth.sky.skies import draw_sky
 from facerf_cli.work.draw_envmaps import write_sheet
 from facerf_cli.work.light_setups import LightSources, collect_setups
+from tests.kinds import Said
 
 
-def test_writes_seeded_maps_and_skips_finished_ones(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_writes_seeded_maps_and_skips_finished_ones(tmp_path: Path, capsys: Said) -> None:
     line = ["envmap", "-o", str(tmp_path), "--count", "3", "--size", "32", "--seed", "5"]
     assert main(line) == 0
     written = [Path(path) for path in capsys.readouterr().out.splitlines()]
@@ -32,9 +31,7 @@ def test_writes_seeded_maps_and_skips_finished_ones(
     assert len(capsys.readouterr().out.splitlines()) == 4
 
 
-def test_the_contact_sheet_has_a_tile_for_each_map(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_contact_sheet_has_a_tile_for_each_map(tmp_path: Path, capsys: Said) -> None:
     line = ["envmap", "-o", str(tmp_path), "--count", "4", "--size", "32", "--kind", "overcast"]
     assert main(line) == 0
     sheet = tmp_path / "envmaps.png"
@@ -49,9 +46,7 @@ def test_the_contact_sheet_has_a_tile_for_each_map(
 
 
 @pytest.mark.parametrize("change", [("--size", "48"), ("--seed", "6")])
-def test_maps_of_other_options_are_made_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str]
-) -> None:
+def test_maps_of_other_options_are_made_again(tmp_path: Path, capsys: Said, change: tuple[str, str]) -> None:
     line = ["envmap", "-o", str(tmp_path), "--count", "2", "--size", "32", "--seed", "5", "--kind", "sun"]
     assert main(line) == main([*line, *change, "--overwrite", "never"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 3
@@ -65,9 +60,7 @@ def test_maps_of_other_options_are_made_again(
     assert capsys.readouterr().out.splitlines()[0] == str(damaged)
 
 
-def test_a_run_that_was_ended_before_its_sheet_is_finished(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_that_was_ended_before_its_sheet_is_finished(tmp_path: Path, capsys: Said) -> None:
     line = ["envmap", "-o", str(tmp_path), "--count", "2", "--size", "32"]
     assert main(line) == 0
     sheet = tmp_path / "envmaps.png"
@@ -79,7 +72,7 @@ def test_a_run_that_was_ended_before_its_sheet_is_finished(
     assert capsys.readouterr().out.splitlines() == [str(sheet)] and not left.exists()
 
 
-def test_a_tile_shows_the_ball_lit_from_where_the_map_is_bright(tmp_path: Path) -> None:
+def test_a_folder_of_maps_is_read_without_its_sheet_whose_balls_are_lit_by_them(tmp_path: Path) -> None:
     pixels = np.zeros((16, 32, 3), np.float32)
     pixels[6:10, 6:10] = 0.02  # dim, at u = 0.25: the image's right
     write_exr(tmp_path / "right.exr", pixels)
@@ -93,9 +86,6 @@ def test_a_tile_shows_the_ball_lit_from_where_the_map_is_bright(tmp_path: Path) 
     left, right = np.split(sheet[:height, width:].mean(-1), 2, 1)
     assert right.mean() > 3 * left.mean() and (right > 0.1).mean() > 0.5  # shaded, not a reflection
     assert sheet[height:].max() > 0.2  # the name
-
-
-def test_a_folder_of_maps_is_read_without_its_sheet(tmp_path: Path) -> None:
     maps = tmp_path / "maps"
     assert main(["envmap", "-o", str(maps), "--count", "2", "--size", "32"]) == 0
     setups = collect_setups(LightSources(envmap=[str(maps)]), tmp_path / "out", 0)
@@ -103,14 +93,8 @@ def test_a_folder_of_maps_is_read_without_its_sheet(tmp_path: Path) -> None:
     assert found == sorted(maps.glob("*.exr")) and len(setups) == 2
 
 
-def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: Said) -> None:
     assert main(["envmap", "-o", str(tmp_path / "new"), "--kind", "sun", "--dry-run", "--count", "2"]) == 0
     maps = [f"{tmp_path}/new/0000{i}_sun.exr" for i in range(2)]
     assert capsys.readouterr().out.splitlines() == [*maps, f"{tmp_path}/new/envmaps.png"]
-    assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize("options", [["--kind", "moon"], ["--size", "33"], ["--count", "0"]])
-def test_bad_options_are_refused(tmp_path: Path, options: list[str]) -> None:
-    assert main(["envmap", "-o", str(tmp_path / "new"), *options]) == 2
     assert not (tmp_path / "new").exists()

@@ -15,6 +15,7 @@ from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.main import main
 from tests.astronaut import PATH as PHOTO
+from tests.kinds import Folders, Said
 
 
 def estimate(given: Path, output: Path, *line: str, photo: Path = PHOTO, lights: str = "12") -> int:
@@ -24,7 +25,7 @@ def estimate(given: Path, output: Path, *line: str, photo: Path = PHOTO, lights:
 
 
 @pytest.fixture(scope="module")
-def estimated(given: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def estimated(given: Path, tmp_path_factory: Folders) -> Path:
     """What the default estimate writes."""
     folder = tmp_path_factory.mktemp("estimated")
     assert estimate(given, folder, "--sh-order", "3") == 0
@@ -35,9 +36,7 @@ def row_of(output: Path) -> dict:
     return json.loads((output / "report.jsonl").read_text().splitlines()[-1])
 
 
-def test_a_light_is_a_map_numbers_and_a_image(
-    given: Path, estimated: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_light_is_a_map_numbers_and_a_image(given: Path, estimated: Path, capsys: Said) -> None:
     light = read_light(estimated / "astronaut_light.json")
     assert torch.allclose(light.directions, rig_directions(12), atol=1e-6) and (light.weights >= 0).all()
     harmonics = rig_coefficients(RigLight(light.directions, light.weights), 3)
@@ -71,27 +70,7 @@ def test_refinement_says_by_which_features_and_lowers_their_loss(given: Path, tm
     )
 
 
-@pytest.mark.parametrize(
-    "line, word",
-    [
-        (["--vgg-weights", "imagenet"], "--refine features"),
-        (["--reflectance", "prt", "--signed"], "--reflectance prt"),
-        (["--lights", "2000"], "1024"),
-        (["--width", "101"], "even"),
-        (["--matte", "nowhere.png"], "no such file"),
-    ],
-)
-def test_what_does_not_go_together_is_said(
-    given: Path, tmp_path: Path, line: list[str], word: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert estimate(given, tmp_path, *line) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert word in said
-
-
-def test_a_face_that_is_not_to_be_seen_is_one_line(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_face_that_is_not_to_be_seen_is_one_line(given: Path, tmp_path: Path, capsys: Said) -> None:
     photo = read_image(PHOTO).pixels
     black, cut, matte, half = (tmp_path / f"{name}.png" for name in ("black", "cut", "matte", "half"))
     nothing = np.zeros(photo.shape[:2], np.float32)
@@ -116,7 +95,7 @@ def test_a_face_that_is_not_to_be_seen_is_one_line(
 
 
 def test_the_light_of_another_photo_is_that_of_the_two_commands(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    given: Path, tmp_path: Path, capsys: Said
 ) -> None:
     other, places = tmp_path / "other.png", tmp_path / "places"
     write_display(other, read_image(PHOTO).pixels * np.float32([1.0, 0.8, 0.5]))

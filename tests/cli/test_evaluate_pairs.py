@@ -10,8 +10,7 @@ from facerf_cli.evaluation.options import NamedCheckpoint
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
 from tests.evaluation.toy_protocol import NOISE, PEOPLE, comparison
-
-Said = pytest.CaptureFixture[str]
+from tests.kinds import Patch, Said
 
 
 @pytest.fixture
@@ -62,9 +61,7 @@ def test_what_is_missing_or_of_another_size_makes_no_table(folders: Path, capsys
     assert not (folders / "out/summary.json").exists()
 
 
-def test_a_folder_may_be_given_from_inside(
-    folders: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_may_be_given_from_inside(folders: Path, capsys: Said, monkeypatch: Patch) -> None:
     monkeypatch.chdir(folders / "good")
     line = ["evaluate", "pairs", ".", "../bad", "--truth", "../truth", "-o", "../out"]
     assert main(line) == 0

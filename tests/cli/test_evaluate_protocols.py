@@ -34,12 +34,13 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import load_models_once
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double
+from tests.kinds import Folders, Patch, Said
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: Folders) -> Path:
     folder = tmp_path_factory.mktemp("dataset")
     write_small_dataset(folder, counts=(1, 0, 2), lights=12, crop_px=64)
     assert main(["relight-dataset", str(folder), "--envmaps", "procedural:3", "--per-subject", "6"]) == 0
@@ -47,7 +48,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def doubles(monkeypatch: pytest.MonkeyPatch) -> None:
+def doubles(monkeypatch: Patch) -> None:
     """Reconstructions by the photo's own texture, which no network delays."""
 
     def load(options: EvaluateOptions, photo: PhotoOptions) -> tuple[Double, ...]:
@@ -64,7 +65,7 @@ def images(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "images.csv").read_text().splitlines()))
 
 
-def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: Said) -> None:
     out = tmp_path / "out"
     assert run("olat", folder, "-o", out, "--every", "4", "--network-alone", "--joint-fit") == 0
     assert "lambert" in capsys.readouterr().out
@@ -78,9 +79,7 @@ def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: pytest
     assert "already finished" in capsys.readouterr().err
 
 
-def test_a_checkpoint_of_another_layout_is_said_once(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_checkpoint_of_another_layout_is_said_once(tmp_path: Path, capsys: Said) -> None:
     layout = {"layout_version": 99, "networks": {"reflectance": {"form": "default"}}}
     save_checkpoint(tmp_path / "other.safetensors", {}, layout)
     words = ["-o", tmp_path / "x", "--against", tmp_path / "other.safetensors"]
@@ -89,9 +88,7 @@ def test_a_checkpoint_of_another_layout_is_said_once(
     assert "other.safetensors: trained for another UV layout" in line
 
 
-def test_couples_are_read_from_a_list(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_couples_are_read_from_a_list(tmp_path: Path, capsys: Said, monkeypatch: Patch) -> None:
     for name in ("a.jpg", "b.jpg"):
         shutil.copy(PHOTO, tmp_path / name)
     monkeypatch.setattr("sys.stdin", io.StringIO(f"{tmp_path / 'a.jpg'}\n{tmp_path / 'b.jpg'}\n"))
@@ -99,9 +96,7 @@ def test_couples_are_read_from_a_list(
     assert "a--b" in capsys.readouterr().out
 
 
-def test_what_a_photos_alpha_leaves_out_is_not_compared(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_photos_alpha_leaves_out_is_not_compared(tmp_path: Path, capsys: Said) -> None:
     photo = np.asarray(Image.open(PHOTO).convert("RGB"))
     shown = np.zeros(photo.shape[:2], np.uint8)
     shown[:, 220:] = 255  # beside the nose
@@ -151,7 +146,7 @@ def test_a_folder_is_a_person_whose_photos_are_taken_two_by_two(tmp_path: Path) 
 
 
 def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, capsys: Said
 ) -> None:
     for protocol, says in (
         ("olat", "1 maps are measured, all there are; the paper measured 160"),
@@ -167,7 +162,7 @@ def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
 
 @pytest.mark.usefixtures("doubles")
 def test_a_frozen_list_gives_the_same_figures_on_a_dataset_of_other_pairs(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    folder: Path, tmp_path: Path, capsys: Said
 ) -> None:
     first, again, bare = (tmp_path / name for name in ("first", "again", "bare"))
     assert run("reconstruction", folder, "-o", first, "--preset", "paper", "--joint-fit") == 0
@@ -189,9 +184,7 @@ def test_a_frozen_list_gives_the_same_figures_on_a_dataset_of_other_pairs(
 
 
 @pytest.mark.usefixtures("doubles")
-def test_people_of_a_dataset_by_every_protocol(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_people_of_a_dataset_by_every_protocol(folder: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     assert run("reconstruction", folder, "-o", tmp_path / "r", "--every", "6", "--joint-fit") == 0
     assert all(float(row["light_error_deg"]) <= 180 for row in images(tmp_path / "r"))
     two_maps = shutil.copytree(folder, tmp_path / "d", ignore=shutil.ignore_patterns("relit"))
@@ -211,16 +204,14 @@ def test_people_of_a_dataset_by_every_protocol(
 
 
 @pytest.mark.usefixtures("doubles")
-def test_a_photo_without_a_face_fails_and_no_summary_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_photo_without_a_face_fails_and_no_summary_is_written(tmp_path: Path, capsys: Said) -> None:
     write_exr(tmp_path / "black.exr", np.zeros((80, 60, 3), np.float32))
     assert run("reconstruction", tmp_path / "black.exr", "-o", tmp_path / "out") == 1
     assert "black.exr: no face" in capsys.readouterr().err
     assert not (tmp_path / "out" / "summary.json").exists()
 
 
-def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch: Patch) -> None:
     """Signed least squares, then features: it reaches every method, and the light of every image."""
     photo = PhotoOptions(Settings(device="cpu"))
     (method,) = methods_of(EvaluateOptions(tmp_path, non_negative=False, refine="features"), photo)

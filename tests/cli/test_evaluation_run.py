@@ -158,13 +158,17 @@ def test_images_are_kept_for_other_methods_and_ours_are_marked(tmp_path: Path) -
     assert evaluate(tmp_path / "again", compare=(tmp_path / "pictures/truth",)) == 0
 
 
-def test_strips_are_few_and_whole(tmp_path: Path) -> None:
+def test_strips_are_few_and_whole_and_the_work_goes_to_other_processes(tmp_path: Path) -> None:
     assert evaluate(tmp_path, Toy(cases=20)) == 0
     for person in PEOPLE:
         strips = json.loads((tmp_path / f"cases/{person}.json").read_text())["strips"]
         assert len(strips) <= 14 and {f"{person}/19", f"{person}/00"} <= {strip["case"] for strip in strips}
         assert all((tmp_path / strip["file"]).read_bytes()[:2] == b"\xff\xd8" for strip in strips)
     assert COMPOSITE_SOURCE_TYPE.encode() in (tmp_path / strips[0]["file"]).read_bytes()
+    work = evaluation(tmp_path / "out")
+    assert pickle.loads(pickle.dumps(work)) == work
+    with pytest.raises(UsageError, match="nothing to evaluate"):
+        evaluation(tmp_path, inputs=[]).run()
 
 
 def test_what_was_kept_and_is_gone_is_made_again(tmp_path: Path, notes: Path) -> None:
@@ -176,10 +180,3 @@ def test_what_was_kept_and_is_gone_is_made_again(tmp_path: Path, notes: Path) ->
         path.unlink()
         assert run.run() == 0 and taken(notes) == ["bea"]
         assert len(path.read_bytes()) == len(before)
-
-
-def test_the_work_goes_to_other_processes(tmp_path: Path) -> None:
-    work = evaluation(tmp_path / "out")
-    assert pickle.loads(pickle.dumps(work)) == work
-    with pytest.raises(UsageError, match="nothing to evaluate"):
-        evaluation(tmp_path, inputs=[]).run()

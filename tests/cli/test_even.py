@@ -57,8 +57,3 @@ def test_python_has_it_of_a_person() -> None:
     field = replace(field, balance=Balance(torch.ones(3), torch.zeros(2), 2.5))
     person = facerf.Person(fitted.models, fitted.photo, fitted.head, replace(fitted.reflectance, field=field))
     assert person.even.weights == pytest.approx(2.5 * facerf.Light.around().weights)
-
-
-def test_baselines_have_none(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert relight(given, tmp_path, "--light", "even", "--reflectance", "diffuse-sh") == 2
-    assert "--light even" in capsys.readouterr().err

@@ -21,6 +21,7 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.shots import ShotOptions, collect_frames
 from tests.cli.toy_checkpoint import save_toy_checkpoint
+from tests.kinds import Folders, Log, Patch, Said
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -61,7 +62,7 @@ def write_qtrle(path: Path, frames: list[np.ndarray]) -> None:
 
 
 @pytest.fixture(scope="module")
-def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def given(tmp_path_factory: Folders) -> Path:
     """A folder with a checkpoint, a small photo and a film."""
     folder = tmp_path_factory.mktemp("given")
     save_toy_checkpoint(folder / "lambert.safetensors")
@@ -79,7 +80,7 @@ def names(folder: Path) -> list[str]:
 
 
 def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    given: Path, tmp_path: Path, capsys: Said
 ) -> None:
     out = tmp_path / "out"
     assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
@@ -96,9 +97,7 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     assert capsys.readouterr().out == "" and names(out) == sorted([*images, "me_track.jsonl", "report.jsonl"])
 
 
-def test_an_interrupted_film_goes_on_where_it_was(
-    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_interrupted_film_goes_on_where_it_was(given: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     out, made = tmp_path / "relit.mp4", []
     line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
     fitted = OpenShot.fitted
@@ -158,7 +157,7 @@ def test_a_photo_under_a_turning_map_becomes_a_film(given: Path, tmp_path: Path)
 
 
 def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
-    given: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    given: Path, tmp_path: Path, caplog: Log
 ) -> None:
     plates = tmp_path / "plates"
     plates.mkdir()
@@ -175,9 +174,7 @@ def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
     assert [row["landmarks"] is None for row in track] == [False, True, False]
 
 
-def test_a_sequence_with_a_hole_is_said(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sequence_with_a_hole_is_said(given: Path, tmp_path: Path, capsys: Said) -> None:
     for number in (1, 3):
         write_exr(tmp_path / f"plate.{number}.exr", frame_of(number) / np.float32(255))
     line = (tmp_path / "plate.1-3.exr", "--sequence", "--light", "0,0", "-o", tmp_path / "out")
@@ -186,7 +183,7 @@ def test_a_sequence_with_a_hole_is_said(
 
 
 @pytest.mark.slow
-def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: Said) -> None:
     """As a photo's: in frames, and in a film of frames that can have it; the other is said."""
     clear = np.zeros((192, 224), np.uint8)
     clear[:, 112:] = 255
@@ -206,9 +203,7 @@ def test_alpha_of_a_film_is_kept(given: Path, tmp_path: Path, capsys: pytest.Cap
 
 
 @pytest.mark.parametrize("name", ["plates", "shot.mov"])
-def test_alpha_that_is_0_in_every_frame_is_none(
-    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_alpha_that_is_0_in_every_frame_is_none(tmp_path: Path, name: str, caplog: Log) -> None:
     """One frame alone is empty: the person has not entered."""
     for shown in (0, 255):
         frames = [np.dstack([frame_of(0), np.full((192, 224), alpha, np.uint8)]) for alpha in (0, shown, 0)]
@@ -233,9 +228,7 @@ def test_alpha_that_is_0_in_every_frame_is_none(
 
 
 @pytest.mark.slow
-def test_a_frame_whose_matte_is_black_is_left_as_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_frame_whose_matte_is_black_is_left_as_it_is(tmp_path: Path, capsys: Said) -> None:
     """By the portrait field, too, which its neighbours have without it; all black is refused."""
     for folder in ("plates", "roto", "black"):
         (tmp_path / folder).mkdir()
@@ -268,7 +261,7 @@ def test_a_frame_whose_matte_is_black_is_left_as_it_is(
 
 
 def test_sound_that_cannot_be_written_is_said_before_the_first_frame(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    given: Path, tmp_path: Path, capsys: Said
 ) -> None:
     """AAC has no 24 channels."""
     with av.open(str(tmp_path / "a.mkv"), "w") as container:
@@ -294,7 +287,7 @@ def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> None:
     """The second take is dark and mirrored; the film is stopped in it, and goes on."""
     takes = [frame_of(0)] * 2 + [(frame_of(0)[:, ::-1] * 0.5).astype(np.uint8)] * 2
     write_source(tmp_path / "cut.mp4", takes)
@@ -362,7 +355,7 @@ def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
     ],
 )
 def test_options_that_a_film_cannot_have(
-    given: Path, tmp_path: Path, line: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+    given: Path, tmp_path: Path, line: tuple[str, ...], message: str, capsys: Said
 ) -> None:
     filled = [part.format(film=given / "me.mp4", photo=PHOTO, out=tmp_path / "out") for part in line]
     assert main(["relight", *filled]) == 2
@@ -370,9 +363,7 @@ def test_options_that_a_film_cannot_have(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_in_a_folder_of_photos_is_left_alone(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_film_in_a_folder_of_photos_is_left_alone(given: Path, tmp_path: Path, capsys: Said) -> None:
     shutil.copy(given / "me.mp4", tmp_path / "live.mp4")
     shutil.copy(PHOTO, tmp_path / "me.jpg")
     assert main(["relight", str(tmp_path), "--light", "0,0", "-o", str(tmp_path / "out"), "--dry-run"]) == 0

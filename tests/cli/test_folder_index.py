@@ -16,7 +16,9 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
-from tests.cli.test_batch import copy, outputs_of, rows, run
+from tests.cli.folders import rows
+from tests.cli.toy_batch import outputs_of, run
+from tests.kinds import Patch, Said
 
 
 @pytest.fixture
@@ -27,12 +29,12 @@ def photos(tmp_path: Path) -> Path:
     return tmp_path / "photos"
 
 
-def made(capsys: pytest.CaptureFixture) -> list[str]:
+def made(capsys: Said) -> list[str]:
     return [Path(line).name[0] for line in capsys.readouterr().out.splitlines()]
 
 
-def test_another_photo_of_the_same_name_is_processed(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not(
+    photos: Path, tmp_path: Path, capsys: Said
 ) -> None:
     run([photos], tmp_path / "out")
     (photos / "a.png").write_bytes(b"z")  # as long as before
@@ -43,11 +45,6 @@ def test_another_photo_of_the_same_name_is_processed(
     assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
     assert "1 made again: the input changed" in said.err
     assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
-
-
-def test_the_same_photo_from_elsewhere_is_finished(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
     run([photos], tmp_path / "out")
     photos.rename(tmp_path / "moved")
     capsys.readouterr()
@@ -55,9 +52,7 @@ def test_the_same_photo_from_elsewhere_is_finished(
     assert made(capsys) == []
 
 
-def test_other_options_make_all_again_and_say_which(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_other_options_make_all_again_and_say_which(photos: Path, tmp_path: Path, capsys: Said) -> None:
     run([photos], tmp_path / "out", recipe={"lights": 150})
     run([photos], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
     assert "2 made again: --lights is 200, was 150" in capsys.readouterr().err
@@ -66,9 +61,7 @@ def test_other_options_make_all_again_and_say_which(
 
 
 @pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
-def test_overwrite(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture, overwrite: str, expected: str
-) -> None:
+def test_overwrite(photos: Path, tmp_path: Path, capsys: Said, overwrite: str, expected: str) -> None:
     run([photos], tmp_path / "out")
     (photos / "a.png").write_bytes(b"new")
     capsys.readouterr()
@@ -76,10 +69,15 @@ def test_overwrite(
     assert "".join(made(capsys)) == expected
 
 
-def test_outputs_of_unknown_origin_and_empty_ones_are_made_again(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+def test_outputs_that_the_user_changed_are_kept_and_those_of_unknown_origin_made_again(
+    photos: Path, tmp_path: Path, capsys: Said
 ) -> None:
     out = tmp_path / "out"
+    run([photos], out)
+    (out / "a_copy.bin").write_bytes(b"retouched")
+    assert run([photos], out) == 0
+    assert "1 outputs were changed after they were written; they are kept" in capsys.readouterr().err
+    assert (out / "a_copy.bin").read_bytes() == b"retouched"
     run([photos], out)
     (out / "a_copy.bin").write_bytes(b"")
     run([photos], out)
@@ -89,18 +87,7 @@ def test_outputs_of_unknown_origin_and_empty_ones_are_made_again(
     assert "2 made again: there is no record" in capsys.readouterr().err
 
 
-def test_an_output_that_the_user_changed_is_kept_and_said(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    out = tmp_path / "out"
-    run([photos], out)
-    (out / "a_copy.bin").write_bytes(b"retouched")
-    assert run([photos], out) == 0
-    assert "1 outputs were changed after they were written; they are kept" in capsys.readouterr().err
-    assert (out / "a_copy.bin").read_bytes() == b"retouched"
-
-
-def test_only_stale_outputs_are_made(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_only_stale_outputs_are_made(photos: Path, tmp_path: Path, capsys: Said) -> None:
     """As when a light is added: what was made, and then changed by hand, stays."""
     out, lights = tmp_path / "out", ["a"]
 
@@ -133,7 +120,7 @@ def test_only_stale_outputs_are_made(photos: Path, tmp_path: Path, capsys: pytes
     assert "1 made again: an output is missing" in capsys.readouterr().err
 
 
-def test_check_reads_all_outputs_again(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_check_reads_all_outputs_again(photos: Path, tmp_path: Path, capsys: Said) -> None:
     out = tmp_path / "out"
     run([photos], out)
     capsys.readouterr()
@@ -144,21 +131,17 @@ def test_check_reads_all_outputs_again(photos: Path, tmp_path: Path, capsys: pyt
     assert main(["check", str(out)]) == 1
     said = capsys.readouterr()
     assert said.out.split("\n")[:2] == [f"{out / 'a_copy.bin'}: changed", f"{out / 'b_copy.bin'}: missing"]
-    assert main(["check", str(photos)]) == 2 and "no index" in capsys.readouterr().err
 
 
-def test_unchanged_files_are_not_read_again(
-    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_finished_folder_is_read_without_writing_or_reading_much(
+    photos: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     run([photos], tmp_path / "out")
     read: list[Path] = []
     monkeypatch.setattr(folder_index, "file_sha256", lambda path: read.append(path) or file_sha256(path))
     run([photos], tmp_path / "out")
     assert read == []
-
-
-def test_a_finished_folder_is_read_without_writing_its_index(photos: Path, tmp_path: Path) -> None:
-    """So that a rerun of thousands of items is quick; a file whose time changed is noted."""
+    # So that a rerun of thousands of items is quick; a file whose time changed is noted.
     run([photos], tmp_path / "out")
     index = tmp_path / "out/.facerf-index.jsonl"
     inode = index.stat().st_ino
@@ -169,7 +152,7 @@ def test_a_finished_folder_is_read_without_writing_its_index(photos: Path, tmp_p
     assert index.stat().st_ino != inode and "1000000000" in index.read_text()
 
 
-def test_damaged_rows_are_passed_over(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_damaged_rows_are_passed_over(photos: Path, tmp_path: Path, capsys: Said) -> None:
     run([photos], tmp_path / "out")
     index = tmp_path / "out" / ".facerf-index.jsonl"
     index.write_text('5\n{"output": 3}\n{"of": {}}\n{"sha256"' + "\n" + index.read_text() + '{"outp')
@@ -178,13 +161,9 @@ def test_damaged_rows_are_passed_over(photos: Path, tmp_path: Path, capsys: pyte
     assert made(capsys) == []
 
 
-def test_shards_know_what_the_others_made(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_shards_know_what_the_others_made(photos: Path, tmp_path: Path, capsys: Said) -> None:
     for number in (1, 2):
-        settings, options = Settings(), BatchOptions(tmp_path / "out", shard=Shard(number, 2))
-        items = collect_items([str(photos)], tmp_path / "out")
-        run_items("copy", items, copy, outputs_of, options, settings, lambda digest_of: [{}])
+        run(photos, tmp_path / "out", Shard(number, 2))
     assert made(capsys) == ["a", "b"]
     run([photos], tmp_path / "out")
     assert made(capsys) == []
@@ -215,27 +194,6 @@ def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path:
     assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
 
 
-def test_relight_reads_its_index_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.png").write_bytes(b"a")
-    read = []
-    init = folder_index._Rows.__init__
-
-    def counted(self: folder_index._Rows, folder: Path) -> None:
-        read.append(folder)
-        init(self, folder)
-
-    monkeypatch.setattr(folder_index._Rows, "__init__", counted)
-    monkeypatch.setattr("facerf_cli.work.relight_options.Relight.readable", lambda self, dry_run: self)
-    line = ["relight", str(tmp_path / "a.png"), "--light", "9,9", "--dry-run"]
-    assert main([*line, "-o", str(tmp_path / "out")]) == 0
-    assert read == [tmp_path / "out"]
-
-
-def test_the_colours_of_input_and_output_are_both_in_a_recipe() -> None:
-    both = {field.name for part in (PhotoOptions, OutputOptions) for field in fields(part)}
-    assert len(both) == len(fields(PhotoOptions)) + len(fields(OutputOptions))  # one would hide the other
-
-
 @dataclass(frozen=True)
 class Inner:
     matte: Path
@@ -249,7 +207,7 @@ class Outer:
     checkpoints: tuple[Path, ...] = ()
 
 
-def test_recipes_hold_the_content_of_files_and_not_what_shapes_nothing(tmp_path: Path) -> None:
+def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) -> None:
     (tmp_path / "one").write_bytes(b"1")
     (tmp_path / "two").write_bytes(b"1")
     one = recipe_of(Outer(Inner(tmp_path / "one"), "150"), file_sha256)
@@ -258,9 +216,6 @@ def test_recipes_hold_the_content_of_files_and_not_what_shapes_nothing(tmp_path:
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
     assert differences(one, other) == "--lights is another, was 150; --matte changed"
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
-
-
-def test_the_files_of_a_folder_and_of_a_pattern_are_in_the_recipe(tmp_path: Path) -> None:
     (tmp_path / "mattes").mkdir()
     (tmp_path / "mattes" / "a.png").write_bytes(b"1")
     given = [tmp_path / "mattes", tmp_path / "mattes" / "{stem}.png"]
@@ -269,3 +224,5 @@ def test_the_files_of_a_folder_and_of_a_pattern_are_in_the_recipe(tmp_path: Path
     assert all(
         recipe_of(Inner(path), file_sha256)["matte"] != old for path, old in zip(given, before, strict=True)
     )
+    both = {field.name for part in (PhotoOptions, OutputOptions) for field in fields(part)}
+    assert len(both) == len(fields(PhotoOptions)) + len(fields(OutputOptions))  # one would hide the other

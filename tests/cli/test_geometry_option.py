@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -54,14 +53,6 @@ def test_a_checkpoint_of_both_networks_regresses_by_default(tmp_path: Path) -> N
     assert load_fit(tmp_path / "out/astronaut_fit.npz").crop.size_px == 192
     texture = read_image(tmp_path / "out/astronaut_texture.exr").pixels
     assert texture.shape == (128, 128, 3)
-
-
-def test_what_contradicts_the_network_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = tmp_path / "points.json"
-    points.write_text(json.dumps(np.zeros((68, 2)).tolist()))
-    assert fit(tmp_path / "out", "--geometry", "network", "--landmarks", str(points)) == 2
-    assert "--landmarks: --geometry network uses none" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import typer.main
 from facerf_cli.cli import manual
 from facerf_cli.cli.examples import examples_of
 from facerf_cli.main import FLAGS, VALUED, app, main
+from tests.kinds import Patch, Said
 
 # Options whose value is a small language, which their help explains.
 LANGUAGES = {"envmap", "light", "light_from", "reflectance", "aov", "background"}
@@ -32,7 +33,7 @@ CONTEXT = typer.Context(ROOT)
 MAN = Path(__file__).parents[2] / "man"
 
 
-def test_the_order_is_that_of_a_day(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_order_is_that_of_a_day(capsys: Said) -> None:
     assert main(["--help"]) == 0
     lines = [line.strip("│╭─╮ ") for line in capsys.readouterr().out.splitlines()]
     first = [line.split()[0] for line in lines if line]
@@ -61,22 +62,24 @@ def test_the_options_of_a_long_help_stand_in_panels(name: str) -> None:
     assert "Batch" not in panels[:-1]
 
 
-def test_paragraphs_fill_the_width() -> None:
+def test_help_and_man_pages_have_panels_paragraphs_and_brackets(capsys: Said, tmp_path: Path) -> None:
     help_text = COMMANDS["estimate-light"].help
     assert "\n" not in help_text.replace("\n\n", "") and help_text.count("\n\n") == 3
-
-
-def test_man_pages_have_the_panels_as_subsections() -> None:
     page = manual.pages()["facerf-estimate-light.1"]
     panels = [line.removeprefix(".SS ") for line in page.splitlines() if line.startswith(".SS ")]
     assert panels == ["Light", "Image", "Face", "Method", "Batch"]
     top = manual.pages()["facerf.1"]
     assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
+    assert manual._text(".a-b\\c") == "\\&.a\\-b\\ec"
+    assert main(["config", "--help"]) == 0
+    assert "([relight]," in capsys.readouterr().out
+    assert "([relight]," in manual.pages()["facerf-config.1"]
+    (tmp_path / "facerf-gone.1").touch()
+    manual.main(["man", str(tmp_path)])
+    assert {path.name for path in tmp_path.iterdir()} == set(manual.pages())
 
 
-def test_the_longest_help_is_under_190_lines(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_longest_help_is_under_190_lines(capsys: Said, monkeypatch: Patch) -> None:
     monkeypatch.setenv("COLUMNS", "100")
     assert main(["relight", "--help"]) == 0
     assert 60 < len(capsys.readouterr().out.splitlines()) < 190
@@ -85,16 +88,6 @@ def test_the_longest_help_is_under_190_lines(
 @pytest.mark.usefixtures("fresh_command_line")
 def test_man_is_in_step_with_the_app() -> None:
     assert {path.name: path.read_text() for path in MAN.glob("*.1")} == manual.pages(), "run `make man`"
-
-
-def test_a_page_that_has_no_verb_any_more_is_removed(tmp_path: Path) -> None:
-    (tmp_path / "facerf-gone.1").touch()
-    manual.main(["man", str(tmp_path)])
-    assert {path.name for path in tmp_path.iterdir()} == set(manual.pages())
-
-
-def test_hyphens_and_backslashes_and_leading_dots_survive_troff() -> None:
-    assert manual._text(".a-b\\c") == "\\&.a\\-b\\ec"
 
 
 @pytest.mark.skipif(shutil.which("groff") is None, reason="groff is not installed")
@@ -121,9 +114,3 @@ def test_each_verb_has_three_examples_of_options_that_it_has(path: tuple[str, ..
         assert not {word for word in words if word[0] == "-"} - known - FLAGS - VALUED
     page = manual.pages()[f"facerf-{'-'.join(path)}.1"]
     assert ".SH EXAMPLES" in page and ".SH EXIT STATUS" in page
-
-
-def test_brackets_of_a_help_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["config", "--help"]) == 0
-    assert "([relight]," in capsys.readouterr().out
-    assert "([relight]," in manual.pages()["facerf-config.1"]

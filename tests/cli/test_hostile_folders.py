@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
-from facerf_cli.batch.run import REPORT_NAME, _exist, print_path
+from facerf_cli.batch.run import _exist, print_path
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.pairs import read_array
@@ -19,6 +19,7 @@ from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.files.read import decode
 from facerf_cli.files.texts import is_regular, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
+from tests.cli.folders import rows
 from tests.cli.toy_batch import run
 from tests.stacks import read_olat_stack
 
@@ -41,27 +42,22 @@ def photos_of(folder: Path, *names: str) -> Path:
     return folder
 
 
-def rows(out: Path) -> list[dict[str, object]]:
-    return [json.loads(line) for line in (out / REPORT_NAME).read_text().split("\n") if line]
-
-
-def test_names_of_all_characters_have_a_row_and_an_output_each(tmp_path: Path) -> None:
+def test_names_of_all_characters_have_a_row_an_output_and_a_pattern_each(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", *HOSTILE)
     assert run(photos, tmp_path / "out") == 0
     text = (tmp_path / "out" / "report.jsonl").read_text()
     assert all(line.isprintable() for line in text.split("\n")) and len(text.splitlines()) == len(HOSTILE)
-    assert {row["item"] for row in rows(tmp_path / "out")} == set(HOSTILE)
+    assert rows(tmp_path / "out").keys() == set(HOSTILE)
     assert run(photos, tmp_path / "out") == 0 and len(rows(tmp_path / "out")) == len(HOSTILE)
-
-
-def test_a_name_of_two_lines_fills_a_pattern(tmp_path: Path) -> None:
-    photos = photos_of(tmp_path / "in", "two\nlines.0007")
+    photos = photos_of(tmp_path / "numbered", "two\nlines.0007")
     pattern = NamePattern.parse("{stem}_{frame}", "--name")
     (item,) = collect_items([str(photos)], tmp_path / "out", PHOTO_SUFFIXES, pattern)
     assert item.name == "two\nlines_0007"
 
 
-def test_a_message_is_one_printable_line_of_limited_length() -> None:
+def test_messages_and_names_are_printable_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name in HOSTILE:
         assert printable_line(f"{name}: is bad").isprintable() and "is bad" in printable_line(
             f"{name}: is bad"
@@ -70,11 +66,6 @@ def test_a_message_is_one_printable_line_of_limited_length() -> None:
     assert json.loads(json_line({"name": "\x7f\u2028\U0001f642\U000e0001"})) == {
         "name": "\x7f\u2028\U0001f642\U000e0001"
     }
-
-
-def test_names_go_to_a_program_as_they_are_and_to_a_terminal_escaped(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
     print_path("\x1b[31m")
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     print_path("\x1b[31m")
@@ -104,20 +95,11 @@ def test_a_pipe_in_a_folder_costs_its_own_item(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", "a", "c")
     os.mkfifo(photos / "b.png")
     assert run(photos, tmp_path / "out") == 1
-    assert {row["item"]: row["status"] for row in rows(tmp_path / "out")} == {
+    assert {name: row["status"] for name, row in rows(tmp_path / "out").items()} == {
         "a": "done",
         "b": "failed",
         "c": "done",
     }
-
-
-def test_links_in_a_circle_and_impossible_names_are_refused_in_one_line(tmp_path: Path) -> None:
-    (tmp_path / "a.png").symlink_to(tmp_path / "a.png")
-    for path in (tmp_path / "a.png", tmp_path / ("n" * 300), tmp_path / "a\0b", tmp_path):
-        with pytest.raises(InputError):
-            require_regular(path)
-        assert not is_regular(path)
-    assert run(tmp_path / "a.png", tmp_path / "out") == 1
 
 
 def test_an_output_folder_that_is_a_link_in_a_circle_is_refused(tmp_path: Path) -> None:
@@ -141,16 +123,22 @@ def test_two_processes_in_a_folder_share_its_report(tmp_path: Path) -> None:
     line = [sys.executable, "-c", command, str(photos), str(tmp_path / "out")]
     both = [subprocess.Popen(line, env=ENVIRONMENT, stderr=subprocess.DEVNULL) for _ in range(2)]
     assert [process.wait() for process in both] == [0, 0]
-    assert sorted(int(str(row["item"])) for row in rows(tmp_path / "out")) == list(range(20))
+    assert sorted(map(int, rows(tmp_path / "out"))) == list(range(20))
     assert len((tmp_path / "written").read_text().split()) == 20  # each once
 
 
-def test_an_empty_file_is_not_finished(tmp_path: Path) -> None:
+def test_an_empty_file_is_not_finished_and_links_in_a_circle_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a").touch()
     (tmp_path / "b").write_text("x")
     os.mkfifo(tmp_path / "c")
     assert [_exist([tmp_path / name]) for name in ("a", "b", "c")] == [False, True, False]
     assert _exist([tmp_path]) and not _exist([])
+    (tmp_path / "a.png").symlink_to(tmp_path / "a.png")
+    for path in (tmp_path / "a.png", tmp_path / ("n" * 300), tmp_path / "a\0b", tmp_path):
+        with pytest.raises(InputError):
+            require_regular(path)
+        assert not is_regular(path)
+    assert run(tmp_path / "a.png", tmp_path / "out") == 1
 
 
 def test_a_worker_that_is_killed_leaves_no_temporary_file(tmp_path: Path) -> None:
@@ -158,4 +146,4 @@ def test_a_worker_that_is_killed_leaves_no_temporary_file(tmp_path: Path) -> Non
     (photos / "b.png").write_bytes(b"fall")
     assert run(photos, tmp_path / "out", jobs=2) == 1
     assert not list((tmp_path / "out").rglob(".*part-*"))
-    assert {row["item"] for row in rows(tmp_path / "out") if row["status"] == "done"} == {"a", "c"}
+    assert {name for name, row in rows(tmp_path / "out").items() if row["status"] == "done"} == {"a", "c"}

@@ -26,6 +26,7 @@ from facerf_cli.main import main
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import companion
 from facerf_cli.work.shots import ShotOptions, collect_frames
+from tests.kinds import Log, Patch, Said
 
 
 @pytest.fixture
@@ -44,13 +45,21 @@ def names(tmp_path: Path, *inputs: Path, pattern: str | None = None) -> list[str
     return [item.name for item in items]
 
 
-def test_a_folder_is_mirrored(photos: Path, tmp_path: Path) -> None:
+def test_folders_are_mirrored_and_named_files_stand_alone(photos: Path, tmp_path: Path) -> None:
     assert names(tmp_path, photos) == ["Z", "a", "b", "x/a", "x/c"]
+    (item,) = collect_items([str(photos / "x" / "a.jpg")], tmp_path / "out", PHOTO_SUFFIXES)
+    assert item.output("/mesh.glb") == tmp_path / "out" / "a" / "mesh.glb"
+    elsewhere = tmp_path / "elsewhere" / "deep" / "e.png"
+    elsewhere.parent.mkdir(parents=True)
+    elsewhere.touch()
+    assert names(tmp_path, photos / "x", elsewhere) == [
+        *names(tmp_path, elsewhere),
+        *names(tmp_path, photos / "x"),
+    ]
+    assert names(tmp_path, photos / "x" / "a.jpg", photos / "x", photos) == ["Z", "a", "b", "x/a", "x/c"]
 
 
-def test_what_a_folder_passes_over_is_counted_and_named(
-    photos: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_a_folder_passes_over_is_counted_and_named(photos: Path, tmp_path: Path, caplog: Log) -> None:
     caplog.set_level(logging.INFO, "facerf")
     for name in ("a.nef", "x/b.NEF", "film.mp4", "LICENCE", "d.bmp", "e.gif", "f.jfif", "g.jpe"):
         (photos / name).touch()
@@ -68,25 +77,6 @@ def test_what_a_folder_passes_over_is_counted_and_named(
     assert not caplog.records
 
 
-def test_a_file_that_is_named_alone_has_its_name_only(photos: Path, tmp_path: Path) -> None:
-    (item,) = collect_items([str(photos / "x" / "a.jpg")], tmp_path / "out", PHOTO_SUFFIXES)
-    assert item.output("/mesh.glb") == tmp_path / "out" / "a" / "mesh.glb"
-
-
-def test_the_place_of_an_input_depends_on_no_other(photos: Path, tmp_path: Path) -> None:
-    elsewhere = tmp_path / "elsewhere" / "deep" / "e.png"
-    elsewhere.parent.mkdir(parents=True)
-    elsewhere.touch()
-    assert names(tmp_path, photos / "x", elsewhere) == [
-        *names(tmp_path, elsewhere),
-        *names(tmp_path, photos / "x"),
-    ]
-
-
-def test_a_file_that_is_given_twice_is_one_item(photos: Path, tmp_path: Path) -> None:
-    assert names(tmp_path, photos / "x" / "a.jpg", photos / "x", photos) == ["Z", "a", "b", "x/a", "x/c"]
-
-
 def test_two_inputs_that_meet_are_refused(photos: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"a.png and .*x/a.jpg: would both be written as a; .* --name"):
         names(tmp_path, photos / "a.png", photos / "x" / "a.jpg")
@@ -102,38 +92,40 @@ def test_two_inputs_that_meet_are_refused(photos: Path, tmp_path: Path) -> None:
     ]
 
 
-def test_only_case_may_tell_apart_files_of_one_folder(tmp_path: Path) -> None:
+def test_names_that_only_case_or_unicode_form_tells_apart(tmp_path: Path) -> None:
     for name in ("f/a.jpg", "f/A.tif", "g/A.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     assert names(tmp_path, tmp_path / "f") == ["A", "a"]
     with pytest.raises(UsageError, match="would both be written"):
         names(tmp_path, tmp_path / "f" / "a.jpg", tmp_path / "g" / "A.jpg")
+    for form in ("NFC", "NFD"):
+        (tmp_path / unicodedata.normalize(form, "né.png")).touch()
+    if len(list(tmp_path.iterdir())) == 2:  # not on every file system
+        with pytest.raises(UsageError, match="would both be written"):
+            names(tmp_path, tmp_path)
 
 
-def test_outputs_inside_the_input_folder_are_not_inputs(photos: Path) -> None:
+def test_outputs_and_contact_sheets_are_no_inputs(photos: Path, tmp_path: Path) -> None:
     (photos / "out").mkdir()
     (photos / "out" / "b_relit.png").touch()
     names = [item.name for item in collect_items([str(photos)], photos / "out", PHOTO_SUFFIXES)]
     assert not [name for name in names if name.startswith("out")]
     with pytest.raises(UsageError, match="output folder"):
         collect_items([str(photos)], photos, PHOTO_SUFFIXES)
-
-
-def test_the_contact_sheet_beside_a_stack_is_no_input(tmp_path: Path) -> None:
+    (tmp_path / "stacks").mkdir()
     for name in ("a_olat.exr", "a_olat.png", "b_olat.png"):
-        (tmp_path / name).touch()
-    names = [item.name for item in collect_items([str(tmp_path)], tmp_path / "out", PHOTO_SUFFIXES)]
+        (tmp_path / "stacks" / name).touch()
+    names = [
+        item.name for item in collect_items([str(tmp_path / "stacks")], tmp_path / "out", PHOTO_SUFFIXES)
+    ]
     assert names == ["a_olat", "b_olat"]
 
 
-def test_a_list_on_stdin(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lists_on_stdin_end_in_lines_or_nul(photos: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n"))
     names = [item.name for item in collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES)]
     assert names == ["b", "a", "c"]
-
-
-def test_names_that_end_in_nul(photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (photos / "two\nlines.png").touch()
     monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\0{photos}/two\nlines.png\0"))
     items = collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES, null_separated=True)
@@ -157,7 +149,7 @@ def test_frames(tmp_path: Path) -> None:
     assert list(expand_inputs([str(tmp_path / "2020-2021.jpg")])) == [str(tmp_path / "2020-2021.jpg")]
 
 
-def test_frames_of_several_sequences_stay_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_of_several_sequences_stay_apart(tmp_path: Path, monkeypatch: Patch) -> None:
     """As printf and Nuke count: with zeros up to the width, and more digits where the number needs them."""
     monkeypatch.chdir(tmp_path)
     for name in ("a_9999", "a_10000", "a_00003", "a_0998", "ab_0001", "a_0998_b", "a9999", "a#1"):
@@ -186,7 +178,7 @@ def test_frames_of_several_sequences_stay_apart(tmp_path: Path, monkeypatch: pyt
     ],
 )
 def test_images_become_the_frames_of_shots(
-    tmp_path: Path, given: list[str], expected: dict[str, list[str]], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, given: list[str], expected: dict[str, list[str]], caplog: Log
 ) -> None:
     folder, out = tmp_path / "plates", tmp_path / "out"
     for name in given:
@@ -210,14 +202,11 @@ def test_images_become_the_frames_of_shots(
     assert sorted(item.name for item in photos) == sorted(given) and not none
 
 
-def test_sequences_that_would_meet_are_refused(tmp_path: Path) -> None:
+def test_sequences_meet_by_the_names_of_their_images(tmp_path: Path) -> None:
     for name in ("shot_0001", "shot0001"):
         (tmp_path / f"{name}.png").touch()
     with pytest.raises(UsageError, match=r"shot0001\.png and .*shot_0001\.png: would both be written"):
         collect_items([str(tmp_path)], tmp_path / "out", sequence=True)
-
-
-def test_mattes_of_a_sequence_have_the_names_of_its_images(tmp_path: Path) -> None:
     for folder in ("plates/a", "roto/a"):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "shot_0001.png").touch()
@@ -226,7 +215,7 @@ def test_mattes_of_a_sequence_have_the_names_of_its_images(tmp_path: Path) -> No
     assert companion(item, tmp_path / "roto", "--person") == tmp_path / "roto/a/shot_0001.png"
 
 
-def test_patterns_of_names(tmp_path: Path) -> None:
+def test_patterns_and_frame_numbers_of_names(tmp_path: Path) -> None:
     def path(text: str, **fields: str) -> str:
         item = Item(
             Path("d/in/me.0007.PNG"), tmp_path / "in" / "me.0007", "in/me.0007", Path("in/me.0007.PNG")
@@ -251,9 +240,6 @@ def test_patterns_of_names(tmp_path: Path) -> None:
     for text in wrong:
         with pytest.raises(UsageError, match="--name"):
             NamePattern.parse(text, "--name")
-
-
-def test_frame_numbers_at_the_end_of_a_name() -> None:
     assert split_frame("sky.0012") == ("sky", ".0012")
     assert split_frame("v2.final") == ("v2.final", "")
     assert split_frame("a\nb.01") == ("a\nb", ".01")
@@ -277,7 +263,7 @@ def plates(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("verb", VERBS)
-def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: Said) -> None:
     line = [verb, str(plates), "-o", str(plates.parent / "out"), "--dry-run"]
     assert main([*line, "--name", "{parent}/{stem}_{ext}_{frame:06}"]) == 0
     said = capsys.readouterr().out
@@ -288,14 +274,6 @@ def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: pytest.Ca
     assert main([*line, "--name", "{stem}_{light}"]) == 2
     assert "{light} is no field" in capsys.readouterr().err
     assert main([*line, "--name", "../{stem}"]) == 2
-
-
-def test_names_that_differ_by_their_unicode_form_alone_are_refused(tmp_path: Path) -> None:
-    for form in ("NFC", "NFD"):
-        (tmp_path / unicodedata.normalize(form, "né.png")).touch()
-    if len(list(tmp_path.iterdir())) == 2:  # not on every file system
-        with pytest.raises(UsageError, match="would both be written"):
-            names(tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])

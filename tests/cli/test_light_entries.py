@@ -20,7 +20,7 @@ def single(text: str) -> StudioLight:
     return light
 
 
-def test_a_light_by_its_keys() -> None:
+def test_lights_by_their_keys_and_by_the_names_of_presets() -> None:
     near = single("at=0.5,0.3,1;size=0.4;kelvin=3200;stops=+1;rgb=1,0.5,0.25;spot=40")
     assert near == StudioLight(None, (0.5, 0.3, 1.0), (1.0, 0.5, 0.25), 3200.0, 1.0, 0.4, 0.0, 40.0)
     far = StudioLight((40.0, 20.0), kelvin=5600.0, stops=-1.0, size_deg=30.0)
@@ -29,6 +29,14 @@ def test_a_light_by_its_keys() -> None:
     assert single("az=40") == single("40,0") and single("el=20") == single("0,20")
     assert single("from=around;stops=-3") == StudioLight(stops=-3.0)
     assert single("at=0,0,1;size=0") == StudioLight(at_m=(0.0, 0.0, 1.0))
+    assert lit_images(["rim"])[0].names == ("right", "left", "fill")
+    assert lit_images(["rim=-150,15"])[0].frames == ((StudioLight((-150.0, 15.0)),),)
+    assert lit_images(["rim=rim"])[0].names == ("rim_right", "rim_left", "rim_fill")
+    assert lit_images(["name=map;map=a.exr"])[0].names == ("map",)  # as pages of `facerf view` write
+    assert preset_names() == ("beauty", "butterfly", "loop", "rembrandt", "rim", "split")
+    setups = collect_setups(LightSources(light=preset_names()), Path("out"))
+    assert [setup.name for setup in setups] == list(preset_names())
+    assert all(setup.lights and len(setup.names) == len(setup.lights) for setup in setups)
 
 
 def test_lights_with_names_share_an_image_whatever_their_form() -> None:
@@ -97,13 +105,6 @@ def test_directions_have_words(word: str, direction: tuple[int, int, int]) -> No
     assert lit_images([f"{word}={word};stops=1"])[0].names == (word,)
 
 
-def test_a_preset_s_name_may_be_a_light_s() -> None:
-    assert lit_images(["rim"])[0].names == ("right", "left", "fill")
-    assert lit_images(["rim=-150,15"])[0].frames == ((StudioLight((-150.0, 15.0)),),)
-    assert lit_images(["rim=rim"])[0].names == ("rim_right", "rim_left", "rim_fill")
-    assert lit_images(["name=map;map=a.exr"])[0].names == ("map",)  # as pages of `facerf view` write
-
-
 def test_lights_apart_from_those_with_names_are_said(caplog: pytest.LogCaptureFixture) -> None:
     """Only what is mixed: lights without names get an image each, as documented."""
 
@@ -120,7 +121,7 @@ def test_lights_apart_from_those_with_names_are_said(caplog: pytest.LogCaptureFi
     assert said("key=40,20", maps=("sky=a.exr",)) == ""
 
 
-def test_a_sweep_numbers_its_frames_and_leaves_out_its_end() -> None:
+def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
     setups = collect_setups(LightSources(light=["az=-90:90:3;el=20"]), Path("out"))
     assert [setup.frame for setup in setups] == [".0000", ".0001", ".0002"]
     assert {setup.name for setup in setups} == {"light_az_-90_90_3_el_20"}  # and so of one exposure
@@ -130,9 +131,6 @@ def test_a_sweep_numbers_its_frames_and_leaves_out_its_end() -> None:
     both = collect_setups(LightSources(light=["az=0:20:2;el=0:90:2;stops=1"]), Path("out"))
     assert [setup.lights[0].azel_deg for setup in both] == [(0, 0), (10, 45)]
     assert collect_setups(LightSources(light=["az=0:20:1"]), Path("out"))[0].frame == ".0000"
-
-
-def test_lights_that_do_not_sweep_shine_in_every_frame() -> None:
     setups = collect_setups(LightSources(light=["name=key;az=0:90:3", "fill=-40,0"]), Path("out"))
     assert [[light.azel_deg for light in setup.lights] for setup in setups] == [
         [(0, 0), (-40, 0)],
@@ -223,13 +221,6 @@ def test_a_fault_of_a_rig_file_names_file_and_light(tmp_path: Path, text: str, s
     with pytest.raises(InputError) as caught:
         lit_images([str(path)])
     assert str(caught.value).startswith(f"{path}: ") and said in str(caught.value)
-
-
-def test_every_preset_is_a_rig() -> None:
-    assert preset_names() == ("beauty", "butterfly", "loop", "rembrandt", "rim", "split")
-    setups = collect_setups(LightSources(light=preset_names()), Path("out"))
-    assert [setup.name for setup in setups] == list(preset_names())
-    assert all(setup.lights and len(setup.names) == len(setup.lights) for setup in setups)
 
 
 def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:

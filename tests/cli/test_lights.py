@@ -41,12 +41,16 @@ def write_map(path: Path, bright_uv: tuple[float, float] | None = None) -> Path:
     return path
 
 
-def test_maps_may_be_files_folders_and_patterns(tmp_path: Path) -> None:
+def test_maps_may_be_files_folders_and_patterns_told_apart_by_folder(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         write_map(tmp_path / f"{name}.exr")
     for given in ([str(tmp_path)], [str(tmp_path / "*.exr")], [str(tmp_path / f"{n}.exr") for n in "cab"]):
         setups = collect_setups(LightSources(envmap=given), tmp_path / "out")
         assert [setup.name for setup in setups] == ["a", "b", "c"]
+    for place in ("day/sky.exr", "night/sky.exr", "night/moon.exr"):
+        write_map(tmp_path / "more" / place)
+    setups = collect_setups(LightSources(envmap=[str(tmp_path / "more")]), tmp_path / "out")
+    assert [setup.name for setup in setups] == ["day_sky", "moon", "night_sky"]
 
 
 def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -66,13 +70,6 @@ def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.L
     assert float((found - weights).abs().max()) < 0.02 * float(weights.max())
     with pytest.raises(UsageError, match="no inputs"):  # a folder is walked for maps alone
         collect_setups(LightSources(envmap=[str(tmp_path)]), tmp_path / "out")
-
-
-def test_maps_of_one_name_in_two_folders_are_told_apart(tmp_path: Path) -> None:
-    for place in ("day/sky.exr", "night/sky.exr", "night/moon.exr"):
-        write_map(tmp_path / place)
-    setups = collect_setups(LightSources(envmap=[str(tmp_path)]), tmp_path / "out")
-    assert [setup.name for setup in setups] == ["day_sky", "moon", "night_sky"]
 
 
 def test_a_pattern_that_the_shell_expanded_stays_with_its_option() -> None:
@@ -116,7 +113,7 @@ def test_wrong_lamps(text: str) -> None:
         collect_setups(LightSources(light=[text]), Path("out"))
 
 
-def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
+def test_a_wrong_value_says_what_is_wanted_and_no_light_comes_twice(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="give AZ,EL or AZ,EL,STRENGTH or AZ,EL,R,G,B, numbers sep"):
         collect_setups(LightSources(light=["60"]), Path("out"))
     with pytest.raises(UsageError, match=r"give DEG or FROM:TO:N, a number"):
@@ -124,9 +121,6 @@ def test_a_wrong_value_says_what_is_wanted_and_where(tmp_path: Path) -> None:
     (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
     with pytest.raises(UsageError, match=r"rig\.txt: '0,100': the elevation is out of range; give -90"):
         parse_lights(str(tmp_path / "rig.txt"))
-
-
-def test_no_light_and_the_same_light_twice() -> None:
     with pytest.raises(UsageError, match="add --envmap, --light"):
         collect_setups(LightSources(), Path("out"))
     with pytest.raises(UsageError, match="once"):
@@ -218,7 +212,7 @@ def balls(setups: Sequence[LightSetup], output: Path, exposure_ev: float | None)
     write_balls(maps, paths, exposure_ev, OutputOptions())
 
 
-def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
+def test_balls_show_which_way_a_map_is_turned_and_name_its_face_model(tmp_path: Path) -> None:
     envmap = write_map(tmp_path / "one.exr", (0.25, 0.49))
     setups = collect_setups(LightSources(envmap=[str(envmap)], light=["0,0"]), tmp_path / "out")
     balls(setups, tmp_path / "out", None)
@@ -227,9 +221,6 @@ def test_balls_show_which_way_the_map_is_turned(tmp_path: Path) -> None:
     half = diffuse.shape[1] // 2
     assert diffuse[:, half:].sum() > 5 * diffuse[:, :half].sum()
     assert sorted(path.name for path in (tmp_path / "out/balls").iterdir()) == ["one.exr", "one.png"]
-
-
-def test_the_ball_of_an_estimated_light_names_its_face_model(tmp_path: Path) -> None:
     marks = {"facerf:face_model": "mine", "facerf:face_model_licence": "MIT"}
     write_exr(tmp_path / "a.exr", np.ones((16, 32, 3), np.float32), metadata=marks)
     light = LightRecord(rig_directions()[:3], torch.ones(3, 3), "three", None, marks)

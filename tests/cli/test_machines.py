@@ -1,6 +1,5 @@
 """`--shard` and `--ray` on the command line, and what shards leave: reports of their own, one summary."""
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.workers import Workers
+from tests.cli.folders import rows
 from tests.cli.toy_batch import outputs_of, run
 
 FOLDER_VERBS = {
@@ -85,33 +85,25 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-def rows(report: Path) -> dict[str, dict]:
-    found = [json.loads(line) for line in report.read_text().splitlines()]
-    return {row["item"]: row for row in found}
-
-
-def test_shards_do_their_own_and_a_run_without_takes_their_rows(photos: Path, tmp_path: Path) -> None:
+def test_shards_do_their_own_and_a_run_without_takes_their_rows(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     (photos / "b.png").write_bytes(b"bad")
     out = tmp_path / "out"
     assert run(photos, out, Shard(1, 2)) == 0 and run(photos, out, Shard(2, 2)) == 1
-    first, second = (rows(out / f"report-{number}-of-2.jsonl") for number in (1, 2))
+    first, second = (rows(out, f"report-{number}-of-2.jsonl") for number in (1, 2))
     assert set(first) == {"a", "c", "e"} and set(second) == {"b", "d"}
     assert not (out / "report.jsonl").exists()
     (photos / "b.png").write_bytes(b"good")
     assert run(photos, out) == 0
-    whole = rows(out / "report.jsonl")
+    whole = rows(out)
     assert {name: whole[name] for name in "acde"} == first | {"d": second["d"]}
     assert whole["b"]["status"] == "done"
     assert (tmp_path / "written").read_text().split() == ["a", "c", "e", "d", "b"]
-
-
-def test_a_shard_beyond_the_items_has_nothing_to_do(photos: Path, tmp_path: Path) -> None:
     assert run(photos, tmp_path / "out", Shard(6, 9)) == 0
-    assert rows(tmp_path / "out/report-6-of-9.jsonl") == {}
-
-
-def test_dry_run_of_a_shard(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert run(photos, tmp_path / "out", Shard(2, 2), dry_run=True) == 0
+    assert rows(tmp_path / "out", "report-6-of-9.jsonl") == {}
+    capsys.readouterr()
+    assert run(photos, tmp_path / "dry", Shard(2, 2), dry_run=True) == 0
     assert [Path(line.split(" -> ")[0]).name for line in capsys.readouterr().out.splitlines()] == [
         "b.png",
         "d.png",

@@ -2,22 +2,21 @@
 
 from pathlib import Path
 
-import pytest
-
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import Outcome, _run_one
 from facerf_cli.batch.settings import Settings
 from facerf_cli.main import global_options_first, main
 from facerf_cli.run import memory
+from tests.kinds import Patch, Said
 
 
-def said(capsys: pytest.CaptureFixture[str]) -> str:
+def said(capsys: Said) -> str:
     """Standard error in one line, whatever the width of the terminal."""
     return " ".join(capsys.readouterr().err.split())
 
 
 def test_a_photo_beyond_the_budget_is_refused_before_it_is_decoded(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: Said, monkeypatch: Patch
 ) -> None:
     photo = tmp_path / "large.pgm"
     photo.write_bytes(b"P5\n7000 5000\n255\n")  # a header alone: decoding it would be another error
@@ -30,24 +29,18 @@ def test_a_photo_beyond_the_budget_is_refused_before_it_is_decoded(
     assert main([*line, "--memory", "inf"]) == 2 and main([*line, "--memory", "0"]) == 2
 
 
-def test_jobs_have_a_share_each_unless_one_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_have_a_share_each_and_items_give_theirs_back(monkeypatch: Patch) -> None:
     assert Settings().job_bytes(4) == memory.default_limit(4)
     assert Settings(memory_bytes=7).job_bytes(4) == 7
     seen = []
     item = Item(Path("a"), Path("a"), "a")
     _run_one(lambda item: seen.append(memory.limit_bytes()), False, 12345, item)  # type: ignore[arg-type]
     assert seen == [12345]
-
-
-def test_an_item_gives_its_memory_back_however_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[str] = []
     monkeypatch.setattr(memory, "give_back", lambda: given.append("back"))
     for process in (lambda item: Outcome([]), lambda item: 1 / 0):
         _run_one(process, False, 1 << 30, Item(Path("a"), Path("a"), "a"))
     assert given == ["back", "back"]
-
-
-def test_it_may_stand_before_or_after_the_verb() -> None:
     assert global_options_first(["relight", "a.jpg", "--memory", "2"]) == [
         "--memory",
         "2",

@@ -54,7 +54,7 @@ def run(verb: object, *arguments: str) -> object:
     return CliRunner().invoke(app, ["verb", *arguments])
 
 
-def test_values_come_back_as_the_groups() -> None:
+def test_groups_come_back_as_values_with_the_docstrings_help() -> None:
     made = []
 
     def verb(context: typer.Context, name: str, paint: Paint, frame: Frame) -> None:
@@ -64,14 +64,17 @@ def test_values_come_back_as_the_groups() -> None:
     name, paint, frame = made[0]
     assert (name, paint.side_px, paint.kind, paint.secret, paint.settings.seed) == ("a", 4, "oil", 3, 5)
     assert frame == Frame(2, True)
-
-
-def test_the_help_of_an_option_is_what_the_docstring_says_of_its_field() -> None:
     assert attributes_of(Frame) == {"width_px": "Width of the frame, in pixels.", "gold": "Gild it."}
 
     def verb(context: typer.Context, frame: Frame) -> None: ...
 
     assert "Width of the frame, in pixels." in run(verb, "--help").output
+
+    def verb(context: typer.Context, paint: Annotated[Paint, Only("kind")]) -> None:
+        assert paint.side_px == 8
+
+    assert run(verb, "--kind", "ink").exit_code == 0
+    assert run(verb, "--size", "4").exit_code == 2
 
 
 @pytest.mark.parametrize(
@@ -86,20 +89,15 @@ def test_limits_hold(wrong: list[str]) -> None:
     assert run(verb, *wrong, *width).exit_code == 2
 
 
-def test_a_verb_may_have_some_of_a_group() -> None:
-    def verb(context: typer.Context, paint: Annotated[Paint, Only("kind")]) -> None:
-        assert paint.side_px == 8
-
-    assert run(verb, "--kind", "ink").exit_code == 0
-    assert run(verb, "--size", "4").exit_code == 2
-
-
 def test_no_two_verbs_write_one_name() -> None:
     photo = PhotoOptions(Settings())
     works = (Segment, FitGeometry, EstimateLight, MakePage, partial(PredictStacks, page=True))
     ends = [end for make in works for end in make(photo=photo).endings]
     ends += ["_relight/info.json", *_ENDINGS.values()]
     assert len(set(ends)) == len(ends)
+    verbs = [kind(photo=photo) for kind in (Segment, FitGeometry, EstimateLight, PredictStacks)]
+    endings = Counter(ending for verb in verbs for ending in verb.endings)
+    assert max(endings.values()) == 1
 
 
 @dataclass(frozen=True)
@@ -122,10 +120,3 @@ def test_groups_hold_groups_and_parse_what_is_typed() -> None:
     assert plain == Picture(Paint(Settings(seed=5)))
     assert given == Picture(Paint(Settings(seed=5), side_px=3), 0.2, ("a", "b"), "square")
     assert run(verb, "--kind", "ink").exit_code == run(verb, "--shape", "flat").exit_code == 2
-
-
-def test_no_two_verbs_on_photos_write_one_name() -> None:
-    photo = PhotoOptions(Settings())
-    verbs = [kind(photo=photo) for kind in (Segment, FitGeometry, EstimateLight, PredictStacks)]
-    endings = Counter(ending for verb in verbs for ending in verb.endings)
-    assert max(endings.values()) == 1

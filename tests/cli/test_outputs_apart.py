@@ -8,12 +8,13 @@ import pytest
 from PIL import Image
 
 from facerf_cli.main import main
+from tests.kinds import Patch, Said
 
 RIG = '[key]\nfrom = "40,20"\n'
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, monkeypatch: Patch) -> Path:
     """Files that a run may read; of each only its name counts, since nothing is to be run."""
     monkeypatch.chdir(tmp_path)
     for name in ("me.png", "other.png", "mattes/me.png", "mattes/me_person.png", "balls/sky.exr", "sky.exr"):
@@ -56,7 +57,7 @@ def test_a_file_that_is_read_is_no_output(
     read: str,
     link: Callable[..., None] | None,
     dry: bool,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Said,
 ) -> None:
     """A hard link of another case is what a file system without case has: one file, two names."""
     output = Path(read)
@@ -82,16 +83,14 @@ def test_a_file_that_is_read_is_no_output(
         ("face-model show me.png -o me.png --overwrite", "me.png"),
     ],
 )
-def test_an_output_in_a_folder_is_no_input(
-    folder: Path, line: str, planned: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_in_a_folder_is_no_input(folder: Path, line: str, planned: str, capsys: Said) -> None:
     before = Path(planned).read_bytes()
     assert main(line.split()) == 2
     assert f"-o {planned}: is the input {planned}" in capsys.readouterr().err
     assert Path(planned).read_bytes() == before
 
 
-def test_outputs_beside_what_is_read_are_made(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_outputs_beside_what_is_read_are_made(folder: Path, capsys: Said) -> None:
     """A rerun finds its own results in the folder of the mattes, and another matte there; none is read."""
     Path("mattes/other_person.png").write_bytes(b"")
     for name in ("me_segment.exr", "me_person.png"):

@@ -38,10 +38,19 @@ def test_own_is_a_light_of_that_name(entry: str) -> None:
     assert light.own and not light.is_around and light.stops == (-1.0 if "stops" in entry else 0.0)
 
 
-def test_it_joins_lights_that_have_names_and_takes_colour() -> None:
+def test_own_is_a_light_like_others_but_for_the_room() -> None:
     image = image_of("key=40,20", "name=day;from=own;rgb=1,.9,.8")
     assert image.names == ("key", "day") and image.frames[0][1].rgb == (1.0, 0.9, 0.8)
     assert not image_of("own=40,20").frames[0][0].own  # a light of that name
+    (both,) = collect_setups(LightSources(light=["own", "key=40,20;stops=1"]), Path("out"))
+    assert in_room(both, None, False).room == 0
+    asked = with_room(in_room(both, "0.1", False))
+    assert asked.names == ("own", "key", "room") and asked.lights[2].rgb == pytest.approx((0.2, 0.2, 0.2))
+    (alone,) = collect_setups(LightSources(light=["own"]), Path("out"))
+    assert not alone.has_single
+    lights = lights_over_rig((alone, both), "12", "cell")
+    assert lights.own is not None and lights.own.tolist() == [[1, 1, 1], [1, 1, 1]]
+    assert lights.weights.abs().sum((1, 2)).tolist() == [0, 6]
 
 
 @pytest.mark.parametrize(
@@ -58,18 +67,6 @@ def test_it_joins_lights_that_have_names_and_takes_colour() -> None:
 def test_what_it_cannot_have_is_refused(entries: list[str], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         lit_images(entries)
-
-
-def test_the_room_is_off_unless_asked_and_counts_the_other_lights() -> None:
-    (both,) = collect_setups(LightSources(light=["own", "key=40,20;stops=1"]), Path("out"))
-    assert in_room(both, None, False).room == 0
-    asked = with_room(in_room(both, "0.1", False))
-    assert asked.names == ("own", "key", "room") and asked.lights[2].rgb == pytest.approx((0.2, 0.2, 0.2))
-    (alone,) = collect_setups(LightSources(light=["own"]), Path("out"))
-    assert not alone.has_single
-    lights = lights_over_rig((alone, both), "12", "cell")
-    assert lights.own is not None and lights.own.tolist() == [[1, 1, 1], [1, 1, 1]]
-    assert lights.weights.abs().sum((1, 2)).tolist() == [0, 6]
 
 
 def test_alone_it_gives_the_photo_back(given: Path, tmp_path: Path) -> None:
@@ -100,16 +97,6 @@ def test_exposure_is_chosen_where_it_is_asked(given: Path, tmp_path: Path) -> No
     assert relight(given, tmp_path, *line) == 0
     (ev,) = json.loads((tmp_path / "report.jsonl").read_text())["exposure_ev"].values()
     assert 2.5 < ev < 3.5
-
-
-@pytest.mark.parametrize(
-    "line", [["--pose", "10,0,0"], ["--composite", "face"], ["--reflectance", "diffuse-sh"]]
-)
-def test_what_it_does_not_shine_on_is_refused(
-    line: list[str], given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert relight(given, tmp_path, "--light", "own", *line) == 2
-    assert "--light own" in capsys.readouterr().err and not any(tmp_path.iterdir())
 
 
 def test_the_soft_view_bends_what_other_lights_add() -> None:

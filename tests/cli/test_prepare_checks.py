@@ -6,30 +6,29 @@ from pathlib import Path
 
 import pytest
 
-from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.findings import LEAST_LIGHTS, Finding
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.main import main
 from tests.dataset.capture import write_capture
+from tests.kinds import Folders, Patch, Said
 
 LIGHTS = 12
-Said = pytest.CaptureFixture[str]
 Plant = Callable[..., None]
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def capture(tmp_path_factory: Folders) -> Path:
     folder = tmp_path_factory.mktemp("stage") / "capture"
     write_capture(folder, subjects=2, lights=LIGHTS)
     return folder
 
 
 @pytest.fixture
-def plant(monkeypatch: pytest.MonkeyPatch) -> Plant:
+def plant(monkeypatch: Patch) -> Plant:
     """Have the checks find these, whatever is there."""
 
     def planted(*findings: Finding) -> None:
-        def check_subject(capture: Capture, subject: str) -> list[Finding]:
+        def check_subject(capture: Said, subject: str) -> list[Finding]:
             return [found for found in findings if found.subject == subject]
 
         monkeypatch.setattr("facerf_cli.dataset.prepare_capture.check_subject", check_subject)
@@ -70,24 +69,18 @@ def test_broken_frames_are_left_out_and_errors_stop_their_subject(
     assert read_dataset(tmp_path).fewer_lights == {}
 
 
-def test_strict_stops_for_a_warning(capture: Path, tmp_path: Path, capsys: Said, plant: Plant) -> None:
+def test_warnings_stop_strict_runs_and_too_many_broken_frames_all(
+    capture: Path, tmp_path: Path, capsys: Said, plant: Plant
+) -> None:
     plant(CLIPPED)
     assert prepare(capture, tmp_path, "--strict") == 1
     assert (
         "0001/C0: clipped: 3 frames are clipped; without --strict it is a warning" in capsys.readouterr().err
     )
     assert read_dataset(tmp_path).subjects == ("0000",)
-
-
-def test_too_many_broken_frames_stop_a_subject(
-    capture: Path, tmp_path: Path, capsys: Said, plant: Plant
-) -> None:
     plant(*(frame(light) for light in range(LIGHTS - LEAST_LIGHTS + 1)))
     assert prepare(capture, tmp_path) == 1
     assert "0000: 9 of 12 lights have a sound frame" in capsys.readouterr().err
-
-
-def test_nothing_is_looked_for_without_checks(capture: Path, tmp_path: Path, plant: Plant) -> None:
     plant(ORDER, frame(4))
     assert prepare(capture, tmp_path, "--checks", "off") == 0
     assert read_dataset(tmp_path).fewer_lights == {} and not (tmp_path / "findings").exists()
@@ -120,16 +113,6 @@ def test_only_checks_write_their_findings_and_nothing_else(
     assert all(found.words in said.err for found in findings) and "findings.jsonl" in said.out
 
 
-def test_only_checks_have_no_shards(capture: Path, tmp_path: Path, capsys: Said) -> None:
-    assert prepare(capture, tmp_path / "out", "--checks", "only", "--shard", "1/2") == 2
-    said = capsys.readouterr().err
-    assert (
-        "--shard: --checks only checks all subjects; omit it" in said
-        and said.count("\n") == 1
-        and not (tmp_path / "out").exists()
-    )
-
-
 def test_real_checks_in_processes_find_the_missing_frame(capture: Path, tmp_path: Path, capsys: Said) -> None:
     hidden = capture / "0001/C2/L002.exr"
     hidden.rename(tmp_path / "hidden.exr")
@@ -144,14 +127,14 @@ def test_real_checks_in_processes_find_the_missing_frame(capture: Path, tmp_path
 
 
 def test_heads_that_moved_are_moved_back(
-    capture: Path, tmp_path: Path, plant: Plant, monkeypatch: pytest.MonkeyPatch
+    capture: Path, tmp_path: Path, plant: Plant, monkeypatch: Patch
 ) -> None:
     """The shifts reach the frames that are stacked, and the record."""
     plant()
     asked = {}
 
     def align_shifts(
-        capture: Capture, subject: str, camera: str, broken: set[str]
+        capture: Said, subject: str, camera: str, broken: set[str]
     ) -> dict[str, tuple[float, float]]:
         asked[camera] = broken
         return {"L002": (1.0, -2.0)} if camera == "C0" else {}

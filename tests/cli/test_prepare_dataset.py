@@ -1,6 +1,5 @@
 """`facerf prepare-dataset` from the command line, on a small capture of two built-in heads."""
 
-import hashlib
 import json
 import os
 import random
@@ -30,6 +29,7 @@ from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
+from tests.cli.folders import tree
 from tests.dataset.capture import Truth, write_capture
 from tests.stacks import read_olat_stack
 
@@ -58,15 +58,6 @@ def prepared(given: Given, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     return read_dataset(output)
 
 
-def tree(folder: Path) -> dict[str, str]:
-    """Every file but the report, by the digest of its bytes."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != "report.jsonl"
-    }
-
-
 def test_every_camera_of_every_subject_is_there(prepared: Dataset) -> None:
     assert prepared.subjects == ("0000", "0001") and len(prepared.light_ids) == LIGHTS
     assert sum(map(len, prepared.splits.values())) == 2 and prepared.crop_px == 96
@@ -82,7 +73,9 @@ def test_every_camera_of_every_subject_is_there(prepared: Dataset) -> None:
     assert all(row["error_iod"] < 0.05 and row["worst_crop_off_iod"] < 0.005 for row in rows)
 
 
-def test_what_is_made_names_the_face_model(prepared: Dataset) -> None:
+def test_what_is_made_names_the_face_model_and_says_what_is_synthetic(
+    prepared: Dataset, given: Given
+) -> None:
     licence = load_face_model().licence
     stack = read_olat_stack(prepared.stack_path("0000", "C1")).header.metadata
     assert (stack["facerf:face_model"], stack["facerf:face_model_licence"]) == ("builtin", licence)
@@ -91,9 +84,6 @@ def test_what_is_made_names_the_face_model(prepared: Dataset) -> None:
         assert {name: fit[name].item() for name in stack} == stack
     sheet = (prepared.folder / "sheets" / "0000.jpg").read_bytes()
     assert b'facerf:face_model="builtin"' in sheet and b"facerf:face_model_licence" in sheet
-
-
-def test_what_comes_of_a_synthetic_capture_says_so(given: Given) -> None:
     capture = replace(read_capture(given[0]), provenance={"synthetic": True})
     how = Preparation(load_face_model(), SHIPPED_NETWORKS, DatasetFolder(given[0]), None, {})
     made = _Subject(capture, "0000", (), how).provenance("C1")
@@ -256,7 +246,9 @@ def test_a_camera_without_most_of_its_frames_goes_alone(given: Given, tmp_path: 
     assert not dataset.stack_path("0000", "C2").exists()
 
 
-def test_black_images_have_no_face(given: Given, tmp_path: Path, capsys: Said) -> None:
+def test_black_images_have_no_face_nor_a_network_that_sees_none(
+    given: Given, tmp_path: Path, capsys: Said
+) -> None:
     content = json.loads((given[0] / "stage.json").read_text())
     content["lights"] = content["lights"][:1]
     capture = tmp_path / "capture"
@@ -267,9 +259,6 @@ def test_black_images_have_no_face(given: Given, tmp_path: Path, capsys: Said) -
     assert prepare(capture, tmp_path / "out") == 1
     assert "0000: no camera shows a face" in capsys.readouterr().err
     assert not (tmp_path / "out/dataset.json").exists()
-
-
-def test_the_network_of_a_checkpoint_looks_for_faces(given: Given, tmp_path: Path, capsys: Said) -> None:
     networks, _ = load_networks(SHIPPED["parsing"], LAYOUT_VERSION)
     with torch.no_grad():
         networks["parsing"].judge[-1].bias[0] = -100  # nobody is there
@@ -279,30 +268,6 @@ def test_the_network_of_a_checkpoint_looks_for_faces(given: Given, tmp_path: Pat
     capture = changed(given, tmp_path / "capture", subjects={"0000": {}}, cameras=cameras)
     assert prepare(capture, tmp_path / "out", "--checkpoint", str(blind)) == 1
     assert "0000: no camera shows a face" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("line", "said"),
-    [
-        (["--split", "300/10/40"], "the capture has 2"),
-        (["--split", "half"], "--split"),
-        (["--crop", "97"], "--crop"),
-        (["--crop", "0"], "--crop"),
-        (["--layout", "multipie"], "there is extended-yale-b, stage"),
-        (["--face-model", "nowhere.npz"], "nowhere.npz"),
-    ],
-)
-def test_wrong_options_stop_the_run(
-    given: Given, tmp_path: Path, capsys: Said, line: list[str], said: str
-) -> None:
-    assert prepare(given[0], tmp_path / "out", *line) in (1, 2)
-    complaint = capsys.readouterr().err
-    assert said in complaint and complaint.count("\n") == 1 and not (tmp_path / "out").exists()
-
-
-def test_no_capture(tmp_path: Path, capsys: Said) -> None:
-    assert prepare(tmp_path, tmp_path / "out") == 2
-    assert "stage.json: no such file" in capsys.readouterr().err
 
 
 def test_other_options_do_not_mix(given: Given, prepared: Dataset, capsys: Said) -> None:

@@ -95,8 +95,3 @@ def test_the_portrait_is_the_default(given: Path, tmp_path: Path) -> None:
         assert attribute(path, "facerf:reflectance") == ("field" if name == "field" else "")
     assert np.array_equal(images[""], images["portrait"])
     assert np.abs(images[""] - images["field"]).max() > 0.05
-
-
-def test_no_such_model(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert relighting.relight(given, tmp_path / "out", "--light", "0,0", "--reflectance", "wax") == 2
-    assert "specular-sh" in capsys.readouterr().err

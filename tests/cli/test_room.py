@@ -19,6 +19,7 @@ from facerf_cli.work.relight_options import parse_background
 from tests.astronaut import PATH as PHOTO
 from tests.cli.test_relight import relight
 from tests.exr_layers import exr_layers
+from tests.kinds import Said
 
 KEY, RIM = "name=key;az=40;el=20;kelvin=3200", "name=rim;az=160;stops=-1;rgb=0.5,1,1"
 
@@ -67,13 +68,10 @@ def test_a_map_has_no_room_and_a_light_of_a_room_turns_the_default_off(sky: Path
         in_room(setup, "0.1", False)
 
 
-def test_none_leaves_the_lights_to_the_last_bit() -> None:
+def test_none_leaves_the_lights_and_a_rooms_light_is_a_share_of_their_sum() -> None:
     (setup,) = setups_of([KEY, RIM])
     assert in_room(setup, "none", False) == setup == with_room(setup)
     assert in_room(setup, "0", False) == setup
-
-
-def test_a_rooms_light_is_a_share_of_the_sum_of_the_lights() -> None:
     red, near = "name=a;az=90;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
     (setup,) = setups_of([red, near])
     lit = with_room(in_room(setup, "0.1", False))
@@ -108,36 +106,18 @@ def test_a_map_with_a_name_turns_in_every_frame_and_has_an_intensity(sky: Path) 
     torch.testing.assert_close(2 * weights[0], weights[1])
 
 
-def test_a_rig_file_names_its_map_from_its_own_folder(sky: Path) -> None:
+def test_maps_of_rig_files_and_rooms(sky: Path) -> None:
     rig = sky.with_name("studio.toml")
     rig.write_text("[sky]\nmap = 'sky.exr'\nstops = -1\n[key]\nfrom = [40, 20]\n")
     (setup,) = setups_of([str(rig)])
     assert setup.lights[0] == StudioLight(envmap=sky, stops=-1.0) and setup.names == ("sky", "key")
-
-
-def test_a_map_may_be_the_room(sky: Path) -> None:
     (setup,) = setups_of([KEY])
     lit = in_room(setup, str(sky), False)
     assert lit.names == ("key", "room") and lit.lights[1] == StudioLight(envmap=sky)
 
 
-@pytest.mark.parametrize("room", ["2", "-0.1", "walls", "", "0.1,0.1"])
-def test_a_wrong_room_is_refused(
-    room: str, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert relight(given, tmp_path / "x", "--light", "0,0", f"--room={room}") == 2
-    assert "--room" in capsys.readouterr().err
-
-
-def test_a_room_without_lights_is_refused(
-    sky: Path, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert relight(given, tmp_path / "x", "--envmap", str(sky), "--room", "0.1") == 2
-    assert "--room 0.1: is added to lights; add --light" in capsys.readouterr().err
-
-
 def test_the_line_says_which_room_was_taken_and_a_stack_has_none(
-    given: Path, stack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    given: Path, stack: Path, tmp_path: Path, capsys: Said
 ) -> None:
     line = ["--light", "70,0", "--composite", "face"]
     assert relight(given, tmp_path / "a", *line) == 0
@@ -152,9 +132,7 @@ def test_the_line_says_which_room_was_taken_and_a_stack_has_none(
     assert images["wide"].mean() > 1.2 * images["none"].mean()
 
 
-def test_each_person_of_a_group_has_lights_of_its_own(
-    given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_person_of_a_group_has_lights_of_its_own(given: Path, tmp_path: Path, capsys: Said) -> None:
     """Red on the left one, which is smaller and so composed last, green on the right one."""
     small = read_image(PHOTO).pixels[:300, 60:400]
     large = resized(small, 375, 425)

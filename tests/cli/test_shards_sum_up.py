@@ -3,7 +3,6 @@
 Those of synth-stage are in `test_synth_stage.py`.
 """
 
-import hashlib
 from pathlib import Path
 
 import pytest
@@ -11,20 +10,11 @@ import pytest
 from facerf_cli.batch.settings import Shard
 from facerf_cli.main import main
 from facerf_cli.run.logs import configure_logging
+from tests.cli.folders import tree
 from tests.dataset.capture import write_capture
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.toy_protocol import evaluate
-
-Said = pytest.CaptureFixture[str]
-
-
-def tree(folder: Path) -> dict[str, str]:
-    """Every file but the reports and indexes, which hold times."""
-    return {
-        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.name.startswith(("report", ".facerf-index"))
-    }
+from tests.kinds import Said
 
 
 def test_evaluate(tmp_path: Path) -> None:

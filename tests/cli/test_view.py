@@ -17,6 +17,7 @@ from facerf_cli.work.matte_models import MatteModel
 from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.view_photos import write_index
+from tests.kinds import Said
 
 
 @pytest.fixture
@@ -28,33 +29,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_one_page_takes_the_name_that_is_given(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", str(folder / "in" / "a.jpg"), "-o", str(folder / "me.html"), "--dry-run"]) == 0
-    assert capsys.readouterr().out.strip().endswith(f"-> {folder / 'me.html'}")
-
-
-def test_pages_of_a_folder_mirror_its_tree(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", str(folder / "in"), "-o", str(folder / "out"), "--dry-run"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(" -> ")[1] for line in lines] == [
-        str(folder / "out" / "a.html"),
-        str(folder / "out" / "b" / "c.html"),
-    ]
-
-
-def test_several_photos_are_not_one_page(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["view", str(folder / "in"), "-o", str(folder / "me.html")]) == 2
-    assert "is one file" in capsys.readouterr().err
-
-
-def test_a_photo_named_index_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "in" / "a.jpg").rename(folder / "in" / "index.jpg")
-    assert main(["view", str(folder / "in"), "-o", str(folder / "out")]) == 2
-    assert "rename the photo" in capsys.readouterr().err
-
-
-def test_the_exposure_of_a_page_s_command_is_understood() -> None:
-    assert parse_exposure("1.37") == 1.37 and parse_exposure("auto") == "auto"
+def test_a_page_takes_the_name_that_is_given_and_a_folder_is_mirrored(folder: Path, capsys: Said) -> None:
+    for given, output, pages in (
+        ("in/a.jpg", "me.html", ["me.html"]), ("in", "out", ["out/a.html", "out/b/c.html"])
+    ):  # fmt: skip
+        assert main(["view", str(folder / given), "-o", str(folder / output), "--dry-run"]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split(" -> ")[1] for line in lines] == [str(folder / page) for page in pages]
+    assert parse_exposure("1.37") == 1.37 and parse_exposure("auto") == "auto"  # as a page's command says
 
 
 def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item, collect_items
+from facerf_cli.batch.made_from import Recipe
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
@@ -31,7 +32,9 @@ class Copy:
         data = item.input_path.read_bytes()
         logging.getLogger(LOGGER_NAME).warning("at %s", item.name)
         if data == b"bad":
-            raise InputError(f"{item.input_path}: is bad")
+            raise InputError(f"{item.input_path}: is bad;\n try another")
+        if data == b"bug":
+            raise RuntimeError("a bug")
         if data == b"stop":
             raise FacerfError("the checkpoint is broken")
         if data == b"die":
@@ -50,7 +53,7 @@ class Copy:
         if data == b"late" and not (self.notes / "late").exists():
             self.note("late", item.name)
             os.kill(os.getpid(), signal.SIGKILL)
-        return Outcome([path], {"bytes": len(data)})
+        return Outcome([path], {"bytes": len(data), "ratio": float("nan")})
 
     def note(self, name: str, line: str) -> None:
         with (self.notes / name).open("a", errors="surrogateescape") as stream:
@@ -63,18 +66,22 @@ class Copy:
 
 
 def run(
-    photos: Path, output: Path, shard: Shard | None = None, ray: str | None = None, **options: object
+    inputs: Path | list[Path],
+    output: Path,
+    shard: Shard | None = None,
+    ray: str | None = None,
+    recipe: Recipe | None = None,
+    **options: object,
 ) -> int:
-    """Copy PHOTOS to OUTPUT; notes go to the folder above."""
+    """Copy photos to OUTPUT; notes go to the folder above."""
+    configure_logging()
     batch = BatchOptions(output, shard=shard or Shard(), ray=ray, **options)  # type: ignore[arg-type]
-    items = collect_items([str(photos)], output)
-    return run_items(
-        "copy", items, Copy(output.parent), outputs_of, batch, Settings(), lambda digest_of: [{}]
-    )
+    items = collect_items([str(path) for path in ([inputs] if isinstance(inputs, Path) else inputs)], output)
+    work, settings = Copy(output.parent), Settings()
+    return run_items("copy", items, work, outputs_of, batch, settings, lambda digest_of: [recipe or {}])
 
 
 if __name__ == "__main__":
     from tests.cli.toy_batch import run as run_importable
 
-    configure_logging()
     run_importable(Path(sys.argv[1]), Path(sys.argv[2]), ray="local", jobs=2)

@@ -34,13 +34,14 @@ from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.kinds import Folders, Log, Patch
 from tests.stacks import read_olat_stack
 
 CROP_PX = 48
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: Folders) -> Dataset:
     return write_small_dataset(tmp_path_factory.mktemp("dataset"), lights=20, crop_px=CROP_PX)
 
 
@@ -74,7 +75,7 @@ def test_pairs_are_the_datasets_images_exposed(dataset: Dataset, reader: PairRea
         assert torch.allclose(found.target[0], expected, rtol=1e-3, atol=1e-5)
 
 
-def test_light_is_in_the_targets_camera_space(dataset: Dataset, reader: PairReader) -> None:
+def test_light_and_landmarks_follow_camera_and_crop(dataset: Dataset, reader: PairReader) -> None:
     """What it lights of a Lambertian face is what looks toward it."""
     for pair in reader.pairs:
         header = read_olat_stack(dataset.stack_path(pair.subject, pair.target_camera)).header
@@ -84,9 +85,6 @@ def test_light_is_in_the_targets_camera_space(dataset: Dataset, reader: PairRead
         lit = found.target[0].mean(0) > 1e-4
         assert found.light.norm().item() == pytest.approx(1, abs=1e-5)
         assert (lit == (cosine > 0))[seen].float().mean() > 0.97
-
-
-def test_landmarks_follow_the_crop(dataset: Dataset, reader: PairReader) -> None:
     pair = next(pair for pair in reader.pairs if pair.source_camera != pair.target_camera)
     smaller = open_pairs(dataset, "train", CROP_PX // 2).read(pair)
     for name, camera in (("source", pair.source_camera), ("target", pair.target_camera)):
@@ -97,9 +95,13 @@ def test_landmarks_follow_the_crop(dataset: Dataset, reader: PairReader) -> None
     assert torch.allclose(torch.nn.functional.avg_pool2d(same.target, 2), smaller.target, atol=1e-5)
 
 
-def test_crops_are_never_enlarged(dataset: Dataset) -> None:
+def test_crops_are_never_enlarged_and_heads_stand_where_their_fits_say(dataset: Dataset) -> None:
     with pytest.raises(InputError, match=f"{CROP_PX} px, the networks need {2 * CROP_PX}.*--texture-size"):
         open_pairs(dataset, "train", 2 * CROP_PX)
+    fits = [load_fit(dataset.fit_path(s, c)) for s in dataset.splits["train"] for c in dataset.cameras[s]]
+    expected = torch.stack([fit.translation_m for fit in fits]).mean(0)
+    assert torch.allclose(torch.tensor(mean_translation_m(dataset)), expected, atol=1e-6)
+    assert expected[2] < -0.9
 
 
 def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: PairReader) -> None:
@@ -131,7 +133,7 @@ def test_a_drawn_crop_is_moved_with_its_landmarks(dataset: Dataset, reader: Pair
 
 
 def test_sources_that_were_not_written_are_weighed(
-    dataset: Dataset, reader: PairReader, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, reader: PairReader, monkeypatch: Patch
 ) -> None:
     pair = reader.pairs[5]
     written = reader.read(pair)
@@ -147,14 +149,19 @@ def _generator_of(step: int, seed: int = 0) -> Callable[..., torch.Generator]:
     return lambda index, step=step: torch.Generator().manual_seed(hash((seed, step, index)))
 
 
-def test_drawing_depends_on_the_generator_alone(reader: PairReader) -> None:
+def test_drawing_depends_on_the_generator_and_is_spread_over_subjects(reader: PairReader) -> None:
     one, again, other = (reader.draw(1, _generator_of(0, seed), 0) for seed in (1, 1, 2))
     assert torch.equal(one.source, again.source) and torch.equal(one.target, again.target)
     assert not torch.equal(one.target, other.target)
+    found = spread_pairs(reader, 4, lambda pair: True)
+    assert found == spread_pairs(reader, 4, lambda pair: True)
+    assert {pair.subject for pair in found} == {pair.subject for pair in reader.pairs}
+    assert spread_pairs(reader, 99, lambda pair: pair.index == 0) == [p for p in reader.pairs if p.index == 0]
+    assert spread_pairs(reader, 3, lambda pair: False) == []
 
 
 def test_a_stack_gives_the_lazy_sources_of_many_steps(
-    dataset: Dataset, reader: PairReader, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, reader: PairReader, monkeypatch: Patch
 ) -> None:
     """They are those that reading gives, whatever the step that drawing begins at."""
     opened: list[Path] = []
@@ -174,14 +181,6 @@ def test_a_stack_gives_the_lazy_sources_of_many_steps(
     module._lazy_sources.cache_clear()
 
 
-def test_spread_is_over_subjects_and_always_the_same(reader: PairReader) -> None:
-    found = spread_pairs(reader, 4, lambda pair: True)
-    assert found == spread_pairs(reader, 4, lambda pair: True)
-    assert {pair.subject for pair in found} == {pair.subject for pair in reader.pairs}
-    assert spread_pairs(reader, 99, lambda pair: pair.index == 0) == [p for p in reader.pairs if p.index == 0]
-    assert spread_pairs(reader, 3, lambda pair: False) == []
-
-
 def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_path: Path) -> None:
     dataset = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=8, crop_px=32)
     with pytest.raises(InputError, match="in the split train; make them with `facerf relight-"):
@@ -189,13 +188,6 @@ def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_
     write_pairs(dataset, draw_pairs(dataset, envmap_names(ProceduralMaps(1, 0, 32)), 2, 0), overwrite=False)
     train, validation = (open_pairs(dataset, split, 32).pairs for split in ("train", "validation"))
     assert len(train) == 2 and validation == train
-
-
-def test_heads_stand_where_their_fits_say(dataset: Dataset) -> None:
-    fits = [load_fit(dataset.fit_path(s, c)) for s in dataset.splits["train"] for c in dataset.cameras[s]]
-    expected = torch.stack([fit.translation_m for fit in fits]).mean(0)
-    assert torch.allclose(torch.tensor(mean_translation_m(dataset)), expected, atol=1e-6)
-    assert expected[2] < -0.9
 
 
 SIDE_PX = 200
@@ -213,7 +205,7 @@ def looked_at() -> list[str]:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked_at: list[str]) -> Path:
+def folder(tmp_path: Path, monkeypatch: Patch, looked_at: list[str]) -> Path:
     """Three photos; in the two darker ones there is a face."""
 
     def find(_: object, pixels: np.ndarray, name: str) -> list[Face]:
@@ -228,12 +220,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, looked_at: list[str]
     return tmp_path
 
 
-def test_faces_are_found_once(
-    folder: Path,
-    looked_at: list[str],
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_faces_are_found_once(folder: Path, looked_at: list[str], caplog: Log, monkeypatch: Patch) -> None:
     paths, cache = sorted(folder.glob("*.png")), folder / "cache"
     with caplog.at_level(logging.WARNING):
         first = open_photos(paths, cache, SHIPPED_NETWORKS, 64)
@@ -249,7 +236,7 @@ def test_faces_are_found_once(
     assert len(looked_at) == 7  # by another network
 
 
-def test_crops_hold_their_landmarks(folder: Path) -> None:
+def test_crops_hold_their_landmarks_and_no_face_at_all_is_an_error(folder: Path) -> None:
     found = open_photos(sorted(folder.glob("*.png")), folder / "cache", SHIPPED_NETWORKS, 64)
     drawn = found.draw(torch.Generator().manual_seed(0))
     assert drawn.crops.shape == (1, 3, 64, 64) and drawn.landmarks_px.shape == (1, 68, 2)
@@ -259,6 +246,8 @@ def test_crops_hold_their_landmarks(folder: Path) -> None:
     assert full.min() > 0 and full.max() < 1 and (full[:, :, 0].amax(1) - full[:, :, 0].amin(1)).min() > 0.4
     records = [json.loads(path.read_text()) for path in (folder / "cache").glob("*.json")]
     assert sum(record["landmarks_px"] is None for record in records) == 1
+    with pytest.raises(InputError, match="--photos: no face in any of 1 photos; give"):
+        open_photos([folder / "c.png"], folder / "cache", SHIPPED_NETWORKS, 64)
 
 
 def _after_the_choice(seed: int) -> torch.Generator:
@@ -266,8 +255,3 @@ def _after_the_choice(seed: int) -> torch.Generator:
     generator = torch.Generator().manual_seed(seed)
     torch.randint(2, (), generator=generator)
     return generator
-
-
-def test_no_face_at_all_is_an_error(folder: Path) -> None:
-    with pytest.raises(InputError, match="--photos: no face in any of 1 photos; give"):
-        open_photos([folder / "c.png"], folder / "cache", SHIPPED_NETWORKS, 64)

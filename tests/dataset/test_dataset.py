@@ -91,14 +91,11 @@ def test_what_is_wrong_is_said(small: Path, tmp_path: Path, change: dict[str, An
     assert "dataset.json" in str(raised.value) and "\n" not in str(raised.value)
 
 
-def test_failed_subjects_are_left_out(small: Path, tmp_path: Path) -> None:
+def test_failed_subjects_are_left_out_and_a_stack_that_is_gone_is_named(small: Path, tmp_path: Path) -> None:
     subjects = {"0000": {"status": "done", "cameras": ["C0"]}, "0009": {"status": "failed"}}
     splits = {"train": ["0000"], "validation": [], "test": []}
     dataset = read_dataset(changed(small, tmp_path, {"subjects": subjects, "splits": splits}))
     assert dataset.subjects == ("0000",) and dataset.cameras["0000"] == ("C0",)
-
-
-def test_a_stack_that_is_gone_is_named(small: Path, tmp_path: Path) -> None:
     subjects = {"0007": {"status": "done", "cameras": ["C0"]}}
     splits: dict[str, list[str]] = {split: [] for split in SPLITS}
     with pytest.raises(InputError, match=r"0007/C0\.exr: missing"):
@@ -135,12 +132,9 @@ def test_a_split_that_is_none(text: str) -> None:
         Split.parse(text)
 
 
-def test_more_subjects_than_there_are() -> None:
+def test_splits_are_stable_disjoint_and_no_larger_than_the_dataset() -> None:
     with pytest.raises(UsageError, match="has 40"):
         Split.parse("300/10/40").counts(40)
-
-
-def test_splits_are_stable_and_disjoint() -> None:
     names = [f"{index:04d}" for index in range(200)]
     split = Split.parse("0.8/0.1/0.1")
     before, after, other = split.of(names, 0), split.of(names[:-1], 0), split.of(names, 1)

@@ -46,7 +46,7 @@ def fresh(dataset: Dataset, folder: Path) -> Dataset:
     return replace(dataset, folder=folder)
 
 
-def test_each_subject_has_its_own_lights(dataset: Dataset) -> None:
+def test_each_subject_has_its_own_lights_of_which_one_is_the_target(dataset: Dataset) -> None:
     assert dataset.lights_of("0000") == (*range(1, 7), *range(9, 20))
     assert dataset.lights_of("0001") == tuple(range(19)) and dataset.lights_of("0002") == tuple(range(20))
     for subject in dataset.subjects:
@@ -54,9 +54,6 @@ def test_each_subject_has_its_own_lights(dataset: Dataset) -> None:
         world = dataset.directions_world[list(dataset.lights_of(subject))]
         np.testing.assert_allclose(world @ header.rotation.T, header.directions, atol=1e-6)
     assert read_dataset(dataset.folder).fewer_lights == dataset.fewer_lights
-
-
-def test_a_target_is_a_light_that_the_subject_has(dataset: Dataset) -> None:
     pairs = draw_pairs(dataset, MAPS, 150, 5)
     for subject in dataset.subjects:
         asked = {pair.target_light for pair in pairs if pair.subject == subject}

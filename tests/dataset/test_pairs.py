@@ -37,13 +37,14 @@ from facerf_cli.files.write import write_exr
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.kinds import Folders, Log, Patch
 from tests.stacks import read_olat_stack
 
 MAPS = envmap_names(ProceduralMaps(4, 7, 32))
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: Folders) -> Dataset:
     return write_small_dataset(tmp_path_factory.mktemp("dataset"), crop_px=48)
 
 
@@ -188,7 +189,7 @@ def test_the_product_is_the_sum_whatever_the_parts(tmp_path: Path) -> None:
 
 
 def test_memory_bounds_what_is_held_and_changes_no_bit(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     source = dataset.stack_path("0000", "C0")
     header = read_olat_header(source)
@@ -216,7 +217,7 @@ def test_memory_bounds_what_is_held_and_changes_no_bit(
     )  # fmt: skip
 
 
-def test_parts_of_a_stack(dataset: Dataset) -> None:
+def test_parts_of_a_stack_and_a_stack_of_another_rig(dataset: Dataset) -> None:
     path = dataset.stack_path("0001", "C1")
     stack = read_olat_stack(path)
     assert torch.equal(read_olats(path), stack.olats)
@@ -224,6 +225,11 @@ def test_parts_of_a_stack(dataset: Dataset) -> None:
     header = read_olat_header(path)
     np.testing.assert_array_equal(header.normals, stack.header.normals)
     np.testing.assert_array_equal(header.directions, stack.header.directions)
+    fewer = replace(dataset, directions_world=dataset.directions_world[:12], light_ids=dataset.light_ids[:12])
+    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
+        world_to_map(fewer)
+    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
+        list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))
 
 
 def test_other_recipes_need_overwrite_and_take_the_old_images_with_them(fresh: Dataset) -> None:
@@ -245,7 +251,7 @@ def test_other_recipes_need_overwrite_and_take_the_old_images_with_them(fresh: D
     assert len(write_pairs(fresh, drawn, overwrite=True)) == 8
 
 
-def test_fewer_pairs_leave_no_image_without_its_own(fresh: Dataset) -> None:
+def test_fewer_or_other_pairs_leave_no_image_without_its_own(fresh: Dataset) -> None:
     write_pairs(fresh, draw_pairs(fresh, MAPS, 3, 0), overwrite=False)
     few = write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)  # recipes alone may go
     assert len(few) == 8
@@ -256,13 +262,17 @@ def test_fewer_pairs_leave_no_image_without_its_own(fresh: Dataset) -> None:
     assert len(read_pairs(fresh)) == 8 and image_path(fresh, "0000", 1).exists()
     write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
     assert not image_path(fresh, "0000", 1).exists()
-
-
-def test_as_many_pairs_of_other_subjects_are_other_pairs(fresh: Dataset) -> None:
     drawn = draw_pairs(fresh, MAPS, 2, 0)
     write_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
     settled = write_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
     assert [pair.subject for pair in settled] == ["0000", "0001", "0002", "0003"] == list(load_pairs(fresh))
+    path = image_path(fresh, "0000", 0)
+    path.parent.mkdir(parents=True)
+    path.write_text("of an unknown light")
+    with pytest.raises(UsageError, match="move the folder relit"):
+        write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
+    assert not path.exists()
 
 
 def test_a_map_that_changed_is_another_map(fresh: Dataset, tmp_path: Path) -> None:
@@ -323,19 +333,7 @@ def test_one_camera_predicts_itself(tmp_path: Path) -> None:
     assert render_source(dataset, pair).isfinite().all()
 
 
-def test_images_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -> None:
-    path = image_path(fresh, "0000", 0)
-    path.parent.mkdir(parents=True)
-    path.write_text("of an unknown light")
-    with pytest.raises(UsageError, match="move the folder relit"):
-        write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
-    write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
-    assert not path.exists()
-
-
-def test_every_bad_map_is_named_and_nothing_is_written(
-    fresh: Dataset, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_every_bad_map_is_named_and_nothing_is_written(fresh: Dataset, tmp_path: Path, caplog: Log) -> None:
     good = write_map(tmp_path / "good.exr", np.ones((4, 8, 3)))
     square = write_map(tmp_path / "square.exr", np.ones((4, 4, 3)))
     black = write_map(tmp_path / "black.exr", np.zeros((4, 8, 3)))
@@ -347,11 +345,3 @@ def test_every_bad_map_is_named_and_nothing_is_written(
     ):
         write_pairs(fresh, draw_pairs(fresh, maps, 20, 0), overwrite=False)
     assert not pairs_path(fresh).exists()
-
-
-def test_a_stack_of_another_rig_is_named(dataset: Dataset) -> None:
-    fewer = replace(dataset, directions_world=dataset.directions_world[:12], light_ids=dataset.light_ids[:12])
-    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
-        world_to_map(fewer)
-    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
-        list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))

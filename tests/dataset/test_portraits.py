@@ -14,6 +14,7 @@ from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.kinds import Folders, Patch
 
 LACKS = 3
 
@@ -23,7 +24,7 @@ def backgrounds() -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def portraits(tmp_path_factory: pytest.TempPathFactory) -> DatasetPortraits:
+def portraits(tmp_path_factory: Folders) -> DatasetPortraits:
     folder = tmp_path_factory.mktemp("dataset")
     write_small_dataset(folder, (2, 1, 0), 1, lights=14, crop_px=192, lacking={"0001": range(LACKS)})
     with pytest.MonkeyPatch.context() as patch:  # another test has processes
@@ -35,8 +36,22 @@ def drawn(portraits: DatasetPortraits, person: int, seed: int = 1) -> PortraitSa
     return portraits.draw([person], 2, torch.Generator().manual_seed(seed))
 
 
-def test_people_are_those_of_the_splits(portraits: DatasetPortraits) -> None:
+def test_people_are_those_of_the_splits_with_the_lights_of_their_stacks(portraits: DatasetPortraits) -> None:
     assert portraits.people(5) == ([0, 1], [2]) and portraits.people(0)[1] == []
+    # A matt face without shadows: each target is its light's cosine, but for the exposure.
+    sample = drawn(portraits, 0)
+    assert sample.targets.shape == (1, 2, 3, SIDE_PX, SIDE_PX) and sample.labelled.tolist() == [0.0]
+    sure = (sample.shares[0, SKIN] > 0.95) & (sample.inputs.covered[0, 0] > 0.5)
+    cosine = torch.einsum("tc,cij->tij", sample.lights[0], sample.inputs.normals[0]).clamp_min(0)
+    for light in range(2):
+        lambert = (sample.albedo[0].mean(0) * cosine[light])[sure]
+        found = sample.targets[0, light].mean(0)[sure]
+        if lambert.mean() > 0.02:
+            assert float(torch.corrcoef(torch.stack([lambert, found]))[0, 1]) > 0.8
+            assert float(found.mean()) == pytest.approx(float(lambert.mean()), rel=0.25)
+    whole, fewer = drawn(portraits, 0), drawn(portraits, 1)
+    assert whole.rig.shape == fewer.rig.shape and whole.rig_visible.shape == fewer.rig_visible.shape
+    assert (fewer.weights[0, -LACKS:] == 0).all() and (whole.weights[0, -LACKS:] > 0).any()
 
 
 def test_what_is_seen_lies_on_the_images(portraits: DatasetPortraits) -> None:
@@ -49,26 +64,6 @@ def test_what_is_seen_lies_on_the_images(portraits: DatasetPortraits) -> None:
     assert moves[errors.index(min(errors))] == (0, 0)
 
 
-def test_targets_are_the_stacks_lights(portraits: DatasetPortraits) -> None:
-    """A matt face without shadows: each target is its light's cosine, but for the exposure."""
-    sample = drawn(portraits, 0)
-    assert sample.targets.shape == (1, 2, 3, SIDE_PX, SIDE_PX) and sample.labelled.tolist() == [0.0]
-    sure = (sample.shares[0, SKIN] > 0.95) & (sample.inputs.covered[0, 0] > 0.5)
-    cosine = torch.einsum("tc,cij->tij", sample.lights[0], sample.inputs.normals[0]).clamp_min(0)
-    for light in range(2):
-        lambert = (sample.albedo[0].mean(0) * cosine[light])[sure]
-        found = sample.targets[0, light].mean(0)[sure]
-        if lambert.mean() > 0.02:
-            assert float(torch.corrcoef(torch.stack([lambert, found]))[0, 1]) > 0.8
-            assert float(found.mean()) == pytest.approx(float(lambert.mean()), rel=0.25)
-
-
-def test_people_with_fewer_lights_fit_into_a_batch(portraits: DatasetPortraits) -> None:
-    whole, fewer = drawn(portraits, 0), drawn(portraits, 1)
-    assert whole.rig.shape == fewer.rig.shape and whole.rig_visible.shape == fewer.rig_visible.shape
-    assert (fewer.weights[0, -LACKS:] == 0).all() and (whole.weights[0, -LACKS:] > 0).any()
-
-
 def test_finished_portraits_are_kept(portraits: DatasetPortraits) -> None:
     path = portraits.views[0][0]
     before = path.stat().st_mtime_ns
@@ -76,9 +71,7 @@ def test_finished_portraits_are_kept(portraits: DatasetPortraits) -> None:
     assert path.stat().st_mtime_ns == before
 
 
-def test_a_split_without_a_face_or_anybody_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_split_without_a_face_or_anybody_is_refused(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr("facerf_cli.dataset.portraits._make_missing", lambda *_: None)
     monkeypatch.setattr("facerf_cli.dataset.portraits._shows_a_face", lambda _: False)
     for count, expected in (

@@ -117,7 +117,7 @@ def test_a_sample_is_exposed_and_weighed_as_the_banks_are(lazy: DatasetTextures)
     assert torch.equal(again.source, sample.source) and not torch.equal(draw(lazy, 1).source, sample.source)
 
 
-def test_the_pairs_light_is_among_the_targets(lazy: DatasetTextures) -> None:
+def test_the_pairs_light_is_among_the_targets_and_the_mean_face_is_the_models(lazy: DatasetTextures) -> None:
     pairs, _ = load_pairs(lazy.dataset)["0000"]
     wanted = {pair.target_light for pair in pairs}
     for seed in range(4):
@@ -126,6 +126,12 @@ def test_the_pairs_light_is_among_the_targets(lazy: DatasetTextures) -> None:
         rotations = [_rotation(lazy, pair.target_camera) for pair in pairs]
         numbers = {int((world @ rotation.T @ face.lights[0]).argmax()) for rotation in rotations}
         assert numbers & wanted and len(face.lights) == 2
+    normals, visibility, directions = lazy.mean_face()
+    assert len(visibility) == len(directions) == LIGHTS
+    front, behind = int(directions[:, 2].argmax()), int(directions[:, 2].argmin())
+    assert visibility[front].mean() > 0.8 > 0.3 > visibility[behind].mean()
+    np.testing.assert_allclose(normals.norm(dim=0), 1, atol=1e-5)
+    assert image_path(lazy.dataset, "0000", 3).name == "00003.exr"
 
 
 def test_a_target_of_another_camera_has_its_normals_and_lights(lazy: DatasetTextures) -> None:
@@ -222,12 +228,3 @@ def test_the_licence_is_what_the_dataset_says(
     content = json.loads((dataset.folder / "dataset.json").read_text()) | {"provenance": provenance}
     (tmp_path / "dataset.json").write_text(json.dumps(content))
     assert words in open_dataset_textures(tmp_path, "builtin", SIDE, 1, LIGHTS).provenance["licence"]
-
-
-def test_the_mean_face_is_that_of_the_model(lazy: DatasetTextures) -> None:
-    normals, visibility, directions = lazy.mean_face()
-    assert len(visibility) == len(directions) == LIGHTS
-    front, behind = int(directions[:, 2].argmax()), int(directions[:, 2].argmin())
-    assert visibility[front].mean() > 0.8 > 0.3 > visibility[behind].mean()
-    np.testing.assert_allclose(normals.norm(dim=0), 1, atol=1e-5)
-    assert image_path(lazy.dataset, "0000", 3).name == "00003.exr"

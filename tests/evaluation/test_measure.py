@@ -109,9 +109,14 @@ def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.M
     assert "lpips" not in measure(comparison, Measures())[0].values
 
 
-def test_what_a_protocol_measured_itself_is_kept(comparison: Comparison) -> None:
+def test_what_a_protocol_measured_is_kept_and_a_scale_a_channel_forgives_colour(
+    comparison: Comparison,
+) -> None:
     near, far = measure(replace(comparison, extra={"far": {"light_error_deg": 3.0}}), Measures())
     assert far.values["light_error_deg"] == 3 and "light_error_deg" not in near.values
+    truth, mask = np.random.default_rng(0).random((6, 8, 3)), np.ones((6, 8))
+    assert si_mse_channels(truth * [1, 2, 3], truth, mask) < 1e-20 < si_mse(truth * [1, 2, 3], truth, mask)
+    assert si_mse_channels(truth[::-1], truth, mask) > 0.01
 
 
 def test_what_cannot_be_compared_is_refused_in_words(comparison: Comparison) -> None:
@@ -138,9 +143,3 @@ def test_a_black_prediction_is_measured_and_a_truth_near_black_has_no_si_mse(com
             for row in measure(dim, Measures(space=space)):
                 unknown = {name for name, value in row.values.items() if np.isnan(value)}
                 assert unknown == (set() if measured else {"si_mse", "si_mse_clipped", "si_mse_channels"})
-
-
-def test_a_scale_a_channel_forgives_colour_alone() -> None:
-    truth, mask = np.random.default_rng(0).random((6, 8, 3)), np.ones((6, 8))
-    assert si_mse_channels(truth * [1, 2, 3], truth, mask) < 1e-20 < si_mse(truth * [1, 2, 3], truth, mask)
-    assert si_mse_channels(truth[::-1], truth, mask) > 0.01

@@ -49,10 +49,19 @@ def ours(tmp_path: Path) -> Path:
     return tmp_path / "ours"
 
 
-def test_an_image_is_no_person() -> None:
+def test_an_image_is_no_person_and_folders_that_are_none_are_refused(truths: Path, ours: Path) -> None:
     described = {"b": Case("b", "bo", {"age": 3.0})}
     assert [case_of(name, described).person for name in ("a", "b", "anna/1/2")] == ["", "bo", "anna"]
     assert case_of("b", described).facts == {"age": 3.0}
+    (truths.parent / "empty").mkdir()
+    for predictions, words in (
+        ([truths.parent / "missing"], "no such folder"),
+        ([ours, truths.parent / "empty"], "no images"),
+        ([truths], "given twice"),
+        ([], "no folder of predictions"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            collect_pairs(predictions, truths)
 
 
 def test_images_of_all_formats_meet_their_truths(truths: Path, ours: Path) -> None:
@@ -154,18 +163,6 @@ def test_lists_that_cannot_be_used(truths: Path, ours: Path, text: str, words: s
     path.write_text(text)
     with pytest.raises(InputError, match=words):
         collect_pairs([ours], truths, facts=path)
-
-
-def test_folders_that_are_none(truths: Path, ours: Path) -> None:
-    (truths.parent / "empty").mkdir()
-    for predictions, words in (
-        ([truths.parent / "missing"], "no such folder"),
-        ([ours, truths.parent / "empty"], "no images"),
-        ([truths], "given twice"),
-        ([], "no folder of predictions"),
-    ):
-        with pytest.raises(UsageError, match=words):
-            collect_pairs(predictions, truths)
 
 
 @pytest.mark.parametrize(

@@ -45,10 +45,11 @@ from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
+from tests.kinds import Folders, Log, Patch
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: Folders) -> Dataset:
     return write_small_dataset(tmp_path_factory.mktemp("dataset"), counts=(0, 0, 1), lights=30, crop_px=96)
 
 
@@ -160,9 +161,7 @@ def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> No
         assert si_mse(found.predictions["unlit"], found.truth, found.mask) < 0.05 * energy
 
 
-def test_the_mean_face_is_compared_where_both_see_the_face(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_mean_face_is_compared_where_both_see_the_face(dataset: Dataset, monkeypatch: Patch) -> None:
     person = found_by_truth(dataset, monkeypatch)
     mean = FaceModelOnly(FACE_ONLY.face.pose_only())
     face = person.portrait(pair(0, "C1", "C1", 0))
@@ -177,7 +176,7 @@ def test_the_mean_face_is_compared_where_both_see_the_face(
     assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
-def found_by_truth(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, blind: str = "") -> PersonOfAlbedo:
+def found_by_truth(dataset: Dataset, monkeypatch: Patch, blind: str = "") -> PersonOfAlbedo:
     """A person in whose images faces are found where they are; in those of the camera `blind` none is."""
     joint = person_of(dataset)
     cameras = {camera: joint.lit(camera).face for camera in ("C0", "C1")}
@@ -197,7 +196,7 @@ def found_by_truth(dataset: Dataset, monkeypatch: pytest.MonkeyPatch, blind: str
     return person_of(dataset, "landmarks")
 
 
-def test_each_image_is_a_photo_of_its_own(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_image_is_a_photo_of_its_own(dataset: Dataset, monkeypatch: Patch) -> None:
     """Its head is fitted to the landmarks that are found in it, in the crop that they give."""
     asked = pair(0, "C0", "C0", 0)
     alone = found_by_truth(dataset, monkeypatch).portrait(asked).by(FACE_ONLY)
@@ -211,9 +210,7 @@ def test_each_image_is_a_photo_of_its_own(dataset: Dataset, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("target", ["C0", "C1"])
-def test_monocular_predictions_lie_on_the_truth(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, target: str
-) -> None:
+def test_monocular_predictions_lie_on_the_truth(dataset: Dataset, monkeypatch: Patch, target: str) -> None:
     person = found_by_truth(dataset, monkeypatch)
     asked = pair(2, "C0", target, side_light(person, target))
     (found,) = olats(person, [asked], [unlit()])
@@ -224,7 +221,7 @@ def test_monocular_predictions_lie_on_the_truth(
 
 
 def test_in_its_own_pose_the_composite_is_the_image_of_relight_in_the_crop(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
+    dataset: Dataset, monkeypatch: Patch
 ) -> None:
     """A reflectance that changes nothing gives the photo back: cropped as the truth and the source are."""
     person = found_by_truth(dataset, monkeypatch)
@@ -247,9 +244,7 @@ def test_in_its_own_pose_the_composite_is_the_image_of_relight_in_the_crop(
     assert torch.equal(asked_for[0], direction[None])
 
 
-def test_in_another_pose_the_shape_stays_the_sources(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_in_another_pose_the_shape_stays_the_sources(dataset: Dataset, monkeypatch: Patch) -> None:
     person = found_by_truth(dataset, monkeypatch)
     source = person.portrait(pair(0, "C0", "C0", 0)).by(FACE_ONLY)
     target = person.lit("C1")
@@ -260,7 +255,7 @@ def test_in_another_pose_the_shape_stays_the_sources(
 
 
 def test_images_without_a_face_are_left_out_and_named(
-    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    dataset: Dataset, monkeypatch: Patch, caplog: Log
 ) -> None:
     person = found_by_truth(dataset, monkeypatch, blind="C1")
     light = side_light(person, "C0")
@@ -269,14 +264,6 @@ def test_images_without_a_face_are_left_out_and_named(
         found = list(olats(person, asked, [unlit()]))
     assert [comparison.case.name for comparison in found] == ["0000/00000"]
     assert sum("left out" in record.message for record in caplog.records) == 2
-
-
-def test_any_other_trouble_with_a_source_is_an_error(person: DatasetPerson) -> None:
-    def compare(*_: object) -> list[Comparison]:
-        raise InputError("damaged")
-
-    with pytest.raises(InputError, match="damaged"):
-        list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare, []))
 
 
 def test_joint_fits_of_another_face_model_are_refused(dataset: Dataset) -> None:
@@ -294,27 +281,34 @@ def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> N
     assert kept.mask[eyes].min() > 0.5 and (kept.mask >= view.mask).all()
 
 
-def test_a_face_of_which_nothing_is_seen_is_named(person: DatasetPerson) -> None:
+def test_a_photo_of_which_nothing_is_seen_or_that_is_damaged_is_an_error(person: DatasetPerson) -> None:
     lit = person.lit("C0")
     unseen = replace(lit.photo, alpha=0 * person.header("C0").seen)
     with pytest.raises(InputError, match="0000/C0: nothing of the fitted face"):
         replace(lit, photo=unseen, _views={}).by(FACE_ONLY)
 
+    def compare(*_: object) -> list[Comparison]:
+        raise InputError("damaged")
 
-def test_couples_are_of_two_cameras_and_two_maps_and_each_image_is_in_one() -> None:
+    with pytest.raises(InputError, match="damaged"):
+        list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare, []))
+
+
+def test_couples_and_presets_are_spread_evenly() -> None:
     sources = [("C0", "a"), ("C0", "b"), ("C1", "a"), ("C1", "a"), ("C1", "c"), ("C0", "a")]
     pairs = [pair(index, camera, camera, 0, envmap) for index, (camera, envmap) in enumerate(sources)]
     couples = [(a.index, b.index) for a, b in couples_of(pairs)]
     assert couples == [(1, 2), (0, 4)]
-
-
-def test_a_preset_takes_the_first_of_each_before_the_second_of_any() -> None:
     groups = {"a": [1, 2, 3, 4], "b": [5], "c": [6, 7]}
     assert evenly(groups, 4, "") == {"a": [1, 2], "b": [5], "c": [6]}
     assert evenly(groups, 99, "") == groups and evenly(groups, 1, "") == {"a": [1]}
+    assert angle_class(0) == angle_class(30) == "0 to 30 deg"
+    assert (angle_class(31), angle_class(180)) == ("30 to 60 deg", "90 to 180 deg")
+    assert turn_class(0.1) == "none" and turn_class(100) == "60 to 180 deg"
+    assert abs(angle_of(pose_to_rotation(-50, 0, 0)) - 50) < 1e-3
 
 
-def test_the_papers_pairs_are_of_its_maps_and_as_many_as_there_are(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_papers_pairs_are_of_its_maps_and_as_many_as_there_are(caplog: Log) -> None:
     cameras = ("C0", "C1", "C2")
     many = {
         name: [replace(pair(i, "C0", cameras[i % 3], 0, f"m{i % 200}"), subject=name) for i in range(12_000)]
@@ -327,13 +321,6 @@ def test_the_papers_pairs_are_of_its_maps_and_as_many_as_there_are(caplog: pytes
     few = {name: members[:30] for name, members in many.items()}
     assert sum(map(len, olat_pairs(few, PAPER).values())) == 60
     assert any("60" not in line and "20 pairs of the same pose" in line for line in caplog.messages)
-
-
-def test_classes_of_angles() -> None:
-    assert angle_class(0) == angle_class(30) == "0 to 30 deg"
-    assert (angle_class(31), angle_class(180)) == ("30 to 60 deg", "90 to 180 deg")
-    assert turn_class(0.1) == "none" and turn_class(100) == "60 to 180 deg"
-    assert abs(angle_of(pose_to_rotation(-50, 0, 0)) - 50) < 1e-3
 
 
 def test_the_true_light_is_that_of_the_pairs_map(tmp_path: Path) -> None:

@@ -81,7 +81,7 @@ def test_one_file_that_needs_nothing_else(tmp_path: Path) -> None:
     assert {attributes["href"][1:] for tag, attributes in reader.tags if tag == "a"} == ids
 
 
-def test_nothing_becomes_markup(tmp_path: Path) -> None:
+def test_nothing_becomes_markup_and_the_page_is_bounded(tmp_path: Path) -> None:
     found = [
         replace(row, case=row.case + NASTY, person=NASTY, method=NASTY, facts={NASTY: NASTY})
         for row in rows([1, 2])
@@ -89,9 +89,6 @@ def test_nothing_becomes_markup(tmp_path: Path) -> None:
     reader = Reader(written(tmp_path, found, text=NASTY))
     assert "script" not in {tag for tag, _ in reader.tags}
     assert {name for _, attributes in reader.tags for name in attributes} <= set(KNOWN.split())
-
-
-def test_the_worst_come_first_and_the_page_is_bounded(tmp_path: Path) -> None:
     errors = list(np.random.default_rng(0).permutation(100) / 100)
     found = rows(errors)
     cases = [row.case for row in found]

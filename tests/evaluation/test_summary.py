@@ -68,17 +68,14 @@ def test_a_table_of_long_names_loses_no_column(capsys: pytest.CaptureFixture[str
     assert out.count(" %") == 1 + 3  # of the interval's column, and the second method's in all groups
 
 
-def test_without_people_there_are_no_intervals() -> None:
+def test_without_people_there_are_no_intervals_and_values_that_are_none_are_counted() -> None:
     unknown = [replace(row, person="" if row.case == "case0" else row.person) for row in rows()]
     summary = summarise(LAYOUT, unknown)
     for cell in summary.groups[0].cells["si_mse"].values():
         assert math.isnan(cell.interval.low) and cell.interval.mean > 0
         assert cell.difference is None or math.isnan(cell.difference.high)
     assert (summary.size, summarise(LAYOUT, rows()).size) == ("4 images", "4 images of 2 people")
-
-
-def test_values_that_are_none_are_counted_not_hidden() -> None:
-    """Such as the Si-MSE of images near black, which must not improve the mean."""
+    # Such as the Si-MSE of images near black, which must not improve the mean.
     found = rows()
     found[0].values["si_mse"] = math.nan
     summary = summarise(LAYOUT, found)
@@ -100,9 +97,12 @@ def test_text_breaks_the_tables_down_and_numbers_do_not() -> None:
     assert summarise(Layout("Toy"), rows()).groups == summary.groups  # by all text, where none is named
 
 
-def test_an_image_measured_twice_is_our_bug() -> None:
+def test_bins_sort_as_numbers_do_and_an_image_measured_twice_is_our_bug() -> None:
     with pytest.raises(ValueError, match="twice"):
         summarise(LAYOUT, [*rows(), rows()[0]])
+    assert sorted(["90 to 180 deg", "5 deg", "30 to 60 deg", "10 deg"], key=natural) == [
+        "5 deg", "10 deg", "30 to 60 deg", "90 to 180 deg",
+    ]  # fmt: skip
 
 
 def test_published_figures_are_those_of_their_group() -> None:
@@ -115,9 +115,3 @@ def test_published_figures_are_those_of_their_group() -> None:
     assert all(
         figure.metric in METRICS and "other data" in figure.data for table in tables for figure in table
     )
-
-
-def test_bins_sort_as_numbers_do() -> None:
-    assert sorted(["90 to 180 deg", "5 deg", "30 to 60 deg", "10 deg"], key=natural) == [
-        "5 deg", "10 deg", "30 to 60 deg", "90 to 180 deg",
-    ]  # fmt: skip

@@ -34,22 +34,20 @@ def test_a_dot_lands_where_the_transform_says(size_px):
     assert centroid_px(crop.apply(image)) == pytest.approx(crop.to_crop(np.array([51.2, 60.9])), abs=0.01)
 
 
-def test_positions_go_there_and_back():
+def test_crops_copy_average_and_keep_to_the_range_of_the_image():
+    image = np.random.default_rng(0).random((30, 45, 3), np.float32)
+    assert Crop(7, 4, 20, 20).apply(image) == pytest.approx(image[4:24, 7:27], abs=1e-6)
+    board = (np.indices((200, 260)).sum(0) % 2).astype(np.float32)[..., None]
+    assert np.ptp(Crop(20, 10, 150, 41).apply(board)) < 0.02
+    image = np.zeros((20, 30, 3), np.float32)
+    image[10, 15] = 1e4
+    cut = Crop(5, 2, 16, 128).apply(image)
+    assert cut.min() == 0 and cut.max() <= 1e4
     crop = Crop(-20.5, 31.0, 333.0, 256)
     points = np.random.default_rng(0).uniform(-50, 400, (9, 2))
     assert crop.to_photo(crop.to_crop(points)) == pytest.approx(points)
     assert crop.to_crop(np.array([-20.5, 31.0])) == pytest.approx([0, 0])
     assert crop.camera.focal_px == 4 * 256
-
-
-def test_a_crop_of_the_pixels_themselves_copies_them():
-    image = np.random.default_rng(0).random((30, 45, 3), np.float32)
-    assert Crop(7, 4, 20, 20).apply(image) == pytest.approx(image[4:24, 7:27], abs=1e-6)
-
-
-def test_shrinking_a_checkerboard_leaves_grey():
-    board = (np.indices((200, 260)).sum(0) % 2).astype(np.float32)[..., None]
-    assert np.ptp(Crop(20, 10, 150, 41).apply(board)) < 0.02
 
 
 @pytest.mark.parametrize("size_px, off_px", [(33, 0.03), (50, 1e-4), (170, 1e-4)])
@@ -62,13 +60,6 @@ def test_ramps_stay_straight(size_px, off_px):
     assert cut == pytest.approx(expected, abs=off_px)
 
 
-def test_light_stays_inside_the_range_of_the_image():
-    image = np.zeros((20, 30, 3), np.float32)
-    image[10, 15] = 1e4
-    cut = Crop(5, 2, 16, 128).apply(image)
-    assert cut.min() == 0 and cut.max() <= 1e4
-
-
 def test_beyond_the_border_the_edge_goes_on_and_is_marked():
     image = np.random.default_rng(0).random((12, 20, 1), np.float32)
     crop = Crop(-8, -4, 32, 32)
@@ -76,9 +67,6 @@ def test_beyond_the_border_the_edge_goes_on_and_is_marked():
     assert valid.sum() == 12 * 20 and valid[4:16, 8:28].all()
     assert cut[:4, 8:28] == pytest.approx(np.repeat(cut[4:5, 8:28], 4, 0), abs=1e-6)
     assert cut[31, 31] == pytest.approx(image[-1, -1], abs=1e-6)
-
-
-def test_a_crop_wholly_outside_holds_the_edge():
     image = np.full((10, 10, 3), 0.25, np.float32)
     assert Crop(50, 50, 10, 8).apply(image) == pytest.approx(np.full((8, 8, 3), 0.25))
 
@@ -94,14 +82,11 @@ def test_chin_and_forehead_fit_however_the_head_lies(turn_deg):
     assert inside.min() > 4 and inside.max() < 252
 
 
-def test_the_crop_follows_the_face():
+def test_the_crop_follows_the_face_and_that_of_a_box_is_larger():
     plain, moved = from_landmarks(frontal_landmarks(), 256), from_landmarks(2 * frontal_landmarks(), 256)
     assert moved.side_px == pytest.approx(2 * plain.side_px)
     assert moved.x0_px == pytest.approx(2 * plain.x0_px)
-
-
-def test_the_crop_around_a_box_is_larger_and_a_little_higher():
-    """A detector's box holds brows to chin; the spans are measured (benchmarks/crop_boxes.py)."""
+    # A detector's box holds brows to chin; the spans are measured (benchmarks/crop_boxes.py).
     crop = from_box((100.0, 40.0, 200.0, 140.0), 64)
     assert crop == Crop(150 - 74, 90 - 2 - 74, 148, 64)
     for bad in ((5.0, 0.0, 5.0, 0.0), (0.0, 0.0, np.inf, 9.0), (0.0, 0.0, np.nan, 9.0)):
@@ -124,13 +109,10 @@ def test_what_is_no_face_is_refused(landmarks):
         check_landmarks(landmarks)
 
 
-def test_torch_is_not_what_apply_takes():
+def test_tensors_and_crops_of_another_world_are_refused():
     with pytest.raises(ValueError, match=r"\[H, W, C\]"):
         Crop(0, 0, 8, 8).apply(torch.zeros(8, 8).numpy())
-
-
-def test_a_crop_of_another_world_is_refused_before_it_is_resampled():
-    """Points far outside the photo once took 23 GB: the weights grow with the crop's side."""
+    # Points far outside the photo once took 23 GB: the weights grow with the crop's side.
     with pytest.raises(InputError, match="pixels wide and the photo 12"):
         Crop(0, 0, 1e8, 8).apply(np.ones((12, 9, 3), np.float32))
 

@@ -15,6 +15,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from tests.kinds import Patch
 
 PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
 
@@ -29,22 +30,17 @@ def descriptor(landmarks_px: np.ndarray) -> np.ndarray:
     return face_descriptor(PHOTO, landmarks_px)
 
 
-def test_a_face_is_its_own_wherever_it_stands(descriptor: np.ndarray, landmarks_px: np.ndarray) -> None:
+def test_a_face_is_its_own_whatever_its_exposure(descriptor: np.ndarray, landmarks_px: np.ndarray) -> None:
     moved = np.pad(PHOTO, ((30, 5), (12, 40), (0, 0)))
     assert descriptor.shape == (128,)
     assert np.linalg.norm(face_descriptor(moved, np.add(landmarks_px, (12, 30))) - descriptor) < 0.02
-
-
-def test_exposure_and_noise_say_little_of_a_face_and_another_place_much(
-    descriptor: np.ndarray, landmarks_px: np.ndarray
-) -> None:
     darker = PHOTO * 0.8 + 0.01 * np.random.default_rng(0).normal(size=PHOTO.shape)
     elsewhere = face_descriptor(PHOTO, np.add(landmarks_px, (60, 90)))
     assert np.linalg.norm(face_descriptor(darker, landmarks_px) - descriptor) < 0.2
     assert np.linalg.norm(elsewhere - descriptor) > 0.5
 
 
-def test_points_are_dlibs_whole_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_points_are_dlibs_whole_pixels(monkeypatch: Patch) -> None:
     class Recorder:
         def compute_face_descriptor(self, image: np.ndarray, shape: Any) -> list[float]:
             self.image, self.points = image, [(point.x, point.y) for point in shape.parts()]
@@ -71,16 +67,11 @@ def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> Non
     )
 
 
-def test_other_shapes_are_refused(landmarks_px: np.ndarray) -> None:
+def test_other_shapes_and_a_missing_model_are_refused(landmarks_px: np.ndarray, monkeypatch: Patch) -> None:
     with pytest.raises(ValueError, match=r"\(330, 290\)"):
         face_descriptor(PHOTO[..., 0], landmarks_px)
     with pytest.raises(ValueError, match=r"\(67, 2\)"):
         face_descriptor(PHOTO, landmarks_px[:67])
-
-
-def test_a_missing_model_says_what_to_install(
-    monkeypatch: pytest.MonkeyPatch, landmarks_px: np.ndarray
-) -> None:
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     module._recognition.cache_clear()
     with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):

@@ -75,24 +75,18 @@ def test_the_pose_of_the_mean_is_found_exactly(model, pose):
     assert fit.alpha.abs().max() < 1e-2 and fit.error_iod.item() < 1e-5
 
 
-def test_a_model_whose_shapes_do_nothing_is_posed_alone(model):
+def test_priors_hold_the_shape_as_strongly_as_they_are_weighed(model):
+    landmarks_px = see(model, *coefficients(model, 0.5), (12, 5, 3))
+    assert fit_batch(model, landmarks_px, CAMERA, WEAK, INNER_ONLY).error_iod.item() < 2e-3
+    landmarks_px = see(model, *coefficients(model, 1), (12, 5, 3))
+    weak = fit_batch(model, landmarks_px, CAMERA, WEAK)
+    strong = fit_batch(model, landmarks_px, CAMERA, FitSettings(identity_std=0.01, expression_std=0.01))
+    assert strong.alpha.norm() < 0.02 < 0.1 * weak.alpha.norm()
     still = replace(model, identity=model.identity[:1] * 0, expression=model.expression[:1] * 0)
     landmarks_px = see(still, *coefficients(still, 0, batch=2), (25, -10, 5))
     fit = fit_batch(still, landmarks_px, CAMERA, FitSettings(steps=40), INNER_ONLY.expand(2, -1))
     assert angle_deg(fit.rotation[1], pose_to_rotation(25, -10, 5)) < 0.02
     assert fit.alpha.shape == fit.beta.shape == (2, 1) and fit.error_iod.max() < 1e-5
-
-
-def test_with_weak_priors_any_shape_is_reached(model):
-    landmarks_px = see(model, *coefficients(model, 0.5), (12, 5, 3))
-    assert fit_batch(model, landmarks_px, CAMERA, WEAK, INNER_ONLY).error_iod.item() < 2e-3
-
-
-def test_strong_priors_keep_the_shape_at_the_mean(model):
-    landmarks_px = see(model, *coefficients(model, 1), (12, 5, 3))
-    weak = fit_batch(model, landmarks_px, CAMERA, WEAK)
-    strong = fit_batch(model, landmarks_px, CAMERA, FitSettings(identity_std=0.01, expression_std=0.01))
-    assert strong.alpha.norm() < 0.02 < 0.1 * weak.alpha.norm()
 
 
 def test_the_cost_is_that_of_landmarks_and_of_priors(model):
@@ -126,7 +120,7 @@ def test_the_jacobian_is_the_derivative(model):
         assert torch.allclose(analytic[..., column], numeric, rtol=1e-5, atol=1e-5)
 
 
-def test_a_batch_is_its_faces_one_by_one(model):
+def test_a_batch_is_its_faces_one_by_one_and_steps_never_raise_the_cost(model):
     alpha, beta = coefficients(model, 0.4, batch=len(POSES))
     landmarks_px = torch.cat([see(model, alpha[[i]], beta[[i]], pose) for i, pose in enumerate(POSES)])
     together = fit_batch(model, landmarks_px, CAMERA)
@@ -134,16 +128,13 @@ def test_a_batch_is_its_faces_one_by_one(model):
         alone = fit_batch(model, landmarks_px[[index]], CAMERA)
         assert torch.allclose(alone.alpha[0], together.alpha[index], atol=1e-5)
         assert torch.allclose(alone.translation_m[0], together.translation_m[index], atol=1e-6)
-
-
-def test_steps_never_raise_the_cost_and_more_of_them_settle(model):
     landmarks_px = see(model, *coefficients(model, 0.8), (20, 5, 0))
     few, many = (fit_batch(model, landmarks_px, CAMERA, FitSettings(steps=steps)) for steps in (20, 60))
     assert (few.error_iod - many.error_iod).abs().item() < 2e-3
     assert angle_deg(few.rotation[0], many.rotation[0]) < 0.5
 
 
-def test_one_wrong_landmark_is_not_believed(model):
+def test_wrong_landmarks_are_not_believed_and_those_without_trust_count_for_nothing(model):
     landmarks_px = see(model, *coefficients(model, 0.2), (5, 0, 0))
     wrong = landmarks_px.clone()
     wrong[0, 33] += 40
@@ -153,9 +144,6 @@ def test_one_wrong_landmark_is_not_believed(model):
     assert angle_deg(right.rotation[0], off.rotation[0]) < 0.5 * angle_deg(
         right.rotation[0], quadratic.rotation[0]
     )
-
-
-def test_a_landmark_without_trust_counts_for_nothing(model):
     landmarks_px = see(model, *coefficients(model, 0.3), (5, 0, 0))
     wrong = landmarks_px.clone()
     wrong[0, :5] += 60
@@ -193,18 +181,19 @@ def test_degenerate_landmarks_are_an_input_error(model, bad):
         fit_batch(model, torch.from_numpy(np.stack([bad, bad])), CAMERA)
 
 
-def test_a_fit_survives_its_file(model, tmp_path):
+def test_a_fit_survives_its_file_which_holds_nothing_of_memory(model, tmp_path):
     fit = fit_landmarks(model, see(model, *coefficients(model, 0.3), (9, 3, 1))[0].numpy(), CROP)
     save_fit(tmp_path / "fit.npz", fit)
     again = load_fit(tmp_path / "fit.npz")
     assert again.crop == fit.crop and again.model == model.name and again.quality == fit.quality
     assert torch.equal(again.vertices_camera(model), fit.vertices_camera(model))
-
-
-def test_what_is_no_fit_is_refused(model, tmp_path):
+    fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
+    error_iod = 0.03456789123
+    a, b = (replace(fit, error_iod=error) for error in (error_iod, np.nextafter(error_iod, 1)))
+    assert a.error_iod != b.error_iod
+    assert fit_to_arrays(a)["error_iod"].tobytes() == fit_to_arrays(b)["error_iod"].tobytes()
     (tmp_path / "text.npz").write_text("hello")
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
     np.savez(tmp_path / "endless.npz", **fit_to_arrays(fit) | {"size_px": np.inf})
     for name in ("text.npz", "other.npz", "endless.npz", "missing.npz"):
         with pytest.raises(InputError, match=name):
@@ -224,16 +213,13 @@ def test_arrays_that_are_no_fit_are_refused(model, name, value):
         fit_from_arrays(arrays | {name: np.asarray(value)})
 
 
-def test_a_fit_knows_its_model_and_its_quality(model):
+def test_a_fit_knows_its_model_its_quality_and_the_turn_to_another(model):
     fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
     assert fit.quality == "good"
     assert [replace(fit, error_iod=error).quality for error in (0.045, 0.06, 0.2)] == ["good", "fair", "poor"]
     with pytest.raises(ValueError, match="other"):
         fit.vertices_camera(replace(model, name="other"))
-
-
-def test_a_turn_leads_from_this_pose_to_the_other(model):
-    """Vectors in camera space, as normals are: N_t = turn N_s."""
+    # Vectors in camera space, as normals are: N_t = turn N_s.
     source, target = pose_to_rotation(30.0, 10.0, 5.0), pose_to_rotation(-20.0, 0.0, 15.0)
     fit = replace(
         fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP), rotation=source
@@ -241,14 +227,6 @@ def test_a_turn_leads_from_this_pose_to_the_other(model):
     normals_head = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
     turned = normals_head @ source.T @ fit.turn_to(target).T
     torch.testing.assert_close(turned, normals_head @ target.T)
-
-
-def test_a_file_does_not_hold_what_depends_on_memory(model):
-    fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
-    error_iod = 0.03456789123
-    a, b = (replace(fit, error_iod=error) for error in (error_iod, np.nextafter(error_iod, 1)))
-    assert a.error_iod != b.error_iod
-    assert fit_to_arrays(a)["error_iod"].tobytes() == fit_to_arrays(b)["error_iod"].tobytes()
 
 
 def test_jaw_points_at_the_border_of_a_tight_crop_are_dropped():

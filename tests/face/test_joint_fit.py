@@ -145,22 +145,17 @@ def test_the_world_may_lie_anywhere(model: MorphableModel, someone: Someone) -> 
     assert (there.vertices_world(model) - expected).abs().max() < 1e-6
 
 
-def test_one_camera_is_a_single_fit_with_its_own_calibration(model: MorphableModel, someone: Someone) -> None:
+def test_one_camera_is_a_single_fit_and_a_face_that_is_none_is_left_out(
+    model: MorphableModel, someone: Someone
+) -> None:
     world, landmarks = someone
     joint = fit_views(model, CAMERAS[1:2], landmarks[1:2])
     assert joint.error_iod[0] is not None and joint.error_iod[0] < 0.03
     assert error_against(model, joint, world, CAMERAS[1]) < 0.03
-
-
-def test_a_face_that_is_none_is_left_out(model: MorphableModel, someone: Someone) -> None:
-    world, landmarks = someone
     wrong = [px if index != 1 else px[::-1] + 90 for index, px in enumerate(landmarks)]
     joint = fit_views(model, CAMERAS, wrong)
     assert [error is None for error in joint.error_iod] == [False, True, False, False]
     assert error_against(model, joint, world, CAMERAS[1]) < 0.04
-
-
-def test_no_face_at_all_is_an_input_error(model: MorphableModel) -> None:
     with pytest.raises(InputError, match="no camera"):
         fit_views(model, CAMERAS, [None] * len(CAMERAS))
 

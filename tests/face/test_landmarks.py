@@ -16,12 +16,9 @@ def landmarks_px():
     return np.random.default_rng(0).uniform(20, 80, (68, 2))
 
 
-def test_of_two_faces_of_one_size_the_surer_is_the_largest(landmarks_px):
+def test_faces_by_size_sureness_and_number(landmarks_px, caplog, monkeypatch):
     doubtful, sure = (Face((0, 0, side, side), score, landmarks_px) for side, score in ((50, 0.4), (49, 1.2)))
     assert choose_face([doubtful, sure], "largest", "p") == [sure]
-
-
-def test_faces_by_number(landmarks_px, caplog, monkeypatch):
     monkeypatch.setattr(find.log, "propagate", True)
     caplog.set_level("INFO")
     small, large = (Face((0, 0, side, side), 1.0, landmarks_px) for side in (20, 50))
@@ -34,9 +31,6 @@ def test_faces_by_number(landmarks_px, caplog, monkeypatch):
     for which in ("-1", "biggest", ""):
         with pytest.raises(UsageError, match="largest"):
             choose_face(faces, which, "p")
-
-
-def test_display_copies_are_exposed_by_themselves():
     linear = np.random.default_rng(0).random((300, 70, 3), np.float32)
     assert to_display(linear).dtype == np.uint8
     assert np.abs(to_display(linear).astype(int) - to_display(linear * 1000)).max() <= 1
@@ -49,12 +43,16 @@ def write_pts(path, points):
     return path
 
 
-def test_files_of_landmarks(tmp_path, landmarks_px):
+def test_files_of_landmarks_are_read_or_named(tmp_path, landmarks_px):
     pts = write_pts(tmp_path / "a.pts", landmarks_px + 0.5)  # iBUG counts the first pixel's centre as 1
     assert read_landmarks(pts) == pytest.approx(landmarks_px)
     for content in (landmarks_px.tolist(), {"landmarks": landmarks_px.tolist()}):
         (tmp_path / "a.json").write_text(json.dumps(content))
         assert read_landmarks(tmp_path / "a.json") == pytest.approx(landmarks_px)
+    (tmp_path / "b.json").write_bytes(bytes(range(256)))
+    for name in ("b.json", "missing.pts"):
+        with pytest.raises(InputError, match=name):
+            read_landmarks(tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -77,10 +75,3 @@ def test_bad_files_are_named(tmp_path, name, text):
     (tmp_path / name).write_text(text)
     with pytest.raises(InputError, match=name):
         read_landmarks(tmp_path / name)
-
-
-def test_missing_and_binary_files_are_named(tmp_path):
-    (tmp_path / "b.json").write_bytes(bytes(range(256)))
-    for name in ("b.json", "missing.pts"):
-        with pytest.raises(InputError, match=name):
-            read_landmarks(tmp_path / name)

@@ -39,20 +39,14 @@ def arrays_of(model: MorphableModel, folder: Path) -> dict[str, np.ndarray]:
         return {key: file[key] for key in file.files}
 
 
-def test_a_head_survives_its_file(model, tmp_path):
+def test_a_head_survives_its_file_and_coefficients_move_it(model, tmp_path):
     save_face_model(tmp_path / "a.npz", model)
     again = load_face_model(tmp_path / "a.npz").head
     for key in ("mean", "identity", "expression", "triangles", "part", "uv"):
         assert torch.equal(getattr(again, key), getattr(model.head, key))
         assert getattr(again, key).dtype == getattr(model.head, key).dtype
-
-
-def test_a_file_without_a_head_loads_as_before(model, tmp_path):
     save_face_model(tmp_path / "a.npz", replace(model, head=None))
     assert load_face_model(tmp_path / "a.npz").head is None and load_face_model().head is None
-
-
-def test_coefficients_move_the_head(model):
     moved = model.head.vertices(torch.tensor([2.0]), torch.tensor([-0.5])) - model.head.mean
     assert torch.allclose(moved, torch.full((4, 3), 0.25))
 

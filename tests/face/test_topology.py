@@ -37,9 +37,11 @@ def test_masks_are_symmetric_and_bounded(name):
     assert mask.min() >= 0 and 0.5 < mask.max() <= 1
 
 
-def test_parts_cover_uv_space_once():
+def test_parts_cover_uv_space_once_and_an_unknown_region_is_named():
     total = sum(region_mask(part, 256) for part in ("skin", "eyes", "brows", "lips", "nostrils", "neck"))
     assert torch.allclose(total, torch.ones(256, 256), atol=1e-6)
+    with pytest.raises(ValueError, match="ears"):
+        region_mask("ears", 8)
 
 
 @pytest.mark.parametrize(
@@ -61,11 +63,6 @@ def test_masks_lie_where_the_landmarks_say(name, inside, outside):
     assert at(mask, inside) > 0.6 and at(mask, outside) < 0.05
 
 
-def test_an_unknown_region_is_named():
-    with pytest.raises(ValueError, match="ears"):
-        region_mask("ears", 8)
-
-
 def _mask(yaw_deg: float, side_px: int = 128) -> tuple[torch.Tensor, torch.Tensor]:
     """The mask [S, S] of the mean face, and its landmarks' pixels [68, 2]."""
     model, camera = load_face_model(), crop_camera(side_px)
@@ -77,7 +74,7 @@ def _mask(yaw_deg: float, side_px: int = 128) -> tuple[torch.Tensor, torch.Tenso
     return mask[0], project(model.landmarks(turned[None])[0], camera)
 
 
-def test_interior_holds_the_features_and_ends_inside_the_jaw() -> None:
+def test_the_interior_holds_the_features_and_what_turns_away_leaves_it() -> None:
     mask, landmarks_px = _mask(0)
     column, row = landmarks_px.long().T
     assert (mask[row[17:], column[17:]] > 0.99).all()  # brows, nose, eyes and mouth, none cut out
@@ -87,14 +84,8 @@ def test_interior_holds_the_features_and_ends_inside_the_jaw() -> None:
     column, row = (torch.from_numpy(LANDMARK_UV) * 64).long().T
     assert (texture[row[27:], column[27:]] == 1).all()
     assert (texture[row[:17], column[:17]] < 0.3).all() and (texture[-1] == 0).all()
-
-
-def test_what_turns_away_leaves_the_interior() -> None:
     frontal, turned = _mask(0)[0], _mask(60)[0]
     assert turned.sum() < 0.9 * frontal.sum()
-
-
-def test_a_face_seen_from_behind_has_no_interior() -> None:
     assert _mask(180)[0].sum() == 0
 
 
@@ -105,17 +96,13 @@ def _turned_face(yaw_deg: float) -> tuple[torch.Tensor, torch.Tensor]:
     return project(vertices, crop_camera(256)), rotation
 
 
-def test_rays_end_at_the_contour_landmarks() -> None:
+def test_outlines_are_the_furthest_of_each_ray_also_of_turned_faces() -> None:
     rays = contour_rays()
     ends = torch.stack([rays[::8, -1] % GRID, rays[::8, -1] // GRID], -1) / (GRID - 1)
     assert (ends - torch.from_numpy(LANDMARK_UV[list(CONTOUR)])).abs().max() < 0.6 / (GRID - 1)
-
-
-def test_outline_is_the_furthest_of_each_ray() -> None:
     seen = [_turned_face(yaw_deg) for yaw_deg in YAWS_DEG]
     px, rotations = (torch.stack(parts) for parts in zip(*seen, strict=True))
     ids = silhouette_ids(px, rotations)
-    rays = contour_rays()
     for face in range(len(YAWS_DEG)):
         for ray, found in zip(rays, ids[face], strict=True):
             assert found in ray
@@ -128,9 +115,6 @@ def test_outline_is_the_furthest_of_each_ray() -> None:
     # turned to the picture's right, that side's outline moves in over the cheek, and the other's does not
     assert at_jaw[1, -half:].mean() < 0.5 < at_jaw[1, :half].mean()
     assert at_jaw[2, :half].mean() < 0.5 < at_jaw[2, -half:].mean()
-
-
-def test_outline_of_a_turned_face_bounds_it() -> None:
     px, rotation = _turned_face(35.0)
     outline = px[silhouette_ids(px[None], rotation[None])[0]]
     cheek = contour_rays()[-40:-24].flatten()  # of the far side

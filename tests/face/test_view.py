@@ -25,20 +25,14 @@ def covered(cell: np.ndarray) -> np.ndarray:
     return np.abs(cell - _BACKGROUND).max(-1) > 0.01
 
 
-def test_every_cell_is_filled_and_none_is_cut(cells: list[np.ndarray]) -> None:
+def test_every_cell_is_filled_and_turns_from_profile_to_profile_in_one_light(cells: list[np.ndarray]) -> None:
     for cell in cells:
         seen = covered(cell)
         assert not seen[[0, -1]].any() and not seen[:, [0, -1]].any()
         assert seen.any(1).sum() > 0.5 * CELL
-
-
-def test_it_turns_from_one_profile_to_the_other(cells: list[np.ndarray]) -> None:
     widths = [covered(cell).any(0).sum() for cell in cells]
     assert min(widths[3:5]) > max(widths[0], widths[7])
     assert (covered(cells[0]) != covered(cells[7])[:, ::-1]).mean() < 0.01
-
-
-def test_light_comes_from_the_upper_left_in_every_pose(cells: list[np.ndarray]) -> None:
     for cell in cells[2:6]:
         seen = covered(cell)
         middle = np.arange(CELL) < np.median(np.nonzero(seen)[1])

@@ -46,13 +46,17 @@ def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) ->
     assert sorted(tmp_path.iterdir()) == sorted([*kept, tmp_path / "a.exr", tmp_path / "folder"])
 
 
-def test_nothing_stays_where_the_writer_fails(tmp_path: Path) -> None:
+def test_nothing_stays_where_the_writer_fails_and_long_names_have_temporary_ones(tmp_path: Path) -> None:
     with pytest.raises(KeyError), atomic_path(tmp_path / "a.exr") as temporary:
         temporary.write_text("half")
         raise KeyError
     with pytest.raises(FacerfError, match="could not be written"), atomic_path(tmp_path / "a.exr"):
         pass
     assert not list(tmp_path.iterdir())
+    for name in ("n" * 251 + ".txt", "\U0001f642" * 62 + ".txt"):  # 252 bytes and more
+        with atomic_path(tmp_path / name) as temporary:
+            temporary.write_text("x")
+        assert (tmp_path / name).read_text() == "x"
 
 
 def test_an_interrupt_while_the_temporary_folder_is_made_leaves_none(
@@ -71,22 +75,12 @@ def test_an_interrupt_while_the_temporary_folder_is_made_leaves_none(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_link_in_the_place_of_an_output_is_replaced_not_followed(tmp_path: Path) -> None:
+def test_links_and_folders_in_the_place_of_an_output_are_replaced(tmp_path: Path) -> None:
     (tmp_path / "theirs").write_text("theirs")
     (tmp_path / "a.txt").symlink_to(tmp_path / "theirs")
     with atomic_path(tmp_path / "a.txt") as temporary:
         temporary.write_text("ours")
     assert (tmp_path / "theirs").read_text() == "theirs" and not (tmp_path / "a.txt").is_symlink()
-
-
-def test_a_long_name_has_a_temporary_one(tmp_path: Path) -> None:
-    for name in ("n" * 251 + ".txt", "\U0001f642" * 62 + ".txt"):  # 252 bytes and more
-        with atomic_path(tmp_path / name) as temporary:
-            temporary.write_text("x")
-        assert (tmp_path / name).read_text() == "x"
-
-
-def test_a_folder_takes_the_place_of_another(tmp_path: Path) -> None:
     for number in ("1", "2"):
         with atomic_path(tmp_path / "page") as temporary:
             temporary.mkdir()
@@ -205,29 +199,23 @@ def test_a_killed_process_holds_nothing(tmp_path: Path, caplog: pytest.LogCaptur
     assert not caplog.text and not list((tmp_path / "out").iterdir())
 
 
-def test_an_empty_folder_that_the_lock_has_made_goes_and_what_is_in_one_stays(tmp_path: Path) -> None:
+def test_a_link_at_the_locks_name_is_refused_and_an_output_folder_may_be_one(tmp_path: Path) -> None:
+    (tmp_path / "theirs").write_text("theirs")
+    (tmp_path / ".lock").symlink_to(tmp_path / "theirs")
+    with pytest.raises(OSError), alone_in(tmp_path, ".lock"):
+        pass
+    assert (tmp_path / "theirs").read_text() == "theirs"
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with atomic_path(tmp_path / "link" / "a.txt") as temporary:
+        temporary.write_text("whole")
+    assert (tmp_path / "real" / "a.txt").read_text() == "whole"
     with alone_in(tmp_path / "new" / "out", ".lock"):
         pass
     assert not list(tmp_path.iterdir())
     with alone_in(tmp_path / "out", ".lock"):
         (tmp_path / "out" / "a.png").touch()
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.png"]
-
-
-def test_a_link_at_the_lock_s_name_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "theirs").write_text("theirs")
-    (tmp_path / ".lock").symlink_to(tmp_path / "theirs")
-    with pytest.raises(OSError), alone_in(tmp_path, ".lock"):
-        pass
-    assert (tmp_path / "theirs").read_text() == "theirs"
-
-
-def test_an_output_folder_may_be_a_link(tmp_path: Path) -> None:
-    (tmp_path / "real").mkdir()
-    (tmp_path / "link").symlink_to("real")
-    with atomic_path(tmp_path / "link" / "a.txt") as temporary:
-        temporary.write_text("whole")
-    assert (tmp_path / "real" / "a.txt").read_text() == "whole"
 
 
 @pytest.mark.parametrize("name", ["n" * 256, "taken/a.txt", "nowhere/a.txt"])

@@ -74,7 +74,7 @@ def test_alpha_of_eight_bits(tmp_path: Path, multiplied: bool) -> None:
     np.testing.assert_allclose(stored(path)[INSIDE], QUADS[INSIDE], atol=4 if multiplied else 1.5)
 
 
-def test_grey_and_orientation_and_another_name(tmp_path: Path) -> None:
+def test_grey_orientation_and_a_profile_count_under_another_name(tmp_path: Path) -> None:
     grey = QUADS[..., 0]
     np.testing.assert_allclose(stored(save(tmp_path / "g.avif", grey))[..., 2], grey, atol=1.5)
     exif = Image.Exif()
@@ -83,11 +83,11 @@ def test_grey_and_orientation_and_another_name(tmp_path: Path) -> None:
     header = read_header(path)
     assert header is not None and (header.width_px, header.height_px, header.bits) == (H, W, 8)
     np.testing.assert_allclose(stored(path), np.rot90(QUADS, -1), atol=2.5)
-
-
-def test_a_profile_counts(tmp_path: Path) -> None:
     path = save(tmp_path / "a.avif", QUADS, icc_profile=icc_profiles.DISPLAY_P3)
     assert read_image(path).colourspace_name == "Display P3"
+    memory.set_limit(H * W * 36 - 1)
+    with pytest.raises(InputError, match=r"deep\.avif: 24 x 16 pixels: needs \S+ GB of memory"):
+        read_image(DEEP)
 
 
 @pytest.mark.parametrize("size", [30, 150, -30, -1])
@@ -97,9 +97,3 @@ def test_a_damaged_one_of_eight_bits(tmp_path: Path, size: int, caplog: pytest.L
     with pytest.raises(InputError, match=r"a\.avif: damaged or cut short; copy it again"):
         read_image(path)
     assert caplog.text == ""
-
-
-def test_memory_is_asked_before_pixels_are_decoded() -> None:
-    memory.set_limit(H * W * 36 - 1)
-    with pytest.raises(InputError, match=r"deep\.avif: 24 x 16 pixels: needs \S+ GB of memory"):
-        read_image(DEEP)

@@ -84,11 +84,13 @@ def visible(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
 
 
-def test_a_file_is_fetched_once_and_then_found(server: Server, tmp_path: Path) -> None:
+def test_a_file_is_fetched_once_and_again_where_it_is_damaged(server: Server, tmp_path: Path) -> None:
     path = fetch(server.published(), OPTION, tmp_path / "new" / "cache")
     assert path == tmp_path / "new" / "cache" / "a file.pth" and path.read_bytes() == CONTENT
     assert visible(path.parent) == ["a file.pth"]
     assert fetch(server.published(), OPTION, path.parent) == path and server.asked == [None]
+    (tmp_path / "a file.pth").write_bytes(CONTENT[:-1] + b"!")
+    assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
 
 
 def test_the_default_place_is_the_users_cache(
@@ -96,11 +98,6 @@ def test_the_default_place_is_the_users_cache(
 ) -> None:
     monkeypatch.setattr(downloads, "cache_folder", lambda: tmp_path)
     assert fetch(server.published(), OPTION).parent == tmp_path
-
-
-def test_a_damaged_file_in_the_cache_is_fetched_again(server: Server, tmp_path: Path) -> None:
-    (tmp_path / "a file.pth").write_bytes(CONTENT[:-1] + b"!")
-    assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
 
 
 @pytest.mark.parametrize("ranges", [True, False])

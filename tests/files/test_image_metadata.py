@@ -16,7 +16,7 @@ from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.files.made import IPTC, properties, write_oiio
 
 
-def test_size_kind_and_space(tmp_path: Path) -> None:
+def test_size_kind_and_space_upright(tmp_path: Path) -> None:
     pixels = np.zeros((6, 9, 3), np.float32)
     write_exr(tmp_path / "a.exr", pixels)
     write_display(tmp_path / "a.png", pixels)
@@ -25,9 +25,6 @@ def test_size_kind_and_space(tmp_path: Path) -> None:
     for header, *kind in ((floating, True, 16, LINEAR), (display, False, 8, SRGB)):
         assert (header.width_px, header.height_px) == (9, 6)
         assert [header.is_floating, header.bits, header.space] == kind
-
-
-def test_the_size_is_upright(tmp_path: Path) -> None:
     header = read_header(
         write_oiio(tmp_path / "a.jpg", np.zeros((6, 9, 3), np.uint8), "uint8", Orientation=6)
     )
@@ -71,9 +68,10 @@ def test_impossible_primaries_are_ignored(
     assert read_image(path).pixels == pytest.approx(0.5)
 
 
-def test_primaries_of_another_type_are_ignored(tmp_path: Path) -> None:
+def test_other_primaries_and_attributes_are_left_out(tmp_path: Path) -> None:
     header = read_header(write_primaries(tmp_path / "a.exr", (0.3,) * 6))
     assert header is not None and header.space == LINEAR
+    assert b"compression" not in xmp_packet({"compression": "zip"})
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
@@ -100,10 +98,6 @@ def test_a_packet_is_added_without_the_file_in_memory(tmp_path: Path, suffix: st
     assert b"another.jpg" in path.read_bytes() and list(tmp_path.iterdir()) == [path]
     assert most < size / 4
     assert read_image(path).pixels.shape == noise.shape
-
-
-def test_attributes_without_an_xmp_name_are_left_out() -> None:
-    assert b"compression" not in xmp_packet({"compression": "zip"})
 
 
 def test_results_keep_how_a_photo_was_made_and_no_names_or_numbers_of_people_and_devices(

@@ -41,7 +41,7 @@ def test_arrays_are_those_that_were_pickled(tmp_path: Path, protocol: int) -> No
         assert found[name].dtype == array.dtype
 
 
-def test_what_python_2_wrote_is_read(tmp_path: Path) -> None:
+def test_what_python_2_and_numpy_wrote_is_read(tmp_path: Path) -> None:
     matrix = sparse.random(5, 40, 0.2, "csc", rng=RNG)
     with chumpy() as Ch:
         value = {"v": Ch(ARRAYS["floats"]), "J": matrix, "kind": "flame", "n": np.float64(3.5)}
@@ -52,18 +52,12 @@ def test_what_python_2_wrote_is_read(tmp_path: Path) -> None:
     assert found["kind"].shape == (0,) and found["n"] == 3.5
     np.testing.assert_array_equal(found["v"], ARRAYS["floats"])
     np.testing.assert_array_equal(found["J"], matrix.toarray())
-
-
-def test_python_2_s_text_for_bytes_is_read(tmp_path: Path) -> None:
     raw = ARRAYS["floats"].tobytes()
     as_bytes = pickle.dumps({"a": ARRAYS["floats"]}, 3)
     head, tail = as_bytes.split(b"B" + struct.pack("<I", len(raw)) + raw)
     as_text = head + b"T" + struct.pack("<i", len(raw)) + raw + tail
     found = pickled_arrays(written(tmp_path / "a.pkl", as_text))
     np.testing.assert_array_equal(found["a"], ARRAYS["floats"])
-
-
-def test_an_object_that_numpy_saved_is_read(tmp_path: Path) -> None:
     found = pickled_arrays(written(tmp_path / "a.npy", saved_object(ARRAYS)))
     np.testing.assert_array_equal(found["floats"], ARRAYS["floats"])
     np.save(tmp_path / "b.npy", ARRAYS["floats"])
@@ -71,11 +65,19 @@ def test_an_object_that_numpy_saved_is_read(tmp_path: Path) -> None:
         arrays_here(pickled_arrays, tmp_path / "b.npy")
 
 
-def test_rows_and_columns_of_sparse_matrices(tmp_path: Path) -> None:
+def test_sparse_matrices_are_read_and_not_trusted(tmp_path: Path) -> None:
     matrix = sparse.random(9, 4, 0.4, "csr", rng=RNG)
     for made in (matrix, matrix.tocsc(), sparse.csr_array(matrix), sparse.csc_array(matrix)):
         found = pickled_arrays(written(tmp_path / "a.pkl", pickle.dumps({"a": made})))
         np.testing.assert_array_equal(found["a"], matrix.toarray())
+    for key, wrong in (
+        ("indices", np.array([0, 99])), ("indices", np.array([0, -1])), ("indptr", np.array([0, 2**40, 2])),
+        ("indptr", np.array([0, 2])), ("data", np.ones(3)), ("_shape", (2, "a")),
+    ):  # fmt: skip
+        matrix = sparse.csr_matrix(np.array([[1.0, 0, 0], [0, 0, 2.0]]))
+        matrix.__dict__[key] = wrong
+        with pytest.raises(ValueError):
+            arrays_here(pickled_arrays, written(tmp_path / "a.pkl", pickle.dumps({"a": matrix})))
 
 
 class Calls:
@@ -163,23 +165,9 @@ def test_what_exhausts_the_unpickler_costs_its_process_alone(tmp_path: Path, dat
         arrays_apart(pickled_arrays, written(tmp_path / "a.pkl", data))
 
 
-def test_a_sparse_matrix_is_not_trusted(tmp_path: Path) -> None:
-    for key, wrong in (
-        ("indices", np.array([0, 99])), ("indices", np.array([0, -1])), ("indptr", np.array([0, 2**40, 2])),
-        ("indptr", np.array([0, 2])), ("data", np.ones(3)), ("_shape", (2, "a")),
-    ):  # fmt: skip
-        matrix = sparse.csr_matrix(np.array([[1.0, 0, 0], [0, 0, 2.0]]))
-        matrix.__dict__[key] = wrong
-        with pytest.raises(ValueError):
-            arrays_here(pickled_arrays, written(tmp_path / "a.pkl", pickle.dumps({"a": matrix})))
-
-
-def test_a_value_without_numbers_is_empty(tmp_path: Path) -> None:
+def test_values_without_numbers_are_empty_and_operations_not_computed(tmp_path: Path) -> None:
     values = {"dict": OrderedDict(b=1), "text": "text", "none": None, "set": {1, 2}, "ragged": [[1], [1, 2]]}
     found = pickled_arrays(written(tmp_path / "a.pkl", pickle.dumps(values)))
     assert all(found[name].shape == (0,) for name in values)
-
-
-def test_an_operation_of_chumpy_is_not_computed(tmp_path: Path) -> None:
     data = b"\x80\x02}X\x01\x00\x00\x00acchumpy.reordering\nSelect\n)\x81}X\x01\x00\x00\x00xK\x01sbs."
     assert pickled_arrays(written(tmp_path / "a.pkl", data))["a"].shape == (0,)

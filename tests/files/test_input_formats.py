@@ -62,30 +62,21 @@ def test_every_suffix_that_folders_are_searched_for_is_read(tmp_path: Path, suff
     assert error.max() < {".hdr": 2.1}.get(suffix, 0.6) + LOSSY.get(suffix, 0)
 
 
-def test_a_photo_of_a_phone() -> None:
+def test_photos_of_phones_under_any_name(tmp_path: Path) -> None:
     image = read_image(HEIC)
     assert image.colourspace_name == "Display P3" and image.pixels.shape == (64, 48, 3)
     stored = levels_of(HEIC, "sRGB")
     for at, level in {(5, 5): (40, 200, 60), (-5, 5): (50, 60, 210), (5, -5): (220, 60, 40)}.items():
         np.testing.assert_allclose(stored[at], level, atol=4)
-
-
-def test_a_heic_of_the_size_of_a_photo() -> None:
-    """Pixels outlive the memory of pi-heif's image."""
+    # Pixels outlive the memory of pi-heif's image.
     stored = levels_of(QUADS)
     assert stored.shape == (400, 600, 3)
     for at, level in {
         (9, 9): (200, 60, 40), (9, -9): (40, 180, 60), (-9, 9): (50, 70, 200), (-9, -9): (128, 128, 128),
     }.items():  # fmt: skip
         np.testing.assert_allclose(stored[at], level, atol=4)
-
-
-def test_a_heic_under_another_name(tmp_path: Path) -> None:
     shutil.copy(HEIC, tmp_path / "a.jpg")
     assert read_image(tmp_path / "a.jpg").pixels.shape == (64, 48, 3)
-
-
-def test_a_heic_beyond_the_budget_is_refused_as_others_are() -> None:
     memory.set_limit(48 * 64 * 24 - 1)
     with pytest.raises(
         InputError, match=r"phone\.heic: \d+ x \d+ pixels: needs \S+ GB of memory, .* --memory"
@@ -147,19 +138,13 @@ def test_film_scans_are_decoded_by_the_cineon_curve(tmp_path: Path) -> None:
         np.testing.assert_allclose(read_image(path).pixels, image.pixels, atol=2e-3)
 
 
-def test_a_psd_has_its_profile(tmp_path: Path) -> None:
+def test_a_psd_has_its_profile_and_its_composite(tmp_path: Path) -> None:
     image = read_image(write_psd(tmp_path / "a.psd", LEVELS, (1039, icc_profiles.DISPLAY_P3)))
     assert image.colourspace_name == "Display P3"
-
-
-def test_a_psd_that_has_its_composite(tmp_path: Path) -> None:
-    """Photoshop says so in the resource of its version."""
+    # Photoshop says so in the resource of its version.
     resources = (1039, b"odd"), (1057, struct.pack(">IB", 1, 1) + bytes(12))
     assert read_image(write_psd(tmp_path / "a.psd", LEVELS, *resources)).pixels.shape == LEVELS.shape
-
-
-def test_the_colour_code_of_a_png(tmp_path: Path) -> None:
-    """Primaries of P3 (12), the curve of sRGB (13)."""
+    # Primaries of P3 (12), the curve of sRGB (13).
     path = write_png(tmp_path / "a.png", LEVELS, (b"cICP", bytes([12, 13, 0, 1])))
     assert read_image(path).colourspace_name == "Display P3"
 

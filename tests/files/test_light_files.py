@@ -31,7 +31,7 @@ def make_light() -> LightRecord:
     )
 
 
-def test_a_light_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+def test_a_light_comes_back_from_plain_json_also_of_coefficients_alone(tmp_path: Path) -> None:
     before, path = make_light(), tmp_path / "deep" / "light.json"
     with np.printoptions(legacy="1.13"):  # as colour-science sets it for its whole process
         write_light(path, before)
@@ -41,19 +41,16 @@ def test_a_light_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert before.sh and after.sh and torch.equal(after.sh.coefficients, before.sh.coefficients)
     assert (after.rig, after.sh.convention, after.attributes) == ("seven", "ours", before.attributes)
     assert list(path.parent.iterdir()) == [path]
-
-
-def test_the_file_is_plain_json_with_its_units(tmp_path: Path) -> None:
     write_light(tmp_path / "a.json", make_light())
     fields = json.loads((tmp_path / "a.json").read_text())
     assert fields["format"] == FORMAT and "white" in fields["units"] and "camera" in fields["axes"]
     assert [len(row) for row in fields["weights"]] == [3] * 7 and fields["sh"]["order"] == 2
-
-
-def test_a_light_may_have_coefficients_alone(tmp_path: Path) -> None:
     write_light(tmp_path / "a.json", LightRecord(torch.zeros(0, 3), torch.zeros(0, 3), sh=make_light().sh))
     after = read_light(tmp_path / "a.json")
     assert len(after.directions) == 0 and after.sh is not None and len(after.sh.coefficients) == 9
+    (tmp_path / "a.json").write_text("[1]")
+    with pytest.raises(InputError, match=r"a\.json is \[1\]; an object"):
+        read_light(tmp_path / "a.json")
 
 
 BAD: dict[str, dict[str, Any]] = {
@@ -88,12 +85,6 @@ def test_damaged_files_are_refused(text: bytes, tmp_path: Path) -> None:
         read_light(tmp_path / "a.json")
     with pytest.raises(InputError, match="no such file"):
         read_light(tmp_path / "b.json")
-
-
-def test_a_list_is_no_light(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text("[1]")
-    with pytest.raises(InputError, match=r"a\.json is \[1\]; an object"):
-        read_light(tmp_path / "a.json")
 
 
 def pano(

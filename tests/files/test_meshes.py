@@ -53,7 +53,7 @@ def test_shape_and_texture_come_back(tmp_path: Path, kind: str) -> None:
     assert np.allclose(mesh.visual.uv[top_left], [0, 1])
 
 
-def test_obj_names_its_material_and_image(tmp_path: Path) -> None:
+def test_obj_names_its_material_and_glb_keeps_provenance(tmp_path: Path) -> None:
     path = written(tmp_path, "obj")
     text = path.read_text()
     assert "mtllib a quad.mtl" in text and "usemtl face" in text and "facerf:synthetic: 1" in text
@@ -63,8 +63,5 @@ def test_obj_names_its_material_and_image(tmp_path: Path) -> None:
         "a quad.obj",
         "a quad_texture.png",
     ]
-
-
-def test_glb_keeps_provenance(tmp_path: Path) -> None:
     scene = trimesh.load(written(tmp_path, "glb"))
     assert scene.metadata["facerf:synthetic"] == 1

@@ -135,7 +135,7 @@ def test_what_is_not_read_says_why(
     assert "supported" not in says or "damaged" not in str(caught.value)
 
 
-def test_headers_of_what_is_not_read(tmp_path: Path) -> None:
+def test_headers_of_what_is_not_read_and_layers_that_are_not_there(tmp_path: Path) -> None:
     """A file that is no image has none; one whose pixels alone are not read has."""
     text(tmp_path / "a.png")
     cut(copied(HEIC), 200)(tmp_path / "a.heic")
@@ -145,12 +145,15 @@ def test_headers_of_what_is_not_read(tmp_path: Path) -> None:
     assert read_header(tmp_path / "hdr.png") and read_header(tmp_path / "cut.avif")
     assert read_image(tmp_path / "hdr.png", "sRGB").pixels == pytest.approx(LINEAR, abs=1e-6)
     assert oiio.geterror() == ""
-
-
-def test_a_deep_exr_is_no_stack(tmp_path: Path) -> None:
-    """OpenImageIO's flat readers return memory as it lies."""
+    # OpenImageIO's flat readers return memory as it lies.
     with pytest.raises(InputError, match="not an OLAT stack"):
         read_olats(made.write_deep(tmp_path / "a.exr"))
+    write_exr(tmp_path / "a.exr", QUADS / np.float32(255), layers={"albedo": QUADS / np.float32(255)})
+    write_png(tmp_path / "a.png", QUADS)
+    with pytest.raises(InputError, match=r"a\.exr: has no layer 'specular'; it has rgba, albedo"):
+        read_image(tmp_path / "a.exr", layer="specular")
+    with pytest.raises(InputError, match="has no layer 'x'; it has none"):
+        read_image(tmp_path / "a.png", layer="x")
 
 
 def test_a_name_that_is_not_utf8_is_an_error(tmp_path: Path) -> None:
@@ -202,12 +205,3 @@ def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None
         with pytest.raises(InputError, match=re.escape(f"{path.name}: ") + ".*" + re.escape(says)):
             read_image(path)
         assert read_header(path) is None
-
-
-def test_a_layer_that_is_not_there(tmp_path: Path) -> None:
-    write_exr(tmp_path / "a.exr", QUADS / np.float32(255), layers={"albedo": QUADS / np.float32(255)})
-    write_png(tmp_path / "a.png", QUADS)
-    with pytest.raises(InputError, match=r"a\.exr: has no layer 'specular'; it has rgba, albedo"):
-        read_image(tmp_path / "a.exr", layer="specular")
-    with pytest.raises(InputError, match="has no layer 'x'; it has none"):
-        read_image(tmp_path / "a.png", layer="x")

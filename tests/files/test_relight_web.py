@@ -66,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_lights_of_the_rig_come_back(folder: Path) -> None:
+def test_lights_of_the_rig_come_back_and_those_between_are_interpolated(folder: Path) -> None:
     directions = front_lights()
     truth, decoder = images(directions), Decoder(folder)
     assert decoder.info["note"] == "ball" and (decoder.info["width"], decoder.info["height"]) == (64, 48)
@@ -79,9 +79,6 @@ def test_lights_of_the_rig_come_back(folder: Path) -> None:
     assert np.mean(errors) < 5
     far = np.abs(truth.mean(0) - truth).mean()
     assert np.mean(errors) < far / 4  # the light is followed, not averaged
-
-
-def test_a_light_between_those_of_the_rig_is_interpolated(folder: Path) -> None:
     toward = np.array([0.4, 0.3, np.sqrt(1 - 0.25)])
     error = np.abs(Decoder(folder).image(toward) - images(toward[None])[0])
     assert error.mean() < 7

@@ -159,10 +159,13 @@ def test_the_fourth_channel_of_a_tga(tmp_path: Path, bits: int, alpha: float | N
     assert image.alpha is None if alpha is None else image.alpha == pytest.approx(alpha)
 
 
-def test_the_alpha_of_a_map_is_no_light(tmp_path: Path) -> None:
+def test_alpha_of_a_map_is_no_light_and_layers_have_names(tmp_path: Path) -> None:
     values = np.full((8, 16, 4), 0.3, np.float32)
     values[..., 3] = np.linspace(0, 1, 16)
     assert read_map_file(write_oiio(tmp_path / "map.exr", values)).numpy() == pytest.approx(0.3)
+    write_exr(tmp_path / "a.exr", LINEAR, layers={"albedo": 1 - LINEAR})
+    albedo = read_image(tmp_path / "a.exr", layer="Albedo").pixels
+    np.testing.assert_allclose(albedo, 1 - LINEAR, atol=1e-3)
 
 
 # Layers
@@ -188,12 +191,6 @@ def test_the_image_of_an_exr_is_chosen_by_its_name(tmp_path: Path, caplog: pytes
         lines = [record.getMessage() for record in caplog.records]
         assert lines == ([f"{path}: the layer {said}"] if said else [])
     assert read_header(path).width_px == W
-
-
-def test_a_layer_by_name(tmp_path: Path) -> None:
-    write_exr(tmp_path / "a.exr", LINEAR, layers={"albedo": 1 - LINEAR})
-    albedo = read_image(tmp_path / "a.exr", layer="Albedo").pixels
-    np.testing.assert_allclose(albedo, 1 - LINEAR, atol=1e-3)
 
 
 # Colour

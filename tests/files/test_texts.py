@@ -13,9 +13,14 @@ from facerf_cli.files.texts import MOST_RIG_LIGHTS, parse_json, read_json, read_
 from facerf_cli.light.entries import parse_lights
 
 
-def test_a_document_within_the_limits_is_read_as_it_stands() -> None:
+def test_documents_within_the_limits_are_read() -> None:
     content = {"a": [1, 2.5, -3e8, "é", None, True], "b": {"c": [[[]]]}, "": 2**62}
     assert parse_json(json.dumps(content)) == content and parse_json(json.dumps(content).encode()) == content
+    assert parse_json("[" * 63 + "]" * 63)
+    assert parse_json(f"[{2**63 - 1}, 1e308]") == [2**63 - 1, 1e308]
+    assert distinct(["a", "b"], "light") == ["a", "b"]
+    with pytest.raises(ValueError, match="light 'b' occurs twice"):
+        distinct(["a", "b", "b"], "light")
 
 
 @pytest.mark.parametrize(
@@ -55,11 +60,6 @@ def test_byte_order_marks_are_no_part_of_a_text(tmp_path: Path, encoding: str) -
     assert parse_lights(str(written("0,10\n20,30\n"))) == [(0, 10), (20, 30)]
 
 
-def test_depth_and_numbers_at_the_limits_pass() -> None:
-    assert parse_json("[" * 63 + "]" * 63)
-    assert parse_json(f"[{2**63 - 1}, 1e308]") == [2**63 - 1, 1e308]
-
-
 def test_the_number_of_values_is_bounded_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(json_reader, "_MOST_VALUES", 100)
     assert len(parse_json(json.dumps([0] * 99))) == 99
@@ -76,6 +76,8 @@ def test_files_are_bounded_and_named(tmp_path: Path) -> None:
         read_json(path, "mend it", 1 << 20)
     with pytest.raises(InputError, match=r"b\.json: no such file; mend it"):
         read_json(tmp_path / "b.json", "mend it")
+    with pytest.raises(InputError, match="no such file"):
+        read_rig(tmp_path / "none.toml")
 
 
 class Entry(Document):
@@ -103,12 +105,6 @@ def test_an_error_is_a_line_with_the_path_in_the_document(content: Any, said: st
     with pytest.raises(InputError, match=said) as raised:
         checked(Root, content, "x.json")
     assert "\n" not in str(raised.value) and "pydantic" not in str(raised.value)
-
-
-def test_what_occurs_twice_is_named() -> None:
-    assert distinct(["a", "b"], "light") == ["a", "b"]
-    with pytest.raises(ValueError, match="light 'b' occurs twice"):
-        distinct(["a", "b", "b"], "light")
 
 
 def test_values_become_the_text_of_an_option(tmp_path: Path) -> None:
@@ -143,8 +139,3 @@ def test_faults(tmp_path: Path, data: bytes, said: str) -> None:
         read_rig(path)
     assert said in str(caught.value) and str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_rig(tmp_path / "none.toml")

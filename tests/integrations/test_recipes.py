@@ -72,20 +72,14 @@ def recipe(output: str, folder: Path) -> np.ndarray:
     return pixels(folder / output)
 
 
-def test_a_mixture_is_the_weighted_sum(folder: Path) -> None:
+def test_mixtures_backgrounds_and_turned_maps_are_what_they_say(folder: Path) -> None:
     parts = [oiio.ImageBuf(str(folder / "me.exr"), part, 0) for part in range(4)]
     found = {p.spec().getattribute("oiio:subimagename"): p.get_pixels(oiio.FLOAT) for p in parts}
     wanted = found["key"] * np.array([0.8, 0.7, 0.5]) + 2 * found["fill"]
     np.testing.assert_allclose(recipe("mixed.exr", folder), wanted, rtol=2e-3)  # half floats
-
-
-def test_the_person_is_over_the_background(folder: Path) -> None:
     found, image = recipe("comp.exr", folder), pixels(folder / "me.exr")
     np.testing.assert_allclose(found[:, :8, :3], 0.25, rtol=1e-3)
     np.testing.assert_allclose(found[:, 8:20, :3], image[:, 8:20, :3], rtol=1e-3)
-
-
-def test_a_turned_map_is_that_of_rotate(folder: Path) -> None:
     rig = rig_directions(50)
     turned = envmap_weights(torch.from_numpy(recipe("turned.exr", folder)[..., :3].copy()), rig)
     sky = torch.from_numpy(pixels(folder / "sky.exr")[..., :3].copy())

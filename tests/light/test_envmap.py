@@ -72,13 +72,17 @@ def test_a_coarse_map_is_cut_at_the_cells_and_not_at_its_pixels() -> None:
     assert error.std() < 0.01 * truth.mean()
 
 
-def test_a_bright_texel_at_u_a_quarter_lights_the_images_right() -> None:
+def test_a_texel_at_u_a_quarter_lights_the_right_and_rotation_adds_to_azimuth() -> None:
     envmap = one_texel(64, (0.25, 0.5))
     normals = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
     right, left = lambert(normals, envmap_weights(envmap, RIG))[:, 0]
     assert right > 0.97 and left == 0
     diffuse = ball(envmap, 65, "diffuse")
     assert diffuse[32, 60].mean() > 0.8 and diffuse[32, 4].mean() < 1e-3
+    ahead = one_texel(64, (0.5, 0.5))
+    weights = envmap_weights(ahead, RIG, rotate_deg=90)
+    brightest = RIG[weights[:, 0].argmax()]
+    assert brightest[0] > 0.95  # from the camera's side to the image's right
 
 
 @pytest.mark.parametrize("azimuth_deg, elevation_deg", [(30, 20), (-110, -45), (175, 60)])
@@ -95,38 +99,25 @@ def test_a_light_and_a_one_texel_map_agree(azimuth_deg: float, elevation_deg: fl
     torch.testing.assert_close(diffuse[inner][:, 1], (normals @ light).clamp(min=0)[inner], rtol=0, atol=0.04)
 
 
-def test_rotation_adds_to_every_azimuth() -> None:
-    ahead = one_texel(64, (0.5, 0.5))
-    weights = envmap_weights(ahead, RIG, rotate_deg=90)
-    brightest = RIG[weights[:, 0].argmax()]
-    assert brightest[0] > 0.95  # from the camera's side to the image's right
-
-
-def test_rotation_by_whole_pixels_moves_the_map() -> None:
+def test_rotation_by_whole_and_half_pixels() -> None:
     envmap = torch.rand(16, 32, 3)
     for pixels in (-3, 37):
         moved = envmap.roll(-pixels, dims=1)  # azimuth grows to the left of the map
         turned = envmap_weights(envmap, RIG, rotate_deg=pixels * 360 / 32)
         torch.testing.assert_close(turned, envmap_weights(moved, RIG), rtol=1e-5, atol=1e-7)
-
-
-def test_rotation_by_half_a_pixel_is_the_mean_of_both_sides() -> None:
     envmap = torch.rand(8, 16, 3)
     half = texel_integrals(envmap, 8, 16, rotate_deg=360 / 32)
     both = (texel_integrals(envmap, 8, 16) + texel_integrals(envmap, 8, 16, rotate_deg=360 / 16)) / 2
     torch.testing.assert_close(half, both, rtol=1e-12, atol=1e-12)
 
 
-def test_a_symmetric_rig_sees_a_turned_map_as_itself_turned() -> None:
+def test_turned_maps_are_themselves_turned_one_by_one_or_together() -> None:
     count = 12
     ring = azel_to_direction(torch.arange(count) * (360 / count) + 7, 0)
     envmap = torch.rand(32, 64, 3)
     plain = envmap_weights(envmap, ring)
     turned = envmap_weights(envmap, ring, rotate_deg=360 / count)
     torch.testing.assert_close(turned, plain.roll(1, dims=0), rtol=0.03, atol=0)
-
-
-def test_many_rotations_are_the_single_ones() -> None:
     envmap = torch.rand(16, 32, 3)
     angles = [0, 12.5, 359]
     for sampling in ("cell", "paper"):
@@ -145,15 +136,12 @@ def test_paper_sampling_takes_the_pixel_at_the_light() -> None:
             [[math.cos(back), 0, math.sin(back)], [0, 1, 0], [-math.sin(back), 0, math.cos(back)]]
         )
         torch.testing.assert_close(seen, RIG @ turn.T, rtol=0, atol=0.02)
-
-
-def test_both_samplings_agree_on_a_smooth_map() -> None:
     envmap = latlong_directions(128, 256) + 2
     cell, paper = envmap_weights(envmap, RIG), envmap_weights(envmap, RIG, sampling="paper")
     assert (cell.sum(0) / paper.sum(0) - 1).abs().max() < 0.01
 
 
-def test_the_mirror_ball_shows_what_lies_behind_the_camera_at_its_centre() -> None:
+def test_balls_show_what_is_around_turned_and_in_its_brightness() -> None:
     envmap = latlong_directions(128, 256)
     mirror = ball(envmap, 61)
     torch.testing.assert_close(mirror[30, 30], torch.tensor([0.0, 0, 1]), rtol=0, atol=0.01)
@@ -161,9 +149,6 @@ def test_the_mirror_ball_shows_what_lies_behind_the_camera_at_its_centre() -> No
     assert mirror[30, right, 0] > 0.98
     assert mirror[60 - right, 30, 1] > 0.98
     assert mirror[0, 0].abs().max() == 0
-
-
-def test_balls_under_a_constant_map_are_white_and_turn_with_the_map() -> None:
     for kind in ("mirror", "diffuse"):
         assert float(ball(torch.ones(8, 16, 3), 33, kind)[16, 16, 0]) == pytest.approx(1, rel=1e-3)
     lit = ball(one_texel(32, (0.5, 0.5)), 33, "diffuse", rotate_deg=90)
@@ -255,19 +240,13 @@ def brightest(image: np.ndarray) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def test_the_camera_looks_away_from_the_middle_of_the_map() -> None:
+def test_the_camera_looks_away_from_the_middle_and_right_is_right() -> None:
     row, column = brightest(seen(dot((0.0, 0.0, -1.0))))
     assert abs(row - 20) <= 3 and abs(column - 30) <= 3
-
-
-def test_right_is_right_and_up_is_up() -> None:
     assert brightest(seen(dot((0.3, 0.0, -1.0))))[1] > 40
     assert brightest(seen(dot((0.0, 0.2, -1.0))))[0] < 14
     assert seen(dot((0.0, 0.0, 1.0))).max() < 0.2  # behind the camera
-
-
-def test_a_map_turns_with_its_light() -> None:
-    """--rotate adds to every azimuth, where 90 degrees is the picture's right."""
+    # --rotate adds to every azimuth, where 90 degrees is the picture's right.
     assert brightest(seen(dot((0.0, 0.0, -1.0)), rotate_deg=-15))[1] > 40
 
 
@@ -278,17 +257,13 @@ def test_radiance_is_kept_and_blur_spreads_it() -> None:
     np.testing.assert_allclose(soft.mean(), sharp.mean(), rtol=0.25)
 
 
-def test_rays_of_rows_are_those_of_the_whole_image() -> None:
+def test_rays_and_backgrounds_of_rows_are_those_of_the_whole_image() -> None:
     camera = Camera(60.0, 60, 40, 30.0, 20.0)
     y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(60) + 0.5, indexing="ij")
     every = pixel_rays(torch.stack([x, y], -1), camera)
     assert torch.equal(rays_of_rows(camera, (40, 60), slice(8, 21)), every[8:21])
     halved = every.view(20, 2, 30, 2, 3).mean((1, 3))  # rays are linear in the pixels
     torch.testing.assert_close(rays_of_rows(camera, (20, 30), slice(0, 20)), halved)
-
-
-def test_rows_of_a_background_are_those_of_the_whole() -> None:
-    camera = Camera(60.0, 60, 40, 30.0, 20.0)
     for blur in (0.0, 0.02, 0.1):
         rows = Backdrop(dot((0.0, 0.0, -1.0)), (40, 60), partial(rays_of_rows, camera), blur=blur)
         np.testing.assert_allclose(rows[8:21], rows[0:40][8:21], rtol=1e-6)

@@ -150,7 +150,7 @@ def test_a_lone_light_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> Non
     assert 0.75 < found < 1.05 and smeared < 0.8 * found
 
 
-def test_a_black_image_has_no_light() -> None:
+def test_a_black_image_and_none_have_no_light() -> None:
     assert estimate_lamps(*flat(shaded_ball()), 1).abs().max() == 0
     evidence = shaded_ball()
     red = LightEvidence(
@@ -161,15 +161,6 @@ def test_a_black_image_has_no_light() -> None:
     )
     found = red.least_squares()
     assert found[:, 0].max() > 0.05 and found[:, 1:].abs().max() < 1e-3
-
-
-@pytest.mark.filterwarnings("error")
-def test_where_nothing_is_seen_there_is_no_light() -> None:
-    found = estimate_lamps(torch.zeros(24, 3, 0), torch.zeros(3, 0), 1)
-    assert found.shape == (24, 3) and (found == 0).all()
-
-
-def test_evidence_without_a_face_or_a_light_is_refused_in_words() -> None:
     evidence = lit(shaded_ball(), some_weights())
     evidence.require_a_face()
     hidden = LightEvidence(
@@ -179,6 +170,12 @@ def test_evidence_without_a_face_or_a_light_is_refused_in_words() -> None:
         hidden.require_a_face()
     with pytest.raises(InputError, match="black"):
         shaded_ball().require_a_face()
+
+
+@pytest.mark.filterwarnings("error")
+def test_where_nothing_is_seen_there_is_no_light() -> None:
+    found = estimate_lamps(torch.zeros(24, 3, 0), torch.zeros(3, 0), 1)
+    assert found.shape == (24, 3) and (found == 0).all()
 
 
 def test_light_from_around_is_even_as_far_as_the_image_allows() -> None:
@@ -209,7 +206,7 @@ def edges(textures: torch.Tensor) -> Sequence[torch.Tensor]:
     return [textures.diff(dim=-1), textures.diff(dim=-2), 0.1 * textures]
 
 
-def test_the_loss_falls_and_the_light_comes_nearer() -> None:
+def test_the_loss_falls_the_light_comes_nearer_and_the_caller_needs_no_gradients() -> None:
     weights = some_weights()
     evidence = lit(shaded_ball(), weights)
     start = (weights + 0.05).roll(1, 1)
@@ -217,33 +214,29 @@ def test_the_loss_falls_and_the_light_comes_nearer() -> None:
     assert refined.loss_after < 0.2 * refined.loss_before
     assert evidence.residual(evidence.relit(refined.weights)) < evidence.residual(evidence.relit(start))
     assert (refined.weights >= 0).all() and refined.steps > 5
-
-
-def test_gradients_are_taken_where_the_caller_needs_none() -> None:
     evidence = lit(shaded_ball(), some_weights())
     with torch.no_grad():  # as in `facerf evaluate`
         refined = refine_light(evidence, some_weights() + 0.1, edges)
     assert refined.loss_after < refined.loss_before
 
 
-def test_a_start_that_is_best_is_given_back() -> None:
+def test_a_start_that_is_best_or_only_harmed_is_given_back() -> None:
     weights = some_weights()
     evidence = lit(shaded_ball(), weights)
     refined = refine_light(evidence, weights, edges)
     assert torch.equal(refined.weights, weights) and refined.loss_after == refined.loss_before
-
-
-def test_steps_that_only_harm_give_the_start_back() -> None:
     start = some_weights() + 0.01
     evidence = lit(shaded_ball(), some_weights())
     refined = refine_light(evidence, start, edges, settings=RefineSettings(steps=15, learning_rate=1e4))
     assert torch.equal(refined.weights, start) and refined.loss_after == refined.loss_before > 0
 
 
-def test_it_ends_when_nothing_is_gained() -> None:
+def test_it_ends_when_nothing_is_gained_and_starts_from_no_light() -> None:
     evidence = lit(shaded_ball(), some_weights())
     settings = RefineSettings(steps=500, patience=5, settled=0.9)
     assert refine_light(evidence, some_weights() + 0.1, edges, settings=settings).steps <= 10
+    refined = refine_light(evidence, torch.zeros(LIGHTS, 3), edges)
+    assert refined.loss_after < refined.loss_before and refined.weights.isfinite().all()
 
 
 def test_signed_weights_may_stay_negative_and_the_others_may_not() -> None:
@@ -266,12 +259,6 @@ def test_clipped_texels_and_those_beyond_the_mask_ask_for_nothing() -> None:
     assert refined.loss_before < 1e-9 and torch.equal(refined.weights, truth)
 
 
-def test_no_light_at_all_is_a_start_too() -> None:
-    evidence = lit(shaded_ball(), some_weights())
-    refined = refine_light(evidence, torch.zeros(LIGHTS, 3), edges)
-    assert refined.loss_after < refined.loss_before and refined.weights.isfinite().all()
-
-
 SEEN = torch.ones(16, 16)
 
 
@@ -281,31 +268,23 @@ def _images() -> tuple[torch.Tensor, torch.Tensor]:
     return explained * (0.8 + 0.4 * torch.rand(3, 16, 16, generator=generator)), explained
 
 
-def test_under_the_photos_own_light_the_error_goes() -> None:
+def test_under_the_photos_own_light_the_error_goes_and_another_is_left_alone() -> None:
     photo, explained = _images()
     corrected = Quotient.of(photo, explained, SEEN).corrected(explained[None])[0]
     assert (corrected - photo).norm() < 0.25 * (explained - photo).norm()
-
-
-def test_a_light_that_shades_otherwise_is_left_alone() -> None:
-    photo, explained = _images()
     side = torch.zeros(1, 3, 16, 16)
     side[..., :2] = 0.5
     other = Quotient.of(photo, explained, SEEN).corrected(side)
     assert torch.allclose(other, side, rtol=0.02)
 
 
-def test_texels_that_the_photo_does_not_show_are_left_alone_and_ratios_are_bounded() -> None:
+def test_unseen_and_black_texels_are_left_alone_and_ratios_are_bounded() -> None:
     photo, explained = _images()
     seen = SEEN.clone()
     seen[:8] = 0
     quotient = Quotient.of(100 * photo, explained, seen)
     assert (quotient.ratio[:, :8] == 1).all()
     assert quotient.ratio.max() <= 3
-
-
-def test_black_and_larger_textures_stay_finite_and_keep_their_shape() -> None:
-    photo, explained = _images()
     quotient = Quotient.of(torch.zeros_like(photo), torch.zeros_like(explained), SEEN)
     corrected = quotient.corrected(torch.zeros(2, 3, 64, 64))
     assert corrected.shape == (2, 3, 64, 64) and (corrected == 0).all()

@@ -36,7 +36,7 @@ def drawn_coefficients(order: int, seed: int = 2) -> Tensor:
     return torch.randn((order + 1) ** 2, 3, generator=draws, dtype=torch.float64)
 
 
-def test_the_basis_is_scipys() -> None:
+def test_the_basis_is_scipys_and_its_degree_one_names_the_axes() -> None:
     directions = unit_vectors(5)
     basis = sh_basis(directions, 20)
     for row, direction in zip(basis.numpy(), directions.numpy(), strict=True):
@@ -44,9 +44,6 @@ def test_the_basis_is_scipys() -> None:
             real_harmonic(degree, m, direction) for degree in range(21) for m in range(-degree, degree + 1)
         ]
         np.testing.assert_allclose(row, truth, rtol=0, atol=1e-13)
-
-
-def test_degree_one_names_the_axes() -> None:
     first = sh_basis(unit_vectors(9), 1)[:, 1:] / math.sqrt(3 / (4 * math.pi))
     torch.testing.assert_close(first, unit_vectors(9)[:, [1, 2, 0]])
 
@@ -78,15 +75,12 @@ def test_a_light_of_weight_one_lights_a_facing_white_surface_with_about_one() ->
     assert float(irradiance(side, coefficients).abs().max()) / math.pi < 0.03  # a cut series rounds the kink
 
 
-def test_irradiance_is_the_integral_over_the_hemisphere() -> None:
+def test_irradiance_is_the_integral_of_the_published_lobe() -> None:
     coefficients, normals = drawn_coefficients(4), unit_vectors(20, 5)
     sources = latlong_directions(200, 400, torch.float64).reshape(-1, 3)
     areas = latlong_solid_angles(200, 400, torch.float64).reshape(-1, 1)
     truth = (normals @ sources.T).clamp(min=0) @ (radiance(coefficients, sources) * areas)
     torch.testing.assert_close(irradiance(normals, coefficients), truth, rtol=0, atol=2e-3)
-
-
-def test_the_cosine_lobe_is_the_published_one() -> None:
     published = [3.141593, 2.094395, 0.785398, 0, -0.130900, 0, 0.049087]  # ibid., Eq. 8 and below
     assert [cosine_lobe(degree) for degree in range(7)] == pytest.approx(published, abs=1e-6)
 
@@ -110,6 +104,10 @@ def test_what_is_no_order_is_said() -> None:
     with pytest.raises(InputError, match="8 spherical-harmonic"):
         order_of(torch.zeros(8, 3))
     assert order_of(torch.zeros(16, 3)) == 3
+    with pytest.raises(InputError, match="from 0 to 20"):
+        latlong_coefficients(torch.ones(4, 8, 3), 21)
+    with pytest.raises(InputError, match="5 spherical-harmonic"):
+        sh_to_latlong(torch.ones(5, 3), 4)
 
 
 def relative_error(found: torch.Tensor, truth: torch.Tensor) -> float:
@@ -129,13 +127,10 @@ def test_the_coefficients_of_a_light_come_back_from_a_map_that_is_nowhere_negati
     assert relative_error(latlong_coefficients(series.clamp(min=0), order), coefficients) > 0.02
 
 
-def test_a_series_that_is_positive_stays_as_it_is() -> None:
+def test_a_point_light_and_none_are_bounded_and_a_positive_series_stays() -> None:
     coefficients = torch.zeros(9, 3)
     coefficients[0], coefficients[3], coefficients[6] = 5.0, 1.0, -0.5
     torch.testing.assert_close(clipped_series(coefficients), coefficients, rtol=0, atol=6e-3)
-
-
-def test_a_point_light_and_no_light_are_bounded() -> None:
     point = rig_coefficients(RigLight(rig_directions(7)[2:3], torch.ones(1, 3)), 2)
     envmap = positive_latlong(point, 64)
     assert float(envmap.max()) < 30 and relative_error(latlong_coefficients(envmap, 2), point) < 0.1
@@ -147,10 +142,14 @@ def drawn(*shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=torch.Generator().manual_seed(sum(shape)))
 
 
-def test_the_projection_is_the_slow_one() -> None:
+def test_the_projection_is_the_slow_one_and_a_far_texel_a_point_light() -> None:
     envmap = drawn(2, 4, 3)
     truth = torch.from_numpy(project_slowly(envmap.numpy().astype(np.float64), 3, samples=24)).float()
     torch.testing.assert_close(latlong_coefficients(envmap, 3), truth, rtol=0, atol=3e-3)
+    envmap = torch.zeros(256, 512, 3)
+    envmap[70, 130] = torch.tensor([1.0, 2, 3]) / latlong_solid_angles(256, 512)[70, 130]
+    truth = sh_basis(latlong_directions(256, 512)[70, 130], 4)[:, None] * torch.tensor([1.0, 2, 3])
+    torch.testing.assert_close(latlong_coefficients(envmap, 4), truth, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("height, width", [(1, 2), (3, 6), (40, 90)])
@@ -159,13 +158,6 @@ def test_the_projection_is_that_of_the_same_map_cut_finer(height: int, width: in
     finer = envmap.repeat_interleave(5, 0).repeat_interleave(7, 1)
     coarse, fine = latlong_coefficients(envmap, 10), latlong_coefficients(finer, 10)
     torch.testing.assert_close(coarse, fine, rtol=0, atol=1e-5)
-
-
-def test_one_far_away_texel_is_a_point_light() -> None:
-    envmap = torch.zeros(256, 512, 3)
-    envmap[70, 130] = torch.tensor([1.0, 2, 3]) / latlong_solid_angles(256, 512)[70, 130]
-    truth = sh_basis(latlong_directions(256, 512)[70, 130], 4)[:, None] * torch.tensor([1.0, 2, 3])
-    torch.testing.assert_close(latlong_coefficients(envmap, 4), truth, rtol=0, atol=2e-3)
 
 
 @pytest.mark.parametrize("order", [0, 2, 7])
@@ -186,10 +178,3 @@ def test_a_map_and_the_rig_that_weighs_it_shade_alike() -> None:
     torch.testing.assert_close(irradiance(normals, of_map), irradiance(normals, of_rig), rtol=0.01, atol=0)
     constant = latlong_coefficients(torch.full((3, 6, 3), 0.7), 4)
     torch.testing.assert_close(irradiance(normals, constant) / math.pi, torch.full((40, 3), 0.7))
-
-
-def test_an_order_of_a_map_that_is_none_is_said() -> None:
-    with pytest.raises(InputError, match="from 0 to 20"):
-        latlong_coefficients(torch.ones(4, 8, 3), 21)
-    with pytest.raises(InputError, match="5 spherical-harmonic"):
-        sh_to_latlong(torch.ones(5, 3), 4)

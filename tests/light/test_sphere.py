@@ -24,7 +24,7 @@ def nearest_neighbour_deg(rig: torch.Tensor) -> torch.Tensor:
     return torch.rad2deg(2 * torch.asin(chord / 2))
 
 
-def test_the_rig_is_uniform() -> None:
+def test_the_rig_is_uniform_and_never_changes() -> None:
     rig = rig_directions(150)
     assert rig.shape == (150, 3) and rig.dtype == torch.float32
     torch.testing.assert_close(rig.norm(dim=-1), torch.ones(150))
@@ -34,9 +34,6 @@ def test_the_rig_is_uniform() -> None:
     share = SphericalVoronoi(unit).calculate_areas() * 150 / (4 * math.pi)
     assert share.min() > 0.9 and share.max() < 1.1
     assert rig.mean(0).norm() < 0.01
-
-
-def test_the_rig_never_changes() -> None:
     assert torch.equal(rig_directions(), rig_directions(150))
     first, last = rig_directions(150)[[0, 149]]
     torch.testing.assert_close(first, torch.tensor(FIRST), atol=1e-4, rtol=0)
@@ -101,25 +98,18 @@ def _angle_deg(a: torch.Tensor, b: torch.Tensor) -> float:
     return float(torch.rad2deg(torch.dot(a, b).clamp(-1, 1).acos()))
 
 
-def test_one_light_is_where_it_is() -> None:
+def test_the_brightest_direction_is_where_one_light_or_two_are() -> None:
     rig = rig_directions()
     for light in (0, 40, 77, 149):
         weights = torch.full((150, 3), 0.01)
         weights[light] = torch.tensor([1.0, 0.8, 0.6])
         assert _angle_deg(brightest_direction(RigLight(rig, weights)), rig[light]) < 2
-
-
-def test_a_light_shared_by_two_lights_lies_between_them_and_beats_a_brighter_single_one() -> None:
-    rig = rig_directions()
     near = (rig @ rig[60]).topk(3).indices
     weights = torch.zeros(150, 3)
     weights[near] = 0.7
     weights[(rig @ rig[60]).argmin()] = 1.0
     found = brightest_direction(RigLight(rig, weights))
     assert _angle_deg(found, torch.nn.functional.normalize(rig[near].sum(0), dim=0)) < 4
-
-
-def test_green_counts_more_than_blue_and_darkness_has_no_direction() -> None:
     rig = torch.tensor([[1.0, 0, 0], [-1.0, 0, 0]])
     light = RigLight(rig, torch.tensor([[0.0, 1.0, 0], [0, 0, 1.0]]))
     assert brightest_direction(light)[0] > 0.99

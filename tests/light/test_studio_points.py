@@ -37,14 +37,11 @@ def test_at_the_centre_of_the_face_a_light_is_as_strong_as_a_far_one(
     )
 
 
-def test_irradiance_falls_with_the_square_of_the_distance() -> None:
+def test_irradiance_falls_with_the_distance_and_a_spot_shines_in_its_cone() -> None:
     points = PointLights.of(StudioLight(at_m=(0.0, 0.0, 0.5)), CENTRE)
     ahead = torch.tensor([0.0, 0.0, 1.0])
     assert irradiance_of_wall(points, CENTRE - 0.5 * ahead, ahead) == pytest.approx(1 / 4, rel=1e-5)
     assert irradiance_of_wall(points, CENTRE + 0.25 * ahead, ahead) == pytest.approx(4, rel=1e-5)
-
-
-def test_a_spot_shines_in_its_cone_alone() -> None:
     points = PointLights.of(StudioLight(at_m=(0.0, 0.0, 1.0), spot_deg=30), CENTRE)
     plain = PointLights.of(StudioLight(at_m=(0.0, 0.0, 1.0)), CENTRE)
     shares = []

@@ -10,6 +10,7 @@ from safetensors.numpy import save_file
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.main import main
 from facerf_cli.network.files import FORMAT, SHIPPED, checkpoint_file, serving_files
+from tests.kinds import Said
 
 
 def checkpoint(path: Path, *networks: str, trained: tuple[str, ...] = ()) -> Path:
@@ -27,26 +28,13 @@ def test_each_file_counts_for_what_its_last_training_trained(tmp_path: Path) -> 
     assert found == SHIPPED | {"reflectance": first, "geometry": first, "portrait": second}
     third = checkpoint(tmp_path / "c.st", "geometry", trained=("geometry",))
     assert serving_files([first, second, third])["geometry"] == third  # before the copy of the first
-
-
-def test_a_file_that_says_nothing_of_its_training_counts_for_all_it_holds(tmp_path: Path) -> None:
-    path = checkpoint(tmp_path / "a.st", "reflectance", "geometry")
-    assert {name for name, file in serving_files([path]).items() if file == path} == {
-        "reflectance",
-        "geometry",
-    }
-
-
-def test_two_files_that_trained_the_same_network_are_refused(tmp_path: Path) -> None:
-    paths = [checkpoint(tmp_path / name, "parsing", trained=("parsing",)) for name in ("a.st", "b.st")]
-    with pytest.raises(UsageError, match=r"b\.st: holds a Parsing Network, as does .*a\.st"):
-        serving_files(paths)
-
-
-def test_a_file_without_use_is_refused_by_name(tmp_path: Path) -> None:
-    path = checkpoint(tmp_path / "a.st", "portrait")
-    with pytest.raises(UsageError, match=r"a\.st: .* Portrait Network, but facerf segment uses the Pars"):
-        serving_files([path], ("parsing",), "facerf segment")
+    silent = checkpoint(tmp_path / "d.st", "reflectance", "geometry")  # counts for all it holds
+    assert serving_files([silent]) == SHIPPED | {"reflectance": silent, "geometry": silent}
+    again = checkpoint(tmp_path / "e.st", "geometry", trained=("geometry",))
+    with pytest.raises(UsageError, match=r"e\.st: holds a Geometry Network, as does .*c\.st"):
+        serving_files([third, again])
+    with pytest.raises(UsageError, match=r"b\.st: .* Portrait Network, but facerf segment uses the Pars"):
+        serving_files([second], ("parsing",), "facerf segment")
 
 
 def test_a_runs_folder_stands_for_its_best_checkpoint(tmp_path: Path) -> None:
@@ -57,9 +45,7 @@ def test_a_runs_folder_stands_for_its_best_checkpoint(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["envmap", "segment", "train", "evaluate", "synth-stage", "check"])
-def test_every_verb_refuses_a_file_without_use(
-    tmp_path: Path, verb: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_verb_refuses_a_file_without_use(tmp_path: Path, verb: str, capsys: Said) -> None:
     path = checkpoint(tmp_path / "a.st", "appearance_features")
     assert main([verb, "x", "-o", str(tmp_path / "out"), "--checkpoint", str(path)]) == 2
     assert "a.st: holds a network appearance_features, but" in capsys.readouterr().err

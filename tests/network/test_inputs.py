@@ -42,7 +42,7 @@ def test_a_strange_light_is_taken_off(light: tuple[float, float, float]) -> None
     assert off(plain) < 0.4 * off(texture)
 
 
-def test_a_stranger_light_does_not_leave_more_of_itself() -> None:
+def test_a_stranger_light_leaves_no_more_of_itself_and_black_stays_black() -> None:
     blue = torch.tensor([0.0, 0.0, 1.0])
     left = []
     for strength in (1.0, 1.5, 2.5):
@@ -50,8 +50,5 @@ def test_a_stranger_light_does_not_leave_more_of_itself() -> None:
         mean = ((texture / colour_cast(texture, visible, TRAINED)) * visible).sum((2, 3))[0]
         left.append(float(mean[2] / mean[1]))
     assert left == sorted(left, reverse=True)
-
-
-def test_black_stays_black() -> None:
     texture, visible = torch.zeros(1, 3, 4, 4), torch.ones(1, 1, 4, 4)
     assert not (texture / colour_cast(texture, visible, TRAINED)).any()

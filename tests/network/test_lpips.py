@@ -30,7 +30,7 @@ def published(count: int = 5) -> dict[str, torch.Tensor]:
     return {f"lin{i}.model.1.weight": torch.rand(1, CHANNELS[i], 1, 1) for i in range(count)}
 
 
-def test_the_distance_is_that_of_the_slow_twin() -> None:
+def test_the_distance_is_that_of_the_slow_twin_and_0_between_equals() -> None:
     network = small().double()
     first = torch.rand(1, 3, 16, 33).double() * 0.9
     second = (first + 0.2 * torch.rand_like(first)).clamp(0, 1)
@@ -39,9 +39,6 @@ def test_the_distance_is_that_of_the_slow_twin() -> None:
     encoded = [linear_to_srgb(image[0].numpy()).astype(np.float64) for image in (first, second)]
     expected = slow_lpips(tensors, [head.numpy() for head in network.heads], *encoded)
     assert network(first, second).item() == pytest.approx(expected, rel=1e-4) and expected > 0.01
-
-
-def test_equal_images_are_at_no_distance_and_each_of_a_batch_is_for_itself() -> None:
     network = small()
     first, second = torch.rand(3, 3, 20, 24), torch.rand(3, 3, 20, 24)
     second[1] = first[1]
@@ -51,7 +48,7 @@ def test_equal_images_are_at_no_distance_and_each_of_a_batch_is_for_itself() -> 
     assert torch.allclose(distance[2], network(first[2:], second[2:])[0])
 
 
-def test_tensors_have_vgg16s_shapes_up_to_conv5_3(whole: Lpips) -> None:
+def test_heads_and_tensors_have_the_published_names_and_shapes(whole: Lpips) -> None:
     assert [len(head) for head in whole.heads] == list(CHANNELS)
     shapes = [tuple(layer.shape[1:]) for layer in whole.trunk.layers(torch.zeros(1, 3, 32, 48))]
     assert shapes == [(64, 32, 48), (128, 16, 24), (256, 8, 12), (512, 4, 6), (512, 2, 3)]
@@ -62,6 +59,10 @@ def test_tensors_have_vgg16s_shapes_up_to_conv5_3(whole: Lpips) -> None:
         22,
         29,
     ]
+    heads = published()
+    whole.load_heads(heads)
+    for mine, (_, given) in zip(whole.heads, sorted(heads.items()), strict=True):
+        assert torch.equal(mine, given.flatten())
 
 
 def test_the_shallow_trunk_gives_the_same_layers_as_the_deep_one() -> None:
@@ -70,13 +71,6 @@ def test_the_shallow_trunk_gives_the_same_layers_as_the_deep_one() -> None:
     image = torch.rand(1, 3, 16, 24)
     for a, b in zip(shallow.layers(image), deep.layers(image)[:3], strict=True):
         assert torch.equal(a, b)
-
-
-def test_heads_are_taken_by_their_published_names(whole: Lpips) -> None:
-    heads = published()
-    whole.load_heads(heads)
-    for mine, (_, given) in zip(whole.heads, sorted(heads.items()), strict=True):
-        assert torch.equal(mine, given.flatten())
 
 
 @pytest.mark.parametrize("trouble", ["missing", "shape", "integers", "nan", "negative"])
@@ -96,12 +90,9 @@ def test_heads_that_are_none_are_refused_in_words(whole: Lpips, trouble: str) ->
     assert all(torch.equal(a, b) for a, b in zip(whole.heads, before, strict=True))
 
 
-def test_images_too_small_for_the_last_layer_are_refused() -> None:
+def test_images_too_small_are_refused_and_gradients_finite_where_nothing_answers() -> None:
     with pytest.raises(ValueError, match="15"):
         small()(torch.zeros(1, 3, 15, 40), torch.zeros(1, 3, 15, 40))
-
-
-def test_gradients_are_finite_where_nothing_answers() -> None:
     network = small()
     for parameter in network.trunk.parameters():
         parameter.zero_()  # every feature is 0

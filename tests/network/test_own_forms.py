@@ -79,18 +79,14 @@ def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
         assert form_of(network, form) == form
 
 
-def test_nothing_comes_from_the_working_directory(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(package)
-    with pytest.raises(UsageError, match="install the package that has it"):
-        installed("my_lab.networks:Darker", "--form")
-
-
-@pytest.mark.parametrize(
-    "name", ["my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"]
-)
-def test_what_is_not_there_is_one_line(package: Path, name: str) -> None:
-    with pytest.raises(UsageError, match=f"--objective {name}: "):
-        installed(name, "--objective")
+def test_what_is_not_installed_is_one_line(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.chdir(package)  # nothing comes from the working directory
+        with pytest.raises(UsageError, match="install the package that has it"):
+            installed("my_lab.networks:Darker", "--form")
+    for name in ("my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"):
+        with pytest.raises(UsageError, match=f"--objective {name}: "):
+            installed(name, "--objective")
 
 
 def test_facerfs_own_forms_import_nothing() -> None:

@@ -8,7 +8,7 @@ import torch
 from facerf_cli.errors import InputError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network import parsing
-from facerf_cli.network.checkpoint import load_networks, save_networks
+from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
 from facerf_cli.relighting.models import load_models
 
@@ -33,16 +33,12 @@ def test_sizes(network: ParsingNetwork, side: int) -> None:
     assert torch.allclose(found.classes.sum(1), torch.ones(2, side, side), atol=1e-5)
 
 
-def test_brightness_and_contrast_do_not_matter(network: ParsingNetwork) -> None:
+def test_brightness_contrast_and_the_others_of_a_batch_do_not_matter(network: ParsingNetwork) -> None:
     plain, other = network(crops()), network(0.2 + 0.5 * crops())
     # the deviation has a floor of 0.02 under it
     assert (plain.classes - other.classes).abs().max() < 0.02
     assert (plain.landmarks - other.landmarks).abs().max() < 0.005
-
-
-def test_a_photo_in_a_batch_is_parsed_as_alone(network: ParsingNetwork) -> None:
-    both, alone = network(crops()), network(crops()[1:])
-    assert torch.allclose(both.logits[1:], alone.logits, atol=1e-4)
+    assert torch.allclose(plain.logits[1:], network(crops()[1:]).logits, atol=1e-4)
 
 
 def test_landmarks_are_the_means_of_their_heatmaps() -> None:
@@ -61,31 +57,6 @@ def test_every_weight_takes_part(network: ParsingNetwork) -> None:
         name for name, weight in network.named_parameters() if weight.grad is None or not weight.grad.any()
     ]
     assert not dead
-
-
-def test_a_checkpoint_gives_the_same_network(network: ParsingNetwork, tmp_path: Path) -> None:
-    save_networks(tmp_path / "a.safetensors", {"parsing": network}, {"layout_version": LAYOUT_VERSION})
-    loaded = load_networks(tmp_path / "a.safetensors", LAYOUT_VERSION)[0]["parsing"]
-    assert isinstance(loaded, ParsingNetwork) and loaded.settings == SMALL
-    assert (loaded(crops()).landmarks - network(crops()).landmarks).abs().max() < 0.01  # halves are stored
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"widths": [8, 8]},
-        {"widths": [8, 8, 12, 999]},
-        {"blocks": [0, 1, 1]},
-        {"blocks": [0, 1, 1, 99]},
-        {"classes": 1},
-        {"landmarks": 7},
-        {"side": 65},
-    ],
-)
-def test_settings_that_make_no_network_are_refused(change: dict[str, object], tmp_path: Path) -> None:
-    described = ParsingNetwork(SMALL).as_metadata() | change
-    with pytest.raises(ValueError, match=r"no Parsing Network|ParsingSettings"):
-        ParsingNetwork.from_metadata(described)
 
 
 def test_a_network_of_other_classes_is_refused(tmp_path: Path) -> None:

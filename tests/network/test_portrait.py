@@ -2,17 +2,14 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.portrait import (
     SKIN,
     PortraitInputs,
@@ -42,21 +39,10 @@ def plain_maps() -> PortraitMaps:
     """A matt surface of albedo 0.5 that faces the camera; the proxy's shadows are taken as they are."""
     wide, half = (SIDE, SIDE), (SIDE // 2, SIDE // 2)
     up = torch.tensor([0.0, 0, 1]).view(1, 3, 1, 1).expand(1, 3, *wide)
-    zeros = torch.zeros(1, 3, *wide)
+    strands, zeros = torch.tensor([0.0, 1, 0]).view(1, 3, 1, 1).expand_as(up), torch.zeros(1, 3, *wide)
     few, many = torch.zeros(1, 16, *half), torch.zeros(1, 25, *half)
-    return PortraitMaps(
-        gain=zeros + 1,
-        bias=zeros,
-        albedo=zeros + 0.5,
-        normals=up,
-        strands=torch.tensor([0.0, 1, 0]).view(1, 3, 1, 1).expand_as(up),
-        gloss=zeros,
-        hair=zeros[:, :1],
-        trust=zeros[:, :1] + 50,
-        lit=few,
-        around=few,
-        shadow=many,
-    )
+    hair, trust = zeros[:, :1], zeros[:, :1] + 50
+    return PortraitMaps(zeros + 1, zeros, zeros + 0.5, up, strands, zeros, hair, trust, few, few, many)
 
 
 def random_maps(seed: int) -> PortraitMaps:
@@ -113,7 +99,7 @@ def test_light_round_corners_needs_no_visibility_and_is_never_negative() -> None
     assert left.max() == 0
 
 
-def test_highlights_lie_where_the_half_vector_meets_the_normal() -> None:
+def test_highlights_lie_at_the_half_vector_and_strands_shine_across_themselves() -> None:
     """Lobe j: (sharpness / 8) (n . h) ^ sharpness, in shadow none."""
     gloss = torch.zeros(1, 3, SIDE, SIDE)
     gloss[:, 1] = 0.1
@@ -124,6 +110,13 @@ def test_highlights_lie_where_the_half_vector_meets_the_normal() -> None:
     wanted = 0.25 + 0.1 * 45 / 8 * math.cos(math.radians(30)) ** 45
     torch.testing.assert_close(aside, torch.full_like(aside, wanted), rtol=1e-3, atol=0)
     assert maps.olats(one_light(0, 0), 0 * lit_everywhere()).max() < 1e-6
+    gloss = torch.zeros(1, 3, SIDE, SIDE)
+    gloss[:, 2] = 0.1
+    maps = plain_maps()._replace(gloss=gloss, hair=1 + gloss[:, :1])  # the strands are upright
+    aside, above = (
+        maps.shaded(one_light(*at), lit_everywhere())[1].mean() for at in ((60.0, 0.0), (0.0, 60.0))
+    )
+    assert aside == pytest.approx(0.1, rel=1e-3) and above < 0.05
 
 
 def test_near_lights_have_a_direction_for_each_pixel() -> None:
@@ -140,26 +133,13 @@ def test_near_lights_have_a_direction_for_each_pixel() -> None:
     torch.testing.assert_close(found[..., edge[1] :], far[0, 1, ..., edge[1] :])
 
 
-def test_strands_shine_across_themselves() -> None:
-    gloss = torch.zeros(1, 3, SIDE, SIDE)
-    gloss[:, 2] = 0.1
-    maps = plain_maps()._replace(gloss=gloss, hair=1 + gloss[:, :1])  # the strands are upright
-    aside, above = (
-        maps.shaded(one_light(*at), lit_everywhere())[1].mean() for at in ((60.0, 0.0), (0.0, 60.0))
-    )
-    assert aside == pytest.approx(0.1, rel=1e-3) and above < 0.05
-
-
-def test_a_mirrored_person_under_mirrored_light_is_the_mirrored_image() -> None:
+def test_mirrored_people_and_inputs_are_the_mirrored_image() -> None:
     maps, light = random_maps(seed=4), one_light(50, 20)
     visible = torch.rand(1, 1, SIDE, SIDE, generator=torch.Generator().manual_seed(5))
     mirrored = maps.mirrored().olats(one_light(-50, 20), visible.flip(-1))
     torch.testing.assert_close(mirrored, maps.olats(light, visible).flip(-1), rtol=1e-4, atol=1e-5)
     for one, two in zip(maps.mirrored().mirrored(), maps, strict=True):
         torch.testing.assert_close(one, two)
-
-
-def test_inputs_in_a_mirror_are_those_of_the_mirrored_person() -> None:
     rig = rig_directions(48)
     opposite = rig * torch.tensor([-1.0, 1, 1])
     visible = torch.rand(48, 8, 8, generator=torch.Generator().manual_seed(6))
@@ -193,15 +173,12 @@ def test_the_gain_starts_from_the_quotient_of_the_proxys_own_shading() -> None:
     assert maps.lit.shape == (1, 16, SIDE // 2, SIDE // 2) and maps.gloss.shape == (1, 3, SIDE, SIDE)
 
 
-def test_every_input_matters() -> None:
+def test_every_input_matters_and_every_scale_begins_with_the_same_maps() -> None:
     network, given = PortraitNetwork(replace(TINY, scaled=True)), inputs()
     before = network(given).gain
     for name in PortraitInputs.__dataclass_fields__:
         changed = replace(given, **{name: getattr(given, name) * 0.5 + 0.1})
         assert not torch.allclose(network(changed).gain, before, atol=1e-4), name
-
-
-def test_at_every_scale_a_network_begins_with_the_same_maps() -> None:
     network, given = PortraitNetwork(TINY), inputs()
     wider = network.at_every_scale(SIDE)
     assert wider.settings == replace(TINY, scaled=True) and wider.at_every_scale(64) is wider
@@ -226,15 +203,12 @@ def test_far_from_the_proxy_nothing_of_it_is_seen() -> None:
     assert not torch.equal(network(given).gain, maps.gain)
 
 
-def test_exposure_is_that_of_the_skin() -> None:
+def test_exposure_is_that_of_the_skin_and_what_reaches_a_point_is_summed_over_the_rig() -> None:
     given = inputs()
     given.classes[:, SKIN, :, SIDE // 2 :] = 0
     given.image[..., SIDE // 2 :] = 100
     exposed = given.image / skin_exposure(given.image, given.classes)
     assert float(exposed[..., : SIDE // 2].mean()) == pytest.approx(0.25, rel=1e-4)
-
-
-def test_what_reaches_a_point_is_summed_over_the_rig() -> None:
     rig = rig_directions(48)
     summary = reached_by(rig, torch.ones(48, 4, 4), 8)
     assert summary.shape == (16, 8, 8)
@@ -242,18 +216,6 @@ def test_what_reaches_a_point_is_summed_over_the_rig() -> None:
     assert summary[1:].abs().max() < 0.2
     from_right = (rig[:, 0] > 0).float()[:, None, None].expand(-1, 4, 4)
     assert reached_by(rig, from_right, 8)[3].min() > 0.3  # degree 1 along x
-
-
-def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
-    network = PortraitNetwork(TINY)
-    path = tmp_path / "portrait.safetensors"
-    save_networks(path, {"portrait": network}, {"layout_version": LAYOUT_VERSION})
-    again = load_networks(path, LAYOUT_VERSION)[0]["portrait"]
-    assert isinstance(again, PortraitNetwork) and again.settings == TINY
-    torch.testing.assert_close(again(inputs()).gain, network(inputs()).gain, atol=5e-3, rtol=5e-3)
-    for wrong in ({"widths": [8]}, {"side": 33}, {"classes": 1}, {"blocks": [0, 1, 99]}):
-        with pytest.raises(ValueError, match=r"[Ss]ettings"):
-            PortraitNetwork.from_metadata(network.as_metadata() | wrong)
 
 
 def test_what_is_turned_away_does_not_shine_but_hair_does() -> None:

@@ -44,15 +44,12 @@ def test_detectors(recorded: dict[str, np.ndarray], name: str, side_px: int) -> 
     assert out["scores"][0, anchors, 0].numpy() == pytest.approx(recorded[f"{name}_scores"], abs=0.2)
 
 
-def test_body(recorded: dict[str, np.ndarray]) -> None:
+def test_bodies_and_persons_are_the_recorded_ones(recorded: dict[str, np.ndarray]) -> None:
     out = StoredGraph("body")(as_input(256))
     assert out["points"][0].numpy() == pytest.approx(recorded["body_points"], abs=1)
     assert out["mask"][0, 0, ::8, ::8].sigmoid().numpy() == pytest.approx(
         1 / (1 + np.exp(-recorded["body_mask"].astype(np.float64).clip(-50, 50))), abs=0.02
     )
-
-
-def test_person(recorded: dict[str, np.ndarray]) -> None:
     share = StoredGraph("person")(as_input(256))["share"][0, 0, ::8, ::8].numpy()
     assert share == pytest.approx(recorded["person_share"], abs=0.01)
 
@@ -68,17 +65,11 @@ def test_mesh_of_a_detected_face(recorded: dict[str, np.ndarray]) -> None:
     assert irises.max() < 0.02 * size_px
 
 
-def test_networks_of_a_batch_do_not_mix() -> None:
+def test_networks_of_a_batch_do_not_mix_and_samples_lie_at_whole_steps() -> None:
     network, images = StoredGraph("person"), torch.rand(3, 3, 256, 256)
     together = network(images)["share"]
     assert torch.allclose(together[1], network(images[1:2])["share"][0], atol=1e-5)
-
-
-def test_bilinear_samples_of_a_network_without_flags_lie_at_whole_steps() -> None:
     row = torch.tensor([0.0, 1.0, 2.0]).expand(1, 1, 3, 3)
     large = OPERATORS["resize"](row, size=[6, 6], align_corners=False, half_pixel=False)
     assert large[0, 0, 0].tolist() == [0, 0.5, 1, 1.5, 2, 2]
-
-
-def test_every_face_of_the_example_is_found_once() -> None:
     assert len(detect_faces(SHIPPED_NETWORKS.people, np.asarray(Image.open(PHOTO).convert("RGB")))) == 1

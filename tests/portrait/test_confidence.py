@@ -49,9 +49,18 @@ def view_of_face(
     return replace(seen, landmarks_px=points, error_px=np.full(LANDMARKS, error * size_px))
 
 
-def test_a_good_face_is_sure() -> None:
+def test_a_good_face_is_sure_and_one_turned_too_far_doubtful() -> None:
     confidence = confidence_of(face_facts(view_of_face(), PHOTO))
     assert confidence.word == "sure" and confidence.score > 0.9 and not confidence.reasons
+    assert SCALES["turned"].factor(45) == 1
+    assert confidence_of({"turned": 72.0}).word == "doubtful"
+    words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
+    assert words == ["sure", "unsure", "doubtful"]
+    both = Confidence({"small": 0.5, "profile": 0.4, "dark": 1.0})
+    assert both.score == pytest.approx(0.2) and both.reasons == ["profile", "small"]
+    photo = 0.5 + PHOTO
+    photo[:20] = 100  # a window
+    assert face_facts(view_of_face(), photo)["overexposed"] == 0
 
 
 @pytest.mark.parametrize(
@@ -84,40 +93,19 @@ def test_what_makes_a_photo_hard_is_named(reason: str, photo: np.ndarray) -> Non
     assert confidence.word != "sure" and confidence.reasons[0] == reason
 
 
-def test_bright_values_of_a_photo_that_holds_brighter_ones_are_not_clipped() -> None:
-    photo = 0.5 + PHOTO
-    photo[:20] = 100  # a window
-    assert face_facts(view_of_face(), photo)["overexposed"] == 0
-
-
-def test_the_words_follow_the_score() -> None:
-    words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
-    assert words == ["sure", "unsure", "doubtful"]
-    both = Confidence({"small": 0.5, "profile": 0.4, "dark": 1.0})
-    assert both.score == pytest.approx(0.2) and both.reasons == ["profile", "small"]
-
-
-def test_a_head_that_is_turned_too_far_is_doubtful() -> None:
-    assert SCALES["turned"].factor(45) == 1
-    assert confidence_of({"turned": 72.0}).word == "doubtful"
-
-
 def disc(x: float, y: float, radius: float) -> np.ndarray:
     """A person's share [150, 220]: 1 in a disc."""
     down, right = np.mgrid[:150, :220]
     return (np.hypot(right - x, down - y) < radius).astype(np.float32)
 
 
-def test_a_matte_that_all_see_alike_loses_nothing() -> None:
+def test_what_spoils_a_matte_is_measured_and_the_frame_touched_where_the_person_ends() -> None:
     person = disc(100, 70, 40)
     assert matte_facts(PersonShares(person, person), person, person, HEAD) == {
         "disputed": 1,
         "crowded": 0,
         "severed": 0,
     }
-
-
-def test_what_spoils_a_matte_is_measured() -> None:
     person, other, arm = disc(100, 70, 40), disc(160, 70, 35), disc(20, 100, 15)
     crowded = matte_facts(PersonShares(person, np.maximum(person, other)), person, person, HEAD)
     assert crowded["crowded"] > 0.15 and crowded["disputed"] < 0.9
@@ -125,9 +113,6 @@ def test_what_spoils_a_matte_is_measured() -> None:
     assert disputed["disputed"] < 0.5
     severed = matte_facts(PersonShares(person + arm, person + arm), person, person, HEAD)
     assert severed["severed"] == pytest.approx(arm.sum() / person.sum())
-
-
-def test_the_frame_is_touched_where_the_person_ends_at_it() -> None:
     person = np.zeros((50, 80))
     person[20:, 30:60] = 1
     person[40:, :60] = 1

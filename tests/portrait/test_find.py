@@ -42,16 +42,30 @@ def resized(image, scale):
     return np.round(255 * skimage.transform.resize(image, size, anti_aliasing=True)).astype(np.uint8)
 
 
-def test_landmarks_lie_where_a_person_marks_them(landmarks_px):
+def test_landmarks_lie_where_a_person_marks_them_in_large_small_tight_and_dark_photos(landmarks_px):
     off_px = np.linalg.norm(landmarks_px[list(MARKED_PX)] - list(MARKED_PX.values()), axis=1)
     assert off_px.max() < 0.06 * iod_px(landmarks_px)
-
-
-def test_a_mirrored_photo_has_mirrored_landmarks(landmarks_px):
     (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[:, ::-1])
     back = face.landmarks_px[MIRROR_68] * [-1, 1] + [PHOTO.shape[1], 0]
     assert (back - landmarks_px).mean(0) == pytest.approx([0, 0], abs=0.25)
     assert error_iod(back, landmarks_px) < 0.02
+    buffer = io.BytesIO()
+    Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.array(Image.open(buffer)))
+    assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, resized(PHOTO, 0.4))
+    assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
+    large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, large)
+    assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
+    low, high = landmarks_px[17:].min(0).astype(int) - 8, landmarks_px[17:].max(0).astype(int) + 10
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[low[1] : high[1], low[0] : high[0]])
+    assert error_iod(face.landmarks_px[17:] + low, landmarks_px[17:]) < 0.06
+    linear = srgb_to_linear(PHOTO.astype(np.float32) / 255)
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.round(PHOTO * 0.03).astype(np.uint8))
+    assert error_iod(face.landmarks_px, landmarks_px) < 0.08
+    (face,) = find_faces(SHIPPED_NETWORKS.people, linear * 1e-3, "dark.exr")
+    assert error_iod(face.landmarks_px, landmarks_px) < 0.02
 
 
 @pytest.mark.parametrize("turns", [1, 2])
@@ -65,39 +79,7 @@ def test_turned_photos(landmarks_px, turns):
     assert left < face.landmarks_px[30, 0] < right and top < face.landmarks_px[30, 1] < bottom
 
 
-def test_a_badge_that_the_detector_is_surer_of_through_a_jpeg(landmarks_px):
-    buffer = io.BytesIO()
-    Image.fromarray(skimage.data.astronaut()).save(buffer, "JPEG", quality=75)
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.array(Image.open(buffer)))
-    assert error_iod(face.landmarks_px - [40, 0], landmarks_px) < 0.03
-
-
-def test_a_small_face(landmarks_px):
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, resized(PHOTO, 0.4))
-    assert error_iod(face.landmarks_px, 0.4 * landmarks_px) < 0.05
-
-
-def test_a_large_image(landmarks_px):
-    large = np.repeat(np.repeat(PHOTO, 10, 0), 10, 1)
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, large)
-    assert error_iod(face.landmarks_px, 10 * landmarks_px) < 0.03
-
-
-def test_a_tight_crop(landmarks_px):
-    low, high = landmarks_px[17:].min(0).astype(int) - 8, landmarks_px[17:].max(0).astype(int) + 10
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO[low[1] : high[1], low[0] : high[0]])
-    assert error_iod(face.landmarks_px[17:] + low, landmarks_px[17:]) < 0.06
-
-
-def test_a_dark_photo(landmarks_px):
-    linear = srgb_to_linear(PHOTO.astype(np.float32) / 255)
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, np.round(PHOTO * 0.03).astype(np.uint8))
-    assert error_iod(face.landmarks_px, landmarks_px) < 0.08
-    (face,) = find_faces(SHIPPED_NETWORKS.people, linear * 1e-3, "dark.exr")
-    assert error_iod(face.landmarks_px, landmarks_px) < 0.02
-
-
-def test_several_faces_from_left_to_right(landmarks_px):
+def test_several_faces_from_left_to_right_and_one_of_24_pixels(landmarks_px):
     small = np.zeros_like(PHOTO)
     small[100:300, 90:270] = resized(PHOTO, 0.5)
     pair = np.concatenate([small, PHOTO], 1)
@@ -106,6 +88,12 @@ def test_several_faces_from_left_to_right(landmarks_px):
     assert len(detect_faces(SHIPPED_NETWORKS.people, pair, everyone=True)) == 2
     for a, b in (faces, faces[::-1]):
         assert [one.landmarks_px is b.landmarks_px for one in a.others] == [True]
+    scale = 24 / np.ptp(landmarks_px[:, 1])
+    wide = np.full((3000, 4000, 3), 128, np.uint8)
+    small = resized(PHOTO, scale)
+    wide[1900 : 1900 + len(small), 3100 : 3100 + small.shape[1]] = small
+    (face,) = detect_faces(SHIPPED_NETWORKS.people, wide, everyone=True)
+    assert error_iod(face.landmarks_px - [3100, 1900], scale * landmarks_px) < 0.15
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 5000, 3), (200, 300, 3)])
@@ -114,12 +102,7 @@ def test_no_face_names_the_image_and_a_way_out(shape):
         find_faces(SHIPPED_NETWORKS.people, np.random.default_rng(0).random(shape, np.float32), "holiday.png")
 
 
-def test_only_display_images_are_searched():
-    with pytest.raises(ValueError, match="uint8"):
-        detect_faces(SHIPPED_NETWORKS.people, np.zeros((5, 5, 3), np.float32))
-
-
-def test_a_face_that_is_larger_than_the_photo():
+def test_a_face_larger_than_the_photo_and_images_for_display_alone():
     """From the eyes to the mouth."""
     (whole,) = detect_faces(SHIPPED_NETWORKS.people, PHOTO)
     face = whole.landmarks_px
@@ -130,6 +113,8 @@ def test_a_face_that_is_larger_than_the_photo():
     )
     off = np.linalg.norm(near.landmarks_px / 3 + [x0, y0] - face, axis=1)
     assert off[INNER].mean() < 0.12 * iod_px(face)
+    with pytest.raises(ValueError, match="uint8"):
+        detect_faces(SHIPPED_NETWORKS.people, np.zeros((5, 5, 3), np.float32))
 
 
 @pytest.mark.parametrize("subject", ["yaleB06", "yaleB12"])
@@ -147,12 +132,3 @@ def test_heads_in_any_turn_are_found_among_others(landmarks_px, turn):
     height = max(len(lying), len(PHOTO))
     pair = [np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in (PHOTO, lying)]
     assert len(detect_faces(SHIPPED_NETWORKS.people, np.concatenate(pair, 1), everyone=True)) == 2
-
-
-def test_a_face_of_24_pixels_in_a_photo_of_12_megapixels(landmarks_px):
-    scale = 24 / np.ptp(landmarks_px[:, 1])
-    wide = np.full((3000, 4000, 3), 128, np.uint8)
-    small = resized(PHOTO, scale)
-    wide[1900 : 1900 + len(small), 3100 : 3100 + small.shape[1]] = small
-    (face,) = detect_faces(SHIPPED_NETWORKS.people, wide, everyone=True)
-    assert error_iod(face.landmarks_px - [3100, 1900], scale * landmarks_px) < 0.15

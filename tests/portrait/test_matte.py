@@ -21,15 +21,12 @@ def photo_of(matte: np.ndarray) -> np.ndarray:
     return np.round(mixed).astype(np.uint8)
 
 
-def test_a_small_matte_gets_the_photos_edge_at_the_photos_size() -> None:
+def test_a_small_matte_gets_the_photos_edge_and_no_pattern_where_it_is_sure() -> None:
     true, small = disc(4 * SIDE), disc(SIDE)
     large = lifted(small, photo_of(small) / np.float32(255), photo_of(true))
     assert large.shape == true.shape
     plain = np.repeat(np.repeat(small, 4, 0), 4, 1)
     assert np.abs(large - true).mean() < 0.1 * np.abs(plain - true).mean()
-
-
-def test_where_the_matte_is_sure_no_pattern_of_the_photo_shows() -> None:
     pattern = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)
     for value in (0.0, 1.0):
         sure = np.full((SIDE, SIDE), value, np.float32)
@@ -62,7 +59,7 @@ def test_what_is_nearly_sure_of_a_matte_is_sure(loose: float) -> None:
     assert (found[guess > 0.94] == 1).all() and (found[guess < 0.05] == 0).all()
 
 
-def test_an_outline_is_narrow_where_skin_and_wall_look_the_same() -> None:
+def test_an_outline_is_narrow_and_a_haze_takes_little_from_the_background() -> None:
     """The matte of a large photo rises over a tenth of it."""
     at = (np.arange(8 * SIDE) + 0.5) / (8 * SIDE) - 0.5
     slow = ((0.3 - np.hypot(*np.meshgrid(at, at))) / 0.1 + 0.5).clip(0, 1).astype(np.float32)
@@ -70,6 +67,14 @@ def test_an_outline_is_narrow_where_skin_and_wall_look_the_same() -> None:
     unsure = ((matte > 0.02) & (matte < 0.98) for matte in (found, slow))
     assert np.divide(*(part.sum() for part in unsure)) < 0.1
     assert ((found > 0.5) == (slow > 0.5)).mean() > 0.99
+    # A matte of .2 over a dark background that holds nothing of the person.
+    own, other = np.array([0.6, 0.3, 0.2], np.float32), np.array([0.02, 0.05, 0.01], np.float32)
+    true = disc(SIDE)
+    photo = true[..., None] * own + (1 - true[..., None]) * other
+    matte = np.maximum(true, np.float32(0.2) * disc(SIDE, 0.34))
+    haze = (true == 0) & (matte > 0.19)
+    left = photo - matte[..., None] * PersonColours(photo, matte)[:]
+    assert (left[haze] > 0.5 * other).all()
 
 
 @pytest.mark.parametrize("value", [0.25, 0.5, 0.9])
@@ -83,14 +88,3 @@ def test_mixed_pixels_get_the_persons_colour_back(value: float) -> None:
     assert np.abs(found[edge] - own).max() < 0.05 < np.abs(photo[edge] - own).max()
     assert (found[matte == 0] == 0).all()
     assert np.abs(found[matte == 1] - own).max() < 1e-3
-
-
-def test_a_haze_takes_little_from_the_background() -> None:
-    """A matte of .2 over a dark background that holds nothing of the person."""
-    own, other = np.array([0.6, 0.3, 0.2], np.float32), np.array([0.02, 0.05, 0.01], np.float32)
-    true = disc(SIDE)
-    photo = true[..., None] * own + (1 - true[..., None]) * other
-    matte = np.maximum(true, np.float32(0.2) * disc(SIDE, 0.34))
-    haze = (true == 0) & (matte > 0.19)
-    left = photo - matte[..., None] * PersonColours(photo, matte)[:]
-    assert (left[haze] > 0.5 * other).all()

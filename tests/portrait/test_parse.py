@@ -31,27 +31,18 @@ def test_a_square_shows_what_lies_there(turn_deg: float, side_px: float) -> None
     assert np.abs(square.to_share(places) - np.stack(np.meshgrid(at, at), -1)).max() < 1e-9
 
 
-def test_a_positive_turn_is_counter_clockwise_on_screen() -> None:
+def test_positive_turns_borders_and_large_photos() -> None:
     right = Square(0.0, 0.0, 2.0, math.radians(30)).to_photo(np.array([1.0, 0.5]))
     assert right == pytest.approx([math.cos(math.radians(30)), -0.5])  # up on screen
-
-
-def test_beyond_the_photo_its_border_goes_on() -> None:
     image = np.zeros((20, 20, 3), np.uint8)
     image[:, -4:] = 255
     cut = Square(30.0, 10.0, 16.0).cut(image, 8).numpy()
     assert (cut > 0.95).all()
     far = Square(300.0, -200.0, 30.0).cut(image, 8).numpy()
     assert far.shape == (3, 8, 8) and np.isfinite(far).all()
-
-
-def test_a_large_photo_is_averaged_first() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (512, 512, 3)).astype(np.uint8)
     cut = Square(256.0, 256.0, 512.0).cut(noise, 16).numpy()
     assert cut.std() < 0.02 and abs(cut.mean() - 0.5) < 0.01
-
-
-def test_mirrored_landmarks() -> None:
     mirror = np.array(mirrored_landmarks())
     assert (mirror[mirror] == np.arange(len(mirror))).all()
     names = dict(zip(MORE_LANDMARKS, (MORE_LANDMARKS[k] for k in mirror), strict=True))

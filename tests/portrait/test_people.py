@@ -14,6 +14,7 @@ from facerf_cli.portrait.people import (
     person_among,
     with_flat_parts,
 )
+from tests.kinds import Patch
 from tests.portrait.seen import white_people
 
 FACE = np.random.default_rng(0).uniform([135, 45], [185, 95], (68, 2))  # around (160, 70)
@@ -25,7 +26,7 @@ def disc(x: float, y: float, radius: float, shape: tuple[int, int] = (240, 320))
     return (right - x) ** 2 + (down - y) ** 2 < radius**2
 
 
-def test_a_view_is_laid_over_where_it_was_cut() -> None:
+def test_a_view_is_laid_over_where_it_was_cut_and_a_border_weighs_fully() -> None:
     y, x = np.mgrid[:120, :160] / 160
     photo = np.stack([x, y, x * y], -1).astype(np.float32)
     square = Square(70, 60, 80)
@@ -33,12 +34,12 @@ def test_a_view_is_laid_over_where_it_was_cut() -> None:
     inside = weight > 0.5
     assert inside.sum() > 60**2 and (weight[:, 115:] == 0).all()
     assert np.allclose(placed.numpy()[:, inside], photo[inside].T, atol=2e-3)
-
-
-def test_a_border_beyond_the_photo_weighs_fully() -> None:
-    """The photo's border lies in the square's rim, where the weight would be a half."""
+    # The photo's border lies in the square's rim, where the weight would be a half.
     _, weight = Square(45, 60, 100).laid_over(torch.ones(1, 256, 256), (120, 160), (120, 160), 0.12)
     assert weight[60, 0] == 1 and weight[60, 94] < 0.1
+    head = HeadPlace.of(FACE)
+    half, small = head.scaled(0.5), HeadPlace.of(FACE * 0.5)
+    assert vars(half) == pytest.approx(vars(small))
 
 
 def test_two_people_are_divided_where_they_touch() -> None:
@@ -54,9 +55,7 @@ def test_two_people_are_divided_where_they_touch() -> None:
     assert part[120, 60] > 0.9 and part[120, 150] > 0.9 and part[120, 175] < 0.1 and part[120, 260] < 0.1
 
 
-def test_each_head_of_a_crowd_is_looked_at_twice_however_many_there_are(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_each_head_of_a_crowd_is_looked_at_twice_however_many_there_are(monkeypatch: Patch) -> None:
     """Once for its own person, and once for all the others; in another image it is looked at again."""
     looks: list[HeadPlace] = []
 
@@ -93,9 +92,6 @@ def test_a_face_that_fills_the_photo_is_what_the_parsing_network_sees() -> None:
     head = HeadPlace(160, 120, 320, 280)
     share = person_among(white_people(), np.zeros((240, 320, 3), np.float32), head, [], parsed).person
     assert (share == parsed).all()
-
-
-def test_the_parsing_network_takes_away_below_the_eyes_alone() -> None:
     image = np.where(disc(160, 70, 55)[..., None], 1.0, 0.3).repeat(3, -1).astype(np.float32)
     share = person_among(white_people(), image, HEAD, [], np.zeros(image.shape[:2])).person
     assert share[30, 160] > 0.9 and share[100, 160] < 0.3
@@ -132,9 +128,3 @@ def test_a_matte_follows_the_edge_of_the_photo_at_its_size(scale: int) -> None:
     off = np.abs(matte - truth).mean() / truth.mean()
     before = 1 - (44 / 45) ** 2
     assert matte.shape == shape and off < before / 2
-
-
-def test_heads_scale_with_the_photo() -> None:
-    head = HeadPlace.of(FACE)
-    half, small = head.scaled(0.5), HeadPlace.of(FACE * 0.5)
-    assert vars(half) == pytest.approx(vars(small))

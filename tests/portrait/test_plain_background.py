@@ -27,15 +27,12 @@ def guessed() -> np.ndarray:
     return guess
 
 
-def test_before_a_plain_wall_colours_decide() -> None:
+def test_before_a_plain_wall_colours_decide_and_what_is_sure_stays() -> None:
     truth, guess = disc(60), guessed()
     found = solved_before_plain_background(guess, seen(truth, WALL))
     assert np.abs(guess - truth).max() > 0.5
     np.testing.assert_allclose(found, truth, atol=0.03)
-
-
-def test_what_is_sure_stays() -> None:
-    """A white button near the outline, too."""
+    # A white button near the outline, too.
     guess, image = guessed(), seen(disc(60), WALL)
     image[120:122, 48:50] = WALL
     assert (guess[120:122, 48:50] == 1).all()

@@ -55,7 +55,7 @@ def proxy(wider: float = 0.0, hair_px: float = 0.0) -> Proxy:
     return proxy_of(load_face_model("builtin"), fit(wider), classes(hair_px), SQUARE)
 
 
-def test_its_maps_are_a_head_that_looks_at_the_camera() -> None:
+def test_its_maps_are_a_head_that_follows_the_fitted_face() -> None:
     maps = proxy_maps(proxy(), square_camera(fit(), SQUARE))
     torch.testing.assert_close(maps.normals.norm(dim=0), torch.ones(SIDE, SIDE))
     assert 0.1 < maps.covered.mean() < 0.9 and maps.covered[48, 48] == 1
@@ -63,10 +63,7 @@ def test_its_maps_are_a_head_that_looks_at_the_camera() -> None:
     z = maps.positions_m[2]
     assert z[44:54, 46:51].max() > z[40, 48]  # the nose stands out
     assert maps.normals[0, 46, 56:62].min() > 0 > maps.normals[0, 46, 34:40].max()
-
-
-def test_it_follows_the_fitted_face() -> None:
-    """Vertices on the face move as the face does, those of the body by its scale alone."""
+    # Vertices on the face move as the face does, those of the body by its scale alone.
     model = load_face_model("builtin")
     plain, other = proxy(), proxy(2.0)
     faces = [f.vertices_camera(model) for f in (fit(), fit(2.0))]
@@ -76,12 +73,17 @@ def test_it_follows_the_fitted_face() -> None:
     assert float(wanted.norm()) > 0.002 and float((moved - wanted).norm()) < 0.3 * float(wanted.norm())
 
 
-def test_hair_pushes_the_scalp_to_its_outline() -> None:
+def test_hair_pushes_the_scalp_and_grows_without_a_wall() -> None:
     camera = square_camera(fit(), SQUARE)
     bald, hairy = (proxy_maps(proxy(hair_px=px), camera).covered for px in (0.0, 40.0))
     top_of = [int(np.flatnonzero(covered[:, 48].numpy()).min()) for covered in (bald, hairy)]
     assert top_of[1] < top_of[0] - 3 and top_of[1] >= 40 - 40 - 1
     assert torch.equal(bald[80:, 48], hairy[80:, 48])
+    # Between neighbouring vertices its share grows by a third at most.
+    person = module._mean_person()
+    ends = person.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    assert (person.hair[ends[:, 0]] - person.hair[ends[:, 1]]).abs().max() < 0.34
+    assert person.hair.max() > 0.99
 
 
 @pytest.mark.parametrize("hair_px", [0.0, 36.0])
@@ -92,14 +94,6 @@ def test_no_step_in_depth_stands_between_a_face_and_its_ears_and_temples(hair_px
     depth_m = rasterize(head.vertices, outside, camera).depth_m.numpy()
     for row in depth_m[100 - np.arange(-10, 70, 5)]:  # from the ears' lobes to the temples
         assert 1000 * np.abs(np.diff(row[np.isfinite(row)])).max() < 25
-
-
-def test_hair_grows_thicker_without_a_wall() -> None:
-    """Between neighbouring vertices its share grows by a third at most."""
-    person = module._mean_person()
-    ends = person.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    assert (person.hair[ends[:, 0]] - person.hair[ends[:, 1]]).abs().max() < 0.34
-    assert person.hair.max() > 0.99
 
 
 def test_heads_cast_shadows() -> None:
@@ -205,15 +199,12 @@ def test_shadows_of_the_proxy_are_in_it() -> None:
     assert middle[band].mean() < 0.4 * middle[BALL_PX // 4 : BALL_PX * 3 // 8].mean()
 
 
-def test_in_a_wide_square_a_small_face_is_enough() -> None:
+def test_in_a_wide_square_a_small_face_is_enough_and_without_skin_nothing_is_guessed() -> None:
     normals, classes, visible = ball()
     classes[SKIN] *= normals[2] > 0.993
     image = torch.einsum("c,cij->ij", RIG[8], normals).clamp_min(0).expand(3, -1, -1)
     near, wide = (own_shading(image, classes, normals, RIG, visible, sides) for sides in (3.0, 6.0))
     assert near.std() == 0 and wide.std() > 0.1
-
-
-def test_without_skin_nothing_is_guessed() -> None:
     normals, classes, visible = ball()
     shading = own_shading(torch.rand(3, BALL_PX, BALL_PX), 0 * classes, normals, RIG, visible, 3.0)
     torch.testing.assert_close(shading, torch.ones(1, BALL_PX, BALL_PX))

@@ -98,7 +98,9 @@ def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(
     assert body.x_px - body.side_px / 2 >= 0 and body.x_px + body.side_px / 2 <= WIDTH
 
 
-def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
+def test_every_pixel_of_the_person_has_a_class_that_sums_to_the_matte(
+    squares: list[Square], people: PeopleNetworks
+) -> None:
     classes = torch.zeros(len(CLASSES), 8, 8)
     classes[0] = 1
     classes[:, :, 4:] = 0
@@ -106,6 +108,11 @@ def test_where_nothing_is_seen_of_a_matte_its_classes_still_sum_to_it() -> None:
     found = Segmentation(classes, np.full((16, 16), 0.5, np.float32))
     total = sum(found.layer(name) for name in CLASSES[1:])
     assert np.allclose(total, 0.5, atol=1e-6) and found.layer("hair").min() > 0.4
+    # A hat that the Parsing Network does not see has the class of the nearest pixel that it sees.
+    image = photo()
+    image[10:40, 140:180] = 220
+    found = segment(people, image, FACE)
+    assert found.matte[20, 160] > 0.9 and found.layer("hair")[20, 160] > 0.9
 
 
 def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch, people: PeopleNetworks) -> None:
@@ -121,14 +128,6 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch, people: P
     at_face = module.seen_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[CLASSES.index("skin")] == pytest.approx(0.745, abs=0.01)  # 1.6^-4 over the sum
     assert at_face[CLASSES.index("neck")] > 0.2
-
-
-def test_no_pixel_of_the_person_is_without_a_class(squares: list[Square], people: PeopleNetworks) -> None:
-    """A hat that the Parsing Network does not see has the class of the nearest pixel that it sees."""
-    image = photo()
-    image[10:40, 140:180] = 220
-    found = segment(people, image, FACE)
-    assert found.matte[20, 160] > 0.9 and found.layer("hair")[20, 160] > 0.9
 
 
 def test_hair_is_likelier_than_seen(monkeypatch: pytest.MonkeyPatch, people: PeopleNetworks) -> None:
@@ -174,20 +173,14 @@ def test_a_doubtful_pixel_of_an_ear_becomes_one(x: float) -> None:
     assert found[SKIN] / found[HAIR] == pytest.approx(0.45 / 0.2, rel=1e-4)
 
 
-def test_the_odds_are_multiplied_by_one_factor() -> None:
+def test_the_odds_are_multiplied_by_one_factor_near_the_ears_alone() -> None:
     def odds(share: float) -> float:
         found = float(lifted({"ears": share, "skin": 1 - share}, 10, 50)[EARS])
         return found / (1 - found) / (share / (1 - share))
 
     assert odds(0.2) == pytest.approx(odds(0.7), rel=1e-3) and 2 < odds(0.2) < 5
-
-
-def test_far_from_the_ears_nothing_changes() -> None:
     assert lifted({"ears": 0.4, "skin": 0.6}, 50, 50)[EARS] == pytest.approx(0.4, abs=1e-4)
     assert lifted({"ears": 0.4, "skin": 0.6}, 10, 90)[EARS] == pytest.approx(0.4, abs=1e-4)
-
-
-def test_sure_hair_and_glasses_stay() -> None:
     assert lifted({"ears": 0.02, "hair": 0.98}, 10, 50)[HAIR] > 0.9
     assert lifted({"ears": 0.3, "glasses": 0.7}, 10, 50)[GLASSES] == pytest.approx(0.7)
 

@@ -16,12 +16,11 @@ from facerf_cli.raster.camera import (
 NOSE = torch.tensor([0.0, 0.0, 1.0])
 
 
-def test_the_crop_camera_is_the_one_of_every_checkpoint() -> None:
+def test_the_crop_camera_is_the_one_of_every_checkpoint_and_projects_by_hand() -> None:
     """Focal length four sides, centred: networks and fits are useless in another one."""
     assert crop_camera(100) == Camera(400.0, 100, 100, 50.0, 50.0)
-
-
-def test_projection_by_hand() -> None:
+    point = torch.tensor([0.05, -0.03, -1.1])
+    torch.testing.assert_close(project(point, crop_camera(512)), 2 * project(point, crop_camera(256)))
     camera = Camera(focal_px=100, width_px=40, height_px=20, cx_px=21, cy_px=9)
     px = project(torch.tensor([[0.0, 0, -1], [0.1, 0, -1], [0, 0.1, -2]]), camera)
     torch.testing.assert_close(px, torch.tensor([[21.0, 9], [31, 9], [21, 4]]))
@@ -65,8 +64,3 @@ def test_so3_exp_has_the_right_gradient_from_zero_to_pi(size: float) -> None:
     omega = (size * torch.tensor([[0.6, 0.0, -0.8]], dtype=torch.float64)).requires_grad_()
     assert torch.autograd.gradcheck(so3_exp, omega)
     assert torch.autograd.gradcheck(so3_exp, omega.detach().expand(2, 3).clone().requires_grad_())
-
-
-def test_crop_camera_scales_with_its_side() -> None:
-    point = torch.tensor([0.05, -0.03, -1.1])
-    torch.testing.assert_close(project(point, crop_camera(512)), 2 * project(point, crop_camera(256)))

@@ -106,19 +106,26 @@ def test_pixel_centres_on_edges_and_corners_are_owned_once() -> None:
     assert isinstance(alone, Tensor) and bool((alone == 1).all())
 
 
-def test_a_triangle_far_larger_than_the_image_fills_it() -> None:
+def test_a_triangle_far_larger_than_the_image_fills_it_and_nothing_is_empty() -> None:
     vertices = torch.tensor([[-90.0, -90, -1], [90, -90, -1], [0, 180, -1]])
     fragments = rasterize(vertices, torch.tensor([[0, 1, 2]]), WIDE)
     assert bool(fragments.covered.all())
     torch.testing.assert_close(fragments.depth_m, torch.ones(22, 37))
+    empty = rasterize(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), WIDE)
+    assert not empty.covered.any() and bool(empty.depth_m.isinf().all())
 
 
-def test_work_in_parts_gives_the_same_image(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_work_in_parts_gives_the_same_image_and_faces_turn_counter_clockwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     vertices, triangles = triangle_soup(60, seed=4)
     whole = rasterize(vertices, triangles, WIDE)
     monkeypatch.setattr("facerf_cli.raster.rasterize._CHUNK_PX", 300)
     parts = rasterize(vertices, triangles, WIDE)
     assert torch.equal(whole.triangle, parts.triangle)
+    vertices = torch.tensor([[-1.0, -1, -2], [1, -1, -2], [0, 1, -2]])
+    triangles = torch.tensor([[0, 1, 2], [0, 2, 1]])
+    assert front_facing(vertices, triangles).tolist() == [True, False]
 
 
 def test_useless_triangles_are_dropped_without_a_trace() -> None:
@@ -140,11 +147,6 @@ def test_useless_triangles_are_dropped_without_a_trace() -> None:
         assert vertices.grad is not None and bool(vertices.grad[:3].isfinite().all()), name
 
 
-def test_nothing_to_see() -> None:
-    empty = rasterize(torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.int64), WIDE)
-    assert not empty.covered.any() and bool(empty.depth_m.isinf().all())
-
-
 def test_interpolated_positions_project_back_to_their_pixels() -> None:
     vertices, triangles = bumpy_grid(12, seed=7)
     fragments = rasterize(vertices, triangles, WIDE)
@@ -164,12 +166,6 @@ def test_gradients_to_vertices_and_attributes() -> None:
     assert torch.autograd.gradcheck(
         image, (vertices.requires_grad_(), attributes.requires_grad_()), eps=1e-7, atol=1e-5, fast_mode=True
     )
-
-
-def test_front_facing_is_counter_clockwise_on_screen() -> None:
-    vertices = torch.tensor([[-1.0, -1, -2], [1, -1, -2], [0, 1, -2]])
-    triangles = torch.tensor([[0, 1, 2], [0, 2, 1]])
-    assert front_facing(vertices, triangles).tolist() == [True, False]
 
 
 def test_crop_camera_is_the_designs() -> None:

@@ -51,7 +51,7 @@ def smooth_texture(side: int, seed: int = 0) -> Tensor:
     return torch.nn.functional.interpolate(coarse, size=(side, side), mode="bicubic")[0].clamp(0, 1)
 
 
-def test_normals_of_a_plane_and_of_a_sphere() -> None:
+def test_normals_of_a_plane_of_a_sphere_and_without_area() -> None:
     plane = torch.cat([UV * torch.tensor([1, -1]), torch.full((len(UV), 1), -2.0)], -1)
     expected = torch.tensor([0.0, 0, 1]).expand(len(UV), 3)
     torch.testing.assert_close(vertex_normals(plane, TRIANGLES), expected)
@@ -62,9 +62,6 @@ def test_normals_of_a_plane_and_of_a_sphere() -> None:
     assert cosine.min() > math.cos(math.radians(1.5))
     baked = normal_map(sphere, TRIANGLES, 32)
     torch.testing.assert_close(baked.norm(dim=0), torch.ones(32, 32))
-
-
-def test_normals_without_area_are_unit_and_have_finite_gradients() -> None:
     vertices = head()
     vertices[: 3 * SIDE] = vertices[0]  # some triangles are points, some vertices see nothing else
     vertices.requires_grad_()
@@ -74,16 +71,13 @@ def test_normals_without_area_are_unit_and_have_finite_gradients() -> None:
     assert vertices.grad is not None and bool(vertices.grad.isfinite().all())
 
 
-def test_baking_the_uv_gives_the_texels_centres() -> None:
+def test_baking_and_sampling_meet_at_the_texels_centres() -> None:
     baked = bake_attributes(UV, SIDE, 48)
     centre = (torch.arange(48) + 0.5) / 48
     torch.testing.assert_close(baked[0], centre.expand(48, 48), rtol=0, atol=1e-6)
     torch.testing.assert_close(baked[1], centre[:, None].expand(48, 48), rtol=0, atol=1e-6)
     with pytest.raises(ValueError, match="4225 vertices, not 10"):
         bake_attributes(UV[:10], SIDE, 48)
-
-
-def test_sampling_at_the_centres_gives_the_texels_and_clamps_beyond() -> None:
     texture = torch.rand(3, 16, 16)
     centres = bake_attributes(UV, SIDE, 16).permute(1, 2, 0)
     torch.testing.assert_close(sample_texture(texture, centres), texture.permute(1, 2, 0))
@@ -151,15 +145,7 @@ def first_hit(vertices: Tensor, points: Tensor) -> Tensor:
     return free.view(points.shape[:2])
 
 
-def test_a_slanted_plane_does_not_hide_itself() -> None:
-    flat = torch.cat([(UV - 0.5) * torch.tensor([0.2, -0.2]), torch.zeros(len(UV), 1)], -1)
-    small = Camera(90.0, 30, 22, 15.0, 11.0)  # a pixel is 1 cm wide, and 2.7 cm deep on the plane
-    plane = flat @ pose_to_rotation(70, 0, 0).T + torch.tensor([0.0, 0, -1])
-    _, visible = unwrap(torch.ones(1, 22, 30), plane, TRIANGLES, small, 64, UnwrapSettings(depth_side_px=1))
-    assert visible.min() > 0.5
-
-
-def test_texels_outside_the_image_are_invisible() -> None:
+def test_texels_outside_the_image_are_invisible_and_a_slanted_plane_is_not() -> None:
     narrow = Camera(900.0, 80, 220, 40.0, 104.0)
     vertices = head()
     _, visible = unwrap(torch.ones(1, 220, 80), vertices, TRIANGLES, narrow, 128)
@@ -168,9 +154,11 @@ def test_texels_outside_the_image_are_invisible() -> None:
     assert visible[(x_px > 1) & (x_px < 79)].mean() > 0.9
     _, behind = unwrap(torch.ones(1, 220, 80), vertices + torch.tensor([0.0, 0, 2]), TRIANGLES, narrow, 32)
     assert behind.max() == 0
-
-
-def test_unwrap_refuses_an_image_of_another_size() -> None:
+    flat = torch.cat([(UV - 0.5) * torch.tensor([0.2, -0.2]), torch.zeros(len(UV), 1)], -1)
+    small = Camera(90.0, 30, 22, 15.0, 11.0)  # a pixel is 1 cm wide, and 2.7 cm deep on the plane
+    plane = flat @ pose_to_rotation(70, 0, 0).T + torch.tensor([0.0, 0, -1])
+    _, visible = unwrap(torch.ones(1, 22, 30), plane, TRIANGLES, small, 64, UnwrapSettings(depth_side_px=1))
+    assert visible.min() > 0.5
     with pytest.raises(ValueError, match="220, 300"):
         unwrap(torch.ones(3, 300, 220), head(), TRIANGLES, CAMERA, 32)
 

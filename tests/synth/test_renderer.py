@@ -64,11 +64,16 @@ def test_a_diffuse_ball_has_the_radiance_of_lambert_and_the_coverage_of_its_disc
     assert (images[:, :, coverage == 0] == 0).all()
 
 
-def test_each_channel_has_its_own_albedo() -> None:
+def test_even_light_shows_reflectance_and_each_channel_its_own_albedo() -> None:
     head = board()
     one = replace(material(), albedo=torch.tensor([0.8, 0.4, 0.1]).view(3, 1, 1).expand(3, 8, 8))
     images, _ = photograph(head, appearance(one), bake(head, AHEAD), camera(), DIFFUSE)
     assert torch.allclose(images[0, :, 32, 32], torch.tensor([0.8, 0.4, 0.1]), atol=1e-5)
+    seen, transmitted = reflections(lens(), RIG)
+    even = torch.full((150,), 4 / 150)
+    two_surfaces = 2 * 0.04 / 1.04  # of refractive index 1.5, with the light that goes back and forth
+    assert float(seen @ even) == pytest.approx(two_surfaces, rel=1e-5)
+    assert float(transmitted) == pytest.approx(1 - two_surfaces, rel=1e-5)
 
 
 def test_pictures_do_not_depend_on_the_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,14 +221,6 @@ def lens(tilt: float = 0.0) -> Lenses:
     return Lenses(torch.tensor([0]), normal, torch.tensor([[0.0, 0.0, 1.0]]))
 
 
-def test_under_even_light_of_radiance_one_it_shows_its_reflectance() -> None:
-    seen, transmitted = reflections(lens(), RIG)
-    even = torch.full((150,), 4 / 150)
-    two_surfaces = 2 * 0.04 / 1.04  # of refractive index 1.5, with the light that goes back and forth
-    assert float(seen @ even) == pytest.approx(two_surfaces, rel=1e-5)
-    assert float(transmitted) == pytest.approx(1 - two_surfaces, rel=1e-5)
-
-
 @pytest.mark.parametrize("tilt_deg", [0, 20, -35])
 def test_it_mirrors_the_light_at_twice_its_tilt(tilt_deg: float) -> None:
     seen, _ = reflections(lens(np.radians(tilt_deg)), RIG)
@@ -231,21 +228,10 @@ def test_it_mirrors_the_light_at_twice_its_tilt(tilt_deg: float) -> None:
     assert int(seen[0].argmax()) == int((RIG @ mirrored).argmax())
 
 
-def test_a_grazing_view_is_mirrored_whole() -> None:
+def test_glasses_mirror_grazing_views_and_hide_what_is_behind() -> None:
     _, steep = reflections(lens(np.radians(85)), RIG)
     _, front = reflections(lens(), RIG)
     assert float(steep) < 0.6 < 0.9 < float(front)
-
-
-def pane(depth_m: float) -> HeadMesh:
-    """A square of 10 cm before the camera."""
-    corners = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
-    points = np.column_stack([corners, np.full(4, -depth_m)])
-    normals = np.broadcast_to([0.0, 0, 1], points.shape)
-    return strandless("frame", points, normals, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((4, 2)))
-
-
-def test_what_is_nearer_hides_it() -> None:
     camera = StageCamera(Camera(SIDE * 5.0, SIDE, SIDE, SIDE / 2, SIDE / 2), torch.eye(3), torch.zeros(3))
     depth_m = np.zeros((SIDE, SIDE), np.float32)
     depth_m[: SIDE // 2] = 0.5  # something nearer than the pane above,
@@ -257,11 +243,16 @@ def test_what_is_nearer_hides_it() -> None:
     assert not shown[: SIDE // 2].any()
     assert shown[SIDE // 2 + 1 : SIDE // 2 + 7, 9:23].all()  # eight pixels around the middle
     assert torch.allclose(found.normals, torch.tensor([0.0, 0, 1]).expand_as(found.normals))
-
-
-def test_images_of_single_lights_get_their_own_reflection() -> None:
     images = torch.rand(150, 3, 1, 2)
     covered = over_lenses(images, lens(), RIG)
     seen, transmitted = reflections(lens(), RIG)
     assert torch.equal(covered[..., 1], images[..., 1])
     assert torch.allclose(covered[:, 1, 0, 0], images[:, 1, 0, 0] * transmitted + seen[0])
+
+
+def pane(depth_m: float) -> HeadMesh:
+    """A square of 10 cm before the camera."""
+    corners = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05]])
+    points = np.column_stack([corners, np.full(4, -depth_m)])
+    normals = np.broadcast_to([0.0, 0, 1], points.shape)
+    return strandless("frame", points, normals, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros((4, 2)))

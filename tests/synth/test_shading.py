@@ -22,17 +22,18 @@ def _skin(side: int = 4, specular: float = 0.04, roughness: float = 0.5) -> Skin
     return Skin(full(3, 1.0), full(1, specular), full(1, roughness), full(2, 0.0), torch.ones(1, 3))
 
 
-def test_a_white_surface_facing_a_light_of_rgb_one_has_radiance_one() -> None:
+def test_a_white_surface_has_radiance_one_and_its_bounce_a_tint() -> None:
     facing = torch.ones(1, 4, 4)
     irradiance = diffuse_irradiance(facing, 0 * facing, facing, torch.ones(3, 4, 4), torch.ones(1, 3))
     assert torch.allclose(irradiance * _skin().albedo[0], torch.ones(3, 4, 4))
-
-
-def test_the_bounce_is_tinted_by_the_albedo() -> None:
     albedo = torch.tensor([0.5, 0.25, 0.125]).view(3, 1, 1).expand(3, 4, 4)
     dark = torch.zeros(1, 4, 4)
     irradiance = diffuse_irradiance(dark, dark + 0.4, dark, albedo, torch.ones(1, 3))
     assert torch.allclose(irradiance[:, 0, 0], torch.tensor([0.2, 0.1, 0.05]))
+    normals = unit_along(torch.randn(1, 3, 4, 4), 1)
+    assert torch.allclose(
+        tilt_normals(normals, normals, normals, torch.zeros(1, 2, 4, 4)), normals, atol=1e-6
+    )
 
 
 def test_scattering_keeps_a_constant_and_the_sum_of_a_point() -> None:
@@ -66,13 +67,6 @@ def test_highlights_reflect_less_than_they_receive_and_are_reciprocal() -> None:
         / view[0, 2, 0, 0]
     )
     assert torch.allclose(there, back, rtol=1e-4)
-
-
-def test_flat_relief_leaves_normals_alone() -> None:
-    normals = unit_along(torch.randn(1, 3, 4, 4), 1)
-    assert torch.allclose(
-        tilt_normals(normals, normals, normals, torch.zeros(1, 2, 4, 4)), normals, atol=1e-6
-    )
 
 
 def test_skins_span_light_to_dark_and_repeat_with_their_seed() -> None:

@@ -27,7 +27,7 @@ def painted() -> Appearance:
     return appearance(material((0.6, 0.4, 0.2), 0.03))
 
 
-def test_layers_of_a_ball_are_those_of_geometry() -> None:
+def test_layers_of_all_classes_are_those_of_geometry_in_camera_space() -> None:
     truth = truth_of(halves(), painted(), camera())
     assert abs(truth.alpha.sum() - np.pi * (RADIUS_M / 0.12 * SIDE_PX) ** 2) < 0.01 * truth.alpha.sum()
     assert ((truth.alpha > 0) & (truth.alpha < 1)).sum() > 60
@@ -48,29 +48,19 @@ def test_layers_of_a_ball_are_those_of_geometry() -> None:
     assert cosines.min() > 0.99
     depth = truth.layers()["depth.Z"][inside]
     assert abs(depth.min() - (FAR_M - RADIUS_M)) < 3e-4
-
-
-def test_normals_and_positions_are_in_camera_space() -> None:
     turned = truth_of(halves(), painted(), camera(yaw_deg=90.0))
-    middle = SIDE_PX // 2
     # The head's left half in the image, skin, turns to the camera when the head turns to the right.
     assert turned.classes[middle, middle, class_index("skin")] > 0.99
     np.testing.assert_allclose(turned.normals[middle, middle], [0, 0, 1], atol=0.03)
     assert turned.positions_m[middle, middle, 2] > -FAR_M + 0.9 * RADIUS_M
-
-
-def test_eight_cameras_stand_before_the_face_at_one_distance() -> None:
+    layers = truth_of(halves(), painted(), camera()).layers()
+    assert {f"class.{name}" for name in CLASSES} < set(layers) and "person.A" in layers
+    assert all(np.isfinite(layer).all() for layer in layers.values())
     cameras = stage_cameras(64)
     places = torch.stack([-c.head_to_camera.T.float() @ c.translation_m.float() for c in cameras])
     assert len(cameras) == 8 and (places[:, 2] > 0).all()
     assert torch.allclose(places.norm(dim=1), torch.tensor(1.2), atol=1e-5)
     assert places[1, 0] < 0 < places[2, 0] and places[7, 1] > 0
-
-
-def test_layers_have_the_names_of_all_classes() -> None:
-    layers = truth_of(halves(), painted(), camera()).layers()
-    assert {f"class.{name}" for name in CLASSES} < set(layers) and "person.A" in layers
-    assert all(np.isfinite(layer).all() for layer in layers.values())
 
 
 def test_irises_follow_the_gaze_and_ears_have_ends() -> None:

@@ -8,15 +8,12 @@ from tools import baseline_priors
 from tools.baseline_priors import LIGHT_ORDER, learn_light, learn_skin
 
 
-def test_drawn_again_they_are_much_the_same() -> None:
+def test_priors_drawn_again_are_faces_with_more_light_from_above() -> None:
     diffuse, gloss = learn_skin(50)
     for found, kept, near in ((diffuse, skin_prior().diffuse, 0.3), (gloss, skin_prior().gloss, 0.1)):
         assert float((found.mean - kept.mean).abs().mean()) < near
     light = learn_light(40)
     assert torch.allclose(light.mean[0], light_prior(LIGHT_ORDER).mean[0], rtol=0.15)
-
-
-def test_faces_of_the_prior_are_faces() -> None:
     mean = skin_prior().diffuse.at(torch.zeros(len(skin_prior().diffuse.modes)), 128).exp()
     assert mean.shape == (3, 128, 128) and float(mean.min()) > 0.005 and float(mean.max()) < 0.9
 
@@ -27,24 +24,18 @@ def test_faces_of_the_prior_are_faces() -> None:
     assert (at("brows") < 0.8 * at("skin")).all()
     assert at("lips")[0] / at("lips")[1] > at("skin")[0] / at("skin")[1]
     assert torch.equal(skin_prior().diffuse.at(torch.zeros(50), SIDE), skin_prior().diffuse.mean)
+    constant, upward = light_prior(1).mean[:2, 1]
+    assert 0.2 < float(upward / constant) < 1.5
+    assert ASSET.stat().st_size < 2 << 20
 
 
-def test_components_of_samples_have_their_variance() -> None:
+def test_components_have_their_variance_and_lower_orders_are_parts_of_higher_ones() -> None:
     samples = torch.randn(4000, 6) * torch.tensor([3.0, 2, 1, 0.5, 0.1, 0.01]) + 5
     found = baseline_priors._principal(samples, 6)
     assert torch.allclose(found.modes.T @ found.modes, samples.T.cov(), atol=1e-3)
     few = baseline_priors._principal(samples[:4], 3)  # fewer samples than dimensions
     assert torch.allclose(few.modes.T @ few.modes, samples[:4].T.cov(), atol=1e-3)
-
-
-def test_a_lower_order_is_a_part_of_a_higher_one() -> None:
     whole, part = light_prior(LIGHT_ORDER), light_prior(2)
     assert torch.equal(part.mean, whole.mean[:9])
     covariance = torch.einsum("rkc,rld->kcld", whole.modes, whole.modes)[:9, :, :9]
     assert torch.allclose(torch.einsum("rkc,rld->kcld", part.modes, part.modes), covariance, atol=1e-2)
-
-
-def test_more_light_comes_from_above() -> None:
-    constant, upward = light_prior(1).mean[:2, 1]
-    assert 0.2 < float(upward / constant) < 1.5
-    assert ASSET.stat().st_size < 2 << 20

@@ -50,17 +50,13 @@ def test_the_asset_is_what_the_recipe_builds(model):
     assert (spread - rebuilt).abs().max() < 3e-5
 
 
-def test_it_is_read_once_a_process():
+def test_the_mean_is_read_once_symmetric_and_its_left_is_the_subjects(model):
     assert load_face_model() is load_face_model("builtin")
-
-
-def test_the_mean_is_symmetric_to_the_last_bit(model):
     assert torch.equal(model.mean, mirrored(model.mean))
-
-
-def test_landmarks_lie_at_their_measures(model):
     found = model.landmarks(model.mean[None])[0].numpy()
     assert np.linalg.norm(found - LANDMARKS_M, axis=-1).max() < 0.5e-3
+    smile = model.expression[model.expression_names.index("smile_left")]
+    assert smile[model.mean[:, 0] > 0.01].norm() > 5 * smile[model.mean[:, 0] < -0.01].norm()
 
 
 def test_sides_of_an_expression_mirror_each_other(model):
@@ -74,19 +70,11 @@ def test_sides_of_an_expression_mirror_each_other(model):
         assert torch.allclose(mirrored(shapes[name]), shapes[name], atol=2e-6), name
 
 
-def test_left_is_the_subjects_own(model):
-    smile = model.expression[model.expression_names.index("smile_left")]
-    assert smile[model.mean[:, 0] > 0.01].norm() > 5 * smile[model.mean[:, 0] < -0.01].norm()
-
-
-def test_the_jaw_parts_the_lips_and_leaves_the_eyes(model):
+def test_jaws_part_the_lips_and_lids_close_over_the_eyeball(model):
     opened = expressed(model, "jaw_open")
     gap = landmark(model, opened, 62)[1] - landmark(model, opened, 66)[1]
     assert 0.02 < gap < 0.045
     assert (landmark(model, opened, 36) - landmark(model, model.mean, 36)).norm() < 0.5e-3
-
-
-def test_lids_close_over_the_eyeball(model):
     closed = expressed(model, "eye_close_left", "eye_close_right")
     for upper, lower in ((37, 41), (38, 40), (43, 47), (44, 46)):
         gap = landmark(model, closed, upper)[1] - landmark(model, closed, lower)[1]
@@ -96,15 +84,12 @@ def test_lids_close_over_the_eyeball(model):
         assert (closed - centre).norm(dim=-1).min() > EYE_RADIUS_MM / 1000
 
 
-def test_identities_neither_move_nor_turn_the_head(model):
+def test_identities_keep_the_head_in_place_and_people_are_mostly_symmetric(model):
     arm = model.mean - model.mean.mean(0)
     shift_mm = model.identity.mean(1).norm() * 1000
     moment = torch.linalg.cross(arm.expand_as(model.identity), model.identity, dim=-1).sum(1)
     turn_deg = torch.rad2deg(moment.norm() / arm.square().sum())
     assert shift_mm < 0.3 and turn_deg < 0.1
-
-
-def test_people_are_mostly_symmetric(model):
     lopsided = torch.stack([mode - mirrored(mode) for mode in model.identity]) / 2
     assert 1e-3 < lopsided.square().sum() / model.identity.square().sum() < 0.05
 
@@ -129,16 +114,12 @@ def test_people_differ_as_much_as_people_do(model, name, ends, low_mm, high_mm):
     assert low_mm < spread_mm < high_mm
 
 
-def test_people_do_not_fold(model):
+def test_people_and_expressions_fold_nothing_but_the_lids(model):
     alpha = torch.randn(20, IDENTITIES, generator=torch.Generator().manual_seed(0)).clamp(-2, 2)
     faces = model.vertices(alpha, torch.zeros(20, len(model.expression_names)))
     normal = triangle_normals(model.mean)
     turned = (torch.stack([triangle_normals(face) for face in faces]) * normal).sum(-1)
     assert (turned < 0).float().mean() < 2e-4
-
-
-def test_expressions_fold_nothing_but_the_lids(model):
-    normal = triangle_normals(model.mean)
     for name in model.expression_names:
         turned = (triangle_normals(expressed(model, name)) * normal).sum(-1) < 0
         assert turned.sum() <= (60 if name.startswith("eye_close") else 4), name

@@ -146,7 +146,9 @@ def assert_agrees(found: np.ndarray, relit: Any, ev: float) -> None:
     assert np.abs(shown().truth(relit, ev) - found[..., :3]).mean() < MEAN
 
 
-def test_lights_of_the_rig_agree_at_the_automatic_exposure(images: dict[str, Drawn]) -> None:
+def test_lights_of_the_rig_and_between_agree_at_given_and_automatic_exposure(
+    images: dict[str, Drawn],
+) -> None:
     for light in RIG:
         image = images[f"light={text_of(light)}"]
         relit = shown().relit(light[None], torch.ones(1, 3))
@@ -154,9 +156,6 @@ def test_lights_of_the_rig_agree_at_the_automatic_exposure(images: dict[str, Dra
         assert abs(image.ev - ev) < 0.03
         assert_agrees(image.pixels, relit, image.ev)
     assert image.ev == round(MOST_OVER_FRONT_EV - math.log2(1.24), 2)  # of the light from behind, and a room
-
-
-def test_lights_between_those_of_the_rig_agree(images: dict[str, Drawn]) -> None:
     errors = [
         shown().errors(
             images[f"light={az},{el}&ev=1"].pixels,
@@ -167,18 +166,12 @@ def test_lights_between_those_of_the_rig_agree(images: dict[str, Drawn]) -> None
     ]
     together = np.concatenate(errors)
     assert together.mean() < MEAN_BETWEEN and np.percentile(together, 95) < PERCENTILE_95
-
-
-def test_coloured_lights_add_up_at_a_given_exposure_and_without_background(images: dict[str, Drawn]) -> None:
     image, alone = images[COLOURED], images[ALONE]
     relit = shown().relit(PAIR, torch.tensor([[1, 0.5, 0.25], [1, 1, 1]]))
     assert_agrees(image.pixels, relit, -0.5)
     assert "--exposure -0.5" in image.command and "--view" not in image.command
     assert np.abs(alone.pixels[..., 3] - 255 * shown().whole.matte).max() < 1
     assert "--background none" in alone.command
-
-
-def test_a_rotated_map_agrees(images: dict[str, Drawn]) -> None:
     image = images[MAP]
     sun = next(one for one in page_maps() if one.name == "sun").pixels.astype(np.float32)
     rig = rig_directions()

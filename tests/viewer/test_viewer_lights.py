@@ -138,10 +138,15 @@ def test_the_photo_s_own_light_is_written_by_its_word(text: str, written: str, f
     assert found[text]["texts"] == [written]
 
 
-def test_every_word_of_light_is_packed_and_own_of_photos_alone() -> None:
+def test_every_word_is_packed_and_keys_of_a_preset_act_on_all_of_its_lights(found: dict[str, Any]) -> None:
     assert set(packed_lights(True)["words"]) == set(WORDS)
     assert set(WORDS) - set(packed_lights(False)["words"]) == {OWN, EVEN}
     assert packed_lights(True, 1.5)["words"][EVEN]["rgb"] == (1.5, 1.5, 1.5)
+    lights = found["key=rembrandt;stops=-1;rgb=1,0.5,0.5"]["lights"]
+    assert [(one["name"], one["stops"]) for one in lights] == [("key_key", -1), ("key_fill", -8.5)]
+    assert all(one["rgb"] == [1, 0.5, 0.5] for one in lights)
+    warm = found["rim;kelvin=3200"]["lights"]
+    assert [(one["name"], one["kelvin"]) for one in warm] == [("right", 3200), ("left", 3200), ("fill", 3200)]
 
 
 @pytest.mark.parametrize("text", FREE)
@@ -150,14 +155,6 @@ def test_words_names_and_near_lights_stand_for_directions(text: str, found: dict
         for key in ("azimuth", "elevation", "size", "stops", "kelvin"):
             assert one[key] == pytest.approx(other[key], abs=1e-4), key
         assert one["name"] == other["name"]
-
-
-def test_keys_of_a_preset_act_on_all_of_its_lights(found: dict[str, Any]) -> None:
-    lights = found["key=rembrandt;stops=-1;rgb=1,0.5,0.5"]["lights"]
-    assert [(one["name"], one["stops"]) for one in lights] == [("key_key", -1), ("key_fill", -8.5)]
-    assert all(one["rgb"] == [1, 0.5, 0.5] for one in lights)
-    warm = found["rim;kelvin=3200"]["lights"]
-    assert [(one["name"], one["kelvin"]) for one in warm] == [("right", 3200), ("left", 3200), ("fill", 3200)]
 
 
 @pytest.mark.parametrize("text", WRONG)

@@ -33,7 +33,7 @@ def basis_of_images(directions: np.ndarray, images: np.ndarray, matte: np.ndarra
     return basis_of_stack(directions, [torch.from_numpy(images).permute(0, 3, 1, 2)], matte, 512)
 
 
-def test_a_basis_gives_the_images_of_its_lights_back() -> None:
+def test_a_basis_gives_the_images_of_its_lights_back_and_is_black_where_nobody_is() -> None:
     random = np.random.default_rng(2)
     directions = rig_directions(20).numpy()
     albedo = random.uniform(0.05, 0.6, (24, 32, 3))
@@ -42,9 +42,6 @@ def test_a_basis_gives_the_images_of_its_lights_back() -> None:
     assert basis.guide.dtype == basis.ratios.dtype == np.uint8
     for direction, image in zip(directions, images, strict=True):
         np.testing.assert_allclose(basis.image(direction), image, rtol=0.02, atol=2e-3)
-
-
-def test_a_basis_is_finite_and_black_where_nobody_is() -> None:
     matte = np.zeros((24, 32))
     matte[4:20, 6:26] = 1
     images = np.ones((6, 24, 32, 3)) * matte[..., None]
@@ -86,7 +83,7 @@ def test_the_brightest_pixels_have_the_percentiles_of_all_under_every_light() ->
     assert Brightest.of(images, mask & False, 90.0).luminances.shape == (12, 0)
 
 
-def test_the_page_loads_nothing_and_names_are_escaped() -> None:
+def test_the_page_loads_nothing_and_an_index_shows_its_strips() -> None:
     made = text('<b>"me" & you</b></script>', "a b/me's.jpg")
     assert "<b>" not in made and made.count("</script>") == 2
     assert not re.search(r"(src|href)\s*=\s*[\"']?(https?:)?//", made)
@@ -98,17 +95,11 @@ def test_the_page_loads_nothing_and_names_are_escaped() -> None:
         name = base64.b64encode(hashlib.sha256(body[1].encode()).digest()).decode()
         assert f"{element}-src 'sha256-{name}'" in made
     assert "default-src 'none'" in made
-
-
-def test_an_index_shows_the_strips_of_its_pages() -> None:
     strip = strip_jpeg([np.full((6, 4, 3), 0.5), np.zeros((6, 4, 3))])
     made = page("me", ["me.jpg"], {}, strip)
     assert strip_of(made) == strip and strip_of("no page") == ""
     listed = index_page([IndexEntry("a<b", "dir/a&b.html", strip)])
     assert "a&lt;b" in listed and 'href="dir/a&amp;b.html"' in listed and strip in listed
-
-
-def test_frames() -> None:
     assert fitted(800, 1200, 600) == (400, 600) and fitted(80, 120, 600) == (80, 120)
     ramp = np.broadcast_to(np.arange(12.0)[:, None, None], (12, 8, 3))
     np.testing.assert_allclose(resized(ramp, 6, 4)[1:-1, 0, 0], [2.5, 4.5, 6.5, 8.5], atol=1e-5)

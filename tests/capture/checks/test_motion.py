@@ -23,16 +23,13 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_stage(tmp_path_factory.mktemp("moved") / "s", frames)
 
 
-def test_shifts_undo_the_motion(stage: Path) -> None:
+def test_shifts_undo_the_motion_frame_by_frame(stage: Path) -> None:
     shifts = align_shifts(read_capture(stage), SUBJECT, CAMERA, set())
     for row, (down, right) in PLANTED.items():
         assert shifts[IDS[row]] == pytest.approx((-down, -right), abs=0.7)  # of a few lamps, far apart
     front = [light for light, way in zip(IDS, directions(), strict=True) if way[2] > 0.5]
     still = set(front) - {IDS[row] for row in PLANTED}
     assert not any(np.hypot(*shifts.get(light, (0, 0))) > 0.7 for light in still)
-
-
-def test_frames_are_read_where_the_head_was(stage: Path) -> None:
     capture = read_capture(stage)
     aligned = with_alignment(capture, SUBJECT, {CAMERA: {IDS[7]}})
     truth = images(directions())[2]
@@ -43,6 +40,9 @@ def test_frames_are_read_where_the_head_was(stage: Path) -> None:
     )
     assert after < 0.4 * before
     assert (SUBJECT, CAMERA, IDS[7]) not in aligned.shifts  # a broken frame is not looked at
+    shifted = replace(capture, shifts={(SUBJECT, CAMERA, IDS[1]): (2.0, 0.0)})
+    assert (shifted.frame(SUBJECT, CAMERA, 1)[2:] == capture.frame(SUBJECT, CAMERA, 1)[:-2]).all()
+    assert (shifted.frame(SUBJECT, CAMERA, 0) == capture.frame(SUBJECT, CAMERA, 0)).all()
 
 
 def test_whole_shifts_move_pixels_and_parts_of_them_share() -> None:
@@ -60,13 +60,6 @@ def test_whole_shifts_move_pixels_and_parts_of_them_share() -> None:
     assert shift_image(image, 0, 0) is image
 
 
-def test_a_shift_in_the_capture_moves_its_frame_alone(stage: Path) -> None:
-    capture = read_capture(stage)
-    shifted = replace(capture, shifts={(SUBJECT, CAMERA, IDS[1]): (2.0, 0.0)})
-    assert (shifted.frame(SUBJECT, CAMERA, 1)[2:] == capture.frame(SUBJECT, CAMERA, 1)[:-2]).all()
-    assert (shifted.frame(SUBJECT, CAMERA, 0) == capture.frame(SUBJECT, CAMERA, 0)).all()
-
-
 def test_a_still_head_is_left_alone(tmp_path: Path) -> None:
     assert not align_shifts(read_capture(write_stage(tmp_path / "s")), SUBJECT, CAMERA, set())
 
@@ -78,14 +71,11 @@ def test_a_camera_that_sees_no_lamp_in_front_is_left_alone(tmp_path: Path) -> No
     assert not align_shifts(behind, SUBJECT, CAMERA, set(IDS[35:]))
 
 
-def test_the_peak_of_a_sampled_parabola() -> None:
+def test_paths_are_told_from_errors_and_jumps_by_sampled_parabolas() -> None:
     values = 3 - (np.arange(5.0) - 1.8) ** 2
     assert peak(values, 2) == pytest.approx(1.8)
     assert peak(values, 0) == 0.0 and peak(values, 4) == 4.0 and peak(np.ones(4), 2) == 2.0
-
-
-def test_a_path_is_told_from_errors_of_shading_and_from_jumps() -> None:
-    """Errors are the same under neighbouring lamps, a path bends slowly in the order of the list."""
+    # Errors are the same under neighbouring lamps, a path bends slowly in the order of the list.
     generator, turn = np.random.default_rng(0), np.arange(120) * 2.399963
     front = np.linspace(0.95, -0.9, 120)
     flat = np.sqrt(1 - front**2)

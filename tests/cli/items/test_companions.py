@@ -23,18 +23,12 @@ def touched(path: Path) -> Path:
     return path
 
 
-def test_a_file_serves_all_photos(item: Item, tmp_path: Path) -> None:
+def test_a_file_a_folder_and_a_pattern_are_companions(item: Item, tmp_path: Path) -> None:
     assert companion(item, tmp_path / "all.pts", "--landmarks") == tmp_path / "all.pts"
-
-
-def test_a_folder_mirrors_the_photos_or_holds_all_in_one_place(item: Item, tmp_path: Path) -> None:
     flat = touched(tmp_path / "points" / "me.json")
     assert companion(item, tmp_path / "points", "--landmarks") == flat
     mirrored = touched(tmp_path / "points" / "x" / "me.pts")
     assert companion(item, tmp_path / "points", "--landmarks") == mirrored
-
-
-def test_a_pattern(item: Item, tmp_path: Path) -> None:
     there = touched(tmp_path / "mattes" / "x" / "me_matte.png")
     pattern = tmp_path / "mattes" / "{dir}" / "{stem}_matte.png"
     assert companion(item, pattern, "--matte") == there

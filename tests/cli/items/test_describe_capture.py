@@ -60,11 +60,16 @@ def test_a_pattern_says_which_part_of_a_path_is_what(bare: Path, capsys: Said) -
     assert main(["prepare-dataset", str(bare), "--describe", "--pattern", pattern]) == 0
     assert f"{pattern}: 2 subjects, 3 cameras, 4 lights" in capsys.readouterr().err
     assert json.loads((bare / "stage.json").read_text())["pattern"] == pattern
-    assert main(["prepare-dataset", str(bare), "-o", str(bare / "out"), "--pattern", pattern]) == 2
-    assert "--pattern is for --describe" in capsys.readouterr().err
 
 
-def test_nothing_is_overwritten(bare: Path, capsys: Said) -> None:
+def test_nothing_is_overwritten_or_written_in_a_dry_run(bare: Path, capsys: Said) -> None:
+    for there in (False, True):  # it refuses nothing, either
+        assert main(["prepare-dataset", str(bare), *DESCRIBE, "--dry-run"]) == 0
+        said = capsys.readouterr()
+        assert said.out == f"{bare} -> {bare / 'stage.json'}\n" and "fill in: direction" in said.err
+        assert (bare / "stage.json").exists() == there
+        (bare / "stage.json").write_text("mine")
+    assert (bare / "stage.json").read_text() == "mine"
     (bare / "stage.json").write_text("mine")
     for output in ([], ["-o", str(bare / "stage.json")]):
         assert main(["prepare-dataset", str(bare), *DESCRIBE, *output]) == 2
@@ -74,16 +79,6 @@ def test_nothing_is_overwritten(bare: Path, capsys: Said) -> None:
     assert "is a folder" in capsys.readouterr().err
     assert main(["prepare-dataset", str(bare), *DESCRIBE, "-o", str(bare / "new/draft.json")]) == 0
     assert (bare / "new/draft.json").is_file()
-
-
-def test_a_dry_run_writes_nothing(bare: Path, capsys: Said) -> None:
-    for there in (False, True):  # it refuses nothing, either
-        assert main(["prepare-dataset", str(bare), *DESCRIBE, "--dry-run"]) == 0
-        said = capsys.readouterr()
-        assert said.out == f"{bare} -> {bare / 'stage.json'}\n" and "fill in: direction" in said.err
-        assert (bare / "stage.json").exists() == there
-        (bare / "stage.json").write_text("mine")
-    assert (bare / "stage.json").read_text() == "mine"
 
 
 @pytest.mark.parametrize(

@@ -35,10 +35,18 @@ def lit(radiance: float) -> Relit:
     return Relit(torch.from_numpy(header().seen * radiance).expand(3, -1, -1).float())
 
 
-def test_alone_the_person_has_its_own_colours_and_the_matte_as_alpha() -> None:
+def test_the_person_alone_has_its_colours_exposure_and_layers_that_add_up() -> None:
     image = StackImages(header(), Path(), header().seen).image(lit(0.6))
     assert image.alpha is not None and image.alpha.mean() == 0.5
     np.testing.assert_allclose(image.pixels[:, :2], 0.6, rtol=1e-6)
+    composer = StackImages(header(), Path(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
+    one, other, both = (composer.light_layer(lit(radiance)) for radiance in (0.2, 0.4, 0.6))
+    np.testing.assert_allclose(one + other, both, rtol=1e-5)
+    composer = StackImages(header(), Path(), header().seen)
+    assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
+    assert set(composer.rendered(RenderRequest(lit(1.0), layers=("normal",)))) == {"rgb", "normal"}
+    with pytest.raises(UsageError, match="--aov albedo"):
+        composer.rendered(RenderRequest(lit(1.0), layers=("albedo",)))
 
 
 def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_its_detail() -> None:
@@ -49,12 +57,6 @@ def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_i
     assert image.pixels[4, 0, 0] == pytest.approx(0.6, rel=2e-3)  # the offset that keeps the change finite
     assert image.pixels[0, 0, 0] == pytest.approx(1.2, rel=2e-3)
     np.testing.assert_allclose(image.pixels[:, -1], photo[:, -1] / 2)  # the background, as it was at 1 EV
-
-
-def test_layers_of_lights_add_up() -> None:
-    composer = StackImages(header(), Path(), header().seen, np.full((8, 8, 3), 0.2, np.float32))
-    one, other, both = (composer.light_layer(lit(radiance)) for radiance in (0.2, 0.4, 0.6))
-    np.testing.assert_allclose(one + other, both, rtol=1e-5)
 
 
 def test_a_large_photo_is_composed_in_rows() -> None:
@@ -72,11 +74,3 @@ def test_a_large_photo_is_composed_in_rows() -> None:
         assert middle.shape == (10, 512, 3) and peak < photo.nbytes / 10
         np.testing.assert_allclose(middle, whole[1000:1010], rtol=1e-6)
     np.testing.assert_allclose(whole[:, -1], 3.0)
-
-
-def test_exposure_and_layers() -> None:
-    composer = StackImages(header(), Path(), header().seen)
-    assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
-    assert set(composer.rendered(RenderRequest(lit(1.0), layers=("normal",)))) == {"rgb", "normal"}
-    with pytest.raises(UsageError, match="--aov albedo"):
-        composer.rendered(RenderRequest(lit(1.0), layers=("albedo",)))

@@ -20,6 +20,7 @@ from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
 from tests.face.importers.heads import Head, arrays_here, head, off_mm
+from tests.kinds import Patch
 
 h5py = pytest.importorskip("h5py")
 
@@ -33,7 +34,7 @@ def face() -> Head:
 
 
 @pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
+def here(monkeypatch: Patch) -> None:
     """Read in this process: starting another takes a second."""
     monkeypatch.setattr(basel, "arrays_apart", arrays_here)
 
@@ -117,7 +118,9 @@ def _nearest(face: Head, number: int) -> int:
     return int(np.linalg.norm(face.mean - face.landmarks[number], axis=-1).argmin())
 
 
-def test_basel_2009_is_read_in_metres_and_deviations(face: Head, tmp_path: Path) -> None:
+def test_basel_2009_is_read_and_becomes_a_model_with_the_built_in_expressions(
+    face: Head, tmp_path: Path
+) -> None:
     (tmp_path / "PublicMM1").mkdir()
     written_mat(tmp_path / "PublicMM1" / "01_MorphableModel.mat", mat(face))
     source = read_basel_2009(tmp_path)  # the folder, as it unpacks
@@ -126,9 +129,6 @@ def test_basel_2009_is_read_in_metres_and_deviations(face: Head, tmp_path: Path)
     np.testing.assert_allclose(source.identity[: len(face.shapes)], face.shapes, atol=1e-8)
     assert source.triangles.min() == 0 and source.triangles.max() == len(face.mean) - 1
     assert source.known == {}  # its vertices are numbered otherwise than the published ones
-
-
-def test_basel_2009_becomes_a_model_with_the_built_in_expressions(face: Head, tmp_path: Path) -> None:
     arrays = mat(face)
     arrays = {**arrays, "shapePC": arrays["shapePC"][:, :5], "shapeEV": arrays["shapeEV"][:5]}
     model = import_face_model("basel-2009", written_mat(tmp_path / "01_MorphableModel.mat", arrays))
@@ -150,9 +150,7 @@ def test_a_file_that_crashes_its_reader_is_refused_in_one_line(face: Head, tmp_p
     assert "\n" not in str(refused.value)
 
 
-def test_the_published_mesh_of_2009_has_its_landmarks(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_published_mesh_of_2009_has_its_landmarks(monkeypatch: Patch, tmp_path: Path) -> None:
     column = 1e6 * np.arange(53490 * 3, dtype=np.float64)[:, None]
     corners = np.array([[1, 2, 3]])
     arrays = {"mean": column, "basis": np.eye(len(column), 1), "deviations": np.ones((1, 1)), "tl": corners}
@@ -228,7 +226,7 @@ def test_the_names_may_be_bytes_or_missing(face: Head, shift: np.ndarray, tmp_pa
     assert read_basel_2017(path).known == {}
 
 
-def test_h5py_is_an_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_h5py_is_an_extra(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(FacerfError, match=r"pip install 'facerf\[face-models\]'"):
         read_basel_2017(tmp_path / "model.h5")

@@ -42,27 +42,17 @@ def test_what_the_known_ones_are_missed_by_moves_their_neighbours_too() -> None:
     assert moved[51] == pytest.approx(1) and moved[62] > 0.7 and moved[19] < 0.2
 
 
-def test_a_face_that_is_turned_is_found_by_a_few_names() -> None:
+def test_turned_mirrored_and_missing_faces_and_any_winding() -> None:
     face = head(70, 70, turn_deg=50)
     known = {number: face.landmarks[number] for number in (8, 30, 36, 45)}
     off_mm = 1000 * np.linalg.norm(find_landmarks(face.mean, face.triangles, known) - face.landmarks, axis=-1)
     assert off_mm.mean() < 1.0
-
-
-def test_the_winding_of_triangles_does_not_matter() -> None:
     face = head(70, 70)
     found = [find_landmarks(face.mean, face.triangles[:, order], {}) for order in ([0, 1, 2], [0, 2, 1])]
     np.testing.assert_array_equal(*found)  # both windings give the same arrays
-
-
-def test_a_mirrored_face_has_mirrored_landmarks() -> None:
-    face = head(70, 70)
     flip = np.array([-1.0, 1, 1])
     found, mirrored = (find_landmarks(mean, face.triangles, {}) for mean in (face.mean, face.mean * flip))
     assert np.linalg.norm(mirrored[MIRROR_68] * flip - found, axis=-1).mean() < 0.0007
-
-
-def test_where_no_face_is_none_is_found() -> None:
     x, y = np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.1, 0.1, 40))
     plane = np.stack([x.ravel(), np.zeros(x.size), y.ravel()], -1)
     with pytest.raises(InputError, match="no face is found"):

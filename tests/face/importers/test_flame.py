@@ -194,14 +194,10 @@ def test_a_table_of_arrays_is_as_good_as_a_pickle(face: Head, source: SourceMode
 
 
 @pytest.mark.usefixtures("here")
-def test_without_a_jaw_the_expressions_open_the_mouth(face: Head, tmp_path: Path) -> None:
+def test_a_jaw_is_opened_by_expressions_and_an_open_licence_is_kept(face: Head, tmp_path: Path) -> None:
     path = tmp_path / "flame2023_no_jaw.pkl"
     path.write_bytes(pickle.dumps(tables(face, 301)))
     assert read_flame(path).expression_names == ("expression_000",)
-
-
-@pytest.mark.usefixtures("here")
-def test_the_open_model_s_licence_is_its_own(face: Head, tmp_path: Path) -> None:
     said = {"expr_components": "last_100", "n_expr": 100}
     path = tmp_path / "flame2023_Open.pkl"
     path.write_bytes(pickle.dumps(changed(face, supr_expression_metadata=said)))

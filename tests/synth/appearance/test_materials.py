@@ -34,12 +34,20 @@ def test_every_part_has_physical_textures(people: list[Appearance]) -> None:
             assert material.roughness.min() >= 0.07 and material.roughness.max() <= 0.9
 
 
-def test_the_same_seed_draws_the_same_person(people: list[Appearance]) -> None:
+def test_people_are_drawn_by_seed_with_named_traits(people: list[Appearance]) -> None:
     generator = torch.Generator().manual_seed(1)
     again = draw_appearance(SIDE, generator)
     assert again.traits == people[0].traits
     assert torch.equal(again.materials["skin"].albedo, people[0].materials["skin"].albedo)
     assert people[1].traits != people[0].traits
+    wanted = {"melanin", "haemoglobin", "oiliness", "ita_deg", "age", "hair_colour", "stubble_mm", "freckles"}
+    for person in people:
+        assert wanted < set(person.traits)
+        assert all(isinstance(value, (float, str, bool)) for value in person.traits.values())
+    by_melanin = sorted(people, key=lambda person: float(person.traits["melanin"]))
+    assert float(by_melanin[0].traits["ita_deg"]) > float(by_melanin[-1].traits["ita_deg"])
+    red, green, blue = people[0].scattering_mm
+    assert red > green > blue > 0.1
 
 
 def test_the_side_changes_the_resolution_and_not_the_person() -> None:
@@ -50,20 +58,6 @@ def test_the_side_changes_the_resolution_and_not_the_person() -> None:
         if not coarse.traits["random_texture"]:
             means = [person.materials["skin"].albedo.mean((1, 2)) for person in (coarse, fine)]
             assert torch.allclose(*means, rtol=0.1)
-
-
-def test_traits_name_the_physical_parameters(people: list[Appearance]) -> None:
-    wanted = {"melanin", "haemoglobin", "oiliness", "ita_deg", "age", "hair_colour", "stubble_mm", "freckles"}
-    for person in people:
-        assert wanted < set(person.traits)
-        assert all(isinstance(value, (float, str, bool)) for value in person.traits.values())
-    by_melanin = sorted(people, key=lambda person: float(person.traits["melanin"]))
-    assert float(by_melanin[0].traits["ita_deg"]) > float(by_melanin[-1].traits["ita_deg"])
-
-
-def test_light_spreads_farthest_in_red(people: list[Appearance]) -> None:
-    red, green, blue = people[0].scattering_mm
-    assert red > green > blue > 0.1
 
 
 def test_samples_are_bilinear_in_the_parts_own_textures(people: list[Appearance]) -> None:
@@ -109,16 +103,13 @@ def test_hair_is_lighter_at_its_tips_and_dark_people_have_dark_eyes() -> None:
     assert irises and set(irises) == {"brown"}
 
 
-def test_a_scalp_is_stained_where_hair_grows(people: list[Appearance]) -> None:
+def test_scalps_are_stained_and_many_points_sampled_at_once(people: list[Appearance]) -> None:
     person = next(p for p in people if p.traits["hair_colour"] == "black")
     cover = (canvas_uv(SIDE)[..., 1] < 0).float()
     stained = with_short_hair(person, cover, torch.Generator().manual_seed(0)).materials["skin"]
     bare = person.materials["skin"]
     assert stained.albedo[:, : SIDE // 4].mean() < 0.5 * bare.albedo[:, : SIDE // 4].mean()
     assert torch.equal(stained.albedo[:, SIDE // 4 :], bare.albedo[:, SIDE // 4 :])
-
-
-def test_many_points_are_sampled_at_once(people: list[Appearance]) -> None:
     generator = torch.Generator().manual_seed(0)
     uv = torch.rand(200_000, 2, generator=generator)
     part = torch.randint(len(PARTS), (200_000,), generator=generator, dtype=torch.uint8)

@@ -54,7 +54,7 @@ def test_colours_are_those_that_colour_science_integrates() -> None:
         assert np.abs(lab_d65(rgb) - lab).max() < 0.15
 
 
-def test_melanin_darkens_and_blood_reddens() -> None:
+def test_melanin_darkens_and_blood_reddens_with_its_two_bands() -> None:
     melanin, blood = grid_of_pigments()
     found = colours(melanin, blood)
     assert (np.diff(found, axis=0) < 0).all()
@@ -63,9 +63,6 @@ def test_melanin_darkens_and_blood_reddens() -> None:
     assert (np.diff(red_over_green[:9], axis=1) > 0).all()
     reflectance = skin_reflectance(melanin, blood)
     assert reflectance.min() > 0 and reflectance.max() < 1
-
-
-def test_haemoglobin_has_its_two_bands_in_pale_skin() -> None:
     pale = skin_reflectance(np.array(0.01), np.array(0.02))
     at = {int(nm): value for nm, value in zip(WAVELENGTHS_NM, pale, strict=True)}
     assert at[540] < at[560] > at[580] and at[580] < at[600] < at[650]
@@ -91,23 +88,17 @@ def test_hair_goes_from_black_to_blond_and_grey() -> None:
     assert grey.min() > 0.3
 
 
-def test_the_canvas_and_the_uv_map_show_the_same_regions() -> None:
+def test_canvas_noise_and_splats_keep_their_measures() -> None:
     uv_map, canvas = Window(64), Window(128, CANVAS_SPAN)
     for name in ("eyes", "lips", "nostrils", "neck"):
         inner = inside(canvas, name)[..., 32:96, 32:96]
         assert (inner - inside(uv_map, name)).abs().max() < 2.5
         assert torch.allclose(mask(canvas, name, 3.0), mask(canvas, name, 3.0).flip(-1), atol=1e-5)
-
-
-def test_noise_has_the_given_width_at_every_size() -> None:
     for span, side in (((0.0, 1.0), 128), (CANVAS_SPAN, 512)):
         field = noise(4, Window(side, span), 20.0, generator(), octaves=1)
         assert 0.7 < field.std() < 1.3
         step = slopes(field, Window(side, span)).std()
         assert 0.05 < step < 0.15  # per millimetre: one bump in twenty
-
-
-def test_splats_keep_their_area_and_blurring_their_sum() -> None:
     window = Window(64)
     places = torch.rand(100, 2, generator=generator()) * torch.tensor([100.0, 80.0]) + torch.tensor([-50, 40])
     layers = splat(window, places, torch.full((100,), 2.0))

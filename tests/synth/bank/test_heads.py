@@ -37,10 +37,16 @@ def test_finished_heads_are_kept_and_a_lost_one_is_rebuilt_the_same(bank_folder:
     assert paths[0].stat().st_mtime_ns == kept
 
 
-def test_heads_of_another_model_are_an_error(bank_folder: Path, tmp_path: Path) -> None:
+def test_heads_of_another_model_and_an_empty_folder_are_errors(bank_folder: Path, tmp_path: Path) -> None:
     save_face_model(tmp_path / "other.npz", replace(load_face_model(), name="other"))
     with pytest.raises(InputError, match="the head is of face model builtin, not of other"):
         bake_heads(bank_folder / "heads", str(tmp_path / "other.npz"), 6, jobs=1, seed=1, settings=TINY)
+    with pytest.raises(InputError, match="no baked heads"):
+        load_bank(tmp_path, tmp_path, {})
+    views = load_file(sorted((bank_folder / "views").iterdir())[1])
+    assert views["warp"].dtype == torch.float16 and views["visible"].dtype == torch.uint8
+    lengths = views["normals"].float().norm(dim=1)
+    assert torch.allclose(lengths, torch.ones_like(lengths), atol=2e-3)
 
 
 def test_head_zero_is_the_mean_face_under_the_unturned_rig() -> None:
@@ -52,16 +58,12 @@ def test_head_zero_is_the_mean_face_under_the_unturned_rig() -> None:
     assert forehead[front > 0.7].min() > 200 and forehead[front < -0.5].max() == 0
 
 
-def test_expressions_differ_and_some_heads_are_neutral() -> None:
+def test_expressions_differ_on_both_sides_and_some_heads_are_neutral() -> None:
     model = load_face_model()
     drawn = [draw_coefficients(model, np.random.default_rng(seed), TINY)[1] for seed in range(40)]
     neutral = sum(bool((beta == 0).all()) for beta in drawn)
     assert 5 < neutral < 25
     assert max(float(beta.max()) for beta in drawn) <= 2.8
-
-
-def test_expressions_come_on_both_sides_and_a_jaw_goes_one_way() -> None:
-    model = load_face_model()
     index = {name: position for position, name in enumerate(model.expression_names)}
     drawn = torch.stack([draw_coefficients(model, np.random.default_rng(s), TINY)[1] for s in range(60)])
     smiles = drawn[:, [index["smile_left"], index["smile_right"]]] > 0
@@ -81,7 +83,7 @@ def test_a_neutral_head_seen_without_error_is_unwrapped_almost_in_place() -> Non
     assert shift[seen].median() < 1.0
 
 
-def test_samples_are_finite_and_at_one_exposure(bank: Bank) -> None:
+def test_samples_are_at_one_exposure_and_targets_brighten_where_they_face_their_light(bank: Bank) -> None:
     sample = bank.draw(torch.tensor([1, 2, 3]), 4, torch.Generator().manual_seed(0))
     for field in (sample.source, sample.target, sample.normals_source, sample.weight):
         assert field.isfinite().all()
@@ -89,9 +91,6 @@ def test_samples_are_finite_and_at_one_exposure(bank: Bank) -> None:
     mean = (sample.source.mean(1) * sample.visible[:, 0]).sum((1, 2)) / sample.visible[:, 0].sum((1, 2))
     assert torch.allclose(mean, torch.full((3,), 0.25), atol=0.03)
     assert torch.allclose(sample.lights.norm(dim=-1), torch.ones(3, 4), atol=1e-5)
-
-
-def test_target_brightens_where_it_faces_its_light(bank: Bank) -> None:
     generator = torch.Generator().manual_seed(2)
     sample = bank.draw(torch.arange(1, 6), 6, generator)
     cosine = torch.einsum("blc,bcij->blij", sample.lights, sample.normals_target)
@@ -107,15 +106,3 @@ def test_light_weights_are_positive_and_range_from_a_flash_to_a_dome() -> None:
     shares = torch.stack([weights.max() / weights.sum() for weights in drawn])
     assert min(weights.min() for weights in drawn) > 0
     assert shares.max() > 0.5 and shares.min() < 0.1
-
-
-def test_an_empty_folder_is_no_bank(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no baked heads"):
-        load_bank(tmp_path, tmp_path, {})
-
-
-def test_views_fit_in_half_precision(bank_folder: Path) -> None:
-    views = load_file(sorted((bank_folder / "views").iterdir())[1])
-    assert views["warp"].dtype == torch.float16 and views["visible"].dtype == torch.uint8
-    lengths = views["normals"].float().norm(dim=1)
-    assert torch.allclose(lengths, torch.ones_like(lengths), atol=2e-3)

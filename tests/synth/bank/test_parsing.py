@@ -12,6 +12,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
 from facerf_cli.synth.bank import parsing
 from facerf_cli.synth.bank.parsing import FeatureWarp, PortraitCrops, StoredPortraits
+from tests.kinds import Folders, Patch
 
 SIDE, STORED = 64, 96
 LANDMARKS = 68 + len(MORE_LANDMARKS)
@@ -19,7 +20,7 @@ EAR_BACKS = [68 + MORE_LANDMARKS.index(f"{side} ear back") for side in ("left", 
 
 
 @pytest.fixture(scope="module")
-def portraits(tmp_path_factory: pytest.TempPathFactory) -> StoredPortraits:
+def portraits(tmp_path_factory: Folders) -> StoredPortraits:
     """Two people: discs of skin on a garment, with landmarks in a ring around the disc's middle."""
     folder = tmp_path_factory.mktemp("portraits")
     at = torch.arange(STORED) + 0.5
@@ -50,7 +51,7 @@ def drawn(portraits: StoredPortraits, seed: int) -> PortraitCrops:
 
 
 @pytest.fixture
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+def plain(monkeypatch: Patch) -> None:
     """Every sample shows a person, uncovered and whole."""
     for name in ("_EMPTY", "_HEADLESS", "_OCCLUDED", "_BORDERED", "_SECOND"):
         monkeypatch.setattr(parsing, name, 0.0)
@@ -96,16 +97,11 @@ def test_a_mirrored_photo_has_mirrored_landmarks(portraits: StoredPortraits) -> 
     assert torch.allclose(again.landmarks_px.nan_to_num(-1), photo.landmarks_px.nan_to_num(-1), atol=1e-4)
 
 
-def test_an_empty_crop_has_no_person(portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crops_bodies_and_borders_without_a_person(portraits: StoredPortraits, monkeypatch: Patch) -> None:
     monkeypatch.setattr(parsing, "_EMPTY", 1.0)
     crop = drawn(portraits, 3)
     assert crop.present.tolist() == [0] and not crop.known.any() and not crop.alpha.any()
     assert crop.crops.std() > 0.01
-
-
-def test_a_body_without_its_head_is_no_head(
-    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
-) -> None:
     for name, share in (("_EMPTY", 0.0), ("_HEADLESS", 1.0), ("_BORDERED", 0.0)):
         monkeypatch.setattr(parsing, name, share)
     crops = [drawn(portraits, seed) for seed in range(12)]
@@ -114,11 +110,6 @@ def test_a_body_without_its_head_is_no_head(
         ((crop.label == class_index("skin")) & (crop.alpha > 0.5)).float().mean() > 0.2 for crop in crops
     )
     assert sum(bool((crop.label == class_index("garment")).any()) for crop in crops) > 6
-
-
-def test_what_stands_before_a_person_is_background(
-    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
-) -> None:
     covered = 0
     for seed in range(20):
         monkeypatch.setattr(parsing, "_OCCLUDED", 1.0)
@@ -128,11 +119,6 @@ def test_what_stands_before_a_person_is_background(
         assert (with_one.alpha <= without.alpha + 1e-6).all()
         covered += int(float(with_one.alpha.sum()) < float(without.alpha.sum()) - 5)
     assert covered > 5
-
-
-def test_beyond_the_photos_border_nothing_is_known(
-    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
-) -> None:
     monkeypatch.setattr(parsing, "_BORDERED", 1.0)
     crop = drawn(portraits, 5)
     outside = crop.weight[0, 0] == 0
@@ -148,7 +134,7 @@ def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("plain")
 def test_decoys_have_the_persons_colours_and_lie_behind(
-    portraits: StoredPortraits, monkeypatch: pytest.MonkeyPatch
+    portraits: StoredPortraits, monkeypatch: Patch
 ) -> None:
     """Each image over black, with decoys and without: the person stays, and shapes appear around it."""
     monkeypatch.setattr(StoredPortraits, "_background", lambda self, side, _: torch.zeros(3, side, side))
@@ -172,7 +158,7 @@ def test_decoys_have_the_persons_colours_and_lie_behind(
     torch.testing.assert_close(seen / colour, (seen[:1] / colour[0]).expand_as(seen))
 
 
-def test_the_outline_lies_just_off_the_person() -> None:
+def test_outlines_landmarks_and_features_go_where_the_image_shows_them() -> None:
     """Around a rectangle of an image that is not mirrored by chance: places are (x, y), within two pixels."""
     alpha = torch.zeros(SIDE, SIDE)
     alpha[10:20, 30:50] = 1
@@ -180,6 +166,15 @@ def test_the_outline_lies_just_off_the_person() -> None:
     assert x.min() == 28 and x.max() == 51 and y.min() == 8 and y.max() == 21
     assert not alpha[y.long(), x.long()].any()
     assert not len(parsing._outline(torch.zeros(SIDE, SIDE)))
+    # The image at p is taken from p + shift(p): from the landmark, where it is shown.
+    for warp in warps():
+        shown = warp.shown_at(FACE_PX)
+        torch.testing.assert_close(shown + warp.shift(shown), FACE_PX, rtol=0, atol=0.1)  # pixels
+    moved = torch.stack([(warp.shown_at(FACE_PX) - FACE_PX).norm(dim=-1) for warp in warps()])
+    extent = float((FACE_PX.amax(0) - FACE_PX.amin(0)).max())
+    assert 0.01 * extent < moved[:, 17:].mean() < 0.06 * extent
+    far = FACE_PX.mean(0) + torch.tensor([[-3 * extent, 0.0], [2 * extent, 2 * extent]])
+    assert max(float(warp.shift(far).abs().max()) for warp in warps()) < 1e-3
 
 
 _MODEL = load_face_model("builtin")
@@ -189,18 +184,3 @@ FACE_PX = _MODEL.landmarks(_MEAN)[0, :, :2] * torch.tensor([1500.0, -1500.0]) + 
 
 def warps() -> list[FeatureWarp]:
     return [FeatureWarp.draw(FACE_PX, torch.Generator().manual_seed(seed)) for seed in range(20)]
-
-
-def test_landmarks_go_where_the_image_shows_them() -> None:
-    """The image at p is taken from p + shift(p): from the landmark, where it is shown."""
-    for warp in warps():
-        shown = warp.shown_at(FACE_PX)
-        torch.testing.assert_close(shown + warp.shift(shown), FACE_PX, rtol=0, atol=0.1)  # pixels
-
-
-def test_features_move_and_what_is_far_away_stays() -> None:
-    moved = torch.stack([(warp.shown_at(FACE_PX) - FACE_PX).norm(dim=-1) for warp in warps()])
-    extent = float((FACE_PX.amax(0) - FACE_PX.amin(0)).max())
-    assert 0.01 * extent < moved[:, 17:].mean() < 0.06 * extent
-    far = FACE_PX.mean(0) + torch.tensor([[-3 * extent, 0.0], [2 * extent, 2 * extent]])
-    assert max(float(warp.shift(far).abs().max()) for warp in warps()) < 1e-3

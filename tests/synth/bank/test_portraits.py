@@ -19,21 +19,15 @@ def photos() -> dict[str, Tensor]:
     return photos_of("builtin", 0, 3, SMALL)
 
 
-def test_sizes(photos: dict[str, Tensor]) -> None:
+def test_photos_differ_by_light_and_share_their_truth(photos: dict[str, Tensor]) -> None:
     assert photos["pictures"].shape == (2, 3, 3, 64, 64) and photos["alpha"].shape == (2, 64, 64)
     assert photos["landmarks_px"].shape == (2, 68 + len(MORE_LANDMARKS), 2)
     assert int(photos["label"].min()) >= 1 and int(photos["label"].max()) < len(CLASSES)
-
-
-def test_photos_differ_by_light_and_share_their_truth(photos: dict[str, Tensor]) -> None:
     pictures, covered = photos["pictures"].float(), photos["alpha"] > 250
     assert (pictures[0, 0] - pictures[0, 1]).abs()[:, covered[0]].mean() > 3
     for view in range(2):
         assert (pictures[view][..., photos["alpha"][view] == 0] == 0).all()
         assert pictures[view][..., covered[view]].mean() > 10
-
-
-def test_landmarks_lie_on_the_face(photos: dict[str, Tensor]) -> None:
     face = {
         class_index(name) for name in ("skin", "brows", "eyes", "lips", "mouth", "beard", "hand", "glasses")
     }

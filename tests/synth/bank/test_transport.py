@@ -55,7 +55,7 @@ def drawn(folder: Path, seed: int) -> PortraitSample:
     return stored.draw([0], 3, torch.Generator().manual_seed(seed))
 
 
-def test_images_are_linear_in_light(view: StoredView) -> None:
+def test_images_are_linear_in_light_and_looks_differ_in_albedo(view: StoredView) -> None:
     """But for the highlights of weak lights, of which only the brightest twelve are kept."""
     single = torch.eye(14)[:, :, None].expand(-1, -1, 3)
     weights = torch.zeros(1, 14, 3)
@@ -63,16 +63,18 @@ def test_images_are_linear_in_light(view: StoredView) -> None:
     images = images_under(view.portrait, view.looks[0], torch.cat([single, weights]))
     summed = torch.einsum("lc,lcij->cij", weights[0], images[:14])
     torch.testing.assert_close(images[14], summed, rtol=1e-3, atol=1e-4)
-
-
-def test_looks_differ_and_albedo_is_theirs(view: StoredView) -> None:
     (first, normals), (second, again) = (albedo_of(view.portrait, look) for look in view.looks)
     assert (first - second).abs().mean() > 0.01 and torch.equal(normals, again)
     assert first.min() >= 0 and first.max() < 1
     assert first[:, view.alpha == 0].max() < 0.05  # alpha is in 256 steps
+    landmarks = view.portrait.landmarks_px[:68]
+    extent = float((landmarks.amax(0) - landmarks.amin(0)).max())
+    low, high = SCALES
+    assert SIDE_PX / high < extent < SIDE_PX / low
+    assert 0.15 < view.alpha.mean() < 0.9
 
 
-def test_squares_are_parts_of_the_photo_and_as_wide_as_drawn() -> None:
+def test_squares_are_parts_of_the_photo_and_many_targets_are_lit_from_behind() -> None:
     """Landmarks in a square lie where its crop of the photo has them."""
     landmarks = np.random.default_rng(0).uniform(-0.07, 0.07, (68, 3))
     subject = cast(Subject, SimpleNamespace(landmarks_world=landmarks))
@@ -85,24 +87,13 @@ def test_squares_are_parts_of_the_photo_and_as_wide_as_drawn() -> None:
         np.testing.assert_allclose(Crop(x0, y0, side, int(size)).to_crop(in_photo), seen, atol=0.02)
         assert np.ptp(seen, 0).max() == pytest.approx(size / sides, rel=1e-4)
         assert min(x0, y0) > -1e-6 and max(x0, y0) + side < drawn.photo.camera.width_px + 1e-6
-
-
-def test_many_targets_are_lit_from_behind() -> None:
-    """Rims: a tenth of all directions, of which none but these and those in front count much."""
+    # Rims: a tenth of all directions, of which none but these and those in front count much.
     rig = rig_directions(150)
     generator = torch.Generator().manual_seed(0)
     chosen = torch.cat([draw_targets(rig, 4, generator) for _ in range(500)])
     azimuth, elevation = direction_to_azel(rig[chosen])
     rims = (azimuth.abs() > 120) & (elevation > 0) & (elevation < 40)
     assert 0.2 < rims.float().mean() < 0.35 and (rig[chosen, 2] > -0.2).float().mean() > 0.6
-
-
-def test_the_square_shows_head_and_shoulders(view: StoredView) -> None:
-    landmarks = view.portrait.landmarks_px[:68]
-    extent = float((landmarks.amax(0) - landmarks.amin(0)).max())
-    low, high = SCALES
-    assert SIDE_PX / high < extent < SIDE_PX / low
-    assert 0.15 < view.alpha.mean() < 0.9
 
 
 def test_what_is_seen_fits_the_truth(folder: Path, view: StoredView) -> None:

@@ -89,34 +89,13 @@ def test_no_hair_passes_through_the_skin_or_floats_far_away(head: HeadMesh, hair
     assert np.quantile(height[on_skull], 0.995) < most / 1000
 
 
-def test_all_hair_is_of_bounded_size(head: HeadMesh) -> None:
+def test_the_same_numbers_give_the_same_hair_of_bounded_size_or_none(head: HeadMesh) -> None:
     many = replace(draw_style(np.random.default_rng(5), "long"), wisps=40_000, segments=7)
     assert 240_000 < len(grow_hair(head, many, np.random.default_rng(5)).vertices) <= MAX_VERTICES
-
-
-def test_triangles_of_the_outer_layer_face_outward(hairs: Hairs) -> None:
-    _, hair = hairs["short"]
-    a, b, c = (hair.vertices[hair.triangles[:, k]] for k in range(3))
-    facet = np.cross(b - a, c - a)
-    outward = (facet * hair.normals[hair.triangles[:, 0]]).sum(-1) / np.linalg.norm(facet, axis=-1)
-    assert (outward > 0).mean() > 0.95
-
-
-def test_the_same_numbers_give_the_same_hair_and_others_another(head: HeadMesh) -> None:
     first, second, other = (grown(head, "short", seed)[1] for seed in (3, 3, 4))
     for name in ("vertices", "normals", "triangles", "uv", "tangents"):
         assert np.array_equal(getattr(first, name), getattr(second, name))
     assert first.vertices.shape != other.vertices.shape or not np.array_equal(first.vertices, other.vertices)
-
-
-def test_the_bald_have_none_and_longer_cuts_reach_lower(head: HeadMesh, hairs: Hairs) -> None:
-    bald = draw_style(np.random.default_rng(0), "bald")
-    assert len(grow_hair(head, bald, np.random.default_rng(0)).vertices) == 0
-    lowest = [hairs[name][1].vertices[:, 1].min() for name in ("buzz", "bob", "long")]
-    assert lowest[0] > lowest[1] > lowest[2]
-
-
-def test_drawing_gives_hair_and_its_style_or_none_for_the_bald(head: HeadMesh) -> None:
     drawn = [draw_style(np.random.default_rng(seed)).name for seed in range(200)]
     assert set(drawn) == set(STYLES)
     bald = drawn.index("bald")
@@ -125,13 +104,26 @@ def test_drawing_gives_hair_and_its_style_or_none_for_the_bald(head: HeadMesh) -
     assert hair is not None and style.name == "buzz"
     with pytest.raises(ValueError, match="hair style 'mullet': unknown; choose one of bald, "):
         draw_style(np.random.default_rng(0), "mullet")
+    assert grow_beard(head, {"beard": 0.0, "moustache": 0.0, "goatee": 0.0}, np.random.default_rng(1)) is None
 
 
-def test_the_cover_of_the_scalp_is_where_roots_are_and_not_on_the_face(hairs: Hairs) -> None:
+def test_outer_triangles_face_outward_and_covers_lie_where_roots_are(hairs: Hairs) -> None:
+    _, hair = hairs["short"]
+    a, b, c = (hair.vertices[hair.triangles[:, k]] for k in range(3))
+    facet = np.cross(b - a, c - a)
+    outward = (facet * hair.normals[hair.triangles[:, 0]]).sum(-1) / np.linalg.norm(facet, axis=-1)
+    assert (outward > 0).mean() > 0.95
     style, hair = hairs["buzz"]
     roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
     assert scalp_cover(cylinder_uv(roots), style).mean() > 0.8
     assert (scalp_cover(np.array([[0.5, 0.3], [0.3, 0.5], [0.5, 0.9]]), style) == 0).all()
+
+
+def test_the_bald_have_none_and_longer_cuts_reach_lower(head: HeadMesh, hairs: Hairs) -> None:
+    bald = draw_style(np.random.default_rng(0), "bald")
+    assert len(grow_hair(head, bald, np.random.default_rng(0)).vertices) == 0
+    lowest = [hairs[name][1].vertices[:, 1].min() for name in ("buzz", "bob", "long")]
+    assert lowest[0] > lowest[1] > lowest[2]
 
 
 def test_tied_hair_ends_in_its_knot_and_lies_on_the_head(head: HeadMesh) -> None:
@@ -184,10 +176,6 @@ def test_moustache_and_beard_are_separate(head: HeadMesh, traits: dict, low: flo
     assert found is not None
     middle = found.vertices[(found.uv[:, 1] == 0) & (np.abs(found.vertices[:, 0]) < 0.015)]
     assert middle[:, 1].min() > low and middle[:, 1].max() < high
-
-
-def test_without_beard_and_moustache_nothing_grows(head: HeadMesh) -> None:
-    assert grow_beard(head, {"beard": 0.0, "moustache": 0.0, "goatee": 0.0}, np.random.default_rng(1)) is None
 
 
 def test_lashes_stand_on_both_lids_of_both_eyes() -> None:

@@ -187,20 +187,15 @@ def seen_parts(mesh: HeadMesh, yaw: float = 0, pitch: float = 0) -> dict[str, in
     return {name: int((part == number).sum()) for number, name in enumerate(PARTS)}
 
 
-def test_teeth_are_seen_in_an_open_mouth_only() -> None:
+def test_eyes_and_teeth_are_seen_where_they_are_open() -> None:
     for yaw, pitch in ((0, 0), (40, 0), (0, -30)):
         assert seen_parts(head("mean"), yaw, pitch)["teeth"] == 0
         assert seen_parts(head("jaw_open"), yaw, pitch)["teeth"] > 60
     assert seen_parts(head("jaw_open"))["mouth"] > 60
     assert seen_parts(head("jaw_open"), 150)["teeth"] == seen_parts(head("jaw_open"), 150)["mouth"] == 0
-
-
-def test_eyes_are_seen_unless_they_are_shut() -> None:
     opened, half, shut = (seen_parts(head(which))["eye"] for which in ("mean", "half_blink", "blink"))
     assert opened > 1.5 * half > 0 == shut
 
-
-def test_the_lower_teeth_go_with_the_jaw() -> None:
     def rows(which: str) -> tuple[float, float]:
         points = head(which).vertices[np.unique(of_part(head(which), "teeth"))]
         half = len(points) // 2
@@ -214,11 +209,17 @@ def test_the_lower_teeth_go_with_the_jaw() -> None:
     assert points[len(points) // 2 :, 1].mean() - lower > 6e-3
 
 
-def test_a_symmetric_face_gives_a_symmetric_head() -> None:
+def test_a_symmetric_face_gives_a_symmetric_head_of_known_measures() -> None:
     for which in ("mean", "jaw_open"):
         points = head(which).vertices.astype(np.float64)
         distance, _ = cKDTree(points).query(points * [-1, 1, 1])
         assert distance.max() < 5e-5
+    mesh = head("mean")
+    skull = mesh.vertices[(mesh.part == 0) & (mesh.vertices[:, 1] > 0.05)] * 1000
+    assert 145 < np.ptp(skull[:, 0]) < 165  # breadth; adults: 135 to 165
+    assert 185 < np.ptp(skull[:, 2]) < 205  # length from the glabella
+    assert 80 < skull[:, 1].max() - 60 < 105  # above the brows
+    assert mesh.vertices[:, 1].min() == pytest.approx(-0.17, abs=0.01)
 
 
 def test_the_gaze_turns_the_eyes() -> None:
@@ -235,15 +236,6 @@ def test_the_gaze_turns_the_eyes() -> None:
     assert (ahead.normals[right, 0] > 0.3).all()
     above = eye[(np.abs(ahead.uv[eye, 1] - 0.25) < 0.15) & (np.abs(ahead.uv[eye, 0] - 0.5) < 0.02)]
     assert (ahead.normals[above, 1] > 0.3).all()
-
-
-def test_the_skull_has_the_measures_of_a_head() -> None:
-    mesh = head("mean")
-    skull = mesh.vertices[(mesh.part == 0) & (mesh.vertices[:, 1] > 0.05)] * 1000
-    assert 145 < np.ptp(skull[:, 0]) < 165  # breadth; adults: 135 to 165
-    assert 185 < np.ptp(skull[:, 2]) < 205  # length from the glabella
-    assert 80 < skull[:, 1].max() - 60 < 105  # above the brows
-    assert mesh.vertices[:, 1].min() == pytest.approx(-0.17, abs=0.01)
 
 
 def test_uv_continues_that_of_the_face() -> None:

@@ -16,6 +16,7 @@ from facerf_cli.synth.head.hair import grow_hair
 from facerf_cli.synth.head.hair_styles import draw_style
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.head.worn import HEADWEAR, Headwear, draw_headwear
+from tests.kinds import Patch
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def require_sound(mesh: HeadMesh, part: str) -> None:
 
 @pytest.mark.parametrize("kind", GLASSES)
 def test_glasses_sit_in_front_of_the_eyes_and_not_in_the_skin(
-    head: HeadMesh, landmarks: np.ndarray, kind: str, monkeypatch: pytest.MonkeyPatch
+    head: HeadMesh, landmarks: np.ndarray, kind: str, monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(glasses, "GLASSES", (kind,))
     frame = draw_glasses(head, landmarks, np.random.default_rng(2)).frame
@@ -73,15 +74,13 @@ def test_the_same_numbers_give_the_same_things(head: HeadMesh, landmarks: np.nda
         assert first.vertices.shape != other.vertices.shape or not np.allclose(first.vertices, other.vertices)
 
 
-def drawn(head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch) -> Headwear:
+def drawn(head: HeadMesh, kind: str, monkeypatch: Patch) -> Headwear:
     monkeypatch.setattr(worn, "HEADWEAR", (kind,))
     return draw_headwear(head, chin_height_m(head), np.random.default_rng(7))
 
 
 @pytest.mark.parametrize("kind", HEADWEAR)
-def test_it_covers_the_skull_and_not_the_face(
-    head: HeadMesh, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_covers_the_skull_and_not_the_face(head: HeadMesh, kind: str, monkeypatch: Patch) -> None:
     worn = drawn(head, kind, monkeypatch)
     assert worn.kind == kind
     assert (worn.mesh.part == PARTS.index("hat")).all() and (worn.mesh.label == class_index("headwear")).all()
@@ -97,9 +96,7 @@ def test_it_covers_the_skull_and_not_the_face(
 
 @pytest.mark.parametrize("kind", HEADWEAR)
 @pytest.mark.parametrize("style_name", ["curly", "long", "short"])
-def test_hair_stays_under_it(
-    head: HeadMesh, kind: str, style_name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hair_stays_under_it(head: HeadMesh, kind: str, style_name: str, monkeypatch: Patch) -> None:
     worn = drawn(head, kind, monkeypatch)
     random = np.random.default_rng(2)
     style = draw_style(random, style_name)

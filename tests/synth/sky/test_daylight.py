@@ -90,27 +90,18 @@ def test_the_sun_agrees_with_a_full_spectral_integral(elevation_deg: float, turb
     np.testing.assert_allclose(found, expected, rtol=0.03, atol=0.02 * expected.max())
 
 
-def test_clean_air_has_rayleighs_optical_depth() -> None:
+def test_air_and_sun_have_their_known_depth_light_and_colour() -> None:
     """0.0973 at 550 nm, as tabulated by Bodhaine et al., 1999; ozone's 0.030 is on top."""
     depth = -np.log(transmittance(np.array([550.0]), 90, 0.99516))  # no aerosol
     assert depth[0] == pytest.approx(0.0973 + 0.0298, rel=0.03)
-
-
-def test_the_sun_above_the_air_gives_its_known_illuminance() -> None:
-    """127.5 to 133 klx, as published (IES; Darula, Kittler and Gueymard 2005)."""
+    # 127.5 to 133 klx, as published (IES; Darula, Kittler and Gueymard 2005).
     assert 126 < (outdoors._sun_to_xyz() @ outdoors._SUN)[1] < 134
-
-
-def test_the_brightest_sky_is_beside_the_sun_and_blue_far_from_it() -> None:
     grid, sun = make_grid(128), toward(0, 40)
     sky = preetham_sky(grid.directions, sun, 2.5)
     zenith = sky[0].mean(0)
     assert zenith[2] > 1.3 * zenith[0]
     row = np.unravel_index(sky[:32].sum(-1)[4:28].argmax(), (24, 128))
     assert grid.directions[row[0] + 4, row[1]] @ sun > 0.99
-
-
-def test_a_low_sun_is_dimmer_and_redder() -> None:
     low, high = sun_irradiance(4, 3), sun_irradiance(60, 3)
     assert (low < high).all() and low[0] / low[2] > 2 * high[0] / high[2]
     assert 70 < high[1] < 110  # klx, as measured on clear days

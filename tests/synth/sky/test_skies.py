@@ -53,12 +53,16 @@ def test_every_kind_is_finite_not_negative_and_of_mean_one(kind: str) -> None:
         assert mean == pytest.approx(1, rel=1e-4)
 
 
-def test_maps_depend_on_seed_and_index_alone() -> None:
+def test_kinds_are_drawn_in_their_share_by_seed_and_index_alone() -> None:
     later = draw_sky(5, 1, 32)[0]
     draw_sky(0, 1, 32)
     assert np.array_equal(later, draw_sky(5, 1, 32)[0])
     assert not np.array_equal(later, draw_sky(5, 2, 32)[0])
     assert not np.array_equal(later, draw_sky(6, 1, 32)[0])
+    assert set(MIX) == set(KINDS)
+    drawn = [kind_of(index, 0) for index in range(1500)]
+    for kind in KINDS:
+        assert drawn.count(kind) / 1500 == pytest.approx(MIX.count(kind) / len(MIX), abs=0.03)
 
 
 @pytest.mark.parametrize("index", range(6))
@@ -82,14 +86,7 @@ def test_size_changes_the_resolution_and_not_the_scene(kind: str) -> None:
     assert np.abs(small - large).max() < 0.12 * large.max()
 
 
-def test_every_kind_is_drawn_in_its_share() -> None:
-    assert set(MIX) == set(KINDS)
-    drawn = [kind_of(index, 0) for index in range(1500)]
-    for kind in KINDS:
-        assert drawn.count(kind) / 1500 == pytest.approx(MIX.count(kind) / len(MIX), abs=0.03)
-
-
-def test_noise_is_periodic_and_of_deviation_one() -> None:
+def test_noise_is_periodic_and_a_rectangle_covers_its_solid_angle() -> None:
     random = np.random.default_rng(0)
     tile, ring = noise_tile(random), ring_noise(random, 1.0)
     assert tile.std() == pytest.approx(1, abs=1e-3) and ring.std() == pytest.approx(1)
@@ -97,6 +94,12 @@ def test_noise_is_periodic_and_of_deviation_one() -> None:
     assert np.ptp(sample_tile(tile, x, 0 * x)) < 1e-3
     columns = sample_ring(make_grid(256), ring)
     assert abs(columns[0] - columns[-1]) < 4 * np.abs(np.diff(columns)).max()
+    grid = make_grid(512)
+    cover_sr = (
+        Rectangle(40, 10, 0.3, 0.5).cover(grid.directions, grid.pixel_rad) * grid.solid_angles_sr
+    ).sum()
+    exact = 4 * np.arcsin(0.3 * 0.5 / np.sqrt((1 + 0.09) * (1 + 0.25)))
+    assert cover_sr == pytest.approx(exact, rel=0.01)
 
 
 def flat_land(grey: float, *skylines: Skyline) -> Land:
@@ -118,13 +121,10 @@ def test_ground_and_walls_reflect_what_falls_on_them() -> None:
     assert lit[13, 0, 0] > 3 * lit[13, 32, 0]  # what faces the sun, opposite to it
 
 
-def test_a_skyline_hides_the_sun() -> None:
+def test_skylines_and_clouds_hide_the_sun_and_rooms_are_brightest_near_their_light() -> None:
     tops = np.where(np.arange(2048) < 1024, 0.3, -0.01)  # azimuth 0 to 180 degrees
     land = flat_land(0.2, Skyline(tops, np.zeros((2048, 3)), 0.0, 0.0))
     assert not sun_is_visible(land, 90, 10) and sun_is_visible(land, 90, 30) and sun_is_visible(land, -90, 10)
-
-
-def test_clouds_hide_the_sun_and_veil_the_sky() -> None:
     grid, sun = make_grid(64), toward(0, 50)
     sky, beam = np.full((32, 64, 3), 5.0) * [0.5, 1, 2], np.full(3, 80.0)
     tile = np.zeros((256, 256), np.float32)
@@ -133,9 +133,6 @@ def test_clouds_hide_the_sun_and_veil_the_sky() -> None:
     assert closed[2, 32, 2] / closed[2, 32, 0] < 2  # bluish sky, whiter cloud
     none, share = add_clouds(grid, sky, beam, sun, [Layer(tile, 2.0, (10.0, 10.0), 1.0, 3.0, 25.0)])
     assert share == 1 and np.allclose(none, sky)
-
-
-def test_a_room_is_brightest_near_its_light() -> None:
     grid, random = make_grid(64), np.random.default_rng(2)
     room, lights = draw_room(grid, random, (0.4, 0.5)), RoomLights(grid)
     centre = toward(70, 20)
@@ -144,15 +141,6 @@ def test_a_room_is_brightest_near_its_light() -> None:
     brightest = grid.directions.reshape(-1, 3)[light.argmax()]
     assert brightest @ centre > 0.8
     assert np.isfinite(light).all() and light.min() > 0
-
-
-def test_a_rectangle_covers_its_solid_angle() -> None:
-    grid = make_grid(512)
-    cover_sr = (
-        Rectangle(40, 10, 0.3, 0.5).cover(grid.directions, grid.pixel_rad) * grid.solid_angles_sr
-    ).sum()
-    exact = 4 * np.arcsin(0.3 * 0.5 / np.sqrt((1 + 0.09) * (1 + 0.25)))
-    assert cover_sr == pytest.approx(exact, rel=0.01)
 
 
 def test_procedural_maps_are_drawn_lazily() -> None:

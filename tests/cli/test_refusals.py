@@ -1,0 +1,371 @@
+"""Lines that are refused in one line, before anything is written: for each verb a table of line -> words."""
+
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.write import write_exr
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_checkpoint, save_networks
+from facerf_cli.network.files import SHIPPED
+from tests.astronaut import PATH as PHOTO
+from tests.capture.yale_fixture import write_yale_b
+from tests.cli.toy_checkpoint import save_toy_checkpoint
+from tests.dataset.capture import write_capture
+from tests.dataset.dataset_fixture import write_small_dataset
+from tests.kinds import Folders, Patch, Said
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: Folders) -> Path:
+    """A folder with data/, stage/, photos, a map, facts, checkpoints, folders of images and a database."""
+    folder = tmp_path_factory.mktemp("place")
+    write_small_dataset(folder / "data", counts=(1, 0, 1), lights=12, crop_px=32)
+    assert main(["relight-dataset", str(folder / "data"), "--envmaps", "procedural:2", "--lazy"]) == 0
+    write_capture(folder / "stage", subjects=2, lights=4)
+    for name in ("a.jpg", "b.jpg", "one/c.jpg", "index/index.jpg"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(PHOTO, folder / name)
+    (folder / "link.jpg").symlink_to("a.jpg")
+    (folder / "who.csv").write_text("name,person\nastronot,Eileen\n")
+    (folder / "empty").mkdir()
+    for name in ("good/0.exr", "truth/0.exr"):
+        write_exr(folder / name, np.ones((4, 5, 3), np.float32))
+    write_exr(folder / "sky.exr", np.ones((8, 16, 3), np.float32))
+    write_yale_b(folder / "yale")
+    network = save_toy_checkpoint(folder / "toy.st")
+    save_networks(folder / "other.st", {"reflectance": network}, {"layout_version": 99})
+    described = {"reflectance": network.as_metadata()}
+    save_checkpoint(folder / "torn.st", {}, {"layout_version": LAYOUT_VERSION, "networks": described})
+    return folder
+
+
+WRONG: dict[str, dict[str, str]] = {
+    "": {
+        "nonsense": "No such command 'nonsense'. (a verb comes first",
+        "--nonsense": "No such option: --nonsense",
+        "doctor --nonsense": "see 'facerf doctor --help'",
+        "--seed x doctor": "Invalid value for '--seed'",
+        "--device abacus doctor": "'abacus' is not one of 'auto'",
+        "-v -q doctor": "-v and -q: contradict each other",
+        "--seed": "'--seed' requires an argument",
+        "-v": "Missing command",
+        "doctor extra": "unexpected extra argument(s) (extra)",
+        "config relighting": "no such verb",
+        "config --config none.toml": "no such file",
+        "check one": "no index",
+    },
+    "relight a.jpg": {
+        "": "no light given; add --envmap, --light",
+        "--light 1": "give AZ,EL or AZ,EL,STRENGTH or AZ,EL,R,G,B, numbers sep",
+        "--light rembrant": "no such preset; give AZ,EL, a rig file",
+        "--light key=1,2 --light key=3,4": "'key': give each light a name of its own",
+        "--light =1,2": "'': give each light a name",
+        "--light 'a b=1,2'": "'a b': give each light a name",
+        "--light key=1": "--light '1': give AZ,EL",
+        "--light own --pose 10,0,0": "--light own",
+        "--light own --composite face": "--light own",
+        "--light own --reflectance diffuse-sh": "--light own",
+        "--light even --reflectance diffuse-sh": "--light even",
+        "--envmap sky.exr --room 0.1": "--room 0.1: is added to lights; add --light",
+        "--envmap procedural:none": "write procedural:N",
+    },
+    "relight a.jpg --light 0,0": {
+        "--rotate left": "give DEG or FROM:TO:N, a number",
+        "--rotate 0:360": "give degrees, or FROM:TO:N",
+        "--pose 1,2": "give YAW,PITCH,ROLL",
+        "--pose 100,20,0": "turns the face away",
+        "--pose 25,0,0 --composite photo": "use --composite face with it",
+        "--exposure bright": "give auto or face or EV",
+        "--exposure 1e9": "give -20 to 20 EV",
+        "--ball": "--ball: shows maps; give --envmap",
+        "--photo b.jpg": "--photo: is for OLAT stacks",
+        "--ocio who.csv": "Error reading OCIO config",
+        "--ocio missing.ocio": "--ocio missing.ocio: no such file; give",
+        "--lights 0": "give 1 to 4096",
+        "--texture-size 100": "give a multiple of 256",
+        "--envmap-sampling best": "'best' is not one of 'cell'",
+        "--background-blur nan": "--background-blur",
+        "--background nothing.png": "--background",
+        "--background '#12345'": "--background",
+        "--background 1,2": "--background",
+        "--background 1,2,-3": "--background",
+        "--matte none.exr": "--matte ",
+        "--room=2": "--room",
+        "--room=-0.1": "--room",
+        "--room walls": "--room",
+        "--room ''": "--room",
+        "--room 0.1,0.1": "--room",
+        "--reflectance wax": "specular-sh",
+        "--reflectance prt --network-alone": "--network-alone: is for the fields",
+        "--input-colourspace nope": "unknown colour space 'nope'",
+        "--identity --composite face": "--identity: is for the whole photo",
+        "--aov beauty": "--aov 'beauty': no such layer",
+        "--view nope": "unknown view 'nope' (known: none, soft, aces, ",
+        "--output-colourspace ACEScgg": "unknown colour space 'ACEScgg' (similar names: ACEScg",
+        "--output-colourspace sRGB": "--output-colourspace sRGB: EXR and TIFF are linear",
+        "--format gif": "--format 'gif': no such format; give some of exr, png, png16, tiff, jpg",
+        "--format png --aov normal": "--aov is for exr; add that to --format",
+        "--format jpg --output-colourspace ACEScg": "--output-colourspace is for exr, tiff; add",
+        "--format exr,tiff --view none": "--view is for png, png16, jpg; add that to --format",
+        "--format tiff --compression zip": "--compression is for exr; add that to --format",
+        "--format png --quality 90": "--quality is for jpg",
+        "-o me.gif": "me.gif: is a file's name; give a folder",
+        "-o who.csv/out": "cannot be written to",
+        "-o two.png --light 9,9": "-o two.png: is ",
+        "-o wrong.png --format exr": "-o wrong.png: is ",
+        "-o a.jpg": "-o a.jpg: is ",
+    },
+    "predict-olat a.jpg": {
+        "--lights 0": "give 1 to 4096",
+        "--lights 99999": "give 1 to 4096",
+        "--lights few": "give a number",
+        "--lights '1,2;3'": "numbers separated by commas",
+        "--lights 1,nan": "numbers separated by commas",
+        "--lights -3": "give a number",
+        "--pose 10,20": "--pose",
+        "--pose a,b,c": "--pose",
+        "--pose inf,0,0": "--pose",
+        "--frame photo --pose 20,0,0": "use --frame face or uv with it",
+        "--frame uv --format relight": "use --frame photo or face",
+        "--frame photo --page --network-alone": "give neither --pose nor --network-alone",
+        "--texture-size 300": "multiple of 256",
+        "--texture-size 0": "multiple of 256",
+        "--precision int8": "int8",
+        "--memory 0": "memory",
+        "--face best": "--face",
+        "--input-colourspace nonsense": "unknown colour space",
+    },
+    "estimate-light a.jpg": {
+        "--vgg-weights imagenet": "--refine features",
+        "--reflectance prt --signed": "--reflectance prt",
+        "--lights 2000": "1024",
+        "--width 101": "even",
+        "--matte nowhere.png": "no such file",
+    },
+    "segment a.jpg": {
+        "-o me.jpg": "or a file as .png or .exr",
+        "-o me.JSON": "me.JSON: is a file's name; give a folder",
+        "-o me.png --face all": "is one file",
+        "-o me.png b.jpg": "is one file",
+        "-o me.png --name {stem}": "--name: is not for",
+        "-o a.JPG": "is a file's name",
+        "--person none.png": "no such file or folder",
+    },
+    "fit-geometry a.jpg": {
+        "--geometry network --landmarks who.csv": "--landmarks: --geometry network uses none",
+        "--landmarks none": "no such file or folder",
+    },
+    "view": {"a.jpg b.jpg -o me.html": "is one file", "index": "rename the photo"},
+    "convert-light sky.exr": {
+        "--to dpr": "--to dpr: no such form; give one of latlong, json",
+        "--to latlong --width 33": "even number",
+        "--to sh --width 64": "--width is for --to latlong, blender, mitsuba",
+        "--to blender --to latlong --order 3": "--order is for --to json, sh",
+        "--to sh --lights 40": "--lights is for --to json",
+        "--to sh --signed": "--signed is for",
+        "--to json --lights many": "--lights",
+        "": "--to",
+        "-o b.exr --to json": "or a file as .json",
+        "-o b.exr --to latlong --to blender": "is one file",
+        "-o sky.exr --to latlong": "is the input sky.exr",
+    },
+    "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
+    "synth-stage": {"--renderer mitsuba --transport": "--transport"},
+    "prepare-dataset stage": {
+        "--split 300/10/40": "the capture has 2",
+        "--split half": "--split",
+        "--crop 97": "--crop",
+        "--crop 0": "--crop",
+        "--layout multipie": "there is extended-yale-b, stage",
+        "--checks only --shard 1/2": "--shard: --checks only checks all subjects; omit it",
+        "--pattern x": "--pattern is for --describe",
+    },
+    "prepare-dataset": {"one": "stage.json: no such file"},
+    "relight-dataset data --per-subject 4": {
+        "--envmaps empty": "empty: no inputs found (looked for .exr .hdr)",
+        "--envmaps procedural:0": "write procedural:N",
+        "--envmaps procedural:999999999": "give at most 1000000",
+        "--envmaps procedural:3 --memory inf": "--memory inf: not a size; give a number",
+        "--envmaps nowhere": "--envmaps nowhere: no such folder",
+    },
+    "train": {
+        "--form cubist": "form cubist: no such Reflectance Network; give one of default, paper",
+        "--dataset d --heads 20": "--heads: is for synthetic heads, which --dataset replaces",
+        "--dataset d --bank b": "--bank: is for synthetic heads, which --dataset replaces",
+        "--dataset d --heads-from builtin": "--heads-from: is for synthetic heads",
+        "--dataset d --views 2": "--views: is for synthetic heads",
+        "--texture-size 64": "--texture-size: applies to a dataset; give --dataset, too",
+        "--preset paper": "--stage joint: needs a prepared dataset; give --dataset",
+        "--stage joint --dataset d --heads 20": "--heads: does not apply to the stage",
+        "--stage appearance-features --dataset d --fit-with m": "--fit-with: does not apply to the stage",
+        "--stage geometry --dataset d": "--dataset: does not apply to the stage geometry",
+        "--vgg-weights imagenet": "--vgg-weights: does not apply to the stage reflectance",
+        "--photos p": "--photos: does not apply to the stage reflectance",
+        "--stage light-features --mean-face": "--mean-face: does not apply to the stage light",
+        "--stage diffuse-sh --without-normals": "--without-normals: does not apply to the stage diffuse-sh",
+        "--dataset d --mean-face": "--mean-face: the dataset is fitted already",
+        "--without-normals --start-from f": "--without-normals: --start-from fixes",
+        "--stage joint --dataset d --geometry landmarks --photos p": "--photos: is for the Geometry Network",
+        "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
+        "--stage appearance-features": "--stage appearance-features: needs a prepared dataset",
+        "--preset paper --dataset d --vgg-weights v --appearance-features a": "takes the place of",
+        "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE ... --crop 512",
+        f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
+        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses the Parsing",
+        "--heads 13": "--heads 13: the mean face and 12 heads are held out; give more",
+        "--stage parsing --preset tiny --heads 4": "4 people are held out; give more",
+        **{
+            f"--max-time={time}": f"--max-time {time}: not a time; write a number and s, m or h, such as 45m"
+            for time in ("soon", "5", "-3m", "2d", "0s")
+        },
+    },
+    "face-model": {
+        "import ict-facekit nowhere -o m.zip": "ends in .npz",
+        "import basel nowhere -o m.npz": "basel",
+        "import ict-facekit nowhere": "--output",
+        "import": "KIND",
+        "": "Missing command",
+        "fetch flame": "flame",
+        "show -o a.exr": "ends in .png",
+    },
+    "evaluate": {
+        "olat data --preset paper --every 2": "exclude each other",
+        "olat data --pairs x.json --every 2": "--pairs: is a list of its own",
+        "olat data --split validation": "no pairs in the split validation",
+        "olat data --reflectance phong": "give portrait, field, diffuse-sh",
+        "olat data --reflectance prt --network-alone": "is for the field",
+        "olat data --against none.safetensors": "no such file",
+        "olat data --against field.safetensors": "two methods have the name 'field'",
+        "olat data --compare good -o good/out": "lies in good, which is read",
+        "olat data --compare nowhere": "no such folder",
+        "geometry data a.jpg": "one dataset among several inputs",
+        "geometry a.jpg --against a.jpg": "--mean-checkpoint",
+        "geometry a.jpg --reflectance prt --mean-checkpoint x": "is for the field",
+        "geometry a.jpg --every 2": "--every is for a prepared dataset",
+        "geometry data --facts who.csv": "--facts is for photos",
+        "reconstruction a.jpg --every 1": "--every is for a prepared dataset",
+        "reconstruction a.jpg --split all": "--split is for a prepared dataset",
+        "reconstruction a.jpg --joint-fit": "--joint-fit is for a prepared dataset",
+        "reconstruction data --face all": "--face is for photos",
+        "transfer a.jpg": "give --photos",
+        "transfer data --landmarks .": "--landmarks is for photos",
+        "transfer data --reflectance prt --held-to-photo": "is for the field",
+        "transfer --photos a.jpg b.jpg --joint-fit": "--joint-fit is for a prepared dataset",
+        "transfer --photos a.jpg": "two of each person",
+        "transfer --photos one": "two of each person",
+        "transfer --photos a.jpg a.jpg": "given twice",
+        "transfer --photos a.jpg link.jpg": "given twice",
+        "transfer --photos a.jpg one/../a.jpg": "given twice",
+        "transfer --photos a.jpg b.jpg b.jpg a.jpg": "given twice",
+        "pairs good": "--truth",
+        "pairs none --truth truth": "no such folder",
+        "pairs good --truth truth -o truth": "give another folder",
+        "pairs good --truth truth -o truth/here": "lies in truth, which is read",
+        "pairs good --truth truth -o good/here": "lies in good, which is read",
+        "pairs good --truth truth --lpips y": "--vgg-weights",
+        "pairs good --truth truth --preset paper": "--preset",
+        "pairs good good --truth truth": "two methods have the name 'good'",
+        "yale-b yale --subjects yaleB07,yaleB99": "--subjects yaleB99: not in",
+        "yale-b yale --keep-eyes": "--keep-eyes",
+    },
+}
+FAILING: dict[str, dict[str, str]] = {
+    "relight a.jpg --light 0,0": {"--face-model nope.npz": "nope.npz: no such face model"},
+    "predict-olat a.jpg": {
+        "--face-model none.npz": "no such face model",
+        "--checkpoint other.st": "another UV layout",
+        "--checkpoint torn.st": "do not fit",
+        "--checkpoint none.st": "no such checkpoint",
+    },
+    "synth-stage": {"--face-model nothing.npz": "no such face model"},
+    "prepare-dataset stage": {"--face-model nowhere.npz": "nowhere.npz"},
+    "relight-dataset": {"empty --envmaps procedural:3": "dataset.json: no such file"},
+    "train": {
+        "--heads-from nobody.npz": "nobody.npz: no such face model",
+        "--start-from who.csv": "not a facerf checkpoint",
+        "--start-from torn.st": "torn.st: its weights do not fit",
+        "--dataset one": "one/dataset.json: no such file",
+    },
+    "face-model": {
+        "import ict-facekit nowhere -o m.npz": "nowhere: no such file; give the ICT-FaceKit",
+        "import flame nowhere.pkl -o m.npz": "nowhere.pkl: no such file; give FLAME's .pkl",
+        "import basel-2009 nowhere.mat -o m.npz": "01_MorphableModel.mat",
+        "import basel-2009 a.mat -o m.npz --landmarks a.npy": "a .txt of 68 vertex",
+        "show nowhere.npz": "nowhere.npz: no such face model",
+    },
+    "evaluate": {
+        "reconstruction a.jpg --facts who.csv": "astronot is no photo of this run; give names such as a",
+        "yale-b nowhere": "no such folder",
+        "yale-b .": "no folders yaleB01",
+        "yale-b yale --shifts shifts.csv": "shifts.csv: no such file",
+        "olat data --against a.jpg": "a.jpg",
+        "geometry a.jpg --mean-checkpoint b.jpg": "b.jpg",
+    },
+}
+TABLES = [
+    (head, line, words, code)
+    for code, table in ((2, WRONG), (1, FAILING))
+    for head, rows in table.items()
+    for line, words in rows.items()
+]
+WITHOUT_OUTPUT = ("", "face-model", "relight-dataset")
+
+
+@pytest.mark.parametrize(("head", "line", "words", "code"), TABLES)
+def test_a_line(
+    place: Path, capsys: Said, monkeypatch: Patch, head: str, line: str, words: str, code: int
+) -> None:
+    monkeypatch.chdir(place)
+    before = set(place.rglob("*"))
+    unasked = " -o " in f" {line}" or head.partition(" ")[0] in WITHOUT_OUTPUT
+    assert main([*head.split(), *shlex.split(line), *([] if unasked else ["-o", "out"])]) == code
+    out, err = capsys.readouterr()
+    said = [each for each in err.splitlines() if all(part in each for part in words.split(" ... "))]
+    assert (out, len(said)) == ("", 1), err
+    made = {path.name for path in set(place.rglob("*")) - before}
+    assert not made if code == 2 or head != "evaluate" else "summary.json" not in made
+
+
+CONFIGURATIONS = {
+    "[train.loss]\nphotometric = -9": "[train.loss] photometric is -9; give a number from 0 on",
+    "[train]\nstage = 'joint'": "--stage joint: needs a prepared dataset",
+    "[train.optimizer]\nname = 'SGD'": "name is 'SGD'; give one of AdamW, Adadelta",
+    "[train.optimizer]\nrho = 0.5": "[train.optimizer] rho: no such setting; give one of learning_rate",
+    "[train.optimizer]\nname = 'Adadelta'\nrho = 1": "rho is 1; give a number from 0 to below 1",
+    "[train.optimizer]\nbetas = [0.9]": "betas is [0.9]; give 2 numbers",
+    "[train.schedule]\nwarmup_steps = 1.5": "warmup_steps is 1.5; give a whole number",
+    "[train]\nschedule = 3": "[train.schedule] is no table",
+    "[train.loss]\nchannels_apart = 1": "channels_apart is 1; give true or false",
+    "[relight]\nexpo = 1": "[relight] expo: no such option; see `facerf relight --help`",
+    "[global]\nversion = true": "[global] version: no such option; see `facerf --help`",
+    "[relighting]\n": "[relighting] is no verb",
+    "[evaluate.olat]\nx = 1": "see `facerf evaluate olat --help`",
+    "relight = 5": "relight is no table",
+    "[relight": "not TOML",
+    "a = " + "[" * 5000: "not TOML",
+    "#" * (1 << 20): "larger than 1 MiB",
+    "[global]\nseed = -1": "--seed",
+    "[relight]\noverwrite = 'x'": "--overwrite",
+}
+
+
+@pytest.mark.parametrize(("text", "words"), CONFIGURATIONS.items(), ids=range(len(CONFIGURATIONS)))
+def test_a_configuration(text: str, words: str, tmp_path: Path, capsys: Said) -> None:
+    (tmp_path / "c.toml").write_text(text + "\n")
+    verb = ["train"] if "[train" in text else ["relight", "a.png"]
+    assert main([*verb, "-o", str(tmp_path / "out"), "--config", str(tmp_path / "c.toml")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "pairs"])
+def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said) -> None:
+    assert main(["evaluate", name, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "--output" in out and "--space" in out and "{options}" not in out
+    assert ("--reflectance" in out) == (name != "pairs") and ("--keep-eyes" in out) == (name[0] not in "yp")
