@@ -100,6 +100,16 @@ def _the_same_photo_costs_once() -> None:
         lambda models, *rest: (models.networks.reflectance, models.source_colours, rest),
         lambda models, *_: type(models.networks.reflectance).__module__.startswith("facerf_cli."),
     )
+    pipeline.reflectance_of = remembered(
+        pipeline.reflectance_of,
+        lambda models, *rest: (
+            *(getattr(models.networks, name) for name in ("reflectance", "portrait", "parsing")),
+            (models.face, models.source_colours, rest),
+        ),
+        lambda models, head, kind, *_: kind == "portrait",
+        most=3,
+        copied=False,  # it is frozen
+    )
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -20,14 +20,16 @@ def remembered(
     inputs: Callable[..., Any] = lambda *given: given,
     applies: Callable[..., bool] = lambda *_: True,
     most: int = 24,
+    copied: bool = True,
 ) -> Callable[..., Any]:
-    """Keep the last results of a pure function; each call gets a copy.
+    """Keep the last results of a pure function.
 
     Args:
         function: Called where its result is not known.
         inputs: From the arguments, all that the result follows from.
         applies: Tells from the arguments whether the result is looked up and kept.
         most: Results that are kept.
+        copied: Each call gets a copy of its own.
     """
     kept: OrderedDict[bytes, Any] = OrderedDict()
 
@@ -42,7 +44,7 @@ def remembered(
         kept.move_to_end(key)
         while len(kept) > most:
             kept.popitem(last=False)
-        return copy.deepcopy(kept[key])
+        return copy.deepcopy(kept[key]) if copied else kept[key]
 
     return again
 

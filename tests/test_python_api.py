@@ -82,23 +82,19 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
 
 def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: Path) -> None:
     sun = ROOT / "examples/maps/low_sun.exr"
-    line = ["relight", str(PHOTO), "--envmap", str(sun), "--rotate", "40", "--lights", "24"]
-    assert (
-        main(
-            [
-                *line,
-                "--background",
-                "envmap",
-                "--background-blur",
-                "0",
-                "--exposure",
-                "0",
-                "-o",
-                str(tmp_path),
-            ]
-        )
-        == 0
-    )
+    line = [
+        "relight",
+        str(PHOTO),
+        "--envmap",
+        str(sun),
+        "--rotate",
+        "40",
+        "--lights",
+        "24",
+        "--exposure",
+        "0",
+    ]
+    assert main([*line, "--background", "envmap", "--background-blur", "0", "-o", str(tmp_path)]) == 0
     (written,) = tmp_path.glob("*.exr")
     light = facerf.Light.from_envmap(page["envmap"], rotate_deg=40, lights=24)
     relit = page["person"].relight(light, background=page["person"].backdrop(page["envmap"], rotate_deg=40))

@@ -1,11 +1,7 @@
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.baselines.diffuse_sh import (
-    Diffuse,
-    explain_texture,
-    refitted,
-)
+from facerf_cli.baselines.diffuse_sh import Diffuse, explain_texture, refitted
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.diffuse_sh import shading

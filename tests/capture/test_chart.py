@@ -7,14 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
-from facerf_cli.capture.chart import (
-    GREYS,
-    centres,
-    fit_colours,
-    neutral_matrix,
-    published_colours,
-    sample,
-)
+from facerf_cli.capture.chart import GREYS, centres, fit_colours, neutral_matrix, published_colours, sample
 from facerf_cli.image.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
 

@@ -9,13 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.capture.draft import (
-    as_text,
-    draft_stage,
-    frames_by_pattern,
-    match_lights,
-    read_light_list,
-)
+from facerf_cli.capture.draft import as_text, draft_stage, frames_by_pattern, match_lights, read_light_list
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError

@@ -119,11 +119,7 @@ def test_bad_lights_are_a_line_each_and_the_others_go_on(tmp_path: Path, capsys:
     (folder / "broken.json").write_text("{")
     assert convert(folder, tmp_path / "out", "--to", "json") == 1
     lines = capsys.readouterr().err.splitlines()
-    for words in (
-        "twice as wide",
-        "another convention",
-        "broken.json: not JSON",
-    ):
+    for words in ("twice as wide", "another convention", "broken.json: not JSON"):
         assert sum(words in line for line in lines) == 1
     assert not any("Traceback" in line for line in lines)
     rows = [json.loads(line) for line in (tmp_path / "out/report.jsonl").read_text().splitlines()]

@@ -55,14 +55,7 @@ def test_a_checkpoint_of_both_networks_regresses_by_default(tmp_path: Path) -> N
     assert texture.shape == (128, 128, 3)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"texture_side": "128"},
-        {"crop_px": 10**9},
-        {"source_colours": 7},
-    ],
-)
+@pytest.mark.parametrize("wrong", [{"texture_side": "128"}, {"crop_px": 10**9}, {"source_colours": 7}])
 def test_a_checkpoint_that_expects_nonsense_is_refused(
     tmp_path: Path, wrong: dict[str, object], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -42,11 +42,7 @@ def test_lights_by_their_keys_and_by_the_names_of_presets() -> None:
 def test_lights_with_names_share_an_image_whatever_their_form() -> None:
     entries = ["key=40,20;rim=160,10,1,0,0", "5,6", "name=top;at=0,1,0", "at=0,0,2;size=1"]
     images = lit_images(entries)
-    assert [image.name for image in images] == [
-        "light_5_6",
-        "light_at_0_0_2_size_1",
-        "light_key+rim+top",
-    ]
+    assert [image.name for image in images] == ["light_5_6", "light_at_0_0_2_size_1", "light_key+rim+top"]
     assert images[2].names == ("key", "rim", "top") and images[0].names == ()
     (lights,) = images[2].frames
     assert lights[1] == StudioLight((160.0, 10.0), rgb=(1.0, 0.0, 0.0)) and lights[2].at_m == (0, 1, 0)

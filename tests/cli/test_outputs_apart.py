@@ -52,12 +52,7 @@ READ = [
 )
 @pytest.mark.parametrize("dry", [True, False])
 def test_a_file_that_is_read_is_no_output(
-    folder: Path,
-    line: str,
-    read: str,
-    link: Callable[..., None] | None,
-    dry: bool,
-    capsys: Said,
+    folder: Path, line: str, read: str, link: Callable[..., None] | None, dry: bool, capsys: Said
 ) -> None:
     """A hard link of another case is what a file system without case has: one file, two names."""
     output = Path(read)

@@ -322,10 +322,7 @@ def test_models_of_older_versions_lie_in_one_folder(rembg: Path, tmp_path: Path,
 
 def test_options_that_do_not_go_together(rembg: Path, given: Path, tmp_path: Path, capsys: Said) -> None:
     person, model = ("--person", given / "mattes"), ("--matte-from", f"rembg:{MODEL}")
-    for more, said in (
-        ((*person, *model), "leave one out"),
-        ((*person, "--face", "all"), "show one person"),
-    ):
+    for more, said in (((*person, *model), "leave one out"), ((*person, "--face", "all"), "show one person")):
         assert facerf("segment", given / "plates", *more, "-o", tmp_path / "out") == 2
         assert said in " ".join(capsys.readouterr().err.split())
 

@@ -97,9 +97,10 @@ def test_failed_subjects_are_left_out_and_a_stack_that_is_gone_is_named(small: P
     dataset = read_dataset(changed(small, tmp_path, {"subjects": subjects, "splits": splits}))
     assert dataset.subjects == ("0000",) and dataset.cameras["0000"] == ("C0",)
     subjects = {"0007": {"status": "done", "cameras": ["C0"]}}
-    splits: dict[str, list[str]] = {split: [] for split in SPLITS}
+    splits = {split: [] for split in SPLITS}
+    (gone := tmp_path / "gone").mkdir()
     with pytest.raises(InputError, match=r"0007/C0\.exr: missing"):
-        read_dataset(changed(small, tmp_path, {"subjects": subjects, "splits": splits}))
+        read_dataset(changed(small, gone, {"subjects": subjects, "splits": splits}))
 
 
 @pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "\0"])

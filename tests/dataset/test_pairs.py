@@ -162,8 +162,7 @@ def test_the_weights_are_those_of_the_turned_map_in_a_cameras_own_directions(
 
 
 @pytest.mark.parametrize(
-    "world_to_capture",
-    [np.diag([1.0, -1, -1]), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.eye(3)],
+    "world_to_capture", [np.diag([1.0, -1, -1]), np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.eye(3)]
 )
 def test_the_vertical_is_found_whatever_the_capture_calls_it(
     dataset: Dataset, world_to_capture: np.ndarray
@@ -262,6 +261,9 @@ def test_fewer_or_other_pairs_leave_no_image_without_its_own(fresh: Dataset) -> 
     assert len(read_pairs(fresh)) == 8 and image_path(fresh, "0000", 1).exists()
     write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
     assert not image_path(fresh, "0000", 1).exists()
+
+
+def test_images_are_of_the_pairs_that_are_settled(fresh: Dataset) -> None:
     drawn = draw_pairs(fresh, MAPS, 2, 0)
     write_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
     settled = write_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
@@ -302,13 +304,7 @@ def test_overwriting_with_bad_maps_takes_nothing_away(fresh: Dataset, tmp_path: 
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"split": "test"},
-        {"subject": "9999"},
-        {"source_camera": "C7"},
-        {"target_light": 20},
-        {"index": 1},
-    ],
+    [{"split": "test"}, {"subject": "9999"}, {"source_camera": "C7"}, {"target_light": 20}, {"index": 1}],
 )
 def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, object]) -> None:
     write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 0), overwrite=False)

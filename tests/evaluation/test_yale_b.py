@@ -98,9 +98,7 @@ def test_images_are_the_benchmarks(databases: tuple[YaleB, Any], subject: str) -
 
 
 def test_scores_are_the_benchmarks(
-    databases: tuple[YaleB, Any],
-    reference: tuple[ModuleType, ModuleType],
-    monkeypatch: pytest.MonkeyPatch,
+    databases: tuple[YaleB, Any], reference: tuple[ModuleType, ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])

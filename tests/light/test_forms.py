@@ -7,12 +7,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.forms import (
-    MapAxes,
-    from_map_axes,
-    rig_to_latlong,
-    to_map_axes,
-)
+from facerf_cli.light.forms import MapAxes, from_map_axes, rig_to_latlong, to_map_axes
 from facerf_cli.light.sphere import (
     RigLight,
     azel_to_direction,

@@ -158,9 +158,7 @@ def test_lights_of_the_rig_and_between_agree_at_given_and_automatic_exposure(
     assert image.ev == round(MOST_OVER_FRONT_EV - math.log2(1.24), 2)  # of the light from behind, and a room
     errors = [
         shown().errors(
-            images[f"light={az},{el}&ev=1"].pixels,
-            shown().relit(towards((az, el)), torch.ones(1, 3)),
-            1.0,
+            images[f"light={az},{el}&ev=1"].pixels, shown().relit(towards((az, el)), torch.ones(1, 3)), 1.0
         )
         for az, el in BETWEEN
     ]

@@ -27,12 +27,7 @@ from facerf_cli.synth.bank.portrait_samples import (
     draw_targets,
     load_view,
 )
-from facerf_cli.synth.bank.transport import (
-    SCALES,
-    TransportBankSettings,
-    add_transport,
-    seen_path,
-)
+from facerf_cli.synth.bank.transport import SCALES, TransportBankSettings, add_transport, seen_path
 from facerf_cli.synth.portraits import albedo_of, images_under
 from facerf_cli.synth.subjects import Subject
 from tests.synth.conftest import SMALL, backgrounds
