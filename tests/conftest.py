@@ -106,7 +106,7 @@ def _the_same_photo_costs_once() -> None:
             *(getattr(models.networks, name) for name in ("reflectance", "portrait", "parsing")),
             (models.face, models.source_colours, rest),
         ),
-        lambda models, head, kind, *_: kind == "portrait",
+        lambda models, head, kind="field", *_: kind == "portrait",
         most=3,
         copied=False,  # it is frozen
     )

@@ -2,6 +2,7 @@
 
 import copy
 import hashlib
+import inspect
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -33,7 +34,11 @@ def remembered(
     """
     kept: OrderedDict[bytes, Any] = OrderedDict()
 
-    def again(*given: Any) -> Any:
+    def again(*given: Any, **named: Any) -> Any:
+        if named:
+            bound = inspect.signature(function).bind(*given, **named)
+            bound.apply_defaults()
+            given = bound.args
         if not applies(*given):
             return function(*given)
         digest = hashlib.sha1()

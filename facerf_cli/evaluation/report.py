@@ -101,10 +101,14 @@ class ChosenCases:
 def choose_cases(
     rows: Sequence[Row], metric: str, among: Collection[str], worst: int = WORST, few: int = FEW
 ) -> ChosenCases:
-    """Choose cases by a metric of the first method, the worst first: `worst` of those beyond the median.
+    """Choose cases by a metric of the first method, the worst first; none without a finite figure.
 
-    With them go a `few` near the median of all rows, and a `few` of the best. Only cases `among` some are
-    chosen, and none without a finite figure.
+    Args:
+        rows: Of all methods and cases.
+        metric: The name of the metric.
+        among: Names of the cases to choose from.
+        worst: Number of cases, of those beyond the median.
+        few: Number near the median of all rows, and of the best.
     """
     sign = 1 if METRICS[metric].lower_is_better else -1
     figures = {

@@ -162,9 +162,15 @@ def fit_landmarks(
     trust: np.ndarray | None = None,
     start: FitStart | None = None,
 ) -> FaceFit:
-    """Fit one face to landmarks [68, 2] in the crop's pixels; trust [68] in 0..1 weights each landmark.
+    """Fit one face to landmarks.
 
-    `start` [1, ...] is a Geometry Network's prediction for the crop, see `fit_batch`.
+    Args:
+        model: The face model.
+        landmarks_px: [68, 2] in the crop's pixels.
+        crop: The crop, whose camera is fixed.
+        settings: Weights and steps.
+        trust: Weight [68] in 0..1 of each landmark.
+        start: A Geometry Network's prediction [1, ...] for the crop, see `fit_batch`.
     """
     target_px = torch.from_numpy(check_landmarks(landmarks_px))
     weights = None if trust is None else torch.from_numpy(np.asarray(trust, np.float64))[None]
@@ -211,9 +217,15 @@ def fit_batch(
     trust: Tensor | None = None,
     start: FitStart | None = None,
 ) -> FitBatch:
-    """Fit B faces to landmarks [B, 68, 2] in the camera's pixels; trust [B, 68] in 0..1 weights them.
+    """Fit B faces, each from `start` or from its landmarks alone, whichever costs less.
 
-    Each face starts from `start` or from its landmarks alone, whichever costs less.
+    Args:
+        model: The face model.
+        landmarks_px: [B, 68, 2] in the camera's pixels.
+        camera: The crops' camera.
+        settings: Weights and steps.
+        trust: Weight [B, 68] in 0..1 of each landmark.
+        start: A Geometry Network's predictions [B, ...].
     """
     target_px = torch.from_numpy(np.stack([check_landmarks(face.numpy()) for face in landmarks_px]))
     trust = torch.ones(target_px.shape[:2], dtype=torch.float64) if trust is None else trust.double()
@@ -231,7 +243,15 @@ def fit_batch(
 def fit_problem(
     model: MorphableModel, target_px: Tensor, camera: Camera, settings: FitSettings, trust: Tensor
 ) -> tuple[Problem, FitState]:
-    """The problem of landmarks [B, 68, 2] with trust [B, 68], and the start that they alone give."""
+    """Pose the problem of landmarks, and the start that they alone give.
+
+    Args:
+        model: The face model.
+        target_px: Landmarks [B, 68, 2] in the camera's pixels.
+        camera: The crops' camera.
+        settings: Weights and steps.
+        trust: Weight [B, 68] in 0..1 of each landmark.
+    """
     basis = fit_basis(model, settings)
     state, scale = weak_perspective(basis, target_px, camera)
     noise_px = landmark_noise(settings) * (IOD_M * scale)[:, None]  # [B, 68]

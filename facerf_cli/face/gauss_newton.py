@@ -109,10 +109,17 @@ def descend(
     state: FitState,
     steps: int,
 ) -> FitState:
-    """Run Levenberg's damped Gauss-Newton; each face accepts a step only if its cost [B] falls.
+    """Run Levenberg's damped Gauss-Newton; each face accepts a step only if its cost falls.
 
     A settled face no longer changes, so its result does not depend on the other faces; the loop ends when all
     faces have settled.
+
+    Args:
+        residuals_of: Residuals, with their derivatives, of a state.
+        cost_of: Cost [B] of a state with its residuals.
+        step_of: Step from a state with its residuals, under a damping [B].
+        state: First state of the B faces.
+        steps: Steps at most.
     """
     damping = torch.full((len(state.coordinates),), _FIRST_DAMPING, dtype=torch.float64)
     at = residuals_of(state)
@@ -266,10 +273,16 @@ def pose_from_landmarks(
 ) -> tuple[Tensor, Tensor]:
     """Pose heads of known shape: rotations [B, 3, 3] and translations [B, 3], float64, without derivatives.
 
-    points [B, N, 3] in the head frame project to pixels [B, N, 2]; rotation and translation_m are a first
-    guess. A scaled orthographic fit at the guess's depths (DeMenthon and Davis, *Model-based object pose in
-    25 lines of code*, 1995) precedes a few rounds of orthogonal iteration (Lu, Hager and Mjolsness, *Fast and
-    globally convergent pose estimation from video images*, 2000).
+    A scaled orthographic fit at the guess's depths (DeMenthon and Davis, *Model-based object pose in 25 lines
+    of code*, 1995) precedes a few rounds of orthogonal iteration (Lu, Hager and Mjolsness, *Fast and globally
+    convergent pose estimation from video images*, 2000).
+
+    Args:
+        points: [B, N, 3] in the head frame, in metres.
+        px: Their pixels [B, N, 2].
+        camera: The camera of all.
+        rotation: First guess [B, 3, 3], head to camera.
+        translation_m: First guess [B, 3].
     """
     depth_m = -(points @ rotation.mT + translation_m[:, None])[..., 2:]
     rays = pixel_rays(px, camera)

@@ -87,9 +87,17 @@ class Head:
 def unwrap_face(
     model: MorphableModel, fit: FaceFit, cropped: np.ndarray, side: int, photo_shape: tuple[int, ...]
 ) -> FaceTexture:
-    """Unwrap the crop [S, S, 3] of a photo [H, W, ...] to `side` texels (paper, 'Network Architecture').
+    """Unwrap the crop of a photo to a texture (paper, 'Network Architecture').
 
-    Raises InputError where the fitted face lies outside the photo.
+    Args:
+        model: The face model of the fit.
+        fit: The face in the crop.
+        cropped: The crop [S, S, 3], scene-linear.
+        side: Texels of the texture's side.
+        photo_shape: [H, W, ...] of the photo.
+
+    Raises:
+        InputError: The fitted face lies outside the photo.
     """
     vertices = fit.vertices_camera(model)
     inside = fit.crop.valid(*photo_shape[:2])  # outside the photo the crop only repeats its border

@@ -229,11 +229,20 @@ def fit_in_crop(
 ) -> tuple[FaceFit, float]:
     """Pose the head in the fixed camera of its crop from a camera's image; keep identity and expression.
 
-    The crop follows the fitted landmarks; `crop_px` None is `CROP_PX`, or less where the camera's image has
-    fewer pixels there, so that nothing is enlarged. The pose brings the vertices that face the camera as
-    close as possible to their pixels in the true camera. The second result is the mean distance that remains,
-    over the inter-ocular distance. Without landmarks_px the fit stores the fitted landmarks. Raises
-    InputError where the camera sees the head from behind.
+    The crop follows the fitted landmarks. The pose brings the vertices that face the camera as close as
+    possible to their pixels in the true camera. The second result is the mean distance that remains, over the
+    inter-ocular distance.
+
+    Args:
+        model: The face model.
+        joint: The fit of all cameras.
+        camera: The true camera.
+        landmarks_px: [68, 2] in its image; without them the fit stores the fitted landmarks.
+        error_iod: Error of the joint fit in this camera, over the inter-ocular distance.
+        crop_px: Side of the crop; None: `CROP_PX`, or less where the camera's image has fewer pixels there.
+
+    Raises:
+        InputError: The camera sees the head from behind.
     """
     vertices_world = joint.vertices_world(model)
     fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()

@@ -320,9 +320,16 @@ def refine_light(
     non_negative: bool = True,
     settings: RefineSettings = RefineSettings(),
 ) -> RefinedLight:
-    """Minimise the feature loss from weights `start` [L, 3] on; the result is never worse than the start.
+    """Minimise the feature loss of a light; the result is never worse than the start.
 
-    Projection keeps weights non-negative. Clipped texels have no error where they are bright enough.
+    Clipped texels have no error where they are bright enough.
+
+    Args:
+        evidence: The photo's texture and its OLATs.
+        start: First weights [L, 3].
+        features: Of textures.
+        non_negative: Keep weights from 0 up, by projection.
+        settings: Steps and their size.
     """
     loss_of = _feature_loss(evidence, features)
     unit = float(start.square().mean().sqrt()) or 1.0  # makes the size of a step the same for all photos

@@ -74,13 +74,23 @@ def bake_mesh(
     two_sided: np.ndarray | None = None,
     clearance_m: np.ndarray | None = None,
 ) -> MeshTransport:
-    """Bake the vertices [V, 3] (m) with unit normals [V, 3] of a mesh, lit from unit directions [L, 3].
+    """Bake the light transport of a mesh's vertices.
 
-    Only `wanted` [V] bool vertices are baked, by default all, and the visibility of those from which light
-    bounces to them. Rays start at least `clearance_m` [V] off the surface. `two_sided` [V] bool vertices
-    (hair) are lit on both sides, with a single ray per light, and only every `_STRAND_STRIDE`-th of them is
-    traced: they are many, close together and finer than any penumbra. Unless the lights are points, shadows
-    are smoothed by a mean over the edges of a vertex, which removes the zigzag of the triangles.
+    Unless the lights are points, shadows are smoothed by a mean over the edges of a vertex, which removes the
+    zigzag of the triangles.
+
+    Args:
+        vertices: [V, 3], in metres.
+        normals: Unit [V, 3].
+        triangles: [F, 3].
+        directions: Unit [L, 3], toward the lights.
+        settings: Samples, and the size of the lights.
+        seed: Of the samples.
+        wanted: Vertices [V] bool to bake, by default all; of others, from which light bounces to them, the
+            visibility alone.
+        two_sided: Vertices [V] bool (hair) lit on both sides, with a single ray per light; only every
+            `_STRAND_STRIDE`-th of them is traced: they are many, close together and finer than any penumbra.
+        clearance_m: Distance [V] off the surface at which rays start, at least.
     """
     count, nothing = len(vertices), np.zeros(len(vertices), bool)
     curve = _along_curve(vertices)  # the order of vertices below: near rays use the same caches
@@ -146,7 +156,15 @@ class MeshSurface:
         two_sided: np.ndarray,
         clearance_m: np.ndarray,
     ) -> "MeshSurface":
-        """Find the edges of a mesh and build its embree scene."""
+        """Find the edges of a mesh and build its embree scene.
+
+        Args:
+            vertices: [V, 3], in metres.
+            normals: Unit [V, 3].
+            triangles: [F, 3].
+            two_sided: Vertices [V] bool that are lit on both sides.
+            clearance_m: Distance [V] off the surface at which rays start.
+        """
         vertices, normals = vertices.astype(np.float32), normals.astype(np.float32)
         edges = _edges(triangles, len(vertices))
         offset_m = np.maximum(_mesh_offset_m(vertices, normals, edges), clearance_m)[:, None]

@@ -54,10 +54,18 @@ def bake_transport(
     settings: BakeSettings = BakeSettings(),
     seed: int = 0,
 ) -> Transport:
-    """Bake texels at positions [T, T, 3] (m) with unit normals [T, T, 3], lit from unit directions [L, 3].
+    """Bake the light transport of texels under an occluder.
 
-    The occluder is a mesh of vertices [V, 3] and triangles [F, 3]. A ray of the bounce takes the light of the
-    texel whose position is nearest to its hit.
+    A ray of the bounce takes the light of the texel whose position is nearest to its hit.
+
+    Args:
+        positions: Of the texels [T, T, 3], in metres.
+        normals: Unit [T, T, 3].
+        vertices: Of the occluder [V, 3], in metres.
+        triangles: Of the occluder [F, 3].
+        directions: Unit [L, 3], toward the lights.
+        settings: Samples, and the size of the lights.
+        seed: Of the samples.
     """
     scene = build_scene(vertices, triangles)
     random = np.random.default_rng(seed)

@@ -198,7 +198,15 @@ class LitUp(nn.Module):
         self.outer = nn.Conv2d(channels_out, channels_out, 3, padding=1)
 
     def forward(self, x: Tensor, skip: Tensor, maps: Tensor, code: Tensor, lights: int) -> Tensor:
-        """Features [B * lights, C, H, W] from those below, the face's, and the maps and codes of lights."""
+        """Return features [B * lights, C, H, W].
+
+        Args:
+            x: Features from below [B * lights, C, h, w].
+            skip: Features of the face [B, C, H, W].
+            maps: Maps of the lights [B * lights, C, h, w], of any side.
+            code: Codes of the lights [B * lights, C].
+            lights: Lights of each face.
+        """
         side = skip.shape[-1]
         x = self.enter(x)
         if self.scale == 2:

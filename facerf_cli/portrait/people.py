@@ -87,9 +87,14 @@ def person_among(
     others: Sequence[OtherHead],
     parsed: np.ndarray,
 ) -> PersonShares:
-    """The person with a head among others in a small image [h, w, 3] in 0..1.
+    """Find the person with a head among others in a small image.
 
-    `parsed` [h, w] is the share that the Parsing Network sees; it alone knows faces that fill the photo.
+    Args:
+        people: The networks that find and cut out people.
+        image: sRGB [h, w, 3] in 0..1.
+        head: The person's head.
+        others: The other heads.
+        parsed: Share [h, w] that the Parsing Network sees; it alone knows faces that fill the photo.
     """
     if not _squares_around(head, image.shape):
         return PersonShares(parsed, parsed)

@@ -171,11 +171,19 @@ def look_at_person(
     matte: np.ndarray | None = None,
     others: Sequence[OtherHead] | None = None,
 ) -> SeenPerson:
-    """Segment a person in a scene-linear photo [H, W, 3] and shape the proxy of the fitted face.
+    """Segment a person in a photo and shape the proxy of the fitted face, in the square around the landmarks.
 
-    All is seen in the square around the landmarks; a `segmentation` may be given, or the person's `matte`
-    [H, W], or the photo's other heads.
-    Raises InputError where no skin is seen, by which the person is exposed.
+    Args:
+        people: The networks that find and cut out people.
+        model: The face model of the fit.
+        photo: Scene-linear [H, W, 3].
+        fit: The fitted face.
+        segmentation: The person's, if it is known.
+        matte: The person's share [H, W], if it is given.
+        others: The photo's other heads; None: they are looked for.
+
+    Raises:
+        InputError: No skin is seen, by which the person is exposed.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = portrait_square(landmarks_px)

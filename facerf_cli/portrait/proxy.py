@@ -237,10 +237,17 @@ def _mean_person() -> _MeanPerson:
 def own_shading(
     image: Tensor, classes: Tensor, normals: Tensor, rig: Tensor, visible: Tensor, sides: float
 ) -> Tensor:
-    """Shading [1, S, S], with a mean of 1 over the skin, of a proxy under a photo's estimated light.
+    """Shade a proxy by a photo's estimated light: [1, S, S], with a mean of 1 over the skin.
 
-    The skin is taken to be of one colour and matt. image [3, S, S] scene-linear; classes [C, S, S]; normals
-    [3, S, S]; visible [L, s, s] of a rig [L, 3] all around. The square is so many faces wide.
+    The skin is taken to be of one colour and matt.
+
+    Args:
+        image: Scene-linear [3, S, S].
+        classes: Shares [C, S, S].
+        normals: Of the proxy [3, S, S].
+        rig: Unit directions [L, 3] all around.
+        visible: Visibility [L, s, s] of each light.
+        sides: Width of the square, in faces.
     """
     solved_px = _SOLVED_PX * max(1, round(sides / _SOLVED_SIDES))
     skin = _at(classes[SKIN : SKIN + 1], solved_px)[0]

@@ -90,9 +90,14 @@ def segment(
     matte: np.ndarray | None = None,
     others: Sequence[OtherHead] | None = None,
 ) -> Segmentation:
-    """Segment one person, with landmarks [68, 2], in an sRGB uint8 image [H, W, 3]; a matte may be given.
+    """Segment one person.
 
-    The photo's other heads are looked for, unless they are given.
+    Args:
+        people: The networks that find and cut out people.
+        image_srgb: uint8 [H, W, 3].
+        landmarks_px: Of the person's face [68, 2].
+        matte: The person's share [H, W], if it is given.
+        others: The photo's other heads; None: they are looked for.
     """
     small = small_image(image_srgb)
     if matte is not None:

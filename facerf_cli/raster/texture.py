@@ -96,10 +96,16 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
 def render_texture(
     texture: Tensor, vertices_camera: Tensor, triangles: Tensor, uv: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Render a textured mesh with vertex `uv` [V, 2] to an image [H, W, C] and a coverage [H, W] of 0 or 1.
+    """Render a textured mesh to an image [H, W, C], black outside of it, and a coverage [H, W] of 0 or 1.
 
-    The image is black outside the mesh. Differentiable in the texture and, through the interpolation, in the
-    vertices.
+    Differentiable in the texture and, through the interpolation, in the vertices.
+
+    Args:
+        texture: [C, T, T].
+        vertices_camera: [V, 3] in camera space, in metres.
+        triangles: [F, 3].
+        uv: Of the vertices [V, 2], v down.
+        camera: The image's camera.
     """
     fragments = rasterize(vertices_camera, triangles, camera)
     coverage = fragments.covered.to(texture.dtype)
@@ -115,12 +121,20 @@ def unwrap(
     texture_side: int,
     settings: UnwrapSettings = UnwrapSettings(),
 ) -> tuple[Tensor, Tensor]:
-    """Unwrap an image [..., C, H, W] to a uniform grid mesh's texture [..., C, T, T].
+    """Unwrap an image to a uniform grid mesh's texture [..., C, T, T] and its visibility [..., T, T].
 
-    Also return its visibility [..., T, T]. A texel is the weighted mean of up to samples x samples points in
-    it, so that it averages over the pixels that it covers. A point's weight is 0 if it is hidden, and falls
-    with the angle between normal and viewing ray. The texture is 0 where visibility is 0. Differentiable in
-    the image and the vertices; visibility is constant.
+    A texel is the weighted mean of up to samples x samples points in it, so that it averages over the pixels
+    that it covers. A point's weight is 0 if it is hidden, and falls with the angle between normal and viewing
+    ray. The texture is 0 where visibility is 0. Differentiable in the image and the vertices; visibility is
+    constant.
+
+    Args:
+        image: [..., C, H, W].
+        vertices_camera: Of the grid [V, 3] in camera space, in metres.
+        triangles: [F, 3].
+        camera: The image's camera.
+        texture_side: T.
+        settings: Samples a texel, and what counts as hidden.
     """
     if image.shape[-2:] != (camera.height_px, camera.width_px):
         raise ValueError(f"image {tuple(image.shape)}: the camera's is {camera.height_px, camera.width_px}")

@@ -159,8 +159,8 @@ def test_a_turned_head_keeps_its_lights_and_memory_and_precision_change_little(
     turned = stack_of(given, tmp_path / "b", "--lights", SIDES, "--pose", "40,0,0").olats.float()
     right, left, _ = turned.mean((1, 2, 3)) / straight.mean((1, 2, 3))
     assert right > 1.2 and left < 0.7  # a nose to the picture's right faces the light from there
-    usual = stack_of(given, tmp_path / "a", "--lights", "7").olats.float()
-    frugal = stack_of(given, tmp_path / "b", "--lights", "7", "--memory", "0.1").olats.float()
+    usual = stack_of(given, tmp_path / "usual", "--lights", "7").olats.float()
+    frugal = stack_of(given, tmp_path / "frugal", "--lights", "7", "--memory", "0.1").olats.float()
     coarse = stack_of(given, tmp_path / "c", "--lights", "7", "--precision", "bf16").olats.float()
     assert torch.allclose(usual, frugal, atol=1e-3) and (usual - coarse).abs().max() < 0.05 * usual.max()
 
@@ -171,7 +171,7 @@ def test_lights_from_a_file_and_a_long_list_that_is_no_files_name(given: Path, t
     assert len(stack.header.directions) == 2 and stack.header.directions[1, 0] < 0
     many = ";".join(f"{azimuth_deg},{azimuth_deg / 4}" for azimuth_deg in range(60))
     assert len(many) > 256
-    assert predict(given, tmp_path, "--lights", many, "--dry-run") == 0
+    assert predict(given, tmp_path / "many", "--lights", many, "--dry-run") == 0
 
 
 def test_all_faces_get_a_number_and_finished_ones_are_skipped(given: Path, tmp_path: Path) -> None:

@@ -73,17 +73,17 @@ def test_warnings_stop_strict_runs_and_too_many_broken_frames_all(
     capture: Path, tmp_path: Path, capsys: Said, plant: Plant
 ) -> None:
     plant(CLIPPED)
-    assert prepare(capture, tmp_path, "--strict") == 1
+    assert prepare(capture, tmp_path / "strict", "--strict") == 1
     assert (
         "0001/C0: clipped: 3 frames are clipped; without --strict it is a warning" in capsys.readouterr().err
     )
-    assert read_dataset(tmp_path).subjects == ("0000",)
+    assert read_dataset(tmp_path / "strict").subjects == ("0000",)
     plant(*(frame(light) for light in range(LIGHTS - LEAST_LIGHTS + 1)))
-    assert prepare(capture, tmp_path) == 1
+    assert prepare(capture, tmp_path / "broken") == 1
     assert "0000: 9 of 12 lights have a sound frame" in capsys.readouterr().err
     plant(ORDER, frame(4))
-    assert prepare(capture, tmp_path, "--checks", "off") == 0
-    assert read_dataset(tmp_path).fewer_lights == {} and not (tmp_path / "findings").exists()
+    assert prepare(capture, tmp_path / "off", "--checks", "off") == 0
+    assert read_dataset(tmp_path / "off").fewer_lights == {} and not (tmp_path / "off/findings").exists()
 
 
 @pytest.mark.parametrize(

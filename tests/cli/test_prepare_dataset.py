@@ -265,7 +265,7 @@ def test_black_images_have_no_face_nor_a_network_that_sees_none(
     blind = tmp_path / "blind.safetensors"
     save_networks(blind, networks, {"layout_version": LAYOUT_VERSION})
     cameras = json.loads((given[0] / "stage.json").read_text())["cameras"][:1]
-    capture = changed(given, tmp_path / "capture", subjects={"0000": {}}, cameras=cameras)
+    capture = changed(given, tmp_path / "seen", subjects={"0000": {}}, cameras=cameras)
     assert prepare(capture, tmp_path / "out", "--checkpoint", str(blind)) == 1
     assert "0000: no camera shows a face" in capsys.readouterr().err
 

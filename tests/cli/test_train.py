@@ -21,9 +21,9 @@ from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.transport import seen_path
+from facerf_cli.training import run as training_run
 from facerf_cli.training.options import TrainOptions
 from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
-from facerf_cli.work import train as train_work
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Patch, Said
 from tests.network.test_own_forms import FORMS, write_own_package
@@ -40,7 +40,7 @@ def test_a_run_has_its_folder_to_itself(tmp_path: Path, monkeypatch: Patch) -> N
         held.append(folder)
         yield
 
-    monkeypatch.setattr(train_work, "alone_in", alone)
+    monkeypatch.setattr(training_run, "alone_in", alone)
     assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "nobody.npz"]) == 1
     assert held == [tmp_path / "run"]
 
@@ -104,7 +104,7 @@ def test_a_configuration_reaches_loss_and_optimizer(tmp_path: Path, monkeypatch:
     assert row["terms"] == {"photometric": 0.0}
     assert "photometric = 0" in (tmp_path / "run/config.toml").read_text()
     seen: list[TrainOptions] = []
-    monkeypatch.setattr(train_work, "run_training", seen.append)
+    monkeypatch.setattr(training_run, "run_training", seen.append)
     (tmp_path / "c.toml").write_text(
         "[train]\nstage = 'joint'\ndataset = 'd'\nema-decay = 0\n[train.loss]\nfeatures = 0.1\n"
         "channels_apart = false\n"
@@ -337,6 +337,6 @@ def test_the_papers_form_trains_in_full_precision_by_default(
     line: tuple[str, ...], expected: bool, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     seen: list[TrainOptions] = []
-    monkeypatch.setattr(train_work, "run_training", seen.append)
+    monkeypatch.setattr(training_run, "run_training", seen.append)
     assert main(["train", "-o", str(tmp_path / "run"), "--heads-from", "builtin", *line]) == 0
     assert seen[0].training.bf16 is expected

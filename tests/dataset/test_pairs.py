@@ -263,11 +263,14 @@ def test_fewer_or_other_pairs_leave_no_image_without_its_own(fresh: Dataset) -> 
     assert not image_path(fresh, "0000", 1).exists()
 
 
-def test_images_are_of_the_pairs_that_are_settled(fresh: Dataset) -> None:
+def test_as_many_pairs_of_other_subjects_are_other_pairs(fresh: Dataset) -> None:
     drawn = draw_pairs(fresh, MAPS, 2, 0)
     write_pairs(fresh, [pair for pair in drawn if pair.subject < "0002"], overwrite=False)
     settled = write_pairs(fresh, [pair for pair in drawn if pair.index == 0], overwrite=False)
     assert [pair.subject for pair in settled] == ["0000", "0001", "0002", "0003"] == list(load_pairs(fresh))
+
+
+def test_images_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -> None:
     path = image_path(fresh, "0000", 0)
     path.parent.mkdir(parents=True)
     path.write_text("of an unknown light")
