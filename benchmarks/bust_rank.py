@@ -20,9 +20,10 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.synth import renderer
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.head.mesh import PARTS
-from facerf_cli.synth.subjects import draw_subject, subject_model
+from facerf_cli.synth.subjects import draw_subject
 from facerf_cli.synth.views import StageCamera, truth_of
 
 SIDE_PX, LIGHTS, MAPS = 128, 150, 100
@@ -31,7 +32,7 @@ SHARES = (0.99, 0.999)
 
 def rendered(model_name: str, index: int, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Radiances [N, L] of the covered pixels and channels of a person, and the class [N] of each."""
-    subject = draw_subject(subject_model(model_name), index, 15, 256)
+    subject = draw_subject(cached_face_model(model_name), index, 15, 256)
     mesh = subject.mesh
     strands = mesh.part == PARTS.index("hair")
     transport = bake_mesh(

@@ -31,8 +31,9 @@ from facerf_cli.portrait.find import detect_faces
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.portraits import bake_subject, images_under, materials_of, view_of
-from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera
 
 SEED, SIDE_PX, LIGHTS = 41, 288, 150
@@ -64,7 +65,7 @@ def main() -> None:
     options = parser.parse_args()
     growth = required(options.growth, "MakeHuman's targets", "--growth", Path("mpfb2"))
     torch.set_num_threads(1)
-    model, rows = subject_model(BUILTIN), []
+    model, rows = cached_face_model(BUILTIN), []
     scores: dict[str, list[dict[str, float]]] = defaultdict(list)
     for index in range(options.people):
         adult = draw_subject(model, index, SEED, SIDE_PX)

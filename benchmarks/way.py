@@ -83,10 +83,10 @@ def _open_frames(frame: FrameType | None) -> list[str]:
 
 def caches(text: str) -> int:
     """Functions and attributes of a source that are kept by functools."""
-    return sum(
-        isinstance(node, ast.Name) and node.id in _CACHES and isinstance(node.ctx, ast.Load)
-        for node in ast.walk(ast.parse(text))
-    )
+    nodes = list(ast.walk(ast.parse(text)))
+    imports = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module == "functools"]
+    names = {alias.name for node in imports for alias in node.names} & set(_CACHES)
+    return sum(isinstance(node, ast.Name) and node.id in names for node in nodes)
 
 
 def closures_of_rows(text: str) -> int:

@@ -17,8 +17,9 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import pose_to_rotation, project
 from facerf_cli.raster.texture import vertex_normals
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.portraits import bake_subject, images_under, materials_of, view_of
-from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera, stage_cameras, surface_samples
 
 _NEAR = 4  # vertices of the face that carry a vertex of the mesh
@@ -218,7 +219,7 @@ def motion_of(frames: list[Posed], rest: Subject) -> dict[str, np.ndarray]:
 
 def draw_clip(person: int, frames: int, size_px: int) -> Clip:
     """Photograph a person who talks and turns; lights are fixed to the camera."""
-    model = subject_model("builtin")
+    model = cached_face_model("builtin")
     actor = Actor(draw_subject(model, person, SEED, size_px), model)
     people = [posed(actor, frame, size_px) for frame in range(frames)]
     images, alphas = [], []

@@ -9,7 +9,6 @@ spherical harmonics (the same authors' *Frequency Space Environment Map Renderin
 
 import math
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import torch
@@ -131,7 +130,6 @@ def _by_degree(factors: tuple[float, ...]) -> Tensor:
     return torch.cat([torch.full((2 * degree + 1,), factor) for degree, factor in enumerate(factors)])
 
 
-@cache
 def _blinn_phong(exponent: float, order: int) -> tuple[float, ...]:
     """Factors at degrees 0 to `order` of a lobe cos^exponent(angle / 2) whose integral is 1.
 

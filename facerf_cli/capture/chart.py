@@ -9,7 +9,7 @@ alternating least squares technique for nonuniform intensity color correction'.
 """
 
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 from skimage.draw import polygon
@@ -84,7 +84,6 @@ def delta_e_2000(linear: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return np.asarray(colour_science().delta_E(lab_d65(linear), lab_d65(wanted), method="CIE 2000"))
 
 
-@cache
 def published_colours() -> np.ndarray:
     """Published colours [24, 3] in linear Rec.709 under D65, adapted from X-Rite's D50 values by Bradford."""
     science = colour_science()

@@ -118,7 +118,7 @@ class PairReader:
         """A reader of these pairs."""
         return replace(self, pairs=pairs)
 
-    @cached_property
+    @property
     def _lazy(self) -> bool:
         return not image_path(self.dataset, *self.pairs[0].key).is_file()
 

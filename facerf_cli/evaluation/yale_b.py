@@ -167,7 +167,6 @@ def _spiral(points: int) -> np.ndarray:
     return np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], 1)
 
 
-@cache
 def face_mask() -> np.ndarray:
     """The mask of the comparison, bool [192, 168]: one ellipse for all images."""
     y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX] + 0.5

@@ -7,7 +7,7 @@ alone constrain identity little and most of the surface not at all, so the prior
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -319,7 +319,8 @@ def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
     by_parameters = torch.cat(
         [-skew_matrix(basis.mean), torch.eye(3).expand(len(basis.mean), 3, 3), basis.modes], -1
     )
-    flat = (by_parameters * _weights()[:, None, None]).flatten(0, 1)
+    weights = _weights(len(basis.mean))[:, None]
+    flat = (by_parameters * weights[..., None]).flatten(0, 1)
     prior = torch.ones(flat.shape[1], dtype=flat.dtype)
     prior[:6] = 0
     factor = torch.linalg.cholesky(flat.mT @ flat + prior.diag())
@@ -327,7 +328,7 @@ def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
     for _ in range(_SEED_ROUNDS):
         points = basis.mean + (coordinates @ basis.modes.flatten(0, 1).mT).reshape(len(wanted), -1, 3)
         off = (wanted - translation[:, None]) @ rotation - points  # head frame
-        right = (off * _weights()[:, None]).flatten(1) @ flat
+        right = (off * weights).flatten(1) @ flat
         right[:, 6:] -= coordinates
         step = torch.cholesky_solve(right.mT, factor).mT
         translation = translation + (rotation @ step[:, 3:6, None])[..., 0]
@@ -336,13 +337,9 @@ def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
     return FitState(rotation, translation, coordinates)
 
 
-@cache
-def _weights() -> Tensor:
-    """Weights [N] of the basis's points in 1 / m; all contour points together count as the inner ones do."""
-    corners, _ = fit_points()
-    weights = torch.full(
-        (len(corners),), (INNER_COUNT / (len(corners) - INNER_COUNT)) ** 0.5, dtype=torch.float64
-    )
+def _weights(count: int) -> Tensor:
+    """Weights [N] of `count` points in 1 / m; all contour points together count as the inner ones do."""
+    weights = torch.full((count,), (INNER_COUNT / (count - INNER_COUNT)) ** 0.5, dtype=torch.float64)
     weights[:INNER_COUNT] = 1
     return weights / _NOISE_M
 
@@ -356,7 +353,6 @@ def _points_camera(start: FitStart) -> Tensor:
     return (mean + offset) @ start.rotation.double().mT + start.translation_m.double()[:, None]
 
 
-@cache
 def _points_of(model: MorphableModel | None) -> tuple[Tensor, Tensor, Tensor]:
     """Mean [N, 3], identity [Ki, N, 3] and expression [Ke, N, 3] of a model at `fit_points`."""
     model, (corners, weights) = model or load_face_model(), fit_points()

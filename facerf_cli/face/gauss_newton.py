@@ -6,7 +6,6 @@ which is found again at every step (paper, 'Landmark loss').
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import cache
 from typing import Self
 
 import numpy as np
@@ -56,7 +55,6 @@ class FitBasis:
     outward: Tensor  # [rays, 3], head frame
 
 
-@cache
 def fit_points() -> tuple[Tensor, Tensor]:
     """Vertex ids [N, 3] and barycentric weights [N, 3] of the points of every model's FitBasis."""
     return locate(np.concatenate([LANDMARK_UV[len(CONTOUR) :], band_uv().reshape(-1, 2)]))

@@ -108,7 +108,6 @@ def cylinder_rays(uv: np.ndarray, radius_m: float = 0.4) -> tuple[np.ndarray, np
 LANDMARK_UV = cylinder_uv(LANDMARKS_M)  # [68, 2]
 
 
-@cache
 def grid_uv() -> Tensor:
     """The (u, v) [V, 2] of every vertex, row by row from the forehead down; V = GRID * GRID."""
     side = torch.linspace(0, 1, GRID)
@@ -158,7 +157,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-@cache
 def landmark_weights() -> tuple[Tensor, Tensor]:
     """Vertex ids [68, 3] and barycentric weights [68, 3] of the landmarks, equal for all models."""
     return locate(LANDMARK_UV)
@@ -245,7 +243,6 @@ def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
     return np.where(inside, distance, -distance)
 
 
-@cache
 def interior_texture(side: int) -> Tensor:
     """The interior in UV space [1, T, T]: 0 on the outline of the region `face`, 1 from 8 mm inside it."""
     return (2 * region_mask("face", side) - 1).clamp_min(0)[None]
@@ -263,7 +260,6 @@ def interior_mask(vertices_camera: Tensor, fragments: Fragments, uv: Tensor, tex
     return (inside * (fragments.covered & of_pixels)).unsqueeze(-3)
 
 
-@cache
 def band_uv() -> np.ndarray:
     """The (u, v) [R, P, 2] of the points of the band, outermost last, right ear to left ear."""
     ends = _between_landmarks(LANDMARK_UV)
@@ -272,7 +268,6 @@ def band_uv() -> np.ndarray:
     return centre + share * (ends - centre)[:, None]
 
 
-@cache
 def contour_rays() -> Tensor:
     """The grid's vertices [R, P] closest to the points of the band."""
     column_row = np.round(band_uv() * (GRID - 1)).astype(np.int64)
@@ -301,7 +296,6 @@ def outermost(px: Tensor, outward: Tensor) -> Tensor:
     return reach.argmax(-1)
 
 
-@cache
 def _outward() -> Tensor:
     """Unit directions [R, 3] in the head frame in which the rays leave a face seen from the front."""
     away = (_between_landmarks(LANDMARKS_M) - LANDMARKS_M[list(NOSE)].mean(0)) * [1, 1, 0]

@@ -20,7 +20,6 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -122,7 +121,6 @@ clean_by(_remove_own)
 atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
 
 
-@cache
 def _machine() -> str:
     """An id of this machine, since machines that share a folder may use the same process ids."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]

@@ -71,7 +71,6 @@ def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> t
     return sinh / (a * sinh + b * cosh), b / (a * sinh + b * cosh)
 
 
-@lru_cache(maxsize=1)
 def observer_weights() -> np.ndarray:
     """Matrix [33, 3] from reflectance at `WAVELENGTHS_NM` to XYZ under D65; white has the colour of D65."""
     return np.array(_TABLES["observer"], float) / 100

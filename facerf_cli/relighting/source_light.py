@@ -8,7 +8,6 @@ the light is one lamp, which may be anywhere, and light from around, which is as
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -94,7 +93,7 @@ class _Frame:
     @staticmethod
     def of(models: Models, face: FaceTexture) -> "_Frame":
         field = Field(models, shrunk(face), even_shade=True)
-        return _Frame(field, torch.cat(list(field.olats(_rig()))))
+        return _Frame(field, torch.cat(list(field.olats(rig_directions(_AROUND)))))
 
     def under(self, directions: Tensor) -> Tensor:
         """OLATs [l, 3, t, t] under lights [l, 3]."""
@@ -109,7 +108,9 @@ def _estimated(frames: Sequence[_Frame]) -> RigLight:
     lamp = _lamp(frames)
     pairs = [(torch.cat([one.under(lamp), one.around]), one) for one in frames]
     olats = torch.cat([one.seen(olats) for olats, one in pairs], -1)
-    return RigLight(torch.cat([lamp, _rig()]), estimate_lamps(olats, _photo(frames), len(lamp)))
+    return RigLight(
+        torch.cat([lamp, rig_directions(_AROUND)]), estimate_lamps(olats, _photo(frames), len(lamp))
+    )
 
 
 def _lamp(frames: Sequence[_Frame]) -> Tensor:
@@ -123,8 +124,8 @@ def _lamp(frames: Sequence[_Frame]) -> Tensor:
         return [lamp_error(lamp, around, photo) for lamp in lamps]
 
     if not len(photo):  # nothing is visible enough
-        return _rig()[:1]
-    places, found = _rig(), errors([one.around for one in frames])
+        return rig_directions(_AROUND)[:1]
+    places, found = rig_directions(_AROUND), errors([one.around for one in frames])
     for ring_deg in _RINGS_DEG:
         best = places[found.index(min(found))]
         ring = _ring(best, ring_deg)
@@ -145,8 +146,3 @@ def _ring(axis: Tensor, degrees: float) -> Tensor:
     turns = torch.arange(_RING)[:, None] * (2 * math.pi / _RING)
     sideways = turns.cos() * across + turns.sin() * other
     return F.normalize(axis + math.tan(math.radians(degrees)) * sideways, dim=-1)
-
-
-@cache
-def _rig() -> Tensor:
-    return rig_directions(_AROUND)

@@ -9,7 +9,6 @@ leave more, have gains of their own, by the same light.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -116,7 +115,6 @@ def _nearest_skin(chroma: Tensor) -> Tensor:
     return known[(known - chroma).norm(dim=1).argmin()]
 
 
-@lru_cache(maxsize=1)
 def _skin_chromas() -> Tensor:
     """Log red / green and blue / green [N, 2] of all skins."""
     red, green, blue = skin_table()[0].flatten(1).log()

@@ -9,7 +9,6 @@ import math
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from pathlib import Path
 from typing import cast
 
@@ -79,7 +78,6 @@ def share_freed() -> None:
         setting(_M_ARENA_MAX, 1)
 
 
-@cache
 def _of_c(name: str) -> Callable[..., int] | None:
     """A function of glibc; None with another library of C."""
     try:

@@ -62,7 +62,6 @@ class Window:
         return (mm - origin.float()) / torch.tensor(self.texel_mm) - 0.5
 
 
-@lru_cache(maxsize=8)
 def places_mm(window: Window) -> tuple[Tensor, Tensor]:
     """Compute x and y [T, T] of every texel centre, in millimetres."""
     low, high = window.span
@@ -86,7 +85,6 @@ def inside(window: Window, region: str) -> Tensor:
     return F.grid_sample(field, 2 * at[None] - 1, padding_mode="border", align_corners=False)
 
 
-@lru_cache(maxsize=64)
 def mask(window: Window, region: str, edge_mm: float, grow_mm: float = 0.0) -> Tensor:
     """Compute a mask [1, 1, T, T] of a region grown by `grow_mm`, with an edge at least a texel wide."""
     ramp = (inside(window, region) + grow_mm) / max(edge_mm, max(window.texel_mm)) + 0.5
@@ -108,7 +106,6 @@ def blob(window: Window, at: int | tuple[float, float], radius_mm: float, tall: 
     return torch.exp(-((dx / radius_mm) ** 2) - (dy / (radius_mm * tall)) ** 2)[None, None]
 
 
-@lru_cache(maxsize=64)
 def blobs(window: Window, u: float, v: float, radius_mm: float, tall: float = 1.0) -> Tensor:
     """Compute two Gaussian bumps [1, 1, T, T], at u and 1 - u."""
     return blob(window, (u, v), radius_mm, tall) + blob(window, (1 - u, v), radius_mm, tall)

@@ -25,10 +25,11 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
 from facerf_cli.synth import path_tracer, renderer
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.renderer import lenses_in, over_lenses
 from facerf_cli.synth.stage_settings import StageSettings
-from facerf_cli.synth.subjects import Subject, subject_model
+from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import CAMERA_DISTANCE_M, StageCamera, stage_cameras, truth_of
 
 _TRANSPORT_SIDE = 128  # texels along a side of the transport that a capture may store
@@ -63,7 +64,7 @@ def describe_stage(settings: StageSettings) -> dict[str, Any]:
                 "world_to_camera": (flip @ pose).tolist(),
             }
         )
-    model = subject_model(settings.face_model)
+    model = cached_face_model(settings.face_model)
     return {
         "format": STAGE_FORMAT,
         "colour_space": "lin_rec709",
@@ -153,7 +154,7 @@ def write_subject(
 
     The colour of the truth is that of the person under an even white light of radiance 1.
     """
-    model = subject_model(settings.face_model)
+    model = cached_face_model(settings.face_model)
     metadata = Provenance(**model.stamp, source_type=COMPUTER_GRAPHICS_SOURCE_TYPE).attributes()
     cameras, transport = photograph_subject(subject, settings)
     with atomic_path(folder) as unfinished:
@@ -201,4 +202,4 @@ def _save_transport(path: Path, subject: Subject, transport: MeshTransport, sett
     }
     with atomic_path(path) as temporary:
         # One entry only: safetensors writes several in random order.
-        save_file(tensors, temporary, metadata={"face_model": subject_model(settings.face_model).credit})
+        save_file(tensors, temporary, metadata={"face_model": cached_face_model(settings.face_model).credit})

@@ -1,14 +1,13 @@
 """Random subjects of the synthetic light stage: head, expression, skin, hair, clothes and glasses."""
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.face.morphable import EXPRESSION_STD, MorphableModel, load_face_model
+from facerf_cli.face.morphable import EXPRESSION_STD, MorphableModel
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, canvas_uv, draw_appearance, with_short_hair
 from facerf_cli.synth.bank.heads import HeadBakeSettings, draw_coefficients
@@ -42,12 +41,6 @@ class Subject:
     more_landmarks_world: dict[str, list[float]]  # of `truth.more_landmarks`, m
     traits: dict[str, Any]
     lenses: HeadMesh | None = None  # of glasses, in world space
-
-
-@lru_cache(maxsize=1)
-def subject_model(name_or_path: str) -> MorphableModel:
-    """Load the face model once per process, since values derived from it are cached by identity."""
-    return load_face_model(name_or_path)
 
 
 def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int, arms: bool = False) -> Subject:

@@ -4,7 +4,6 @@ Further landmarks than the 68 of `face.topology` have names: centres and outline
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -40,7 +39,6 @@ class StageCamera:
         return points @ self.head_to_camera.T.to(points) + self.translation_m.to(points)
 
 
-@lru_cache(maxsize=4)
 def stage_cameras(size_px: int, frame: Frame = "head") -> tuple[StageCamera, ...]:
     """Build the eight cameras; world axes are those of a head that looks into the first camera."""
     high_m, middle_m = _FRAMES_M[frame]

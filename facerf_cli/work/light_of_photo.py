@@ -129,9 +129,8 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
     return write_each(item, image, options.photo, write)
 
 
-@cache
 def light_of_photo(path: Path, options: LightOptions) -> RigLight:
-    """The light of the (largest) face of a photo on disk, estimated once a process."""
+    """The light of the (largest) face of a photo on disk, estimated."""
     item = Item(path, Path(path.stem), path.stem)
     image = read_photo(item, options.photo)
     face = fit_faces(item, image, options.photo)[0]

@@ -7,17 +7,18 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings
 from facerf_cli.run.workers import one_thread
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.path_tracer import load_mitsuba
 from facerf_cli.synth.stage import close_capture, open_capture, write_subject
 from facerf_cli.synth.stage_settings import StageSettings
-from facerf_cli.synth.subjects import draw_subject, subject_model
+from facerf_cli.synth.subjects import draw_subject
 
 
 def photograph_people(
     subjects: int, stage: StageSettings, transport: bool, batch: BatchOptions, settings: Settings
 ) -> int:
     """Write a capture of synthetic people; return the exit code."""
-    subject_model(stage.face_model)  # raises for an invalid model before anything is written
+    cached_face_model(stage.face_model)  # raises for an invalid model before anything is written
     if stage.renderer == "mitsuba":
         load_mitsuba()
     folders = [batch.output / f"{index:04d}" for index in range(subjects)]
@@ -45,7 +46,7 @@ class _Photograph:
 
     def __call__(self, item: Item) -> Outcome:
         """Draw and photograph a person."""
-        model = subject_model(self.stage.face_model)
+        model = cached_face_model(self.stage.face_model)
         with one_thread():
             subject = draw_subject(model, int(item.name), self.stage.seed, self.stage.size_px)
             write_subject(item.output_base, subject, self.stage, self._transport_path(item))

@@ -18,8 +18,9 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.main import main
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from facerf_cli.synth import stage
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.stage_settings import Frame
-from facerf_cli.synth.subjects import draw_subject, subject_model
+from facerf_cli.synth.subjects import draw_subject
 from facerf_cli.synth.views import stage_cameras, truth_of
 from tests.cli.folders import tree
 from tests.exr_layers import exr_layers
@@ -138,7 +139,7 @@ def test_every_camera_has_its_truth(capture: Path) -> None:
 
 
 def test_a_bust_shows_more_of_the_garment() -> None:
-    subject = draw_subject(subject_model("builtin"), 0, 0, 64)
+    subject = draw_subject(cached_face_model("builtin"), 0, 0, 64)
     frames: tuple[Frame, Frame] = ("head", "bust")
     head, bust = (
         truth_of(subject.mesh, subject.appearance, stage_cameras(64, frame)[0]).layers() for frame in frames

@@ -103,7 +103,6 @@ def _sparse_face() -> _SparseFace:
     return _SparseFace(mean, np.moveaxis(basis, 0, -1), len(grid))
 
 
-@cache
 def _normals() -> np.ndarray:
     """Normals [M, 3] of the built-in mean at the points; the deformation changes them little."""
     mesh = trimesh.Trimesh(load_face_model().mean.double().numpy(), grid_triangles().numpy(), process=False)

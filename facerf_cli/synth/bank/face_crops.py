@@ -172,7 +172,6 @@ def _image(
     return (stored * 255).round().byte().permute(2, 0, 1).contiguous()
 
 
-@cache
 def _coarse_grid() -> tuple[Tensor, Tensor]:
     """Vertex ids [v] of every `_COARSE`-th row and column of the face grid, and their triangles [f, 3]."""
     ids = torch.arange(GRID * GRID).view(GRID, GRID)[::_COARSE, ::_COARSE]

@@ -26,11 +26,12 @@ from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.bank import Files, fill
 from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
+from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.portraits import BakedPortrait, bake_subject, images_under, materials_of, view_of
 from facerf_cli.synth.random_fields import Random, Uniform, generators
 from facerf_cli.synth.sky.skies import draw_sky
-from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera
 
 BACKGROUND_PX, BACKGROUND_MAPS, BACKGROUND_HEAPS = 320, 60, 240  # side, and numbers of a bank
@@ -194,7 +195,7 @@ def photos_of(face_model: str, index: int, seed: int, settings: PortraitBankSett
     [V, 68 + M, 2], NaN for those that a person does not have; rotation [V, 3, 3], head_to_camera.
     """
     random, generator = generators(seed, index, 3)
-    subject = draw_subject(subject_model(face_model), index, seed, settings.side_px)
+    subject = draw_subject(cached_face_model(face_model), index, seed, settings.side_px)
     cameras = [_draw_camera(settings.side_px, random) for _ in range(settings.views)]
     views = seen_by(cameras, subject, _LIGHTS, _BAKE, index, random)
     looks = draw_looks(subject, _LOOKS, generator)

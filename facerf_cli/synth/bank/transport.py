@@ -46,7 +46,7 @@ from facerf_cli.synth.bank.texture_samples import draw_light
 from facerf_cli.synth.portraits import BakedPortrait, images_under, materials_of, portrait_tensors
 from facerf_cli.synth.random_fields import Random, generators
 from facerf_cli.synth.shading import Material
-from facerf_cli.synth.subjects import Subject, draw_subject, subject_model
+from facerf_cli.synth.subjects import Subject, draw_subject
 from facerf_cli.synth.views import StageCamera
 
 # Bounced light is smoothed over more than an edge of cloth, where few rays would leave spots.
@@ -105,7 +105,7 @@ def transport_of(face_model: str, index: int, seed: int, settings: TransportBank
     255; squares [Q, 4], the fields of a `Crop` of the photo; directions [L, 3] of the lights.
     """
     random, generator = generators(seed, index, 5)
-    subject = draw_subject(subject_model(face_model), index, seed, settings.side_px, arms=True)
+    subject = draw_subject(cached_face_model(face_model), index, seed, settings.side_px, arms=True)
     drawn = _draw_cameras(subject, random, settings)
     cameras = [camera for one in drawn for camera in (one.photo, *one.squares)]
     views = iter(seen_by(cameras, subject, settings.lights, _BAKE, index, random))

@@ -8,7 +8,6 @@ that hangs in front of the face is grown a second time, shorter. Heights and azi
 """
 
 from dataclasses import replace
-from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -321,7 +320,6 @@ _LIDS = (((36, 37, 38, 39), 110), ((39, 40, 41, 36), 60), ((42, 43, 44, 45), 110
 _LASH_M = {110: 0.009, 60: 0.0055}  # length of upper and lower lashes, by their number
 
 
-@lru_cache(maxsize=1)
 def _density() -> np.ndarray:
     """Density [T, T] of a beard over the canvas."""
     return np.asarray(beard_density(Window(256, CANVAS_SPAN))[0, 0].numpy())

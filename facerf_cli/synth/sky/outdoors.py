@@ -9,7 +9,6 @@ ozone extinction. Mixed gases and water vapour are left out, as they absorb only
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -91,7 +90,6 @@ def transmittance(wavelength_nm: np.ndarray, elevation_deg: float, turbidity: fl
     return np.asarray(np.exp(-air_mass * (0.008735 * um**-4.08 + beta * um**-1.3 + ozone)))
 
 
-@lru_cache(maxsize=1)
 def _sun_to_xyz() -> np.ndarray:
     """Matrix [3, W] from the spectral radiance of the sun (table 2) to its XYZ irradiance in klx."""
     per_nm = SUN_SR * 10.0  # from W / (cm2 um sr) over the disc to W / (m2 nm)
