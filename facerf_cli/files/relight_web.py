@@ -36,7 +36,8 @@ def write_relight_web(
     lights, height, width, _ = images.shape
     planes = min(_PLANES, 3 * lights)
     mean, components = _principal(images, planes)
-    low, high = _ranges(images, mean, components)
+    some = [((values - mean) @ components.T)[::4] for _, values in _blocks(images)]
+    low, high = np.percentile(np.concatenate(some), (_CLIPPED, 100 - _CLIPPED), axis=0)  # but for few pixels
     spread = np.maximum(high - low, 1e-6)
     document = {
         "width": width,
@@ -95,13 +96,6 @@ def _principal(images: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     mean = np.round(mean * _BYTES) / _BYTES  # as it is stored
     vectors = np.linalg.eigh(moment / number - np.outer(mean, mean))[1]
     return mean.astype(np.float32), np.ascontiguousarray(vectors.T[::-1][:count], np.float32)
-
-
-def _ranges(images: np.ndarray, mean: np.ndarray, components: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least and largest weights [P] of the components, but for a few pixels."""
-    some = [((values - mean) @ components.T)[::4] for _, values in _blocks(images)]
-    low, high = np.percentile(np.concatenate(some), (_CLIPPED, 100 - _CLIPPED), axis=0)
-    return low, high
 
 
 def _basis(mean: np.ndarray, components: np.ndarray) -> list[int]:

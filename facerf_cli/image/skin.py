@@ -44,7 +44,10 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
     eumelanin, pheomelanin = 6.6e11 * nm**-3.33, 2.9e15 * nm**-4.75
     pigment = (1 - _PHEOMELANIN_SHARE) * eumelanin + _PHEOMELANIN_SHARE * pheomelanin
     epidermis = melanin * pigment + (1 - melanin) * bloodless
-    dermis = blood * _blood_absorption() + (1 - blood) * bloodless
+    oxy, deoxy = (np.array(_TABLES[name], float) for name in ("oxyhaemoglobin", "deoxyhaemoglobin"))
+    molar = _OXYGENATION * oxy + (1 - _OXYGENATION) * deoxy
+    whole_blood = np.log(10) * molar * _BLOOD_G_PER_L / _HAEMOGLOBIN_G_PER_MOL  # absorption per cm
+    dermis = blood * whole_blood + (1 - blood) * bloodless
     # Kubelka-Munk reflectance of an infinitely deep layer; K = 2 mu_a, S = 3/4 mu_s'.
     ratio = 2 * dermis / (0.75 * (43.6 * (0.41 * (nm / 500) ** -4 + 0.59 * (nm / 500) ** -0.562)))
     below = 1 + ratio - np.sqrt(ratio * (ratio + 2))
@@ -53,13 +56,6 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
     )
     inside = reflected + passed**2 * below / (1 - reflected * below)
     return (1 - _OUTSIDE_REFLECTION) * (1 - _INSIDE_REFLECTION) * inside / (1 - _INSIDE_REFLECTION * inside)
-
-
-def _blood_absorption() -> np.ndarray:
-    """Absorption [33] of whole blood, per cm."""
-    oxy, deoxy = (np.array(_TABLES[name], float) for name in ("oxyhaemoglobin", "deoxyhaemoglobin"))
-    molar = _OXYGENATION * oxy + (1 - _OXYGENATION) * deoxy
-    return np.log(10) * molar * _BLOOD_G_PER_L / _HAEMOGLOBIN_G_PER_MOL
 
 
 def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> tuple[np.ndarray, np.ndarray]:

@@ -122,18 +122,13 @@ class ParsingNetwork(UNet):
 
     def forward(self, crops: Tensor) -> Parsing:
         """Parse crops; they may have any side that is a multiple of 32."""
-        halved = self.halved(_normalised(crops))
+        centred = crops - crops.mean((1, 2, 3), keepdim=True)
+        halved = self.halved(centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02))
         judged = self.judge(halved[-1].mean((2, 3))).float()
         *_, at_quarter, at_half = self.doubled(halved)
         logits = F.pixel_shuffle(self.classify(at_half), _ALPHA_STEPS)
         landmarks = _means(self.heat(at_quarter).float())
         return Parsing(logits, landmarks, judged[:, 1:], judged[:, 0])
-
-
-def _normalised(crops: Tensor) -> Tensor:
-    """Crops of zero mean and unit deviation each."""
-    centred = crops - crops.mean((1, 2, 3), keepdim=True)
-    return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)
 
 
 def _means(heat: Tensor) -> Tensor:

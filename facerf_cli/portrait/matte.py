@@ -1,12 +1,13 @@
-"""The matte of a person at the photo's own resolution, and the person's colours without the background's."""
+"""The matte of a person, solved at its outline, at the photo's resolution; and the person's own colours."""
 
 import math
 import threading
 from functools import partial
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
-from scipy.sparse import csr_array
+from scipy.ndimage import binary_dilation, distance_transform_edt, maximum_filter, uniform_filter
+from scipy.sparse import csr_array, dia_array
+from scipy.sparse.linalg import cg
 
 from facerf_cli.image.strips import between, box_means, enlarged, fitted, strips
 
@@ -19,6 +20,15 @@ _OUTLINE_PX = 768  # longest side at which distances from the outline are measur
 _SOLID_PX = (1.0, 3.0)  # distances from it over which a person comes to hide all, and to be absent
 _LOOSE_PX = 7  # side of the square around a pixel of the classes in which hair leaves its matte as it is
 _LEFT = 0.7  # of the background nearby, that a mixture holds at least
+_SAME_COLOUR = 1e-5  # variance of the colours of a window, sRGB in 0..1, below which its alpha is constant
+_PULL = 3e-3  # toward the expected alpha
+_TOLERANCE, _MOST_STEPS = 1e-3, 200
+_WINDOW = 9  # pixels
+_SMALL_PX = 256  # longest side at which colours before a plain background are measured
+_NEAR, _FAR = 0.1, 0.2  # sides of the squares of their means, in longest sides
+_ALLOWED = 0.1  # deviation of alpha that the colours' variance would give, at which half is believed
+_PLAIN_SURE = (0.02, 0.95)  # alpha up to which a pixel is background, and from which it is person
+_SEEN = 0.02  # share of a square that must be sure
 _TINY = 1e-5
 
 
@@ -169,3 +179,85 @@ def weighted_mean(colours: np.ndarray, weight: np.ndarray, size: int) -> np.ndar
     """Means [H, W, 3] over squares of `size` pixels, under weights [H, W]."""
     total = uniform_filter(colours * weight[..., None], (size, size, 1), mode="nearest")
     return np.asarray(total / (uniform_filter(weight, size, mode="nearest")[..., None] + _TINY))
+
+
+def solve_matte(image_srgb: np.ndarray, expected: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+    """Find alpha [H, W] in 0..1 where it is unknown [H, W]; elsewhere it is as expected [H, W].
+
+    Closed-form matting (Levin et al., *A closed-form solution to natural image matting*, 2008).
+
+    Around each pixel alpha is a linear function of the colour of the image [H, W, 3] in 0..1. Only windows of
+    3 x 3 pixels that touch unknown ones are looked at, so the cost goes with their number.
+    """
+    alpha = np.array(expected, np.float64)
+    if not unknown.any() or min(unknown.shape) < 3:
+        return alpha.astype(np.float32)
+    pixels = _windows(unknown)
+    affinity = _affinities(image_srgb.reshape(-1, 3)[pixels])
+    count = int(unknown.sum())
+    number = np.full(unknown.size, -1)
+    number[unknown.ravel()] = np.arange(count)
+    rows, columns = (
+        np.broadcast_to(number[pixels][sides], affinity.shape)
+        for sides in (np.s_[:, :, None], np.s_[:, None])
+    )
+    inner, border = (rows >= 0) & (columns >= 0), (rows >= 0) & (columns < 0)
+    laplacian = csr_array((affinity[inner], (rows[inner], columns[inner])), (count, count))
+    known = np.broadcast_to(alpha.ravel()[pixels][:, None], affinity.shape)
+    right = -np.bincount(rows[border], affinity[border] * known[border], count)
+    start = alpha[unknown]
+    system = laplacian + dia_array((np.full((1, count), _PULL), [0]), (count, count))
+    scaled = dia_array((1 / system.diagonal()[None], [0]), (count, count))
+    solved, _ = cg(system, right + _PULL * start, start, rtol=_TOLERANCE, maxiter=_MOST_STEPS, M=scaled)
+    alpha[unknown] = solved.clip(0, 1)
+    return alpha.astype(np.float32)
+
+
+def _windows(unknown: np.ndarray) -> np.ndarray:
+    """Numbers [N, 9] of the pixels of each window that touches an unknown pixel."""
+    middle = binary_dilation(unknown, np.ones((3, 3)))
+    middle[[0, -1], :] = middle[:, [0, -1]] = False
+    offsets = np.arange(-1, 2)[:, None] * unknown.shape[1] + np.arange(-1, 2)
+    return np.flatnonzero(middle)[:, None] + offsets.ravel()
+
+
+def _affinities(colours: np.ndarray) -> np.ndarray:
+    """The matting Laplacian's entries [N, 9, 9] of windows with colours [N, 9, 3] (equation 12)."""
+    centred = colours.astype(np.float64) - colours.mean(1, keepdims=True)
+    covariance = centred.transpose(0, 2, 1) @ centred / _WINDOW + _SAME_COLOUR / _WINDOW * np.eye(3)
+    alike = centred @ np.linalg.inv(covariance) @ centred.transpose(0, 2, 1)
+    return np.asarray(np.eye(_WINDOW) - (1 + alike) / _WINDOW)
+
+
+def solved_before_plain_background(alpha: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Solve a matte [H, W] of a scene-linear image [H, W, 3] again, where it is unsure before a plain one.
+
+    Where the colours of person F and background B nearby are known and differ by more than they vary, a pixel
+    I = a F + (1 - a) B has one answer, a = (B - I) . (B - F) / |B - F|^2. The background must be plain far
+    around: what stands in it beside the person, as a tree does, could be the person's as well.
+    """
+    size = fitted(alpha.shape[0], alpha.shape[1], _SMALL_PX)
+    matte, image = shrunk(alpha, size), shrunk(linear, size)
+    near, far = (2 * round(share * max(size) / 2) + 1 for share in (_NEAR, _FAR))
+    is_person = (matte > _PLAIN_SURE[1]).astype(np.float32)
+    is_background = (matte < _PLAIN_SURE[0]).astype(np.float32)
+    person, person_varies, person_seen = _colours(image, is_person, near)
+    background, background_varies, background_seen = _colours(image, is_background, near)
+    _, varies_far, _ = _colours(image, is_background, far)
+    contrast = np.square(background - person).sum(-1)
+    variance = (person_varies + np.maximum(background_varies, varies_far)) / contrast.clip(min=1e-9)
+    trust = np.exp2(-variance / _ALLOWED**2) * ((person_seen > _SEEN) & (background_seen > _SEEN))
+    maps = np.concatenate([person, background, contrast[..., None], trust[..., None]], -1)
+    own, other, apart, trust = np.split(enlarged(maps.transpose(2, 0, 1), alpha.shape), [3, 6, 7])
+    along = ((other - linear.transpose(2, 0, 1)) * (other - own)).sum(0)
+    solved = (along / apart[0].clip(min=1e-9)).clip(0, 1)
+    unsure = (alpha > 0) & (alpha < 1)
+    return np.asarray(alpha + unsure * trust[0] * (solved - alpha), np.float32)
+
+
+def _colours(image: np.ndarray, sure: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means [h, w, 3] and variances [h, w] of an image's sure pixels over squares, and the share of those."""
+    mean = weighted_mean(image, sure, size)
+    squares = weighted_mean(np.square(image), sure, size)
+    seen = weighted_mean(sure[..., None], np.ones_like(sure), size)[..., 0]
+    return mean, (squares - mean**2).clip(min=0).sum(-1), seen

@@ -24,10 +24,8 @@ from facerf_cli.face.head import OtherHead
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
-from facerf_cli.portrait.closed_form import solve_matte
-from facerf_cli.portrait.matte import lifted, shrunk
+from facerf_cli.portrait.matte import lifted, shrunk, solve_matte, solved_before_plain_background
 from facerf_cli.portrait.parse import Square
-from facerf_cli.portrait.plain_background import solved_before_plain_background
 
 _SOLVED_PX, _SOLVED_HEAD_PX = 768, 320  # longest side, and height of the head, at which the outline is solved
 _NETWORK_PX = 256

@@ -193,7 +193,8 @@ def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) 
     pixels = (torch.stack([x, y], -1) * (camera.width_px / side)).view(-1, 2) - middle
     outline_px = _reach(pixels, (own > 0.5).flatten())
     per_metre = camera.focal_px / float(-centre_m[2])
-    upper = np.sin(_bin_angles()) < 0.3  # image directions upward and to the sides; y points down
+    angles = (np.arange(_ANGLES) + 0.5) * 2 * np.pi / _ANGLES  # of the bins, clockwise from the right
+    upper = np.sin(angles) < 0.3  # image directions upward and to the sides; y points down
     thick_m = ((outline_px - bald_px) / per_metre).clip(0, _HAIR_M) * (bald_px > 0) * upper
     thick_m = gaussian_filter1d(thick_m, _SMOOTH, mode="wrap")
     offset = (places - middle).numpy()
@@ -203,11 +204,6 @@ def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) 
     push_m = torch.from_numpy(mean_m + near_outline * (thick_m[at] - mean_m)).float() * hair
     outward = F.normalize(vertices - centre_m, dim=1)
     return vertices + push_m[:, None] * outward
-
-
-def _bin_angles() -> np.ndarray:
-    """Image angles of the middle of the bins, clockwise from the right."""
-    return (np.arange(_ANGLES) + 0.5) * 2 * np.pi / _ANGLES
 
 
 def _bin_of(offset: np.ndarray) -> np.ndarray:

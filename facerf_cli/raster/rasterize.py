@@ -65,9 +65,11 @@ def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fra
     the choice of triangle has none.
     """
     size = (*vertices_camera.shape[:-2], camera.height_px, camera.width_px)
-    vertices, corners = vertices_camera.flatten(0, -2), _of_each_mesh(triangles, vertices_camera)
+    meshes, vertices = math.prod(size[:-2]), vertices_camera.flatten(0, -2)
+    first = torch.arange(meshes, device=triangles.device) * vertices_camera.shape[-2]
+    corners = (triangles + first[:, None, None]).flatten(0, 1)  # [M F, 3] of M meshes one after the other
     with torch.no_grad():
-        triangle = _visible_triangles(vertices.detach(), corners, camera, math.prod(size[:-2]))
+        triangle = _visible_triangles(vertices.detach(), corners, camera, meshes)
     pixel = _places(triangle >= 0)
     weights, depth = _hit(vertices, corners, triangle[pixel], pixel, camera)
     nothing, far = vertices.new_zeros(len(triangle), 3), vertices.new_full((len(triangle),), torch.inf)
@@ -89,13 +91,6 @@ def _places(chosen: Tensor) -> Tensor:
 def _counts(tensor: Tensor) -> bool:
     """Tell if the sizes of a tensor's device are known to the host at once."""
     return tensor.device.type == "cpu"
-
-
-def _of_each_mesh(triangles: Tensor, vertices: Tensor) -> Tensor:
-    """Vertex ids [M F, 3] of the triangles of M meshes [..., V, 3], whose vertices follow each other."""
-    *batch, count, _ = vertices.shape
-    first = torch.arange(math.prod(batch), device=triangles.device) * count
-    return (triangles + first[:, None, None]).flatten(0, 1)
 
 
 def interpolate(attributes: Tensor, triangles: Tensor, fragments: Fragments) -> Tensor:

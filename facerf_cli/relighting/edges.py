@@ -77,14 +77,12 @@ def trust_in(colours: Tensor, solid: Tensor, loose: Tensor) -> Tensor:
     Elsewhere, as in the face, edges are features, and shade where the surface turns away; and what is `loose`
     [S, S], as hair, is all edges.
     """
-    high, low, near = (_highest(part, _NEAR_PX) for part in (colours, -colours, solid[None]))
+    side = 2 * _NEAR_PX + 1
+    high, low, near = (
+        F.max_pool2d(part[None], side, 1, _NEAR_PX)[0] for part in (colours, -colours, solid[None])
+    )
     edge = 1 - torch.exp(-(((high + low).amax(0) / _EDGE) ** 4))
     return (1 - edge * (2 * (near[0] - loose)).clamp(0, 1)).clamp_min(_LEAST_TRUST)
-
-
-def _highest(maps: Tensor, reach: int) -> Tensor:
-    """Largest values of maps [C, S, S] around each pixel."""
-    return F.max_pool2d(maps[None], 2 * reach + 1, 1, reach)[0]
 
 
 def places(colours: Tensor, trust: Tensor, grid: Tensor, radiance: Tensor, unit: float) -> Tensor:

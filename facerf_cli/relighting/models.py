@@ -90,7 +90,9 @@ class Networks:
     def parsing(self) -> ParsingNetwork:
         """The Parsing Network."""
         network = self._loaded("parsing")
-        _require_these_classes(self.files["parsing"], network)
+        if (network.settings.classes, network.settings.landmarks) != (len(CLASSES), LANDMARKS):
+            path = self.files["parsing"]
+            raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
         return network
 
     @cached_property
@@ -222,13 +224,6 @@ def _require_builtin_coefficients(path: Path, geometry: GeometryNetwork) -> None
         return
     if settings.identity > len(model.identity) or settings.expression > len(model.expression):
         raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
-
-
-def _require_these_classes(path: Path, parsing: ParsingNetwork) -> None:
-    """Raise InputError where a Parsing Network knows other classes or landmarks than this version."""
-    settings = parsing.settings
-    if (settings.classes, settings.landmarks) != (len(CLASSES), LANDMARKS):
-        raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
 
 
 @cache

@@ -111,11 +111,6 @@ def _gain(found: Tensor, wanted: Tensor) -> Tensor:
 
 
 def _nearest_skin(chroma: Tensor) -> Tensor:
-    known = _skin_chromas()
-    return known[(known - chroma).norm(dim=1).argmin()]
-
-
-def _skin_chromas() -> Tensor:
-    """Log red / green and blue / green [N, 2] of all skins."""
     red, green, blue = skin_table()[0].flatten(1).log()
-    return torch.stack([red - green, blue - green], 1)
+    known = torch.stack([red - green, blue - green], 1)  # [N, 2] of all skins
+    return known[(known - chroma).norm(dim=1).argmin()]

@@ -64,7 +64,8 @@ def in_ray(
     running: dict[Any, tuple[int, int]] = {}
     try:
         while waiting or running:
-            while waiting and len(running) < (jobs or 2 * _cpus(ray)):
+            at_once = jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))  # a cluster may grow
+            while waiting and len(running) < at_once:
                 number, attempt = waiting.popleft()
                 running[task.remote(shared, items[number], site)] = number, attempt
             for reference in ray.wait(list(running), timeout=1)[0]:
@@ -153,10 +154,6 @@ def _warn_of_what_lacks(ray: Any, gpus: int) -> None:
     for name, wanted in (("CPU", 1), ("GPU", gpus)):
         if have.get(name, 0) < wanted:
             log.warning("the Ray cluster has no %s now; tasks wait for one", name)
-
-
-def _cpus(ray: Any) -> int:
-    return max(1, int(ray.cluster_resources().get("CPU", 1)))
 
 
 def _answer_of(ray: Any, reference: Any) -> "_Answer | str":

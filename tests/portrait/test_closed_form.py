@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facerf_cli.portrait.closed_form import solve_matte
+from facerf_cli.portrait.matte import solve_matte
 
 
 @pytest.mark.parametrize("colours", [((0.9, 0.9, 0.9), (0.1, 0.1, 0.1)), ((0.2, 0.1, 0.1), (0.3, 0.8, 0.4))])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from facerf_cli.portrait.plain_background import solved_before_plain_background
+from facerf_cli.portrait.matte import solved_before_plain_background
 
 SIDE = 200
 PERSON, WALL = np.float32([0.1, 0.06, 0.05]), np.float32([0.9, 0.9, 0.85])
