@@ -346,21 +346,15 @@ def _weights(count: int) -> Tensor:
 
 def _points_camera(start: FitStart) -> Tensor:
     """The points of `fit_points` [B, N, 3] on the start's heads, camera space, float64."""
-    mean, identity, expression = _points_of(start.model)
-    alpha, beta = start.alpha.double(), start.beta.double()
-    offset = torch.einsum("bk,knc->bnc", alpha, identity[: alpha.shape[1]])
-    offset = offset + torch.einsum("bk,knc->bnc", beta, expression[: beta.shape[1]])
-    return (mean + offset) @ start.rotation.double().mT + start.translation_m.double()[:, None]
-
-
-def _points_of(model: MorphableModel | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean [N, 3], identity [Ki, N, 3] and expression [Ke, N, 3] of a model at `fit_points`."""
-    model, (corners, weights) = model or load_face_model(), fit_points()
+    model, (corners, weights) = start.model or load_face_model(), fit_points()
     mean, identity, expression = (
         (basis[..., corners, :].double() * weights[..., None].double()).sum(-2)
         for basis in (model.mean, model.identity, model.expression)
     )
-    return mean, identity, expression
+    alpha, beta = start.alpha.double(), start.beta.double()
+    offset = torch.einsum("bk,knc->bnc", alpha, identity[: alpha.shape[1]])
+    offset = offset + torch.einsum("bk,knc->bnc", beta, expression[: beta.shape[1]])
+    return (mean + offset) @ start.rotation.double().mT + start.translation_m.double()[:, None]
 
 
 def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px: int) -> np.ndarray:

@@ -67,7 +67,6 @@ def skin_sheet(subdivisions: int, cut: tuple[str, ...]) -> Sheet:
     )
 
 
-@cache
 def outline(name: str) -> np.ndarray:
     """Closed outline [N, 2] of an opening in (u, v): dense, with its corners among the points."""
     if name == "eye_right":

@@ -196,7 +196,7 @@ def shell_head(vertices: Tensor, gaze_deg: tuple[float, float], subdivisions: in
     roots = {side: _ear_root(skin_mm, sheet, side) for side in (-1.0, 1.0)}
     for side, root in roots.items():
         skin_mm = _hollowed(skin_mm, root, side)
-    around = {name: skin_mm[_around_eye(subdivisions, cut, name)] for name in _LIDS}
+    around = {name: skin_mm[_around_eye(sheet.u_level, name)] for name in _LIDS}
     balls = {name: fitted_centre(face_surface(face_mm, outline(name)), around[name]) for name in _LIDS}
     normals = _normals(skin_mm, sheet.triangles, sheet.same)
     parts = [_ear(root, side) for side, root in roots.items()]
@@ -245,18 +245,13 @@ def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, 
     skin = np.empty((len(on), 3))
     skin[on] = face_surface(face_mm, sheet.u_level[on])
     for name in cut:
-        for lip, samples in zip(lips(name), _side_samples(subdivisions, cut, name), strict=True):
+        for lip in lips(name):
+            samples = np.flatnonzero(lip.holds(sheet.u_level))
             side_mm = face_mm.copy()
             side_mm[lip.replaced] = lip.weights @ face_mm[lip.sources]
             skin[samples] = face_surface(side_mm, sheet.u_level[samples])
     skin[~on] = _surroundings(subdivisions).positions(face_mm)
     return skin[sheet.same]
-
-
-@cache
-def _side_samples(subdivisions: int, cut: tuple[str, ...], name: str) -> list[np.ndarray]:
-    """Ids of the samples of the upper and of the lower side of an opening."""
-    return [np.flatnonzero(lip.holds(skin_sheet(subdivisions, cut).u_level)) for lip in lips(name)]
 
 
 @cache
@@ -272,11 +267,9 @@ def _on_face(u_level: np.ndarray) -> np.ndarray:
     return inside[:, 0] & inside[:, 1]
 
 
-@cache
-def _around_eye(subdivisions: int, cut: tuple[str, ...], name: str) -> np.ndarray:
-    """Ids [M] of the skin's samples around an eye."""
-    uv, line = skin_sheet(subdivisions, cut).u_level, outline(name)
-    margin = _AROUND_EYE_MM / 1000 / (TOP_M - BOTTOM_M)
+def _around_eye(uv: np.ndarray, name: str) -> np.ndarray:
+    """Ids [M] of samples at uv [N, 2] around an eye."""
+    line, margin = outline(name), _AROUND_EYE_MM / 1000 / (TOP_M - BOTTOM_M)
     return np.flatnonzero(((uv > line.min(0) - margin) & (uv < line.max(0) + margin)).all(-1))
 
 
