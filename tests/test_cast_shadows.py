@@ -55,7 +55,7 @@ def test_the_edge_of_a_shadow_lies_where_the_light_puts_it(above_m: float) -> No
     )
 
 
-def test_the_edge_under_a_near_light_is_in_line_with_it() -> None:
+def test_edges_under_near_lights_are_in_line_and_under_large_ones_soft() -> None:
     place = torch.tensor([[-0.3, 0.0, 0.5]])
     visible = shadow_on_floor(0.05, place, near=True)
     x, _, height = place[0].tolist()
@@ -63,18 +63,12 @@ def test_the_edge_under_a_near_light_is_in_line_with_it() -> None:
     assert edge_m(visible) == pytest.approx(reached, abs=PIXEL_M)
     below = torch.tensor([[-0.3, 0.0, 0.02]])  # under the board, which is not between
     assert (shadow_on_floor(0.05, below, near=True) == 1).all()
-
-
-def test_a_large_light_casts_a_soft_shadow() -> None:
     light, small = (far_samples(StudioLight((-SLANT_DEG, 0.0), size_deg=size))[0] for size in (18.0, 0.0))
     soft, hard = (shadow_on_floor(0.06, ends) for ends in (light, small))
     wide = [int(((shadow > 0) & (shadow < 1)).sum()) for shadow in (soft, hard)]
     assert wide[0] > 2 * wide[1]
     assert edge_m(soft) == pytest.approx(edge_m(hard), abs=2 * PIXEL_M)
-
-
-def test_what_lies_near_the_surface_is_a_fold_of_the_proxy() -> None:
-    """A board 2 mm above: the coarse visibility, .7, stays."""
+    # A board 2 mm above: the coarse visibility, .7, stays.
     visible = shadow_on_floor(OFF_M + 0.002, torch.tensor([[0.0, 0.0, 1.0]]))
     assert visible[:10] == pytest.approx(0.7, abs=1e-5) and visible[-1] == 1
 

@@ -21,6 +21,7 @@ from facerf_cli.files.texts import is_regular, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
 from tests.cli.folders import rows
 from tests.cli.toy_batch import run
+from tests.kinds import Patch, Said
 from tests.stacks import read_olat_stack
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
@@ -55,9 +56,7 @@ def test_names_of_all_characters_have_a_row_an_output_and_a_pattern_each(tmp_pat
     assert item.name == "two\nlines_0007"
 
 
-def test_messages_and_names_are_printable_on_a_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_messages_and_names_are_printable_on_a_terminal(monkeypatch: Patch, capsys: Said) -> None:
     for name in HOSTILE:
         assert printable_line(f"{name}: is bad").isprintable() and "is bad" in printable_line(
             f"{name}: is bad"

@@ -12,11 +12,12 @@ import pytest
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files import atomic
 from facerf_cli.files.atomic import _machine, alone_in, atomic_path
+from tests.kinds import Log, Patch
 from tests.processes import wait_until
 
 
 @pytest.fixture(autouse=True)
-def _no_folder_was_swept(monkeypatch: pytest.MonkeyPatch) -> None:
+def _no_folder_was_swept(monkeypatch: Patch) -> None:
     monkeypatch.setattr(atomic, "_swept", set())
 
 
@@ -60,7 +61,7 @@ def test_nothing_stays_where_the_writer_fails_and_long_names_have_temporary_ones
 
 
 def test_an_interrupt_while_the_temporary_folder_is_made_leaves_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     make = os.mkdir
 
@@ -96,7 +97,7 @@ class Disk:
     has happened or not, unless its folder was synced after it.
     """
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, path: Path, old: str) -> None:
+    def __init__(self, monkeypatch: Patch, path: Path, old: str) -> None:
         self.path, self.old = path, old
         self.synced: dict[int, str] = {}  # contents by inode
         self.states: list[set[str]] = [{old}]  # what a cut may leave at `path`, after each step
@@ -122,9 +123,7 @@ class Disk:
 
 
 @pytest.mark.parametrize("lacks", ["", "fsync of the file", "fsync of the folder"])
-def test_a_power_cut_leaves_the_old_or_the_new(
-    lacks: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_power_cut_leaves_the_old_or_the_new(lacks: str, tmp_path: Path, monkeypatch: Patch) -> None:
     if not os.path.isdir("/proc/self/fd"):
         pytest.skip("needs /proc")
     path = tmp_path / "a.txt"
@@ -139,7 +138,7 @@ def test_a_power_cut_leaves_the_old_or_the_new(
     assert (never_half, disk.states[-1] == {"new"}) == (lacks != "fsync of the file", lacks == "")
 
 
-def test_all_of_a_folder_is_brought_to_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_of_a_folder_is_brought_to_the_disk(tmp_path: Path, monkeypatch: Patch) -> None:
     synced: list[str] = []
     monkeypatch.setattr(atomic, "_sync", lambda path: synced.append(path.name))
     with atomic_path(tmp_path / "page") as temporary:
@@ -169,7 +168,7 @@ def holder(folder: Path, notes: Path) -> subprocess.Popen:
     return process
 
 
-def test_the_second_waits_for_the_first_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_second_waits_for_the_first_and_says_so(tmp_path: Path, caplog: Log) -> None:
     out = tmp_path / "new" / "out"
     process = holder(out, tmp_path)
     logging.getLogger("facerf").propagate = True
@@ -190,7 +189,7 @@ def test_the_second_waits_for_the_first_and_says_so(tmp_path: Path, caplog: pyte
     assert f"(process {process.pid})" in caplog.text and str(out) in caplog.text
 
 
-def test_a_killed_process_holds_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_killed_process_holds_nothing(tmp_path: Path, caplog: Log) -> None:
     process = holder(tmp_path / "out", tmp_path)
     process.send_signal(signal.SIGKILL)
     process.wait()

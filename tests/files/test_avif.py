@@ -18,6 +18,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.run import memory
 from tests import icc_profiles
 from tests.files.made import levels_of
+from tests.kinds import Log, Patch
 
 H, W = 16, 24
 CORNERS = np.array([[200, 60, 40], [40, 180, 60], [50, 70, 200], [255, 255, 255]], np.uint8)
@@ -38,7 +39,7 @@ def save(path: Path, values: np.ndarray, **options: object) -> Path:
 
 
 @pytest.mark.parametrize("path", [DEEP, MULTIPLIED, LIMITED], ids=lambda path: path.stem)
-def test_ten_and_twelve_bits_keep_their_depth(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_ten_and_twelve_bits_keep_their_depth(path: Path, caplog: Log) -> None:
     """Nearer than a value of 8 bits is, which the same files miss by 1 and more."""
     image, header = read_image(path), read_header(path)
     np.testing.assert_allclose(stored(path)[INSIDE], QUADS[INSIDE], atol=0.4)
@@ -52,9 +53,7 @@ def test_ten_and_twelve_bits_keep_their_depth(path: Path, caplog: pytest.LogCapt
     assert caplog.text == ""
 
 
-def test_without_pyav_a_line_says_that_bits_are_lost(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_pyav_a_line_says_that_bits_are_lost(caplog: Log, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     image = read_image(MULTIPLIED)
     np.testing.assert_allclose(255 * image.alpha, 102, atol=1e-3)
@@ -91,7 +90,7 @@ def test_grey_orientation_and_a_profile_count_under_another_name(tmp_path: Path)
 
 
 @pytest.mark.parametrize("size", [30, 150, -30, -1])
-def test_a_damaged_one_of_eight_bits(tmp_path: Path, size: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_one_of_eight_bits(tmp_path: Path, size: int, caplog: Log) -> None:
     path = save(tmp_path / "a.avif", QUADS)
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(InputError, match=r"a\.avif: damaged or cut short; copy it again"):

@@ -16,6 +16,7 @@ import pytest
 from facerf_cli.errors import FacerfError
 from facerf_cli.files import downloads
 from facerf_cli.files.downloads import PublishedFile, fetch, opener_of
+from tests.kinds import Patch
 
 CONTENT = bytes(range(256)) * 2000
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -93,9 +94,7 @@ def test_a_file_is_fetched_once_and_again_where_it_is_damaged(server: Server, tm
     assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
 
 
-def test_the_default_place_is_the_users_cache(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_default_place_is_the_users_cache(server: Server, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(downloads, "cache_folder", lambda: tmp_path)
     assert fetch(server.published(), OPTION).parent == tmp_path
 
@@ -162,7 +161,7 @@ def test_offline_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_silent_server_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_server_is_given_up(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(downloads, "TIMEOUT_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/a.pth"
@@ -188,7 +187,7 @@ def test_a_cache_that_cannot_be_written_is_named(server: Server, tmp_path: Path)
 
 
 def test_a_full_disk_is_named_and_what_came_is_kept(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Server, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     class Full(io.FileIO):
         def write(self, data: Any) -> int:
@@ -221,7 +220,7 @@ def test_two_at_once_fetch_it_once(server: Server, tmp_path: Path) -> None:
 
 
 def test_a_server_that_drips_is_given_up_and_what_came_is_kept(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    server: Server, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(downloads, "DEADLINE_S", -1.0)
     with pytest.raises(FacerfError, match="the next run continues it"):

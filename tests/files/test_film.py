@@ -17,6 +17,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
 from tests.files.made import bt2020_of, write_png
+from tests.kinds import Log, Patch
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PCM = "pcm_s16le"
@@ -75,16 +76,12 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
             np.testing.assert_allclose(found, COLOURS[number], atol=steps / 255)
 
 
-def test_an_odd_size_is_made_even(tmp_path: Path) -> None:
+def test_an_odd_size_is_made_even_and_uneven_times_are_kept(tmp_path: Path) -> None:
     path = tmp_path / "film.mp4"
     write_film(path, images_of(tmp_path, (35, 49)), Timing.steady(5, Fraction(24)), "")
     with closing(Film(path)) as film:
         assert film.read(0).shape == (36, 50, 3)
-
-
-def test_times_of_a_film_with_an_uneven_rate_are_kept(tmp_path: Path) -> None:
     times_s = tuple(map(Fraction, ("0", "1/30", "1/10", "1/5", "1/2")))
-    path = tmp_path / "film.mp4"
     write_film(path, images_of(tmp_path), Timing(times_s, Fraction(20)), "")
     assert [float(time_s) for time_s in film_timing(path).times_s] == pytest.approx(list(map(float, times_s)))
 
@@ -311,7 +308,9 @@ def test_interlaced_frames_become_progressive(tmp_path: Path, name: str) -> None
         np.testing.assert_allclose(frame[inside], bars(number, 0)[inside], atol=5)
 
 
-def test_an_interlaced_frame_is_the_same_in_any_order(tmp_path: Path) -> None:
+def test_interlaced_frames_are_the_same_in_any_order_and_progressive_ones_not_filtered(
+    tmp_path: Path,
+) -> None:
     """The first frame after a cut is coded without others, and made progressive with the one before."""
     noise = np.random.default_rng(8).integers(0, 256, (2, 32, 48, 1), np.uint8)
     frames = list(noise.repeat(3, 3).repeat(3, 0).repeat(2, 1).repeat(2, 2))
@@ -321,9 +320,6 @@ def test_an_interlaced_frame_is_the_same_in_any_order(tmp_path: Path) -> None:
         inside = [film.read(number) for number in range(6)]
         np.testing.assert_array_equal(other.read(3), inside[3])
         assert np.abs(inside[3].astype(int) - inside[4]).max() > 9  # what is before counts
-
-
-def test_a_progressive_film_is_not_filtered(tmp_path: Path) -> None:
     frames = [bars(number, 1) for number in range(3)]  # combs that nothing states
     with closing(Film(film_of(tmp_path / "a.mp4", "libx264", "yuv444p", frames, crf="1"))) as film:
         np.testing.assert_allclose(film.read(1), frames[1], atol=5)
@@ -451,9 +447,7 @@ def test_a_film_that_begins_late(tmp_path: Path, codec: str) -> None:
     assert starts == pytest.approx([0, 0], abs=0.03)  # a frame of AAC
 
 
-def test_sound_that_cannot_be_kept_is_said_before_the_first_frame(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_sound_that_cannot_be_kept_is_said_before_the_first_frame(tmp_path: Path, caplog: Log) -> None:
     data = bytearray(with_sounds(tmp_path / "a.mp4", [("aac", 48000, 440, 0.1)] * 2).read_bytes())
     at = data.rindex(b"mp4a")
     data[at : at + 4], config = b"apac", data.index(b"esds", at)
@@ -465,7 +459,7 @@ def test_sound_that_cannot_be_kept_is_said_before_the_first_frame(
     assert len(heard(tmp_path / "out.mp4")) == 1
 
 
-def test_without_av_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_av_one_line_says_what_to_install(monkeypatch: Patch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UsageError, match=r"pip install 'facerf\[video\]'"):
         film_timing(tmp_path / "a.mp4")

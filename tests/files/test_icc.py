@@ -12,6 +12,7 @@ from facerf_cli.files.spaces import space_of_profile
 from facerf_cli.files.write import linear_profile
 from facerf_cli.image import colour
 from tests import icc_profiles
+from tests.kinds import Log
 
 COLOURS = np.random.default_rng(5).integers(30, 226, (12, 17, 3), np.uint8)
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
@@ -105,7 +106,7 @@ def test_a_grey_profile_that_gives_lightness(tmp_path: Path, gamma: int) -> None
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "webp"])
 def test_a_grey_profile_of_an_image_with_colours_is_left_out(
-    tmp_path: Path, suffix: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, suffix: str, caplog: Log
 ) -> None:
     grey = icc_profiles.grey_profile("Dot Gain", icc_profiles.sampled(512))
     lossless = {"lossless": True} if suffix == "webp" else {}
@@ -130,9 +131,7 @@ def test_broken_profiles_are_no_space() -> None:
         space_of_profile(bytes(damaged), "x")
 
 
-def test_a_profile_of_tables_is_one_line_that_says_what_is_assumed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_profile_of_tables_is_one_line_that_says_what_is_assumed(tmp_path: Path, caplog: Log) -> None:
     tables = icc_profiles.DISPLAY_P3.replace(b"rTRC", b"A2B0").replace(*(
         name.encode("utf-16-be") for name in ("Display P3", "Scanner 77")
     ))  # fmt: skip

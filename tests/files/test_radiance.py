@@ -7,6 +7,7 @@ import pytest
 
 from facerf_cli.files.read import read_image
 from tests.files.made import MAP, TO_709, H, W, long_runs, write_hdr
+from tests.kinds import Log
 
 
 @pytest.mark.parametrize("form", ["plain", "old", "new"])
@@ -21,9 +22,7 @@ def test_long_old_runs(tmp_path: Path) -> None:
     assert read_image(path).pixels == pytest.approx(0.25) and path.stat().st_size < 150
 
 
-def test_exposures_corrections_and_primaries_are_undone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_exposures_corrections_and_primaries_are_undone(tmp_path: Path, caplog: Log) -> None:
     head = "EXPOSURE=2.0\nEXPOSURE= 3\nCOLORCORR= 1 0.5 .25\n"
     stored = MAP * 6 * (1, 0.5, 0.25)
     np.testing.assert_allclose(

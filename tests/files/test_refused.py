@@ -20,6 +20,7 @@ from facerf_cli.files.read import PHOTO_LIMIT_PX, read_image
 from facerf_cli.files.write import write_display, write_exr
 from tests.files import made
 from tests.files.made import GREY, LEVELS, LINEAR, MAP, QUADS, write_oiio, write_png
+from tests.kinds import Log, Patch, Said
 
 HERE = Path(__file__).parent
 HEIC, DEEP_AVIF = HERE / "phone.heic", HERE / "deep.avif"
@@ -123,9 +124,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("name", list(REFUSED))  # else its functions keep modules alive at the end
-def test_what_is_not_read_says_why(
-    tmp_path: Path, name: str, capfd: pytest.CaptureFixture, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_is_not_read_says_why(tmp_path: Path, name: str, capfd: Said, caplog: Log) -> None:
     path, (write, says) = tmp_path / name, REFUSED[name]
     write(path)
     with pytest.raises(InputError, match=says) as caught:
@@ -198,7 +197,7 @@ def test_a_raw_file_is_never_read_as_its_thumbnail(tmp_path: Path) -> None:
         assert read_header(path) is None
 
 
-def test_what_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_not_installed_is_named(monkeypatch: Patch) -> None:
     monkeypatch.setattr("PIL.AvifImagePlugin.SUPPORTED", False)
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     for path, says in ((HEIC, "pip install 'facerf[heic]'"), (DEEP_AVIF, "AVIF needs Pillow 11.3")):

@@ -11,6 +11,7 @@ from PIL import Image
 
 from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.light.sphere import rig_directions
+from tests.kinds import Folders, Patch
 
 HEIGHT, WIDTH = 48, 64
 
@@ -59,7 +60,7 @@ class Decoder:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: Folders) -> Path:
     """The ball, written in the format."""
     folder = tmp_path_factory.mktemp("ball") / "out"
     write_relight_web(folder, images(front_lights()), front_lights(), {"note": "ball"})
@@ -84,9 +85,7 @@ def test_lights_of_the_rig_come_back_and_those_between_are_interpolated(folder: 
     assert error.mean() < 7
 
 
-def test_many_lights_take_no_more_memory_than_their_images(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_many_lights_take_no_more_memory_than_their_images(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr("facerf_cli.files.relight_web._VALUES_AT_ONCE", 1 << 16)
     images = np.random.default_rng(0).integers(0, 255, (20, 160, 160, 3), np.uint8)
     tracemalloc.start()

@@ -8,6 +8,7 @@ from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.relighting import sequence as follow
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.relighting.sequence import LONGEST_GAP, Follower, Sighting, gaps, path_of
+from tests.kinds import Patch
 
 BLANK = np.zeros((100, 160, 3), np.uint8)
 
@@ -23,7 +24,7 @@ def seen_at(*places: tuple[float, float]) -> list[Sighting | None]:
 
 
 def watch(
-    monkeypatch: pytest.MonkeyPatch, which: str, frames: list[list[np.ndarray]], near: bool = False
+    monkeypatch: Patch, which: str, frames: list[list[np.ndarray]], near: bool = False
 ) -> list[np.ndarray | None]:
     """Follow a face through frames whose faces are given; `near` finds the nearest one without a search."""
     shown = iter(frames)
@@ -45,9 +46,7 @@ def watch(
 
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize(("which", "start"), [("0", 40.0), ("1", 100.0)])
-def test_the_same_of_two_faces_is_followed(
-    monkeypatch: pytest.MonkeyPatch, which: str, start: float, near: bool
-) -> None:
+def test_the_same_of_two_faces_is_followed(monkeypatch: Patch, which: str, start: float, near: bool) -> None:
     frames = [[face_of(40 + 3 * n, 50), face_of(100 - 3 * n, 40)] for n in range(8)]
     for at, found in enumerate(watch(monkeypatch, which, frames, near)):
         assert found is not None
@@ -55,16 +54,11 @@ def test_the_same_of_two_faces_is_followed(
         assert found.mean(0)[0] == pytest.approx(start + step)
 
 
-def test_a_lost_face_is_found_again_and_another_one_is_not_taken_for_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_lost_face_is_found_again_and_none_has_a_number_that_is_not_there(monkeypatch: Patch) -> None:
     own, far, small = face_of(40, 50), face_of(140, 50), face_of(42, 50, 12)
     found = watch(monkeypatch, "largest", [[own], [], [far], [small], [far, face_of(50, 52)]])
     assert [one is not None for one in found] == [True, False, False, False, True]
     assert found[-1] is not None and found[-1].mean(0)[0] == pytest.approx(50)
-
-
-def test_no_face_has_the_number_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     assert watch(monkeypatch, "1", [[face_of(40, 50)]]) == [None]
 
 

@@ -44,7 +44,7 @@ def test_one_identity_and_the_pose_of_each_frame() -> None:
     assert fits[2].beta[jaw] > fits[0].beta[jaw] + 0.2
 
 
-def test_a_known_identity_explains_the_landmarks() -> None:
+def test_a_known_identity_explains_the_landmarks_and_key_frames_are_spread() -> None:
     model, frames = load_face_model("builtin"), frames_of_a_head(2.0)
     person = OnePerson(model, drawn_identity(2.0), SIZE, 128)
     for frame in frames:
@@ -52,8 +52,5 @@ def test_a_known_identity_explains_the_landmarks() -> None:
         found = project(model.landmarks(fit.vertices_camera(model)[None])[0], fit.camera)[17:]
         apart_px = (found - fit.landmarks_px[17:]).norm(dim=1).mean()
         assert apart_px < 0.35  # of 128; the crop's perspective is not quite the camera's
-
-
-def test_key_frames_are_spread_from_end_to_end() -> None:
     assert spread_over([3, 4, 8, 9, 20], 3) == [3, 8, 20]
     assert spread_over(range(2), 5) == [0, 1]

@@ -14,6 +14,7 @@ from facerf_cli.relighting import sequence as shot_view
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides
 from facerf_cli.relighting.sequence import KEY_FRAMES, LONGEST_GAP, Sighting, SteadyShot
 from tests.film.test_follow import face_of
+from tests.kinds import Patch
 
 FRAMES = 60
 
@@ -21,7 +22,7 @@ FRAMES = 60
 class Watched:
     """Stands for the Parsing Network: the classes of frame n are n everywhere."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch: Patch) -> None:
         self.looked: list[int] = []
         self.held: list[weakref.ref[Any]] = []
         monkeypatch.setattr(shot_view, "to_display", lambda photo: photo)
@@ -61,7 +62,7 @@ def first_class(view: SteadyShot, frame: int) -> float:
     return float(view.segmentation(frame).classes[0].mean()) * 1000
 
 
-def test_each_frame_is_looked_at_once_and_little_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_frame_is_looked_at_once_and_little_is_kept(monkeypatch: Patch) -> None:
     watched = Watched(monkeypatch)
     view, most = view_of(watched, seen(FRAMES)), 0
     gc.freeze()  # what was there before is not looked through each time
@@ -74,9 +75,7 @@ def test_each_frame_is_looked_at_once_and_little_is_kept(monkeypatch: pytest.Mon
     assert most < FRAMES / 2
 
 
-def test_a_frame_is_the_mean_of_both_sides_and_of_none_beyond_a_lost_face(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_frame_is_the_mean_of_both_sides_and_of_none_beyond_a_lost_face(monkeypatch: Patch) -> None:
     view = view_of(Watched(monkeypatch), [*seen(20), *[None] * (LONGEST_GAP + 1), *seen(20)])
     assert first_class(view, 10) == pytest.approx(10, abs=1e-3)
     assert first_class(view, 19) < 19 - 0.3  # frames after it are lost
@@ -85,7 +84,7 @@ def test_a_frame_is_the_mean_of_both_sides_and_of_none_beyond_a_lost_face(
         view.segmentation(25)
 
 
-def test_key_frames_are_those_that_show_the_face(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_key_frames_are_those_that_show_the_face(monkeypatch: Patch) -> None:
     sightings = seen(30)
     sightings[14:17] = [None] * 3  # bridged, but not to be trusted
     view = view_of(Watched(monkeypatch), sightings)

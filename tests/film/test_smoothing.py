@@ -7,22 +7,16 @@ import torch
 from facerf_cli.relighting.sequence import REACH, smoothed, steadied
 
 
-def test_a_parabola_is_kept_and_noise_is_not() -> None:
+def test_a_parabola_is_kept_by_both_sides_alike_and_noise_is_not() -> None:
     time = np.arange(40.0)
     path = np.stack([0.1 * time**2 - time, 3 - 2 * time], -1)
     np.testing.assert_allclose(smoothed(path, np.ones(40)), path, atol=1e-9)
     noise = np.random.default_rng(0).normal(size=path.shape)
     left = smoothed(path + noise, np.ones(40)) - path
     assert np.abs(np.diff(left, axis=0)).mean() < 0.25 * np.abs(np.diff(noise, axis=0)).mean()
-
-
-def test_it_looks_at_both_sides_alike() -> None:
     step = (np.arange(42) >= 21).astype(float)
     there = smoothed(step, np.ones(42))
     np.testing.assert_allclose(there, 1 - there[::-1], atol=1e-9)  # a filter with delay is not symmetric
-
-
-def test_frames_without_weight_do_not_count() -> None:
     path = 2.0 * np.arange(12)
     wrong = np.where(np.arange(12) == 5, 100.0, path)
     weights = (np.arange(12) != 5).astype(float)

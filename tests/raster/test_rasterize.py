@@ -5,6 +5,7 @@ from torch import Tensor
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from tests.fake_device import OnDevice, counted
+from tests.kinds import Patch
 from tests.oracles.rasterize import rasterize_slowly
 
 WIDE = Camera(focal_px=40.0, width_px=37, height_px=22, cx_px=17.3, cy_px=11.9)  # neither square nor centred
@@ -58,7 +59,7 @@ def test_values_and_gradients_are_the_oracles(seed: int) -> None:
 
 
 @pytest.mark.parametrize("chunk_px", [None, 500])
-def test_a_device_waits_once_for_the_same_bits(chunk_px: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_waits_once_for_the_same_bits(chunk_px: int | None, monkeypatch: Patch) -> None:
     """Sizes that the CPU counts are bounded there; in parts, it waits for each."""
     if chunk_px:
         monkeypatch.setattr("facerf_cli.raster.rasterize._CHUNK_PX", chunk_px)
@@ -115,9 +116,7 @@ def test_a_triangle_far_larger_than_the_image_fills_it_and_nothing_is_empty() ->
     assert not empty.covered.any() and bool(empty.depth_m.isinf().all())
 
 
-def test_work_in_parts_gives_the_same_image_and_faces_turn_counter_clockwise(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_work_in_parts_gives_the_same_image_and_faces_turn_counter_clockwise(monkeypatch: Patch) -> None:
     vertices, triangles = triangle_soup(60, seed=4)
     whole = rasterize(vertices, triangles, WIDE)
     monkeypatch.setattr("facerf_cli.raster.rasterize._CHUNK_PX", 300)

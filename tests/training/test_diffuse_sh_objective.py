@@ -41,7 +41,7 @@ def test_training_explains_both_and_a_validation_is_always_the_same(bank: Bank) 
     assert after.sheet is not None and after.sheet.shape == (4 * 2 * 32, 5 * 32, 3)
 
 
-def test_the_source_teaches_the_light_alone(bank: Bank) -> None:
+def test_a_sample_depends_on_no_neighbour_and_the_source_teaches_the_light_alone(bank: Bank) -> None:
     """Else the albedo copies it."""
     stage = objective(bank)
     batch = stage.draw(1, lambda i: seeded(4, i), 0)
@@ -50,9 +50,6 @@ def test_the_source_teaches_the_light_alone(bank: Bank) -> None:
     assert network.albedo.weight.grad is None and network.light[-1].weight.grad.abs().sum() > 0
     stage(batch)["targets"].backward()
     assert network.albedo.weight.grad.abs().sum() > 0
-
-
-def test_a_sample_does_not_depend_on_its_neighbours(bank: Bank) -> None:
     stage = objective(bank)
     whole = stage.draw(3, lambda i: seeded(1, i), 0)
     part = stage.draw(1, lambda i: seeded(1, i + 2), 0)

@@ -13,6 +13,7 @@ from facerf_cli.network.checkpoint import VGG16, load_vgg, save_networks
 from facerf_cli.network.features import LightNetwork, LightSettings, VggFeatures
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from facerf_cli.training.losses import load_features
+from tests.kinds import Patch, Said
 
 # What is beyond the trunk in the published file, smaller here.
 BEYOND = {"features.17.weight": torch.zeros(2, 2), "classifier.6.bias": torch.zeros(1000)}
@@ -36,7 +37,7 @@ def test_a_path_is_taken_as_it_is(tmp_path: Path, weights: dict[str, torch.Tenso
 
 
 def test_imagenet_is_the_published_file_in_the_cache(
-    tmp_path: Path, weights: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, weights: dict[str, torch.Tensor], monkeypatch: Patch
 ) -> None:
     asked = []
 
@@ -65,9 +66,7 @@ BROKEN = ("missing", "folder", "text", "empty", "pickle", "old pickle", "list", 
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_what_is_no_vgg_is_refused_in_one_line(
-    tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_vgg_is_refused_in_one_line(tmp_path: Path, kind: str, capsys: Said) -> None:
     path = tmp_path / ("b.safetensors" if kind == "safetensors" else "b.pth")
     if kind == "folder":
         path.mkdir()
@@ -89,7 +88,7 @@ def test_what_is_no_vgg_is_refused_in_one_line(
     assert "a pickle was run" not in capsys.readouterr().out
 
 
-def test_light_features_come_back_frozen(tmp_path: Path) -> None:
+def test_light_features_come_back_frozen_or_are_refused(tmp_path: Path) -> None:
     network = LightNetwork(LightSettings(width=1 / 16, grid=2, hidden=4))
     path = tmp_path / "last.safetensors"
     save_networks(path, {"light_features": network}, {"layout_version": LAYOUT_VERSION})
@@ -97,17 +96,13 @@ def test_light_features_come_back_frozen(tmp_path: Path) -> None:
     texture = torch.rand(2, 3, 16, 16)
     assert torch.allclose(loaded(texture), network(texture), atol=1e-2)  # stored in half precision
     assert not any(parameter.requires_grad for parameter in loaded.parameters())
-
-
-def test_a_checkpoint_without_light_features_is_refused(tmp_path: Path) -> None:
     network = DefaultReflectanceNetwork(DefaultReflectanceSettings(32, (8, 8), (8, 8), 2, 4))
-    path = tmp_path / "last.safetensors"
     save_networks(path, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
     with pytest.raises(InputError, match="has no network light_features; give one of `facerf train"):
         load_features(path, "light_features")
 
 
-def test_offline_names_the_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_offline_names_the_option(tmp_path: Path, monkeypatch: Patch) -> None:
     nowhere = PublishedFile("http://127.0.0.1:9/vgg16-397923af.pth", VGG16.sha256, VGG16.size_limit)
     monkeypatch.setattr(feature_networks, "VGG16", nowhere)
     monkeypatch.setattr("facerf_cli.files.downloads.cache_folder", lambda: tmp_path)

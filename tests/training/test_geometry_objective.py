@@ -44,7 +44,7 @@ def draw(objective, count=4, seed=7):
     return objective.draw(count, lambda index: seeded(seed, index), 0)
 
 
-def test_images_show_a_face_before_an_open_background(faces):
+def test_images_show_a_face_and_the_paper_form_learns_from_them(faces):
     image = faces.images[1]["pictures"][0]
     cover = image[3].float() / 255
     assert image.shape == (4, 160, 160) and 0.3 < cover.mean() < 0.95
@@ -52,12 +52,29 @@ def test_images_show_a_face_before_an_open_background(faces):
     assert cover[inner[:, 1], inner[:, 0]].min() == 1
     lit = image[:3].float().mean(0)
     assert lit[cover > 0].mean() > 10 and lit[cover == 0].max() == 0
+    network = GeometryNetwork(GeometryNetworkSettings("paper", 80, 29))
+    objective = GeometryObjective(faces, network, FEW)
+    sum(objective(draw(objective, 1)).values()).backward()
+    assert network.trunk[0].weight.grad.abs().max() > 0
 
 
-def test_samples_do_not_depend_on_their_neighbours(objective):
+def test_samples_depend_on_no_neighbours_and_terms_are_means(objective):
     both, second = draw(objective, 2), objective.draw(1, lambda index: seeded(7, index + 1), 0)
     for field in fields(both):
         assert torch.equal(getattr(both, field.name)[1:], getattr(second, field.name)), field.name
+    batch = draw(objective, 4)
+    halves = [
+        type(batch)(*(getattr(batch, f.name)[part] for f in fields(batch))) for part in ([0, 1], [2, 3])
+    ]
+    whole, (one, other) = objective(batch), (objective(half) for half in halves)
+    for name, value in whole.items():
+        assert float((one[name] + other[name]).detach() / 2) == pytest.approx(float(value.detach()), rel=1e-4)
+    batch = draw(objective, 8)
+    truth = GeometryEstimate(batch.rotation, batch.translation_m, batch.alpha[:, :40], batch.beta)
+    percent = 100 * objective.distances_iod(truth, batch)
+    assert percent[:, 17:].mean() < 4  # the built-in model's fit to other heads
+    mirrored = truth._replace(rotation=truth.rotation.flip(0))
+    assert objective.distances_iod(mirrored, batch).mean() > 2 * percent.mean() / 100
 
 
 def test_the_pose_follows_every_move_of_the_crop(objective):
@@ -67,15 +84,6 @@ def test_the_pose_follows_every_move_of_the_crop(objective):
     assert (fit.rotation.float() - batch.rotation).flatten(1).norm(dim=1).max() < 0.05  # 2 degrees
     assert (fit.translation_m.float() - batch.translation_m).abs().max() < 0.012
     assert (fit.beta.float() - batch.beta).abs().max() < 0.3 < fit.beta.abs().max()
-
-
-def test_the_truth_costs_least(objective):
-    batch = draw(objective, 8)
-    truth = GeometryEstimate(batch.rotation, batch.translation_m, batch.alpha[:, :40], batch.beta)
-    percent = 100 * objective.distances_iod(truth, batch)
-    assert percent[:, 17:].mean() < 4  # the built-in model's fit to other heads
-    mirrored = truth._replace(rotation=truth.rotation.flip(0))
-    assert objective.distances_iod(mirrored, batch).mean() > 2 * percent.mean() / 100
 
 
 def test_a_few_steps_lower_the_loss(objective):
@@ -93,16 +101,6 @@ def test_a_few_steps_lower_the_loss(objective):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_terms_are_means_over_samples(objective):
-    batch = draw(objective, 4)
-    halves = [
-        type(batch)(*(getattr(batch, f.name)[part] for f in fields(batch))) for part in ([0, 1], [2, 3])
-    ]
-    whole, (one, other) = objective(batch), (objective(half) for half in halves)
-    for name, value in whole.items():
-        assert float((one[name] + other[name]).detach() / 2) == pytest.approx(float(value.detach()), rel=1e-4)
-
-
 def test_validation_is_the_same_every_time_and_shows_it(objective):
     first, second = objective.validate(), objective.validate()
     assert first.metrics == second.metrics and objective.chooses_by in first.metrics
@@ -111,13 +109,6 @@ def test_validation_is_the_same_every_time_and_shows_it(objective):
     assert first.sheet.shape == (side, FEW.held_out_draws * side, 3)
     for colour in ((0, 1, 0), (1, 0, 0)):  # true landmarks, and where the network has them
         assert (first.sheet == colour).all(-1).any()
-
-
-def test_the_paper_form_learns_from_the_same_crops(faces):
-    network = GeometryNetwork(GeometryNetworkSettings("paper", 80, 29))
-    objective = GeometryObjective(faces, network, FEW)
-    sum(objective(draw(objective, 1)).values()).backward()
-    assert network.trunk[0].weight.grad.abs().max() > 0
 
 
 def test_no_images_is_said(tmp_path):

@@ -150,7 +150,7 @@ def _landmarks(asked: Asked, which: int) -> Tensor:
     return ((found - wanted) * 2 / CROP_PX).square().sum(-1).mean()
 
 
-def test_the_source_is_unwrapped_by_its_own_head(asked: Asked) -> None:
+def test_the_source_is_unwrapped_by_its_own_head_and_the_target_gives_normals_and_light(asked: Asked) -> None:
     texture, normals, visible = asked.network.encoded
     face = unwrap_images(asked.batch.source, asked.head(SOURCE), CAMERA, SIDE)
     colours = asked.objective.source_colours
@@ -158,21 +158,25 @@ def test_the_source_is_unwrapped_by_its_own_head(asked: Asked) -> None:
     _close(texture, face.texture / colour_cast(face.texture, face.visible, colours))
     _close(visible, face.visible)
     _close(normals[0], normal_map(asked.head(SOURCE).vertices[0], grid_triangles(), SIDE))
-
-
-def test_the_target_gives_normals_and_light(asked: Asked) -> None:
-    """N_t are those of the target's head; the light is the pair's, in camera space."""
+    # N_t are those of the target's head; the light is the pair's, in camera space.
     code, normals, light = asked.network.decoded
     assert code == "code"
     _close(normals[0], normal_map(asked.head(TARGET).vertices[0], grid_triangles(), SIDE))
     assert torch.equal(light, asked.batch.light[:, None])
 
 
-def test_the_photometric_term_compares_the_target(asked: Asked) -> None:
+def test_photometric_and_feature_terms_compare_the_target(asked: Asked) -> None:
     """L_p = 5 |M_t (I^_t - I_t)|_1, rendered with the target's head."""
     image, mask = render_textures(asked.network.texture, asked.head(TARGET), CAMERA)
     error = ((image - asked.batch.target).abs() * mask).sum() / 3 / mask.sum()
     _close(asked.terms["photometric"], 5 * error)
+    # L_I is of I^_t and T^_t, L_L of T^_t alone; both against the target's own.
+    truth = unwrap_images(asked.batch.target, asked.head(TARGET), CAMERA, SIDE)
+    seen = (truth.visible > 0).float()
+    of_image = _raw_distance(asked, "appearance", image * mask, asked.batch.target * mask)
+    of_texture = _raw_distance(asked, "light", asked.network.texture * seen, truth.texture * seen)
+    _close(asked.terms["appearance_features"], of_image + of_texture)
+    _close(asked.terms["light_features"], of_texture)
 
 
 def _raw_distance(asked: Asked, name: str, a: Tensor, b: Tensor) -> Tensor:
@@ -185,26 +189,12 @@ def _raw_distance(asked: Asked, name: str, a: Tensor, b: Tensor) -> Tensor:
     return sum((x - y).square().mean() / power for x, y, power in layers)
 
 
-def test_features_compare_the_target_s_image_and_texture(asked: Asked) -> None:
-    """L_I is of I^_t and T^_t, L_L of T^_t alone; both against the target's own."""
-    image, mask = render_textures(asked.network.texture, asked.head(TARGET), CAMERA)
-    truth = unwrap_images(asked.batch.target, asked.head(TARGET), CAMERA, SIDE)
-    seen = (truth.visible > 0).float()
-    of_image = _raw_distance(asked, "appearance", image * mask, asked.batch.target * mask)
-    of_texture = _raw_distance(asked, "light", asked.network.texture * seen, truth.texture * seen)
-    _close(asked.terms["appearance_features"], of_image + of_texture)
-    _close(asked.terms["light_features"], of_texture)
-
-
-def test_geometry_terms_add_source_and_target(asked: Asked) -> None:
+def test_geometry_terms_add_source_target_and_photos(asked: Asked) -> None:
     """L_l = 25 (source + target); L_r = .4 |alpha|^2 + .002 |beta|^2 of both."""
     _close(asked.terms["landmarks"], 25 * (_landmarks(asked, SOURCE) + _landmarks(asked, TARGET)))
     estimate = _estimate()
     prior = 0.4 * estimate.alpha.square().mean(1).sum() + 0.002 * estimate.beta.square().mean(1).sum()
     _close(asked.terms["regularisation"], prior)
-
-
-def test_photos_have_geometry_terms_of_one_head(asked: Asked) -> None:
     batch = asked.batch
     terms = asked.objective(PhotoCrops(batch.source, batch.source_landmarks_px))
     assert set(terms) == {"landmarks", "regularisation"}

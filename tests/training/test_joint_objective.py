@@ -25,6 +25,7 @@ from facerf_cli.training.joint import (
 from facerf_cli.training.losses import PaperWeights
 from facerf_cli.training.objective import seeded
 from tests import fake_device
+from tests.kinds import Folders, Patch
 from tests.training.joint_dataset import CROP_PX, SIDE, write_joint_dataset
 
 SETTINGS = JointSettings(crop_px=CROP_PX, texture_side=SIDE, validation_pairs=2)
@@ -60,7 +61,7 @@ class FakePhotos:
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory: Folders) -> Dataset:
     return write_joint_dataset(tmp_path_factory.mktemp("dataset"))
 
 
@@ -129,7 +130,7 @@ def objective(dataset: Dataset) -> JointObjective:
     return objective
 
 
-def test_each_term_reaches_what_it_should(objective: JointObjective) -> None:
+def test_each_term_reaches_what_it_should_and_photos_the_geometry_alone(objective: JointObjective) -> None:
     terms = objective(batch_of(objective, photos=False))
     reached = {name: gradients(objective, term) for name, term in terms.items()}
     assert set(reached) == {
@@ -143,9 +144,6 @@ def test_each_term_reaches_what_it_should(objective: JointObjective) -> None:
         assert sums["geometry"] > 0, name  # through the mesh, the texture, the normals or the picture
         assert (sums["reflectance"] > 0) == (name not in ("landmarks", "regularisation")), name
     assert all(parameter.grad is None for parameter in objective.feature_networks.parameters())
-
-
-def test_photos_reach_the_geometry_alone(objective: JointObjective) -> None:
     terms = objective(batch_of(objective, photos=True))
     assert set(terms) == {"landmarks", "regularisation"}
     sums = gradients(objective, torch.stack(list(terms.values())).sum())
@@ -164,7 +162,7 @@ def test_a_fifth_of_the_batches_are_photos(objective: JointObjective) -> None:
     assert not isinstance(batch_of(objective, photos=False), PhotoCrops)
 
 
-def test_samples_do_not_know_their_neighbours_and_terms_are_means(objective: JointObjective) -> None:
+def test_samples_do_not_know_their_neighbours_and_checkpoints_their_losses(objective: JointObjective) -> None:
     with torch.no_grad():
         for photos in (False, True):
             joint = objective(batch_of(objective, photos, count=2))
@@ -172,6 +170,8 @@ def test_samples_do_not_know_their_neighbours_and_terms_are_means(objective: Joi
             for name, term in joint.items():
                 mean = (apart[0][name] + apart[1][name]) / 2
                 assert torch.allclose(term, mean, rtol=1e-3, atol=1e-6), name
+    vgg, light = objective.provenance["feature_losses"]
+    assert "ImageNet" in vgg and light == "S_f" and objective.provenance["photos"] == 1
 
 
 def test_networks_trained_here_see_channels_apart(dataset: Dataset, objective: JointObjective) -> None:
@@ -294,7 +294,7 @@ def test_validation_tells_poses_apart(objective: JointObjective) -> None:
     assert objective.chooses_by in first.metrics
 
 
-def test_validation_sees_a_tint(objective: JointObjective, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_validation_sees_a_tint(objective: JointObjective, monkeypatch: Patch) -> None:
     network: Any = objective.networks["reflectance"]
     decode, tint = network.decode, torch.tensor([1.5, 1.0, 0.5])[:, None, None]
     before = objective.validate().metrics
@@ -303,8 +303,3 @@ def test_validation_sees_a_tint(objective: JointObjective, monkeypatch: pytest.M
     ratios = [after[name] / before[name] for name in ("tint_red", "tint_blue")]
     assert ratios == pytest.approx([1.5, 0.5])
     assert after["si_mse"] != before["si_mse"]
-
-
-def test_a_checkpoint_says_what_its_losses_learnt_from(objective: JointObjective) -> None:
-    vgg, light = objective.provenance["feature_losses"]
-    assert "ImageNet" in vgg and light == "S_f" and objective.provenance["photos"] == 1

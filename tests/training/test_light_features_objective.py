@@ -54,7 +54,9 @@ def test_a_sample_does_not_depend_on_its_neighbours(bank: Bank) -> None:
     assert torch.allclose(stage(whole)["light"], torch.stack(terms).mean())
 
 
-def test_textures_are_black_where_unseen_and_lit_from_the_lights_side(bank: Bank) -> None:
+def test_lights_are_unit_vectors_in_the_frame_of_the_head(bank: Bank) -> None:
+    lights = objective(bank).draw(4, lambda i: seeded(3, i), 0).lights_head
+    assert torch.allclose(lights.norm(dim=-1), torch.ones(4, 4), atol=1e-5)
     batch = objective(bank).draw(8, lambda i: seeded(2, i), 0)
     assert (batch.textures.amax((1, 2)) == 0).any()
     brightness = batch.textures.mean(2)
@@ -63,11 +65,6 @@ def test_textures_are_black_where_unseen_and_lit_from_the_lights_side(bank: Bank
     clear = sideways.abs() > 0.5
     assert clear.sum() > 4
     assert (right_less_left[clear].sign() == sideways[clear].sign()).float().mean() > 0.9
-
-
-def test_lights_of_a_real_direction_stay_unit_vectors(bank: Bank) -> None:
-    lights = objective(bank).draw(4, lambda i: seeded(3, i), 0).lights_head
-    assert torch.allclose(lights.norm(dim=-1), torch.ones(4, 4), atol=1e-5)
 
 
 def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
@@ -93,7 +90,7 @@ def test_the_crops_of_a_stack_give_its_textures(tmp_path: Path) -> None:
     assert not any(dataset.folder.glob("textures-32/*/relit*"))
 
 
-def test_a_camera_casts_colours_or_sees_none() -> None:
+def test_cameras_cast_colours_and_turns_are_found_from_normals() -> None:
     matrices = torch.stack([camera_matrix(seeded(draw)) for draw in range(400)])
     grey = matrices[:, 0, 1] > 0
     cast, mixed = matrices[~grey], matrices[grey]
@@ -102,9 +99,6 @@ def test_a_camera_casts_colours_or_sees_none() -> None:
     assert torch.equal(mixed, mixed[:, :1].expand_as(mixed)), "a row for all channels"
     balance = matrices.sum(1).log()
     assert balance.abs().max() < 0.121 and balance.std() > 0.05
-
-
-def test_the_heads_turn_is_found_from_its_normals() -> None:
     mean = torch.nn.functional.normalize(
         torch.randn(3, 8, 8) + torch.tensor([0, 0, 2.0]).view(3, 1, 1), dim=0
     )

@@ -73,7 +73,9 @@ def test_training_lowers_the_loss_and_writes_what_a_run_has(whole: Path) -> None
     assert row["terms"].keys() == {"root"} and 0 < row["waiting"] < 1 and row["gradient"] > 0
 
 
-def test_what_is_saved_is_the_average_and_best_is_the_best(whole: Path) -> None:
+def test_what_is_saved_is_the_average_and_workers_draw_what_the_loop_would(
+    whole: Path, tmp_path: Path
+) -> None:
     state = state_of(whole)
     networks, _ = load_networks(whole / "last.safetensors", LAYOUT_VERSION)
     first = next(iter(networks["reflectance"].state_dict().values()))
@@ -82,6 +84,8 @@ def test_what_is_saved_is_the_average_and_best_is_the_best(whole: Path) -> None:
     assert state["best"] == min(measured)
     _, metadata = load_networks(whole / "best.safetensors", LAYOUT_VERSION)
     assert metadata["metrics"]["si_mse"] == min(measured)
+    train(toy_objective(), tmp_path, replace(TINY, workers=1))
+    assert losses_of(tmp_path) == pytest.approx(losses_of(whole), rel=1e-6)
 
 
 def test_best_stays_where_later_ones_are_worse(tmp_path: Path) -> None:
@@ -204,11 +208,6 @@ def test_time_ends_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     rows = rows_of(tmp_path)
     assert 0.5 <= rows[-1]["seconds"] < 1 and rows[-1]["rate"] < rows[len(rows) // 2]["rate"]
     assert "validation" in rows[-1]
-
-
-def test_workers_draw_what_the_loop_would(tmp_path: Path, whole: Path) -> None:
-    train(toy_objective(), tmp_path, replace(TINY, workers=1))
-    assert losses_of(tmp_path) == pytest.approx(losses_of(whole), rel=1e-6)
 
 
 def test_workers_say_what_went_wrong_in_one_line(tmp_path: Path) -> None:

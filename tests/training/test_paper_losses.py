@@ -19,10 +19,15 @@ from facerf_cli.training.losses import (
 )
 
 
-def test_weights_are_the_papers() -> None:
+def test_weights_are_the_papers_and_regularisation_their_weighed_mean() -> None:
     weights = PaperWeights()
     assert (weights.landmarks, weights.photometric, weights.regularisation, weights.features) == (25, 5, 1, 1)
     assert (weights.alpha, weights.beta) == (0.4, 0.002)
+    alpha, beta = torch.randn(3, 40), torch.randn(3, 29)
+    for face, value in enumerate(regularisation(alpha, beta).tolist()):
+        by_hand = 0.4 * sum(a * a for a in alpha[face].tolist()) / 40
+        by_hand += 0.002 * sum(b * b for b in beta[face].tolist()) / 29
+        assert value == pytest.approx(by_hand, rel=1e-5)
 
 
 @pytest.mark.parametrize("side_px", [64, 512])
@@ -35,7 +40,7 @@ def test_landmarks_are_in_half_sides(side_px: int) -> None:
         assert value == pytest.approx(total / 66, rel=1e-4)
 
 
-def test_contour_slides_to_the_closest_candidates_and_pulls_only_them() -> None:
+def test_the_contour_slides_to_the_closest_candidates_and_with_the_mesh() -> None:
     candidates = (torch.rand(2, 40, 2) * 100).requires_grad_()
     detected = (torch.rand(2, 17, 2) * 100).requires_grad_()
     ids = closest_points(candidates, detected)
@@ -50,22 +55,11 @@ def test_contour_slides_to_the_closest_candidates_and_pulls_only_them() -> None:
     assert candidates.grad is not None
     moved = {(face, int(i)) for face, i, _ in candidates.grad.nonzero().tolist()}
     assert moved == {(face, int(i)) for face in range(2) for i in ids[face]}
-
-
-def test_contour_moves_along_when_the_mesh_slides() -> None:
-    """A landmark that the mesh passes by finds another vertex, not the one that it had."""
+    # A landmark that the mesh passes by finds another vertex, not the one that it had.
     line = torch.stack([torch.arange(20.0), torch.zeros(20)], -1)[None]
     landmark = torch.tensor([[[7.2, 1.0]]])
     assert closest_points(line, landmark).item() == 7
     assert closest_points(line + torch.tensor([5.0, 0]), landmark).item() == 2
-
-
-def test_regularisation_is_the_weighed_mean_of_squares() -> None:
-    alpha, beta = torch.randn(3, 40), torch.randn(3, 29)
-    for face, value in enumerate(regularisation(alpha, beta).tolist()):
-        by_hand = 0.4 * sum(a * a for a in alpha[face].tolist()) / 40
-        by_hand += 0.002 * sum(b * b for b in beta[face].tolist()) / 29
-        assert value == pytest.approx(by_hand, rel=1e-5)
 
 
 def test_photometric_loss_is_a_mean_over_the_mask() -> None:
@@ -98,7 +92,7 @@ def _seen(side: int) -> MaskedPair:
     return MaskedPair(torch.rand(2, 3, side, side).requires_grad_(), torch.rand(2, 3, side, side), mask)
 
 
-def test_features_are_of_masked_images_and_textures(net: VggFeatures) -> None:
+def test_features_are_of_masked_images_and_their_powers_mean_squares(net: VggFeatures) -> None:
     image, texture = _seen(24), _seen(16)
     expected: Tensor = torch.zeros(2)
     for seen in (image, texture):
@@ -111,9 +105,6 @@ def test_features_are_of_masked_images_and_textures(net: VggFeatures) -> None:
     assert torch.allclose(light_loss(features, texture), feature_distance(net, *masked, POWERS))
     ones = torch.ones(3)
     assert torch.allclose(feature_distance(net, *masked), feature_distance(net, *masked, ones))
-
-
-def test_powers_are_mean_squares_of_the_layers(net: VggFeatures) -> None:
     images = torch.rand(4, 3, 16, 16)
     wanted = torch.stack([layer.square().mean() for layer in net.layers(images)])
     torch.testing.assert_close(layer_powers(net, images), wanted)
@@ -132,7 +123,7 @@ def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) ->
         assert (grad[(seen.mask == 0).expand_as(grad)] == 0).all()
 
 
-def test_channels_apart_no_colour_is_preferred(net: VggFeatures) -> None:
+def test_channels_apart_prefer_no_colour_and_stay_finite(net: VggFeatures) -> None:
     """An error of one channel pulls it alone, and as hard as another, on skin of any colour."""
     skin = torch.tensor([1.5, 0.9, 0.6])[:, None, None] * (torch.rand(2, 1, 24, 24) + 0.2)
     pulls = torch.empty(3, 3)
@@ -145,9 +136,6 @@ def test_channels_apart_no_colour_is_preferred(net: VggFeatures) -> None:
         pulls[channel] = -slope.sum((0, 2, 3))
     assert pulls[0, 0] > 0
     torch.testing.assert_close(pulls, pulls[0, 0] * torch.eye(3), rtol=1e-2, atol=0)
-
-
-def test_channels_apart_of_black_and_of_pure_colours_are_finite(net: VggFeatures) -> None:
     for colour in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]):
         target = torch.tensor(colour)[:, None, None].expand(1, 3, 24, 24)
         wrong = torch.rand(1, 3, 24, 24).requires_grad_()

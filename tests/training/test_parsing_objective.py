@@ -73,14 +73,21 @@ def terms(answer: Parsing, batch: PortraitCrops | None = None) -> dict[str, floa
     return {name: float(term) for name, term in found.items()}
 
 
-def test_a_perfect_network_pays_only_for_its_own_doubts() -> None:
+def test_a_perfect_network_pays_for_its_doubts_alone() -> None:
     found = terms(seen(truth()))
     assert found["classes"] < 1e-6 and found["matte"] < 1e-6
     assert found["distance"] == 0 and found["presence"] < 1e-6
     assert found["landmarks"] == pytest.approx(SETTINGS.landmarks * 2 * -3.0)
+    validation = objective_of(seen(truth())).validate()
+    assert validation.metrics["mean_iou"] == pytest.approx(1) and validation.metrics["matte_error"] < 1e-6
+    assert validation.metrics["landmarks_percent"] == 0 and validation.metrics["presence_wrong"] == 0
+    assert validation.sheet is not None and validation.sheet.shape == (SIDE, 2 * SIDE, 3)
+    answer = seen(truth())
+    answer.logits[:, :, :, 5] = answer.logits[:, :, :, 6]  # the person ends a column too early
+    assert terms(answer)["matte"] == pytest.approx(1 / 8 + 2 / 7, rel=1e-3)
 
 
-def test_a_landmark_weighs_by_the_error_that_is_expected_of_it() -> None:
+def test_landmarks_weigh_by_their_expected_error_and_cost_nothing_unknown() -> None:
     answer = seen(truth())
     answer.landmarks[:, 3, 0] += 0.1
     found = terms(answer)
@@ -89,9 +96,6 @@ def test_a_landmark_weighs_by_the_error_that_is_expected_of_it() -> None:
     assert found["landmarks"] == pytest.approx(float(expected), rel=1e-5)
     answer.log_error[:, 3] = -1.0
     assert terms(answer)["landmarks"] < found["landmarks"] + SETTINGS.landmarks * 4 / 68
-
-
-def test_landmarks_that_are_not_known_cost_nothing() -> None:
     answer = seen(truth())
     answer.landmarks[:, 70] += 0.3
     assert terms(answer) == terms(seen(truth()))
@@ -123,19 +127,6 @@ def test_a_soft_edge_is_best_met_by_its_own_share() -> None:
         return found["classes"] + found["matte"]
 
     assert cost(0.3) < min(cost(0.2), cost(0.4))
-
-
-def test_the_matte_pays_for_edges_in_the_wrong_place() -> None:
-    answer = seen(truth())
-    answer.logits[:, :, :, 5] = answer.logits[:, :, :, 6]  # the person ends a column too early
-    assert terms(answer)["matte"] == pytest.approx(1 / 8 + 2 / 7, rel=1e-3)
-
-
-def test_validation_of_a_perfect_network() -> None:
-    validation = objective_of(seen(truth())).validate()
-    assert validation.metrics["mean_iou"] == pytest.approx(1) and validation.metrics["matte_error"] < 1e-6
-    assert validation.metrics["landmarks_percent"] == 0 and validation.metrics["presence_wrong"] == 0
-    assert validation.sheet is not None and validation.sheet.shape == (SIDE, 2 * SIDE, 3)
 
 
 def test_the_loss_of_a_real_network_falls() -> None:

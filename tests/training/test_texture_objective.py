@@ -37,7 +37,7 @@ def test_training_on_the_bank_lowers_the_loss(bank: Bank, tmp_path: Path) -> Non
     assert rows[-1]["validation"]["si_mse"] < rows[9]["validation"]["si_mse"]
 
 
-def test_a_sample_does_not_depend_on_its_neighbours() -> None:
+def test_a_sample_depends_on_no_neighbour_and_a_batch_is_the_mean_of_its_halves() -> None:
     objective = toy_objective()
     whole = objective.draw(4, lambda i: seeded(5, i), 1)
     halves = [objective.draw(2, lambda i, first=first: seeded(5, first + i), 1) for first in (0, 2)]
@@ -45,12 +45,6 @@ def test_a_sample_does_not_depend_on_its_neighbours() -> None:
     assert torch.equal(whole.sample.target, joined.target) and torch.equal(whole.sample.source, joined.source)
     assert whole.heads.tolist() == [head for half in halves for head in half.heads.tolist()]
     assert len(set(whole.heads.tolist())) > 1
-
-
-def test_the_loss_of_a_batch_is_the_mean_of_its_halves() -> None:
-    objective = toy_objective()
-    halves = [objective.draw(2, lambda i, first=first: seeded(5, first + i), 1) for first in (0, 2)]
-    whole = objective.draw(4, lambda i: seeded(5, i), 1)
     mean = torch.stack([objective(half)["root"] for half in halves]).mean()
     assert torch.allclose(objective(whole)["root"], mean, rtol=1e-6)
 
