@@ -4,14 +4,24 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import pytest
 
-from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.batch import made_from as folder_index
+from facerf_cli.batch.inputs import Item, collect_items
+from facerf_cli.batch.made_from import differences, recipe_of
+from facerf_cli.batch.run import BatchOptions, Outcome, run_items
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.texts import file_sha256
+from facerf_cli.main import main
+from facerf_cli.work.output_options import OutputOptions
+from facerf_cli.work.photo_options import PhotoOptions
 from tests.cli.folders import rows
-from tests.cli.toy_batch import run
-from tests.kinds import Said
+from tests.cli.toy_batch import outputs_of, run
+from tests.kinds import Patch, Said
 from tests.processes import wait_until
 
 
@@ -157,3 +167,210 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path, jobs: int)
     assert process.returncode != 0
     left = sorted(path.name for path in out.rglob("*") if path.is_file())
     assert left == [".facerf-index.jsonl", "report.jsonl", "started"]
+
+
+@pytest.fixture
+def two(tmp_path: Path) -> Path:
+    (tmp_path / "photos").mkdir()
+    for name in ("a", "b"):
+        (tmp_path / "photos" / f"{name}.png").write_bytes(name.encode())
+    return tmp_path / "photos"
+
+
+def made(capsys: Said) -> list[str]:
+    return [Path(line).name[0] for line in capsys.readouterr().out.splitlines()]
+
+
+def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not(
+    two: Path, tmp_path: Path, capsys: Said
+) -> None:
+    run([two], tmp_path / "out")
+    (two / "a.png").write_bytes(b"z")  # as long as before
+    os.utime(two / "b.png", ns=(1, 1))  # touched, and the same
+    capsys.readouterr()
+    assert run([two], tmp_path / "out") == 0
+    said = capsys.readouterr()
+    assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
+    assert "1 made again: the input changed" in said.err
+    assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
+    run([two], tmp_path / "out")
+    two.rename(tmp_path / "moved")
+    capsys.readouterr()
+    run([tmp_path / "moved"], tmp_path / "out")
+    assert made(capsys) == []
+
+
+def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, capsys: Said) -> None:
+    run([two], tmp_path / "out", recipe={"lights": 150})
+    run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
+    assert "2 made again: --lights is 200, was 150" in capsys.readouterr().err
+    run([two], tmp_path / "out", recipe={"lights": 300})
+    assert "2 made again: --lights is 300, was 150" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
+def test_overwrite(two: Path, tmp_path: Path, capsys: Said, overwrite: str, expected: str) -> None:
+    run([two], tmp_path / "out")
+    (two / "a.png").write_bytes(b"new")
+    capsys.readouterr()
+    run([two], tmp_path / "out", overwrite=overwrite)
+    assert "".join(made(capsys)) == expected
+
+
+def test_outputs_that_the_user_changed_are_kept_and_those_of_unknown_origin_made_again(
+    two: Path, tmp_path: Path, capsys: Said
+) -> None:
+    out = tmp_path / "out"
+    run([two], out)
+    (out / "a_copy.bin").write_bytes(b"retouched")
+    assert run([two], out) == 0
+    assert "1 outputs were changed after they were written; they are kept" in capsys.readouterr().err
+    assert (out / "a_copy.bin").read_bytes() == b"retouched"
+    run([two], out)
+    (out / "a_copy.bin").write_bytes(b"")
+    run([two], out)
+    assert "1 made again: an output is empty" in capsys.readouterr().err
+    (out / ".facerf-index.jsonl").unlink()
+    run([two], out)
+    assert "2 made again: there is no record" in capsys.readouterr().err
+
+
+def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) -> None:
+    """As when a light is added: what was made, and then changed by hand, stays."""
+    out, lights = tmp_path / "out", ["a"]
+
+    def files(item: Item) -> list[Path]:
+        return [item.output(f"_{light}.bin") for light in lights]
+
+    def write(item: Item) -> Outcome:
+        made = [path for path in files(item) if not item.stale or path in item.stale]
+        for path in made:
+            path.write_bytes(b"made")
+        return Outcome(made)
+
+    def call() -> int:
+        recipes = [{"light": light} for light in lights]
+        options, settings = BatchOptions(out), Settings()
+        items = collect_items([str(two)], out)
+        return run_items("copy", items, write, files, options, settings, lambda digest_of: recipes)
+
+    assert call() == 0
+    (out / "a_a.bin").write_bytes(b"retouched")
+    lights.append("b")
+    capsys.readouterr()
+    assert call() == 0
+    said = capsys.readouterr()
+    assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
+    assert "made again" not in said.err and "1 outputs were changed" in said.err
+    assert (out / "a_a.bin").read_bytes() == b"retouched"
+    (out / "b_a.bin").unlink()
+    assert call() == 0
+    assert "1 made again: an output is missing" in capsys.readouterr().err
+
+
+def test_check_reads_all_outputs_again(two: Path, tmp_path: Path, capsys: Said) -> None:
+    out = tmp_path / "out"
+    run([two], out)
+    capsys.readouterr()
+    assert main(["check", str(out)]) == 0
+    assert "2 whole" in capsys.readouterr().err
+    (out / "a_copy.bin").write_bytes(b"A")  # as long as before
+    (out / "b_copy.bin").unlink()
+    assert main(["check", str(out)]) == 1
+    said = capsys.readouterr()
+    assert said.out.split("\n")[:2] == [f"{out / 'a_copy.bin'}: changed", f"{out / 'b_copy.bin'}: missing"]
+
+
+def test_a_finished_folder_is_read_without_writing_or_reading_much(
+    two: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    run([two], tmp_path / "out")
+    read: list[Path] = []
+    monkeypatch.setattr(folder_index, "file_sha256", lambda path: read.append(path) or file_sha256(path))
+    run([two], tmp_path / "out")
+    assert read == []
+    # So that a rerun of thousands of items is quick; a file whose time changed is noted.
+    run([two], tmp_path / "out")
+    index = tmp_path / "out/.facerf-index.jsonl"
+    inode = index.stat().st_ino
+    run([two], tmp_path / "out")
+    assert index.stat().st_ino == inode
+    os.utime(next(two.glob("*")), (1, 1))
+    run([two], tmp_path / "out")
+    assert index.stat().st_ino != inode and "1000000000" in index.read_text()
+
+
+def test_damaged_rows_are_passed_over(two: Path, tmp_path: Path, capsys: Said) -> None:
+    run([two], tmp_path / "out")
+    index = tmp_path / "out" / ".facerf-index.jsonl"
+    index.write_text('5\n{"output": 3}\n{"of": {}}\n{"sha256"' + "\n" + index.read_text() + '{"outp')
+    capsys.readouterr()
+    assert run([two], tmp_path / "out") == 0
+    assert made(capsys) == []
+
+
+def test_shards_know_what_the_others_made(two: Path, tmp_path: Path, capsys: Said) -> None:
+    for number in (1, 2):
+        run(two, tmp_path / "out", Shard(number, 2))
+    assert made(capsys) == ["a", "b"]
+    run([two], tmp_path / "out")
+    assert made(capsys) == []
+    assert {row["status"] for row in rows(tmp_path / "out").values()} == {"done"}
+
+
+def test_a_single_photo_that_fails_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"bad")
+    assert run([tmp_path / "a.png"], tmp_path / "out") == 1
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
+    assert run([tmp_path / "a.png"], tmp_path / "out") == 1
+    assert (tmp_path / "out" / "report.jsonl").exists()  # a folder that was there stays
+
+
+def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path: Path) -> None:
+    """As when two shards of one photo each begin in a new folder."""
+    out = tmp_path / "out"
+    (tmp_path / "a.png").touch()
+
+    def fail(item: Item) -> Outcome:
+        (out / "other").mkdir()
+        (out / "other" / "b_copy.bin").write_bytes(b"b")
+        raise InputError(f"{item.input_path}: is bad")
+
+    given = collect_items([str(tmp_path / "a.png")], out)
+    run_items("copy", given, fail, outputs_of, BatchOptions(out), Settings(), lambda digest_of: [{}])
+    assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
+
+
+@dataclass(frozen=True)
+class Inner:
+    matte: Path
+    jobs: int = field(default=1, metadata=NOT_IN_RECIPE)
+
+
+@dataclass(frozen=True)
+class Outer:
+    inner: Inner
+    lights: str
+    checkpoints: tuple[Path, ...] = ()
+
+
+def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) -> None:
+    (tmp_path / "one").write_bytes(b"1")
+    (tmp_path / "two").write_bytes(b"1")
+    one = recipe_of(Outer(Inner(tmp_path / "one"), "150"), file_sha256)
+    assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
+    (tmp_path / "two").write_bytes(b"2")
+    other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
+    assert differences(one, other) == "--lights is another, was 150; --matte changed"
+    assert len(one["checkpoint"]) > 32  # the networks that facerf ships
+    (tmp_path / "mattes").mkdir()
+    (tmp_path / "mattes" / "a.png").write_bytes(b"1")
+    given = [tmp_path / "mattes", tmp_path / "mattes" / "{stem}.png"]
+    before = [recipe_of(Inner(path), file_sha256)["matte"] for path in given]
+    (tmp_path / "mattes" / "a.png").write_bytes(b"2")
+    assert all(
+        recipe_of(Inner(path), file_sha256)["matte"] != old for path, old in zip(given, before, strict=True)
+    )
+    both = {field.name for part in (PhotoOptions, OutputOptions) for field in fields(part)}
+    assert len(both) == len(fields(PhotoOptions)) + len(fields(OutputOptions))  # one would hide the other

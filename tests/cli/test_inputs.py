@@ -4,7 +4,7 @@ import io
 import logging
 import sys
 import unicodedata
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.main import main
-from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photo_options import PhotoOptions, check_companion
 from facerf_cli.work.photos import companion
 from facerf_cli.work.shots import ShotOptions, collect_frames
 from tests.kinds import Log, Patch, Said
@@ -304,3 +304,38 @@ def test_a_missing_companion_is_said_with_the_files_that_serve(tmp_path: Path) -
         companion(item, tmp_path, "--person")
     with pytest.raises(InputError, match=r"a/me\.0001\.jpg: --person has no mattes/me\.png; add it there"):
         companion(item, Path("mattes/{stem}.png"), "--person")
+
+
+@pytest.fixture
+def item(tmp_path: Path) -> Item:
+    return Item(
+        tmp_path / "in" / "x" / "me.jpg", tmp_path / "out" / "x" / "me", "x/me", PurePosixPath("x/me.jpg")
+    )
+
+
+def touched(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    return path
+
+
+def test_a_file_a_folder_and_a_pattern_are_companions(item: Item, tmp_path: Path) -> None:
+    assert companion(item, tmp_path / "all.pts", "--landmarks") == tmp_path / "all.pts"
+    flat = touched(tmp_path / "points" / "me.json")
+    assert companion(item, tmp_path / "points", "--landmarks") == flat
+    mirrored = touched(tmp_path / "points" / "x" / "me.pts")
+    assert companion(item, tmp_path / "points", "--landmarks") == mirrored
+    there = touched(tmp_path / "mattes" / "x" / "me_matte.png")
+    pattern = tmp_path / "mattes" / "{dir}" / "{stem}_matte.png"
+    assert companion(item, pattern, "--matte") == there
+    there.unlink()
+    with pytest.raises(InputError, match=r"me.jpg: --matte has no .*me_matte.png; add it there"):
+        companion(item, pattern, "--matte")
+
+
+def test_what_does_not_exist_is_refused_before_the_first_photo(tmp_path: Path) -> None:
+    check_companion(None, "--matte")
+    check_companion(tmp_path / "{stem}.png", "--matte")
+    for wrong in (tmp_path / "none.png", tmp_path / "{light}.png"):
+        with pytest.raises(UsageError, match="--matte"):
+            check_companion(wrong, "--matte")

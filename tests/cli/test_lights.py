@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
-from facerf_cli.light.entries import parse_lights
+from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
 from facerf_cli.main import main, repeat_options
@@ -249,3 +249,233 @@ def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
 def test_a_bad_number_of_procedural_maps_is_refused(word: str, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="procedural"):
         collect_setups(LightSources(envmap=[word]), tmp_path)
+
+
+def single(text: str) -> StudioLight:
+    (image,) = lit_images([text])
+    ((light,),) = image.frames
+    return light
+
+
+def test_lights_by_their_keys_and_by_the_names_of_presets() -> None:
+    near = single("at=0.5,0.3,1;size=0.4;kelvin=3200;stops=+1;rgb=1,0.5,0.25;spot=40")
+    assert near == StudioLight(None, (0.5, 0.3, 1.0), (1.0, 0.5, 0.25), 3200.0, 1.0, 0.4, 0.0, 40.0)
+    far = StudioLight((40.0, 20.0), kelvin=5600.0, stops=-1.0, size_deg=30.0)
+    assert single("from=40,20; kelvin=5600 ;stops=-1;size_deg=30") == far
+    assert single("az=40;el=20;kelvin=5600;stops=-1;size_deg=30") == far
+    assert single("az=40") == single("40,0") and single("el=20") == single("0,20")
+    assert single("from=around;stops=-3") == StudioLight(stops=-3.0)
+    assert single("at=0,0,1;size=0") == StudioLight(at_m=(0.0, 0.0, 1.0))
+    assert lit_images(["rim"])[0].names == ("right", "left", "fill")
+    assert lit_images(["rim=-150,15"])[0].frames == ((StudioLight((-150.0, 15.0)),),)
+    assert lit_images(["rim=rim"])[0].names == ("rim_right", "rim_left", "rim_fill")
+    assert lit_images(["name=map;map=a.exr"])[0].names == ("map",)  # as pages of `facerf view` write
+    assert preset_names() == ("beauty", "butterfly", "loop", "rembrandt", "rim", "split")
+    setups = collect_setups(LightSources(light=preset_names()), Path("out"))
+    assert [setup.name for setup in setups] == list(preset_names())
+    assert all(setup.lights and len(setup.names) == len(setup.lights) for setup in setups)
+
+
+def test_lights_with_names_share_an_image_whatever_their_form() -> None:
+    entries = ["key=40,20;rim=160,10,1,0,0", "5,6", "name=top;at=0,1,0", "at=0,0,2;size=1"]
+    images = lit_images(entries)
+    assert [image.name for image in images] == ["light_5_6", "light_at_0_0_2_size_1", "light_key+rim+top"]
+    assert images[2].names == ("key", "rim", "top") and images[0].names == ()
+    (lights,) = images[2].frames
+    assert lights[1] == StudioLight((160.0, 10.0), rgb=(1.0, 0.0, 0.0)) and lights[2].at_m == (0, 1, 0)
+
+
+def test_a_name_a_place_and_options_combine_in_any_light() -> None:
+    key = lit_images(["key=40,20;stops=-1;kelvin=3200"])[0]
+    assert (key.name, key.names) == ("light_key", ("key",))
+    assert key.frames == ((StudioLight((40.0, 20.0), kelvin=3200.0, stops=-1.0),),)
+    assert lit_images(["name=key;40,20;stops=-1;kelvin=3200"]) == [key]
+    assert lit_images(["stops=-1;kelvin=3200;name=key;from=40,20"]) == [key]
+    assert single("40,20,1,0.5,0;rgb=0.5,1,1;size_deg=9") == StudioLight(
+        (40.0, 20.0), rgb=(0.5, 0.5, 0.0), size_deg=9.0
+    )
+    assert [one.name for one in lit_images(["40,20;stops=1", "40.0,20"])] == [
+        "light_40_20_stops_1",
+        "light_40_20",
+    ]
+
+
+def test_options_of_a_preset_act_on_all_its_lights(tmp_path: Path) -> None:
+    (plain,) = lit_images(["rembrandt"])
+    named, alone = (
+        lit_images(["key=rembrandt;stops=-1;rgb=1,0.5,1;face=2"]),
+        lit_images(["rembrandt;stops=-1"]),
+    )
+    assert [light.stops for light in plain.frames[0]] == [0.0, -7.5]
+    assert [light.stops for light in named[0].frames[0]] == [-1.0, -8.5]
+    assert {(light.rgb, light.face) for light in named[0].frames[0]} == {((1.0, 0.5, 1.0), 2)}
+    assert [light.at_m for light in named[0].frames[0]] == [light.at_m for light in plain.frames[0]]
+    assert (named[0].name, named[0].names) == ("light_key", ("key_key", "key_fill"))
+    assert (alone[0].name, alone[0].names) == ("light_rembrandt_stops_-1", ("key", "fill"))
+    (tmp_path / "a;b=c.toml").write_text("[top]\nfrom = 'above'\n[side]\naz = '0:90:2'\n")
+    (rig,) = lit_images([str(tmp_path / "a;b=c.toml")])
+    assert (rig.name, rig.names, len(rig.frames)) == ("a;b=c", ("top", "side"), 2)
+    assert rig.frames[1] == (StudioLight((0.0, 90.0)), StudioLight((45.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    "word, direction",
+    [
+        ("left", (-1, 0, 0)),
+        ("right", (1, 0, 0)),
+        ("above", (0, 1, 0)),
+        ("below", (0, -1, 0)),
+        ("front", (0, 0, 1)),
+        ("behind", (0, 0, -1)),
+    ],
+)
+def test_directions_have_words(word: str, direction: tuple[int, int, int]) -> None:
+    """By the axes of the camera: x to the image's right, y up, z toward the camera."""
+    azimuth, elevation = single(word).azel_deg or (0.0, 0.0)
+    np.testing.assert_allclose(azel_to_direction(azimuth, elevation), direction, atol=1e-6)
+    assert single(f"key={word}") == single(f"from={word}") == single(word)
+    assert lit_images([f"{word};40,20"])[0].name == f"light_{word}+40_20"
+    assert lit_images([f"{word}={word};stops=1"])[0].names == (word,)
+
+
+def test_lights_apart_from_those_with_names_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    """Only what is mixed: lights without names get an image each, as documented."""
+
+    def said(*entries: str, maps: tuple[str, ...] = ()) -> str:
+        caplog.clear()
+        collect_setups(LightSources(light=[*entries], envmap=[*maps]), Path("out"))
+        return "\n".join(caplog.messages)
+
+    assert said("40,20", "rembrandt") == said("key=40,20", "fill=rembrandt") == said("key=40,20") == ""
+    mixed = said("key=40,20", "60,10", "5,6")
+    assert mixed.startswith("light_60_10 and 1 more: apart from light_key,") and "fill=rembrandt" in mixed
+    assert "rim alone is the preset, rim=AZ,EL a light of that name" in said("key=40,20", "rim")
+    assert said("key=40,20", maps=("procedural:1",)).startswith("00000_")
+    assert said("key=40,20", maps=("sky=a.exr",)) == ""
+
+
+def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
+    setups = collect_setups(LightSources(light=["az=-90:90:3;el=20"]), Path("out"))
+    assert [setup.frame for setup in setups] == [".0000", ".0001", ".0002"]
+    assert {setup.name for setup in setups} == {"light_az_-90_90_3_el_20"}  # and so of one exposure
+    assert [setup.lights[0].azel_deg for setup in setups] == [(-90, 20), (-30, 20), (30, 20)]
+    item = Item(Path("a.jpg"), Path("out/a"), "a")
+    assert setups[1].output(item, "", ".exr") == Path("out/a_light_az_-90_90_3_el_20.0001.exr")
+    both = collect_setups(LightSources(light=["az=0:20:2;el=0:90:2;stops=1"]), Path("out"))
+    assert [setup.lights[0].azel_deg for setup in both] == [(0, 0), (10, 45)]
+    assert collect_setups(LightSources(light=["az=0:20:1"]), Path("out"))[0].frame == ".0000"
+    setups = collect_setups(LightSources(light=["name=key;az=0:90:3", "fill=-40,0"]), Path("out"))
+    assert [[light.azel_deg for light in setup.lights] for setup in setups] == [
+        [(0, 0), (-40, 0)],
+        [(30, 0), (-40, 0)],
+        [(60, 0), (-40, 0)],
+    ]
+    assert all(setup.names == ("key", "fill") for setup in setups)
+    with pytest.raises(UsageError, match="sweeps of 2 and 3 frames"):
+        lit_images(["name=a;az=0:90:3", "name=b;az=0:90:2"])
+
+
+@pytest.mark.parametrize(
+    "entry, said",
+    [
+        ("at=0,0,1;colour=red", "'colour': no such key; give at, from"),
+        ("at=0,0", "at '0,0': give X,Y,Z"),
+        ("at=0,0,0.1", "at '0,0,0.1': the distance from the face is out of range; give 0.15"),
+        ("at=0,0,1;from=0,0", "give one of at=X,Y,Z"),
+        ("kelvin=3200", "give one of at=X,Y,Z"),
+        ("at=0,0,1;kelvin=50", "kelvin '50': out of range; give 1667 to 25000"),
+        ("at=0,0,1;rgb=1,-1,1", "rgb '1,-1,1': out of range"),
+        ("at=0,0,1;size_deg=3", "size_deg is of far lights"),
+        ("from=0,0;size=1", "size is of near lights"),
+        ("at=0,0,1;at=0,0,2", "at is given twice"),
+        ("az=60,el=10", "give ; between keys, as in 'az=60;el=10'"),
+        ("az=0:90;el=3", "az '0:90': give degrees, or FROM:TO:N"),
+        ("az=0:90:2;el=0:9:3", "give one N"),
+        ("el=0:200:4", "the elevation is out of range"),
+        ("from=around;size_deg=3", "a light from all around has no size; leave size_deg out"),
+        ("at=0,0,1;rotate=30", "rotate is of maps (map=); leave it out"),
+        ("az=20;face=1.5", "face '1.5': give the number of one"),
+        ("name=;at=0,0,1", "'': give each light a name of its own"),
+        ("=40,20", "'': give each light a name"),
+        ("rembrant", "no such preset; give AZ,EL, a rig file (.toml) or one of beauty, butterfly"),
+        ("rembrant", "split, left, right, above, below, behind, front, around"),
+        ("key=rembrant;stops=1", "rembrant: no such preset"),
+        ("key=40,20;colour=red", "'colour': no such key; give at, from"),
+        ("colour=red;at=0,0,1", "'colour': no such key; give at, from"),
+        ("key=40,20,stops=-1", "give ; between keys"),
+        ("key=40,20;az=3", "give one of AZ,EL, at=X,Y,Z"),
+        ("a=40,20;b=left;stops=1", "stops is of one light; give each light a --light of its own"),
+        ("key=40,20;60,30", "some lights have names; give each one, as in key=40,20, or none"),
+        ("rembrandt;60,30", "some lights have names"),
+        ("name=a;key=40,20", "the light has two names"),
+        ("map=40,20", "map is a key; give another name, as in map_light=40,20"),
+        ("size=rembrandt;stops=1", "size is a key; give another name, as in size_light=rembrandt"),
+        ("face=left", "face is a key; give another name, as in face_light=left"),
+        ("key=rembrandt;size=3", "size is of near lights"),
+        ("key=around;size_deg=3", "a light from all around has no size"),
+        ("from=up", "from 'up': give AZ,EL or one of left, right"),
+        ("missing.toml", "missing.toml: no such rig file"),
+    ],
+)
+def test_faults_say_what_to_give(entry: str, said: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        collect_setups(LightSources(light=[entry]), Path("out"))
+    assert said in str(caught.value) and str(caught.value).startswith("--light")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> None:
+    (tmp_path / "studio.toml").write_text(
+        "[key]\nat = [0.5, 0.3, 1]\nsize = 0.4\nkelvin = 3200\n[rim]\naz = '150:170:2'\nel = 10\nstops = -1\n"
+    )
+    setups = collect_setups(LightSources(light=[str(tmp_path / "studio.toml"), "key=1,2"]), tmp_path / "out")
+    assert [setup.name + setup.frame for setup in setups] == ["studio.0000", "studio.0001", "light_key"]
+    assert setups[0].names == ("key", "rim")
+    assert setups[1].lights == (
+        StudioLight(at_m=(0.5, 0.3, 1.0), kelvin=3200.0, size_m=0.4),
+        StudioLight((160.0, 10.0), stops=-1.0),
+    )
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("[key]\nat = [0, 0, 1]\nwatts = 3\n", "key: 'watts': no such key"),
+        ("[key]\nname = 'a'\nat = [0, 0, 1]\n", "key: 'name': no such key"),
+        ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0': give X,Y,Z"),
+        ("['a b']\nat = [0, 0, 1]\n", "'a b': give each light a name"),
+        ("[key]\nfrom = 'up'\n", "key: from 'up': give AZ,EL or one of left, right"),
+        ("[a]\naz = '0:9:2'\n[b]\naz = '0:9:3'\n", "sweeps of 2 and 3 frames"),
+    ],
+)
+def test_a_fault_of_a_rig_file_names_file_and_light(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "studio.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        lit_images([str(path)])
+    assert str(caught.value).startswith(f"{path}: ") and said in str(caught.value)
+
+
+def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
+    entries = ["name=a;at=0,0,1;stops=1", "b=30,0", "at=0,0,1;rgb=1,0,0", "at=0,0,2"]
+    setups = collect_setups(LightSources(light=entries), Path("out"))  # the image of names comes last
+    lights = lights_over_rig(setups, "150", "cell")
+    assert [light.at_m for light in lights.near] == [(0, 0, 1), (0, 0, 2)]
+    assert lights.near_weights is not None and lights.near_weights.tolist() == [
+        [[1, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [1, 1, 1]],
+        [[2, 2, 2], [0, 0, 0]],
+    ]
+    assert len(lights.directions) == 1 and lights.weights.sum((1, 2)).tolist() == [0, 0, 3]
+    assert [light.at_m for light in lights[1:2].near] == [(0, 0, 2)]
+    alone = lights_over_rig(setups[:1], "150", "cell")
+    assert len(alone.directions) == 1 and alone.weights.abs().max() == 0  # a dark one, since models want one
+
+
+def test_strengths_count_all_light_wherever_it_comes_from(tmp_path: Path) -> None:
+    write_exr(tmp_path / "even.exr", np.full((16, 32, 3), 0.5, np.float32))
+    entries = ["0,0,3,3,3", "180,0", "at=0,0,1;stops=1", "from=around"]
+    setups = collect_setups(LightSources(envmap=[str(tmp_path / "even.exr")], light=entries), Path("out"))
+    assert lights_over_rig(setups, "150", "cell").strengths() == pytest.approx(
+        [2, 3, 1, 2, 4], rel=1e-3
+    )  # an even map of 0.5 first

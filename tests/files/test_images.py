@@ -17,7 +17,8 @@ from facerf_cli.files.write import HALF_MAX, write_display, write_exr, write_tif
 from facerf_cli.image import colour
 from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers
-from tests.files.made import IPTC, properties, write_oiio
+from tests.files.made import IPTC, MAP, TO_709, H, W, long_runs, properties, write_hdr, write_oiio
+from tests.kinds import Log
 
 VALUES = np.random.default_rng(1).random((23, 34, 4)).astype(np.float32)  # [H, W, RGBA], not square
 
@@ -347,3 +348,32 @@ def test_the_soft_view_is_plain_up_to_its_start_and_where_it_has_no_share(tmp_pa
     np.testing.assert_allclose(read_image(tmp_path / "b.png").pixels[0, :, 0], soft, atol=1e-4)
     write_display(tmp_path / "c.png", linear, bits=16)
     np.testing.assert_allclose(read_image(tmp_path / "c.png").pixels[0, :, 0], [0.1, 0.8, 1, 1, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize("form", ["plain", "old", "new"])
+@pytest.mark.parametrize("order", ["-Y +X", "-Y -X", "+Y -X", "+Y +X", "+X -Y", "-X -Y", "-X +Y", "+X +Y"])
+def test_eight_orders_of_axes_and_three_forms(tmp_path: Path, order: str, form: str) -> None:
+    path = write_hdr(tmp_path / "a.hdr", MAP, "", order, form)
+    np.testing.assert_allclose(read_image(path).pixels, MAP, atol=0.005)
+
+
+def test_long_old_runs(tmp_path: Path) -> None:
+    path = long_runs(tmp_path / "a.hdr")
+    assert read_image(path).pixels == pytest.approx(0.25) and path.stat().st_size < 150
+
+
+def test_exposures_corrections_and_primaries_are_undone(tmp_path: Path, caplog: Log) -> None:
+    head = "EXPOSURE=2.0\nEXPOSURE= 3\nCOLORCORR= 1 0.5 .25\n"
+    stored = MAP * 6 * (1, 0.5, 0.25)
+    np.testing.assert_allclose(
+        read_image(write_hdr(tmp_path / "a.hdr", stored, head)).pixels, MAP, rtol=0.02, atol=0.005
+    )
+    for zeros in ("0 0 0", "0 0 0 0 0 0 0 0"):  # as in the maps of Poly Haven
+        found = read_image(write_hdr(tmp_path / "0.hdr", MAP, f"PRIMARIES={zeros}\n"))
+        np.testing.assert_allclose(found.pixels, MAP, rtol=0.02, atol=0.005)
+    assert caplog.text == ""
+    head = "PRIMARIES=0.708 0.292 0.170 0.797 0.131 0.046 0.3127 0.3290\n"
+    found = read_image(write_hdr(tmp_path / "b.hdr", MAP, head)).pixels
+    np.testing.assert_allclose(found, MAP @ TO_709.T, atol=0.005)
+    wide = read_image(write_hdr(tmp_path / "c.hdr", MAP, "PIXASPECT=0.5\n")).pixels
+    assert wide.shape == (H, 2 * W, 3)
