@@ -90,17 +90,9 @@ def test_the_source_distribution_has_what_the_tests_read_and_no_cache(built: Pat
 
 def test_the_installed_wheel_runs_away_from_its_source(built: Path, wheel: zipfile.ZipFile) -> None:
     prefix = built / "installed"
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-compile",
-        "--ignore-installed",
-    ]
-    subprocess.run([*command, "--prefix", str(prefix), str(wheel.filename)], check=True, capture_output=True)
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-compile"]
+    command += ["--ignore-installed", "--prefix", str(prefix), str(wheel.filename)]
+    subprocess.run(command, check=True, capture_output=True)
     packages = next(prefix.glob("**/facerf_cli/py.typed")).parents[1]
     environment = os.environ | {"PYTHONPATH": str(packages)}
     script = next(prefix.glob("**/bin/facerf"))

@@ -156,7 +156,7 @@ def nearest_of_rig() -> torch.Tensor:
     return rig[[int(rig[:, 2].argmax())]]
 
 
-def test_light_that_arrives_from_near_and_far() -> None:
+def test_light_arrives_from_near_and_far_and_grain_mixes_no_lips_and_eyes() -> None:
     place = torch.tensor([0.0, 0.0, -1.0])
     near = StudioLight(at_m=(0.0, 2.0, 0.0), rgb=(1.0, 1.0, 1.0))
     lights = Lights(
@@ -166,6 +166,15 @@ def test_light_that_arrives_from_near_and_far() -> None:
     mean = torch.einsum("mnc,nd->mcd", weights, directions)[0, 0]
     torch.testing.assert_close(mean, torch.tensor([1.0, 2.0, 0.0]), atol=1e-4, rtol=1e-3)
     assert math.isclose(float(weights[0, :, 0].sum()), 3.0, rel_tol=1e-3)
+    person = astronaut.person()
+    shown = person.in_photo()
+    assert isinstance(shown, PersonInPhoto)
+    grain, _ = shown._finish
+    red = np.where(person.segmentation.layer("lips")[..., None] > 0.5, [1, 0, 0], [0, 0, 1]).astype(
+        np.float32
+    )
+    rows = grain.observe(slice(120, 160))
+    np.testing.assert_allclose(grain.given(red[rows.wide], rows)[..., 0], red[120:160, :, 0], atol=1e-3)
 
 
 def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_is() -> None:
@@ -182,18 +191,6 @@ def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_
     images = view.mirrored(lights, view.person.maps.positions_m.mean((1, 2)))[0, :, 0]
     left, right = (float(image.sum(0) @ at / image.sum()) for image in images)
     assert left > 0.05 and right < -0.05  # toward the nose
-
-
-def test_lips_and_eyes_get_no_grain_that_mixes_their_colours() -> None:
-    person = astronaut.person()
-    shown = person.in_photo()
-    assert isinstance(shown, PersonInPhoto)
-    grain, _ = shown._finish
-    red = np.where(person.segmentation.layer("lips")[..., None] > 0.5, [1, 0, 0], [0, 0, 1]).astype(
-        np.float32
-    )
-    rows = grain.observe(slice(120, 160))
-    np.testing.assert_allclose(grain.given(red[rows.wide], rows)[..., 0], red[120:160, :, 0], atol=1e-3)
 
 
 def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,7 +71,7 @@ def lamp(azimuth_deg: float, elevation_deg: float = 0.0) -> RigLight:
     return RigLight(azel_to_direction(azimuth_deg, elevation_deg)[None], torch.ones(1, 3))
 
 
-def test_under_its_own_light_the_photo_comes_back(
+def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_what_is_before_it(
     photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     models, head = person.models, person.head
@@ -81,6 +81,14 @@ def test_under_its_own_light_the_photo_comes_back(
     assert 10 * np.log10(1 / error) > 30  # the maps are coarse, and grain is of a photo without light
     alone = reflectance_of(models, head, "portrait", network_alone=True, photo=photo)
     assert isinstance(alone, PortraitField) and alone.views[0].correction is None
+    # Hair and glasses over the face are not the face's field.
+    shown = copy(person.in_photo())
+    height, width = shown.size_px
+    half = np.tile(np.arange(width) < width // 2, (height, 1))
+    shown._bare_face = half  # type: ignore[assignment]
+    seen = shown.observe(slice(0, height))
+    mask = shown.view.mask[seen.inside].numpy()
+    np.testing.assert_array_equal(seen.face_share, mask * half[shown.view.window])
 
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
@@ -260,17 +268,6 @@ def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
         np.testing.assert_allclose(cut[name], expected, atol=1e-6)
 
 
-def test_what_is_before_the_face_is_not_of_it(person: Person) -> None:
-    """Hair and glasses over the face are not the face's field."""
-    shown = copy(person.in_photo())
-    height, width = shown.size_px
-    half = np.tile(np.arange(width) < width // 2, (height, 1))
-    shown._bare_face = half  # type: ignore[assignment]
-    seen = shown.observe(slice(0, height))
-    mask = shown.view.mask[seen.inside].numpy()
-    np.testing.assert_array_equal(seen.face_share, mask * half[shown.view.window])
-
-
 def test_no_pixel_depends_on_the_strip_that_it_is_in(
     photo: np.ndarray, person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,7 +292,7 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
         np.testing.assert_allclose(one, other, atol=1e-4 * max(1.0, float(np.abs(one).max())))
 
 
-def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitField) -> None:
+def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(field: PortraitField) -> None:
     """Over even grey, maps of one brightness in each view show no border between the views."""
     head, wide = field.views
     assert wide.person.square.side_px > head.person.square.side_px
@@ -303,6 +300,16 @@ def test_a_wider_view_goes_on_where_the_square_of_the_head_ends(field: PortraitF
     columns, weight = Enlarged(head, matte.shape, 0.0).weight(slice(0, len(matte)))
     assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
     assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
+    head, matte = Crop(40, 30, 60, SEEN_PX), np.zeros((300, 200), np.float32)
+    matte[40:80, 50:90] = 1
+    assert wider_square(head, matte) is None
+    matte[40:160, 20:90] = 1
+    wide = wider_square(head, matte)
+    assert wide is not None and wide.y0_px <= 30 and wide.y0_px + wide.side_px >= 160
+    assert wide.x0_px <= 20 and wide.x0_px + wide.side_px >= 100
+    matte[40:] = 1
+    largest = wider_square(head, matte)
+    assert largest is not None and largest.side_px == pytest.approx(140) and largest.y0_px == 30
 
 
 def test_strands_break_up_light_from_behind_and_nothing_else_does(field: PortraitField) -> None:
@@ -327,16 +334,3 @@ def test_strands_break_up_light_from_behind_and_nothing_else_does(field: Portrai
     hair, skin = (classes[class_index(name)] for name in ("hair", "skin"))
     assert np.abs(ratio[skin > 0.999] - 1).max() < 0.01
     assert 0.9 < ratio[hair > 0.8].mean() < 1.1 and ratio[hair > 0.8].std() > 0.05
-
-
-def test_a_wider_square_holds_the_person_and_the_square_of_the_head() -> None:
-    head, matte = Crop(40, 30, 60, SEEN_PX), np.zeros((300, 200), np.float32)
-    matte[40:80, 50:90] = 1
-    assert wider_square(head, matte) is None
-    matte[40:160, 20:90] = 1
-    wide = wider_square(head, matte)
-    assert wide is not None and wide.y0_px <= 30 and wide.y0_px + wide.side_px >= 160
-    assert wide.x0_px <= 20 and wide.x0_px + wide.side_px >= 100
-    matte[40:] = 1
-    largest = wider_square(head, matte)
-    assert largest is not None and largest.side_px == pytest.approx(140) and largest.y0_px == 30

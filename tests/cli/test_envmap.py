@@ -31,7 +31,7 @@ def test_writes_seeded_maps_and_skips_finished_ones(tmp_path: Path, capsys: Said
     assert len(capsys.readouterr().out.splitlines()) == 4
 
 
-def test_the_contact_sheet_has_a_tile_for_each_map(tmp_path: Path, capsys: Said) -> None:
+def test_the_sheet_has_a_tile_for_each_map_and_a_dry_run_writes_nothing(tmp_path: Path, capsys: Said) -> None:
     line = ["envmap", "-o", str(tmp_path), "--count", "4", "--size", "32", "--kind", "overcast"]
     assert main(line) == 0
     sheet = tmp_path / "envmaps.png"
@@ -43,6 +43,10 @@ def test_the_contact_sheet_has_a_tile_for_each_map(tmp_path: Path, capsys: Said)
     assert main(line) == 0  # only the sheet is made again
     assert capsys.readouterr().out.splitlines() == [str(sheet)]
     np.testing.assert_array_equal(read_image(sheet).pixels, pixels)
+    assert main(["envmap", "-o", str(tmp_path / "new"), "--kind", "sun", "--dry-run", "--count", "2"]) == 0
+    maps = [f"{tmp_path}/new/0000{i}_sun.exr" for i in range(2)]
+    assert capsys.readouterr().out.splitlines() == [*maps, f"{tmp_path}/new/envmaps.png"]
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("change", [("--size", "48"), ("--seed", "6")])
@@ -91,10 +95,3 @@ def test_a_folder_of_maps_is_read_without_its_sheet_whose_balls_are_lit_by_them(
     setups = collect_setups(LightSources(envmap=[str(maps)]), tmp_path / "out", 0)
     found = [light.envmap for setup in setups for light in setup.lights]
     assert found == sorted(maps.glob("*.exr")) and len(setups) == 2
-
-
-def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: Said) -> None:
-    assert main(["envmap", "-o", str(tmp_path / "new"), "--kind", "sun", "--dry-run", "--count", "2"]) == 0
-    maps = [f"{tmp_path}/new/0000{i}_sun.exr" for i in range(2)]
-    assert capsys.readouterr().out.splitlines() == [*maps, f"{tmp_path}/new/envmaps.png"]
-    assert not (tmp_path / "new").exists()

@@ -54,14 +54,13 @@ def test_a_light_is_a_map_numbers_and_a_image(given: Path, estimated: Path, caps
     assert row_of(estimated)["status"] == "done" and not capsys.readouterr().out  # finished already
 
 
-def test_the_plain_form_fits_better_and_is_signed(given: Path, estimated: Path, tmp_path: Path) -> None:
+def test_the_plain_form_fits_better_and_refinement_lowers_its_loss(
+    given: Path, estimated: Path, tmp_path: Path
+) -> None:
     assert estimate(given, tmp_path, "--signed", "--lights", "120") == 0
     plain = row_of(tmp_path)
     assert plain["residual"] < row_of(estimated)["residual"] and not plain["non_negative"]
     assert (read_light(tmp_path / "astronaut_light.json").weights < 0).any()
-
-
-def test_refinement_says_by_which_features_and_lowers_their_loss(given: Path, tmp_path: Path) -> None:
     assert estimate(given, tmp_path, "--refine", "features", "--sh-order", "0") == 0
     row = row_of(tmp_path)
     assert row["features"] == "S_f (shipped)" and row["feature_loss"][1] < row["feature_loss"][0]

@@ -240,16 +240,8 @@ def test_a_frame_whose_matte_is_black_is_left_as_it_is(tmp_path: Path, capsys: S
         Image.fromarray(matte * np.uint8(0)).save(tmp_path / f"black/me_{number}.png")
 
     def made(mattes: str) -> int:
-        line = (
-            "relight",
-            tmp_path / "plates",
-            "--sequence",
-            "--person",
-            tmp_path / mattes,
-            "--light",
-            "70,20",
-        )
-        more = ("--lights", "12", "--format", "png", "--exposure", "0", "-o", tmp_path / f"{mattes}_lit")
+        line = ("relight", tmp_path / "plates", "--sequence", "--person", tmp_path / mattes, "--lights", "12")
+        more = ("--light", "70,20", "--format", "png", "--exposure", "0", "-o", tmp_path / f"{mattes}_lit")
         return main([str(part) for part in (*line, *more)])
 
     assert made("roto") == 0

@@ -44,17 +44,13 @@ def test_the_order_is_that_of_a_day(capsys: Said) -> None:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_texts_are_short(name: str) -> None:
+def test_help_texts_are_short_and_options_of_a_long_help_stand_in_panels(name: str) -> None:
     long = [
         option.name
         for option in COMMANDS[name].params
         if len(option.help or "") > (MOST_OF_LANGUAGE if option.name in LANGUAGES else MOST)
     ]
     assert not long
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_options_of_a_long_help_stand_in_panels(name: str) -> None:
     options = [option for option in COMMANDS[name].params if option.param_type_name == "option"]
     bare = {option.name for option in options if not option.rich_help_panel and not option.required}
     assert len(options) <= FEW or bare <= {"output"}

@@ -297,12 +297,18 @@ def test_a_model_of_rembg_gives_the_matte_and_its_licence_is_said(
     assert "made again: the model of --matte-from changed" in capsys.readouterr().err
 
 
-def test_a_model_that_is_not_there_is_refused_with_the_command_that_fetches_it(rembg: Path) -> None:
+def test_models_that_are_not_there_are_refused_with_the_command_that_fetches_them(
+    rembg: Path, given: Path, tmp_path: Path, capsys: Said
+) -> None:
     with pytest.raises(UsageError, match="facerf downloads no model; fetch it with `rembg d bria-rmbg`"):
         parse_matte_from("rembg:bria-rmbg")
     for wrong in ("rembg", "rembg:", "u2net", "rembg:../u2net"):
         with pytest.raises(UsageError, match="give rembg:NAME"):
             parse_matte_from(wrong)
+    (tmp_path / "python/rembg.py").unlink()
+    line = ("--matte-from", f"rembg:{MODEL}", "-o", tmp_path / "out")
+    assert facerf("segment", given / "plates", *line) == 2
+    assert "pip install 'facerf[rembg]'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_models_of_older_versions_lie_in_one_folder(rembg: Path, tmp_path: Path, monkeypatch: Patch) -> None:
@@ -325,10 +331,3 @@ def test_options_that_do_not_go_together(rembg: Path, given: Path, tmp_path: Pat
     for more, said in (((*person, *model), "leave one out"), ((*person, "--face", "all"), "show one person")):
         assert facerf("segment", given / "plates", *more, "-o", tmp_path / "out") == 2
         assert said in " ".join(capsys.readouterr().err.split())
-
-
-def test_without_rembg_its_extra_is_named(rembg: Path, given: Path, tmp_path: Path, capsys: Said) -> None:
-    (tmp_path / "python/rembg.py").unlink()
-    line = ("--matte-from", f"rembg:{MODEL}", "-o", tmp_path / "out")
-    assert facerf("segment", given / "plates", *line) == 2
-    assert "pip install 'facerf[rembg]'" in " ".join(capsys.readouterr().err.split())

@@ -105,16 +105,13 @@ def test_jobs_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, cap
         )
 
 
-def test_an_older_charts_image_does_not_outlive_its_dataset(
-    wrong: Path, corrected: Path, tmp_path: Path
+def test_an_older_charts_image_does_not_outlive_its_dataset_and_a_file_is_none(
+    wrong: Path, corrected: Path, tmp_path: Path, capsys: Said
 ) -> None:
     shutil.copytree(corrected, tmp_path / "again")
     assert prepare(wrong, tmp_path / "again", *SPLIT, "--overwrite", "always") == 0
     assert "colour_charts" not in normalisation(tmp_path / "again")
     assert (corrected / "colour_chart.png").is_file() and not (tmp_path / "again/colour_chart.png").exists()
-
-
-def test_a_file_is_no_dataset(wrong: Path, tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "file").touch()
     assert prepare(wrong, tmp_path / "file", *SPLIT, "--colour-chart", str(wrong / "chart.exr"), *PLACE) == 2
     assert "file: cannot be written to" in capsys.readouterr().err

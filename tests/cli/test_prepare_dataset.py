@@ -120,7 +120,9 @@ def test_light_normals_and_skin_agree(given: Given, prepared: Dataset) -> None:
     assert np.abs(green - albedo * mirrored).mean() / green.mean() > 3 * left
 
 
-def test_the_stack_is_relit_like_any_other(prepared: Dataset, tmp_path: Path) -> None:
+def test_the_stack_is_relit_like_any_other_and_the_page_shows_everybody(
+    prepared: Dataset, tmp_path: Path
+) -> None:
     write_exr(tmp_path / "white.exr", np.ones((32, 64, 3), np.float32))
     stack = prepared.stack_path("0001", "C2")
     line = ["relight", str(stack), "--envmap", str(tmp_path / "white.exr"), "-o", str(tmp_path / "out")]
@@ -132,9 +134,6 @@ def test_the_stack_is_relit_like_any_other(prepared: Dataset, tmp_path: Path) ->
     assert relit.metadata["facerf:synthetic"] == 1 and relit.metadata["facerf:input"] == "0001/C2"
     assert relit.metadata["IPTC:DigitalSourceType"].endswith("/compositeCapture")  # of photographs
     assert relit.metadata["facerf:face_model_licence"] == load_face_model().licence
-
-
-def test_the_page_shows_everybody(prepared: Dataset) -> None:
     page = (prepared.folder / "index.html").read_text()
     for subject in prepared.subjects:
         assert f'src="sheets/{subject}.jpg"' in page and prepared.split_of(subject) in page
@@ -270,10 +269,14 @@ def test_black_images_have_no_face_nor_a_network_that_sees_none(
     assert "0000: no camera shows a face" in capsys.readouterr().err
 
 
-def test_other_options_do_not_mix(given: Given, prepared: Dataset, capsys: Said) -> None:
+def test_other_options_do_not_mix_and_a_dry_run_writes_nothing(
+    given: Given, prepared: Dataset, capsys: Said, tmp_path: Path
+) -> None:
     line = ["prepare-dataset", str(given[0]), "-o", str(prepared.folder), "--crop", "128"]
     assert main(line) == 2
     assert "was prepared otherwise: --crop is 128, was 96; give --overwrite always" in capsys.readouterr().err
+    assert prepare(given[0], tmp_path / "out", "--dry-run") == 0
+    assert "olat/0001/C2.exr" in capsys.readouterr().out and not (tmp_path / "out").exists()
 
 
 def changed(given: Given, capture: Path, **changes: object) -> Path:
@@ -372,19 +375,7 @@ def test_records_of_another_run_stay_out_of_the_dataset(
             patch.setattr(
                 Path, "unlink", lambda path, **k: None if path.name == "0001.json" else unlink(path, **k)
             )
-            line = [
-                "prepare-dataset",
-                str(given[0]),
-                "-o",
-                str(output),
-                "--crop",
-                "64",
-                "--overwrite",
-                "always",
-                "--checks",
-                "off",
-            ]
-            assert main(line) == 1
+            assert prepare(given[0], output, "--crop", "64", "--overwrite", "always") == 1
     finally:
         (tmp_path / "hidden.exr").rename(torn)
     dataset = read_dataset(output)
@@ -403,8 +394,3 @@ def test_a_small_capture_is_not_enlarged(given: Given, tmp_path: Path) -> None:
             assert read_olat_stack(dataset.stack_path(subject, camera)).olats.shape[-1] == crop.size_px
             sides.append(crop.size_px)
     assert dataset.crop_px == max(sides) < 256
-
-
-def test_a_dry_run_writes_nothing(given: Given, tmp_path: Path, capsys: Said) -> None:
-    assert prepare(given[0], tmp_path / "out", "--dry-run") == 0
-    assert "olat/0001/C2.exr" in capsys.readouterr().out and not (tmp_path / "out").exists()

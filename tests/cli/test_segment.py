@@ -58,7 +58,9 @@ def test_one_file_is_that_of_the_folder(cut: Path, tmp_path: Path, capsys: Said)
     assert main(["segment", str(tmp_path / "none.png"), "-o", str(target)]) == 1
 
 
-def test_classes_sum_to_the_matte_of_a_person_over_the_photo(layers: dict[str, np.ndarray]) -> None:
+def test_classes_sum_to_the_matte_and_lie_where_face_hair_and_garment_are(
+    layers: dict[str, np.ndarray], cut: Path
+) -> None:
     matte = layers["person.A"]
     photo = read_image(PHOTO).pixels
     assert matte.shape == photo.shape[:2] and matte.min() >= 0 and matte.max() <= 1
@@ -69,9 +71,6 @@ def test_classes_sum_to_the_matte_of_a_person_over_the_photo(layers: dict[str, n
     inside = layers["person.A"] == 1
     assert inside.mean() > 0.1 and np.abs(own - photo)[inside].max() < 0.02
     assert (own[layers["A"] == 0] == 0).all()
-
-
-def test_face_hair_and_garment_lie_where_they_are(layers: dict[str, np.ndarray], cut: Path) -> None:
     points = read_landmarks(cut / "astronaut_landmarks.json")
     nose, brow = points[30].astype(int), points[19:25].mean(0)
     up = int(brow[1] - 0.55 * (points[8, 1] - brow[1]))

@@ -52,7 +52,7 @@ def lit(folder: Path, subject: str, camera: int, light: int) -> np.ndarray:
     return read_image(folder / subject / f"C{camera}" / f"L{light:03d}.exr").pixels
 
 
-def test_it_is_a_capture_like_any_other(capture: Path) -> None:
+def test_it_is_a_capture_like_any_other_with_its_bake_and_its_truth(capture: Path) -> None:
     found = read_capture(capture)
     assert list(found.subjects) == ["0000", "0001"] and len(found.cameras) == CAMERAS
     described = json.loads((capture / "stage.json").read_text())
@@ -63,6 +63,23 @@ def test_it_is_a_capture_like_any_other(capture: Path) -> None:
     assert image.pixels.shape == (64, 64, 3)
     assert image.metadata["facerf:face_model"] == "builtin" and image.metadata["facerf:synthetic"] == 1
     assert image.metadata["IPTC:DigitalSourceType"] == COMPUTER_GRAPHICS_SOURCE_TYPE
+    bake = load_file(capture / "transport" / "0001.safetensors")
+    assert bake["visibility"].shape == bake["bounce"].shape == (LIGHTS, 128, 128)
+    front = bake["directions"][:, 2].argmax()
+    behind = bake["directions"][:, 2].argmin()
+    assert bake["visibility"][front, 40:90, 40:90].mean() > 180 > 20 > bake["visibility"][behind].mean()
+    assert np.abs(np.linalg.norm(bake["directions"], axis=-1) - 1).max() < 1e-5
+    found = exr_layers(capture / "0000" / "truth" / "C0.exr")
+    classes = np.stack([values for name, values in found.items() if name.startswith("class.")])
+    np.testing.assert_allclose(classes.sum(0), 1, atol=4e-3)  # half floats
+    np.testing.assert_allclose(found["person.A"], 1 - found["class.background"], atol=2e-3)
+    # Under an even light nothing is brighter than white, and the person is not black.
+    even = np.stack([found[name] for name in "RGB"])
+    assert 0.02 < even[:, found["person.A"] > 0.9].mean() < 1
+    assert np.abs(even[:, found["person.A"] == 0]).max() == 0
+    record = json.loads((capture / "0000" / "subject.json").read_text(encoding="utf-8"))
+    assert np.array(record["head_to_world"]).shape == (3, 3)
+    assert {"left iris", "right ear lobe"} < set(record["more_landmarks_world"])
 
 
 def test_other_threads_shards_and_one_more_person_change_no_byte(capture: Path, tmp_path: Path) -> None:
@@ -96,15 +113,6 @@ def test_lights_and_calibration_agree_with_the_images(capture: Path) -> None:
     assert nose_px[1][0] > nose_px[0][0] + 2 > nose_px[2][0] + 4
 
 
-def test_the_bake_is_kept_in_the_chart(capture: Path) -> None:
-    bake = load_file(capture / "transport" / "0001.safetensors")
-    assert bake["visibility"].shape == bake["bounce"].shape == (LIGHTS, 128, 128)
-    front = bake["directions"][:, 2].argmax()
-    behind = bake["directions"][:, 2].argmin()
-    assert bake["visibility"][front, 40:90, 40:90].mean() > 180 > 20 > bake["visibility"][behind].mean()
-    assert np.abs(np.linalg.norm(bake["directions"], axis=-1) - 1).max() < 1e-5
-
-
 def test_other_settings_need_another_folder(capture: Path, capsys: Said) -> None:
     before = tree(capture)
     assert photograph(capture, "--subjects", "2", "--seed", "1") == 2
@@ -122,20 +130,6 @@ def test_a_missing_path_tracer_is_named_and_a_dry_run_writes_nothing(
     assert photograph(tmp_path / "capture", "--renderer", "mitsuba") == 2
     assert "pip install 'facerf[synth]'" in capsys.readouterr().err
     assert not (tmp_path / "capture").exists()
-
-
-def test_every_camera_has_its_truth(capture: Path) -> None:
-    found = exr_layers(capture / "0000" / "truth" / "C0.exr")
-    classes = np.stack([values for name, values in found.items() if name.startswith("class.")])
-    np.testing.assert_allclose(classes.sum(0), 1, atol=4e-3)  # half floats
-    np.testing.assert_allclose(found["person.A"], 1 - found["class.background"], atol=2e-3)
-    # Under an even light nothing is brighter than white, and the person is not black.
-    even = np.stack([found[name] for name in "RGB"])
-    assert 0.02 < even[:, found["person.A"] > 0.9].mean() < 1
-    assert np.abs(even[:, found["person.A"] == 0]).max() == 0
-    record = json.loads((capture / "0000" / "subject.json").read_text(encoding="utf-8"))
-    assert np.array(record["head_to_world"]).shape == (3, 3)
-    assert {"left iris", "right ear lobe"} < set(record["more_landmarks_world"])
 
 
 def test_a_bust_shows_more_of_the_garment() -> None:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
-from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.olat_stack import write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.work.matte_models import MatteModel
@@ -18,6 +18,7 @@ from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.view_photos import write_index
 from tests.kinds import Said
+from tests.stacks import header_of
 
 
 @pytest.fixture
@@ -42,18 +43,8 @@ def test_a_page_takes_the_name_that_is_given_and_a_folder_is_mirrored(folder: Pa
 def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
     seen = np.zeros((24, 32), np.float32)
     seen[4:20, 6:26] = 1
-    header = StackHeader(
-        kind="image",
-        directions=rig_directions(12).numpy(),
-        rotation=np.eye(3),
-        source=np.full((24, 32, 3), 0.2, np.float32),
-        seen=seen,
-        normals=np.zeros((24, 32, 3), np.float32),
-        layout_version=1,
-        fit={},
-    )
     olats = torch.rand(12, 3, 24, 32) * torch.from_numpy(seen)
-    write_olat_stack(tmp_path / "captured.exr", header, [olats])
+    write_olat_stack(tmp_path / "captured.exr", header_of(rig_directions(12), seen, 0.2), [olats])
     assert main(["view", str(tmp_path / "captured.exr"), "-o", str(tmp_path / "page.html")]) == 0
     made = (tmp_path / "page.html").read_text()
     assert "<title>captured.exr · facerf</title>" in made  # the input's name, not that of the page

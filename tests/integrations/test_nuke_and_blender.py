@@ -13,10 +13,11 @@ import OpenImageIO as oiio
 import pytest
 import torch
 
-from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
+from facerf_cli.files.olat_stack import write_olat_stack
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import azel_to_direction, direction_to_uv, rig_directions
+from tests.stacks import header_of
 
 ROOT = Path(__file__).parents[2]
 
@@ -31,17 +32,7 @@ def module_of(path: str) -> ModuleType:
 
 def stack(path: Path, lights: int = 4) -> None:
     """A stack of flat images."""
-    empty = np.zeros((6, 8, 3), np.float32)
-    header = StackHeader(
-        kind="image",
-        directions=rig_directions(lights).numpy(),
-        rotation=np.eye(3, dtype=np.float32),
-        source=empty,
-        seen=empty[..., 0],
-        normals=empty,
-        layout_version=1,
-        fit={},
-    )
+    header = header_of(rig_directions(lights), np.zeros((6, 8), np.float32))
     write_olat_stack(path, header, iter([torch.rand(lights, 3, 6, 8)]))
 
 

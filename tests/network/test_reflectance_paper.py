@@ -79,16 +79,14 @@ def test_what_each_input_reaches() -> None:
 
 
 @torch.no_grad()
-def test_skips_are_convolved_as_if_stacked(network: PaperReflectanceNetwork) -> None:
+def test_skips_are_convolved_as_if_stacked_and_both_normal_maps_matter(
+    network: PaperReflectanceNetwork,
+) -> None:
     up = network.up[2]
     x, skip = torch.randn(2, 12, 4, 4), torch.randn(2, 12, 4, 4)
     stacked = F.interpolate(torch.cat([x, skip], 1), scale_factor=2.0)
     expected = F.leaky_relu(up.norm(up.convolution(stacked)), 0.2)
     assert torch.allclose(up(x, skip, 8), expected, atol=1e-5)
-
-
-@torch.no_grad()
-def test_both_normal_maps_matter_unless_they_are_left_out(network: PaperReflectanceNetwork) -> None:
     texture, normals, visible = _face(32)
     turned, light = normals.roll(1, 1), _lights(1)
     plain = network.decode(network.encode(texture, normals, visible), normals, light)

@@ -31,16 +31,9 @@ def fit(wider: float = 0.0) -> FaceFit:
     """A frontal face; `wider` is the size of a random departure from the mean, in standard deviations."""
     model = load_face_model("builtin")
     alpha = wider * torch.randn(len(model.identity), generator=torch.Generator().manual_seed(1))
-    return FaceFit(
-        model.name,
-        CROP,
-        pose_to_rotation(0, 0, 0),
-        torch.tensor([0.0, 0.0, -1.0]),
-        alpha,
-        torch.zeros(len(model.expression)),
-        torch.zeros(68, 2),
-        0.0,
-    )
+    place = torch.tensor([0.0, 0.0, -1.0])
+    rest = torch.zeros(len(model.expression)), torch.zeros(68, 2), 0.0
+    return FaceFit(model.name, CROP, pose_to_rotation(0, 0, 0), place, alpha, *rest)
 
 
 def classes(hair_px: float = 0.0) -> Tensor:

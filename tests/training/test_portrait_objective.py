@@ -28,19 +28,9 @@ def whole(value: Tensor | float, channels: int = 3, side: int = SIDE) -> Tensor:
 def perfect() -> PortraitMaps:
     """The maps of a matt wall of albedo 0.4, all of skin."""
     few, many = whole(0, 16, SIDE // 2), whole(0, 25, SIDE // 2)
-    return PortraitMaps(
-        gain=whole(1),
-        bias=whole(0),
-        albedo=whole(0.4),
-        normals=whole(NORMAL),
-        strands=whole(NORMAL),
-        gloss=whole(0),
-        hair=whole(0, 1),
-        trust=whole(60, 1),
-        lit=few,
-        around=few,
-        shadow=many,
-    )
+    surface = {"albedo": whole(0.4), "normals": whole(NORMAL), "strands": whole(NORMAL), "gloss": whole(0)}
+    light = {"hair": whole(0, 1), "trust": whole(60, 1), "lit": few, "around": few, "shadow": many}
+    return PortraitMaps(gain=whole(1), bias=whole(0), **surface, **light)
 
 
 def truth() -> PortraitSample:
@@ -54,13 +44,7 @@ def truth() -> PortraitSample:
     targets = 0.4 * cosines.view(1, 2, 1, 1, 1).expand(1, 2, 3, SIDE, SIDE)
     return PortraitSample(
         inputs=PortraitInputs(
-            image=whole(own),
-            classes=shares,
-            normals=whole(NORMAL),
-            depth=whole(0, 1),
-            covered=whole(1, 1),
-            reached=whole(0, 16),
-            own=whole(1, 1),
+            *(whole(own), shares, whole(NORMAL), whole(0, 1), whole(1, 1), whole(0, 16), whole(1, 1)),
             sides=torch.full((1, 1, 1, 1), 3.0),
         ),
         lights=lights,

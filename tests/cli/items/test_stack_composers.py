@@ -11,6 +11,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.relighting.relightable import Relit, RenderRequest
 from facerf_cli.work.stack_composers import StackImages
+from tests.stacks import header_of
 
 SIDE = 4
 
@@ -19,16 +20,7 @@ def header() -> StackHeader:
     """A grey photo of 0.2 whose left half is a person."""
     seen = np.zeros((SIDE, SIDE), np.float32)
     seen[:, :2] = 1
-    return StackHeader(
-        kind="photo",
-        directions=np.array([[0.0, 0.0, 1.0]]),
-        rotation=np.eye(3),
-        source=np.full((SIDE, SIDE, 3), 0.2, np.float32),
-        seen=seen,
-        normals=np.ones((SIDE, SIDE, 3), np.float32),
-        layout_version=1,
-        fit={},
-    )
+    return header_of([[0.0, 0.0, 1.0]], seen, 0.2, 1.0, "photo")
 
 
 def lit(radiance: float) -> Relit:

@@ -78,7 +78,7 @@ def test_samples_are_bilinear_in_the_parts_own_textures(people: list[Appearance]
     assert found.roughness.shape == (4,) and found.relief.shape == (4, 2)
 
 
-def test_eyes_have_pupil_iris_limbus_and_sclera(people: list[Appearance]) -> None:
+def test_eyes_and_hair_have_their_colours(people: list[Appearance]) -> None:
     for person in people:
         albedo = person.materials["eye"].albedo.mean(0)
         side = albedo.shape[-1]
@@ -87,9 +87,6 @@ def test_eyes_have_pupil_iris_limbus_and_sclera(people: list[Appearance]) -> Non
         limbus, sclera = albedo[(out > 27) & (out < 28.5)].mean(), albedo[(out > 32) & (out < 50)].mean()
         assert pupil < iris < sclera and limbus < sclera
         assert pupil < 0.02 and 0.3 < sclera < 0.6
-
-
-def test_hair_is_lighter_at_its_tips_and_dark_people_have_dark_eyes() -> None:
     generator = torch.Generator().manual_seed(2)
     tips, irises = [], []
     for _ in range(24):

@@ -68,7 +68,7 @@ def test_melanin_darkens_and_blood_reddens_with_its_two_bands() -> None:
     assert at[540] < at[560] > at[580] and at[580] < at[600] < at[650]
 
 
-def test_drawn_skins_are_of_all_six_classes_and_hues_as_published() -> None:
+def test_drawn_skins_are_of_all_classes_and_hair_from_black_to_grey() -> None:
     found = bare_skin(draw_people(400, generator())).double().numpy()
     angles = ita_deg(found)
     assert angles.max() > 55 and angles.min() < -30
@@ -77,9 +77,6 @@ def test_drawn_skins_are_of_all_six_classes_and_hues_as_published() -> None:
     lab = lab_d65(found)
     assert np.percentile(lab[:, 1], 2) > 4 and np.percentile(lab[:, 1], 98) < 20
     assert np.percentile(lab[:, 2], 2) > 8 and np.percentile(lab[:, 2], 98) < 25
-
-
-def test_hair_goes_from_black_to_blond_and_grey() -> None:
     black, brown, blond = hair_albedo(torch.tensor([8.0, 1.3, 0.3]), torch.zeros(3), torch.zeros(3)).mean(-1)
     assert black < brown < blond and black < 0.02 and blond > 0.05
     red = hair_albedo(torch.tensor([0.3]), torch.tensor([1.5]), torch.zeros(1))[0]
@@ -149,7 +146,7 @@ def test_features_lie_where_the_face_has_them() -> None:
     assert at_landmark(worn, 57, (0, -0.02))[1] < 0.6 * lip[1]
 
 
-def test_freckles_and_wrinkles_appear_with_their_parameters() -> None:
+def test_freckles_appear_with_their_parameters_and_dark_skin_shines_alike() -> None:
     assert painted(freckles=1.0).std((1, 2)).mean() > 1.05 * painted().std((1, 2)).mean()
     person = picked(draw_people(1, generator()), 0)
     young, old = (
@@ -157,10 +154,6 @@ def test_freckles_and_wrinkles_appear_with_their_parameters() -> None:
         for years in (25, 72)
     )
     assert old[..., 20:60, 40:150].std() > 1.3 * young[..., 20:60, 40:150].std()  # the forehead
-
-
-def test_dark_skin_shines_as_light_skin_does() -> None:
-    person = picked(draw_people(1, generator()), 0)
     pale, dark = (
         paint_skin(altered(person, **(PLAIN | {"melanin": melanin})), Window(64), generator(8), True)
         for melanin in (0.01, 0.2)
@@ -182,7 +175,7 @@ def test_maps_are_physical_and_repeat_with_their_seed() -> None:
     assert (red > green).all() and (green > blue).all()
 
 
-def test_a_share_of_faces_wears_random_colours() -> None:
+def test_people_are_drawn_by_seed_and_a_share_wears_random_colours() -> None:
     assert 0.05 <= RANDOM_TEXTURES <= 0.07
     people = draw_people(4000, generator())
     assert 0.045 < people.random_texture.mean() < 0.075
@@ -191,10 +184,7 @@ def test_a_share_of_faces_wears_random_colours() -> None:
     spread = [np.ptp(np.arctan2(*lab_d65(x.permute(1, 2, 0).numpy())[..., 1:].reshape(-1, 2).T)) for x in
               (odd[:, 20:60, 40:150], usual[:, 60:80, 40:60])]  # fmt: skip
     assert spread[0] > 2 * spread[1]
-
-
-def test_the_same_seed_draws_the_same_people() -> None:
-    """A change here means that every shipped network is to be trained again."""
+    # A change here means that every shipped network is to be trained again.
     people, skin = draw_people(4, generator()), draw_skin(2, 32, generator())
     assert people.melanin.tolist() == pytest.approx([0.00761, 0.010765, 0.019953, 0.008225], rel=1e-4)
     assert people.hair_eumelanin.tolist() == pytest.approx([0.362061, 2.488394, 0.554631, 2.675644], rel=1e-4)

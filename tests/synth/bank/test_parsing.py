@@ -57,11 +57,15 @@ def plain(monkeypatch: Patch) -> None:
         monkeypatch.setattr(parsing, name, 0.0)
 
 
-def test_a_draw_is_a_function_of_its_generator(portraits: StoredPortraits) -> None:
+def test_a_draw_is_a_function_of_its_generator_and_an_empty_folder_none(
+    portraits: StoredPortraits, tmp_path: Path
+) -> None:
     for seed in range(12):
         one, two = drawn(portraits, seed), drawn(portraits, seed)
         assert all(torch.equal(getattr(one, name), getattr(two, name)) for name in vars(one))
         assert one.crops.min() >= 0 and one.crops.max() <= 1 and one.crops.isfinite().all()
+    with pytest.raises(InputError, match="no portraits"):
+        StoredPortraits(tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
 
 
 @pytest.mark.usefixtures("plain")
@@ -125,11 +129,6 @@ def test_crops_bodies_and_borders_without_a_person(portraits: StoredPortraits, m
     assert outside.all() and torch.equal(crop.crops[0, :, 0], crop.crops[0, :, 1])
     px = (crop.landmarks[0] * SIDE).long().clamp(0, SIDE - 1)
     assert not crop.known[0][crop.weight[0][px[:, 1], px[:, 0]] == 0].any()
-
-
-def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no portraits"):
-        StoredPortraits(tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
 
 
 @pytest.mark.usefixtures("plain")

@@ -148,12 +148,9 @@ def test_a_mirrored_sample_is_lit_from_the_other_side(folder: Path) -> None:
     assert torch.equal(mirrored(other).inputs.image, sample.inputs.image)
 
 
-def test_a_bank_without_portraits(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no portraits"):
-        StoredTransport(tmp_path, backgrounds(), {})
-
-
-def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finished_people_are_kept_and_a_bank_without_portraits_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made: list[int] = []
 
     def draw(model: str, index: int, seed: int, settings: TransportBankSettings) -> Files:
@@ -165,3 +162,5 @@ def test_finished_people_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     add_transport(tmp_path, ["a", "b"], range(2), 1, 0, SMALL)
     add_transport(tmp_path, ["a", "b"], range(3), 1, 0, SMALL)
     assert made == [0, 1, 2] and len(list(tmp_path.iterdir())) == 6
+    with pytest.raises(InputError, match="no portraits"):
+        StoredTransport(tmp_path, backgrounds(), {})

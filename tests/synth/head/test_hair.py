@@ -44,7 +44,9 @@ def without_tail(head: HeadMesh, style: HairStyle, hair: HeadMesh) -> tuple[Hair
 
 
 @pytest.mark.parametrize("name", HAIRY)
-def test_every_style_is_a_sound_mesh_of_bounded_size(hairs: Hairs, name: str) -> None:
+def test_every_style_is_a_sound_mesh_rooted_on_the_scalp_alone(
+    hairs: Hairs, name: str, head: HeadMesh
+) -> None:
     style, hair = hairs[name]
     assert 12_500 < len(hair.vertices) <= 150_000 and len(hair.triangles) <= 150_000
     assert hair.triangles.min() == 0 and hair.triangles.max() == len(hair.vertices) - 1
@@ -55,12 +57,6 @@ def test_every_style_is_a_sound_mesh_of_bounded_size(hairs: Hairs, name: str) ->
         np.testing.assert_allclose(np.linalg.norm(field, axis=-1), 1, atol=1e-4)
     assert hair.uv.min() == 0 and hair.uv.max() == 1
     assert style.name == name
-
-
-@pytest.mark.parametrize("name", HAIRY)
-def test_hair_is_rooted_on_the_scalp_and_not_on_ears_face_or_neck(
-    head: HeadMesh, hairs: Hairs, name: str
-) -> None:
     style, hair = without_tail(head, *hairs[name])
     roots = hair.vertices[hair.uv[:, 1] == 0].astype(float)
     assert (scalp_margin_m(roots, style) > -0.012).all()
@@ -71,15 +67,13 @@ def test_hair_is_rooted_on_the_scalp_and_not_on_ears_face_or_neck(
 
 
 @pytest.mark.parametrize("name", HAIRY)
-def test_eyes_nose_and_mouth_are_seen_from_the_front(hairs: Hairs, name: str) -> None:
+def test_hair_leaves_the_face_free_and_does_not_pass_through_the_skin(
+    hairs: Hairs, name: str, head: HeadMesh
+) -> None:
     _, hair = hairs[name]
     x, y, _ = hair.vertices.T
     before = (np.abs(x) < 0.045) & (np.abs(y + 0.005) < 0.045) & (hair.vertices[:, 2] > 0)
     assert not before.any()
-
-
-@pytest.mark.parametrize("name", HAIRY)
-def test_no_hair_passes_through_the_skin_or_floats_far_away(head: HeadMesh, hairs: Hairs, name: str) -> None:
     style, hair = without_tail(head, *hairs[name])
     free = hair.vertices[hair.uv[:, 1] > 0.5].astype(float)
     height = hull_of(head).height(free)
@@ -119,14 +113,11 @@ def test_outer_triangles_face_outward_and_covers_lie_where_roots_are(hairs: Hair
     assert (scalp_cover(np.array([[0.5, 0.3], [0.3, 0.5], [0.5, 0.9]]), style) == 0).all()
 
 
-def test_the_bald_have_none_and_longer_cuts_reach_lower(head: HeadMesh, hairs: Hairs) -> None:
+def test_longer_cuts_reach_lower_and_tied_hair_ends_in_its_knot(head: HeadMesh, hairs: Hairs) -> None:
     bald = draw_style(np.random.default_rng(0), "bald")
     assert len(grow_hair(head, bald, np.random.default_rng(0)).vertices) == 0
     lowest = [hairs[name][1].vertices[:, 1].min() for name in ("buzz", "bob", "long")]
     assert lowest[0] > lowest[1] > lowest[2]
-
-
-def test_tied_hair_ends_in_its_knot_and_lies_on_the_head(head: HeadMesh) -> None:
     random = np.random.default_rng(3)
     style = replace(draw_style(random, "tied"), tail="", frizz_mm=0.0, curl_mm=0.0)
     hair = grow_hair(head, style, random)

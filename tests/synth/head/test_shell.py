@@ -84,7 +84,7 @@ def loops(edges: np.ndarray) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("which", FACES)
-def test_the_skin_is_closed_but_for_neck_and_openings(which: str | int) -> None:
+def test_the_skin_is_closed_with_normals_turned_outward(which: str | int) -> None:
     mesh = head(which)
     found = loops(border(mesh, of_part(mesh, "skin")))
     heights = np.empty(len(mesh.vertices))
@@ -97,11 +97,6 @@ def test_the_skin_is_closed_but_for_neck_and_openings(which: str | int) -> None:
     assert all(np.ptp(widths[loop]) < 0.08 for loop in rims)
     expected = {"mean": 2, "jaw_open": 3, "blink": 0, "half_blink": 2}
     assert len(rims) == expected.get(str(which), len(rims)) <= 3
-
-
-@pytest.mark.parametrize("which", FACES)
-def test_normals_are_unit_and_turned_outward(which: str | int) -> None:
-    mesh = head(which)
     assert mesh.vertices.dtype == mesh.normals.dtype == mesh.uv.dtype == np.float32
     assert mesh.triangles.dtype == np.int64
     for values in (mesh.vertices, mesh.normals, mesh.uv):
