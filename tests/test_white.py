@@ -57,6 +57,15 @@ def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white(
     assert error("photo") < 0.03 < 0.3 < error("scene")
 
 
+def test_the_colour_of_shade_has_no_part_in_a_scene() -> None:
+    tint = torch.tensor([1.1, 0.8, 1.1])[:, None, None]
+    shade = torch.where(torch.arange(SIZE[1]) < 17, tint, 1)  # more than half of the skin, the darker one
+    tinted = of_colour(PALE) * shade
+    plain = balance("scene", torch.ones(3)).gain
+    torch.testing.assert_close(balance("scene", torch.ones(3), photo=tinted).gain, plain)
+    assert (balance("photo", torch.ones(3), photo=tinted).gain - plain).abs().max() > 0.05
+
+
 def test_few_grey_clipped_or_black_pixels_of_skin_change_nothing() -> None:
     few = torch.zeros(SIZE)
     few.flatten()[:499] = 1

@@ -23,6 +23,7 @@ from facerf_cli.relighting import White
 
 SURE = 0.9  # share of a class
 _BLACK = 0.15  # of the median brightness of a class: what is darker has no colour of its own
+_BY_KEY = 0.6  # quantile of it: what is darker may have the colour of another light than the scene's key
 _LEAST = 500  # pixels or texels that have a colour
 _BALANCED, _FAR = 0.3, 0.8  # difference of log chromaticities of a photo's skin from all colours of skin
 BARE = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
@@ -35,13 +36,14 @@ class Balance:
 
     `even` is the brightness of even light, from all around, under which skin is as bright as in the photo.
     `off_white` is how far the photo's skin is from all colours of skin, in log chromaticity; in most photos
-    about 0.
+    about 0. `white` says whose colours are kept.
     """
 
     gain: Tensor
     light: Tensor
     even: float
     off_white: float = 0.0
+    white: White = "photo"
 
     @staticmethod
     def of(white: White, relit: Tensor, photo: Tensor, skin: Tensor) -> "Balance":
@@ -50,11 +52,11 @@ class Balance:
         That light has the radiance 1 / 4: a surface that nothing shades receives that much of it.
         `skin` [...] is the share of skin. Grey photos, and those where little skin has a colour, keep theirs.
         """
-        chromas = _chromas(relit, photo, skin)
+        chromas = _chromas(relit, photo, skin, white)
         seen, lit = (float(luminance((one * skin).flatten(1).sum(1).numpy())) for one in (photo, relit))
         even = seen / max(4 * lit, 1e-6)
         if chromas is None:
-            return Balance(torch.ones(3), torch.zeros(2), even)
+            return Balance(torch.ones(3), torch.zeros(2), even, white=white)
         found, shown = chromas
         nearest = _nearest_skin(shown)
         off_white = float((shown - nearest).norm())
@@ -62,7 +64,7 @@ class Balance:
         if white == "scene":
             share = smoothstep(torch.tensor((off_white - _BALANCED) / (_FAR - _BALANCED)))
             wanted = torch.lerp(nearest, _nearest_skin(found), share)
-        return Balance(_gain(found, wanted), shown - wanted, even, off_white)
+        return Balance(_gain(found, wanted), shown - wanted, even, off_white, white)
 
     @property
     def is_far(self) -> bool:
@@ -76,14 +78,14 @@ class Balance:
         """
         gains = torch.ones(len(CLASSES), 3)
         for group in _GROUPS:
-            chromas = _chromas(relit, photo, classes[group].sum(0))
+            chromas = _chromas(relit, photo, classes[group].sum(0), self.white)
             if chromas is not None:
                 gains[group] = _gain(chromas[0], chromas[1] - self.light)
         person = classes[1:].sum(0).clamp_min(1e-6)
         return 1 + torch.einsum("k...,kc->c...", classes[1:] / person, gains[1:] - 1)
 
 
-def _chromas(relit: Tensor, photo: Tensor, share: Tensor) -> tuple[Tensor, Tensor] | None:
+def _chromas(relit: Tensor, photo: Tensor, share: Tensor, white: White) -> tuple[Tensor, Tensor] | None:
     """Median chromaticities [2] of what is surely of a class and has a colour: relit, and in the photo."""
     sure = share > SURE
     sure &= ~clipped(photo, sure).any(0)
@@ -91,6 +93,8 @@ def _chromas(relit: Tensor, photo: Tensor, share: Tensor) -> tuple[Tensor, Tenso
     sure &= brightness > _BLACK * brightness[sure].median()
     if sure.sum() < _LEAST or is_grey(photo):
         return None
+    if white == "scene":
+        sure &= brightness >= torch.quantile(brightness[sure], _BY_KEY)
     return _chroma(relit[:, sure]), _chroma(photo[:, sure])
 
 
