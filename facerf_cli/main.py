@@ -1,9 +1,9 @@
 """The command line: verbs, global options, errors to exit codes.
 
-A verb is a function in `facerf_cli/cli/`, named like the verb and listed under its panel in `VERBS`. typer
-needs every verb's signature before it parses the line, so this module imports all of them. To keep
-`facerf --help` fast, the modules directly in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy):
-the work of a verb is in `work/`, behind a deferred import. A test checks it.
+A verb is a function in `facerf_cli/cli/`, in the file of its name, and listed with its panel in `VERBS`; its
+file is imported when the verb runs, or its help is shown. To keep `facerf --help` fast, the modules directly
+in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a verb is behind a deferred
+import. A test checks it.
 """
 
 import atexit
@@ -14,8 +14,9 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -23,41 +24,32 @@ import typer
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.settings import DeviceName, Settings
-from facerf_cli.cli import evaluate, face_model
-from facerf_cli.cli.convert_light import convert_light
-from facerf_cli.cli.envmap import envmap
-from facerf_cli.cli.estimate_light import estimate_light
 from facerf_cli.cli.examples import epilog_of, examples_of
-from facerf_cli.cli.fit_geometry import fit_geometry
-from facerf_cli.cli.installation import check, config, doctor, read_config
 from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups
-from facerf_cli.cli.predict_olat import predict_olat
-from facerf_cli.cli.prepare_dataset import prepare_dataset
-from facerf_cli.cli.relight import relight
-from facerf_cli.cli.relight_dataset import relight_dataset
-from facerf_cli.cli.segment import segment
-from facerf_cli.cli.synth_stage import synth_stage
-from facerf_cli.cli.train import train
-from facerf_cli.cli.view import view
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals
 from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 
-_PHOTOS, _LIGHT, _DATA, _SETUP = "Photos", "Light", "Data, training, evaluation", "Installation"
-# The verbs by panel of the help, in the order of a user's day.
-VERBS: dict[str, tuple[Callable[..., Any], ...]] = {
-    _PHOTOS: (relight, view, estimate_light, predict_olat, segment, fit_geometry),
-    _LIGHT: (convert_light, envmap),
-    _DATA: (synth_stage, prepare_dataset, relight_dataset, train),
-    _SETUP: (check, doctor, config),
+# The verbs in the order of a user's day, and their panels of the help.
+VERBS = {
+    verb: panel
+    for panel, verbs in {
+        "Photos": ("relight", "view", "estimate-light", "predict-olat", "segment", "fit-geometry"),
+        "Light": ("convert-light", "envmap"),
+        "Data, training, evaluation": (
+            "synth-stage",
+            "prepare-dataset",
+            "relight-dataset",
+            "train",
+            "evaluate",
+        ),
+        "Installation": ("check", "doctor", "config", "face-model"),
+    }.items()
+    for verb in verbs
 }
-# Verbs with subcommands, and their panels; typer lists them after the verbs of a panel.
-GROUPS: dict[str, tuple[typer.Typer, str]] = {
-    "evaluate": (evaluate.app, _DATA),
-    "face-model": (face_model.app, _SETUP),
-}
+_FILES = dict.fromkeys(("check", "doctor", "config"), "installation")  # of verbs whose file has another name
 
 # The networks that verbs use; with some options they use fewer.
 _ALL = networks_of(NETWORKS) | {"light_features"}
@@ -87,7 +79,52 @@ _LONGEST_PATH = 4096  # bytes, of Linux
 _MOST_SEED = 2**63 - 1  # torch's
 _PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
 log = logging.getLogger(LOGGER_NAME)
+
+
+class _Commands(Mapping[str, Any]):
+    """The commands of all verbs, by name; each is made when it is asked for."""
+
+    def __init__(self, more: Mapping[str, Any]) -> None:
+        self._made = dict(more)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*VERBS, *self._made)))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._made and name in VERBS:
+            self._made[name] = _command(name)
+        return self._made[name]
+
+
+def _command(name: str) -> Any:
+    """The command of a verb; the file of a verb with subcommands has an app."""
+    file = import_module(f"facerf_cli.cli.{_FILES.get(name, name).replace('-', '_')}")
+    verbs = getattr(file, "app", None)
+    if verbs is None:
+        verbs = typer.Typer(add_completion=False)
+        verbs.command(name, context_settings=HELP_NAMES)(with_groups(getattr(file, name.replace("-", "_"))))
+    for one in verbs.registered_commands:
+        own = one.name or one.callback.__name__.replace("_", "-")
+        one.help = unwrapped(one.callback.__doc__ or "")
+        one.epilog = epilog_of(own if own == name else f"{name} {own}", EPILOG)
+    found = typer.main.get_command(verbs)
+    found.name, found.rich_help_panel = name, VERBS[name]  # type: ignore[attr-defined]
+    return found
+
+
+class _Verbs(typer.core.TyperGroup):
+    """The group of all verbs."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = _Commands(self.commands)  # type: ignore[assignment]
+
+
 app = typer.Typer(
+    cls=_Verbs,
     name="facerf",
     help="One photo of a face in; the face under any light, from any direction, out.",
     pretty_exceptions_enable=False,
@@ -103,6 +140,8 @@ def _print_version(wanted: bool) -> None:
 
 def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     if path is not None:
+        from facerf_cli.cli.installation import read_config
+
         context.default_map = read_config(path, context.command)
     return path
 
@@ -192,20 +231,6 @@ def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, .
             serving_files(files, USES.get(verb, ()), f"facerf {verb}")
         return files
     return files if verb in USES else ()
-
-
-for _panel, _verbs in VERBS.items():
-    for _verb in _verbs:
-        _add = app.command(context_settings=HELP_NAMES, rich_help_panel=_panel)
-        _add(with_groups(_verb))
-for _name, (_group, _panel) in GROUPS.items():
-    app.add_typer(_group, name=_name, rich_help_panel=_panel)
-for _above, _verbs_of in (("", app), *((f"{name} ", group) for name, (group, _) in GROUPS.items())):
-    for _command in _verbs_of.registered_commands:
-        assert _command.callback is not None
-        _verb_name = _above + (_command.name or _command.callback.__name__.replace("_", "-"))
-        _command.help = unwrapped(_command.callback.__doc__ or "")
-        _command.epilog = epilog_of(_verb_name, EPILOG)
 
 
 def run() -> None:

@@ -18,9 +18,6 @@ from torch import Tensor
 
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.baselines.base import Explained, Reflectance
-from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh
-from facerf_cli.baselines.prt import explain_by_prt
-from facerf_cli.baselines.specular_sh import explain_by_specular_sh
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import FitStart, Geometry, fit_landmarks, regressed_fit, trust_inside
@@ -218,12 +215,13 @@ def explain(
     if kind == "field":
         light = estimate_light(models, head, estimator=estimator).light
         return Explained(reflectance_of(models, head, kind, network_alone), light)
-    baselines = {
-        "diffuse-sh": explain_by_diffuse_sh,
-        "specular-sh": explain_by_specular_sh,
-        "prt": explain_by_prt,
-    }
-    return baselines[kind](models, head.fit, head.face)
+    if kind == "diffuse-sh":  # relighting by the fields loads none of these
+        from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh as explained
+    elif kind == "specular-sh":
+        from facerf_cli.baselines.specular_sh import explain_by_specular_sh as explained
+    else:
+        from facerf_cli.baselines.prt import explain_by_prt as explained
+    return explained(models, head.fit, head.face)
 
 
 def predict_olat(

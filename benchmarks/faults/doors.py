@@ -177,13 +177,12 @@ def _configuration(path: Path) -> None:
 
 
 def _index(path: Path) -> None:
-    from facerf_cli.batch.made_from import FolderIndex, check_outputs
-    from facerf_cli.batch.settings import Shard
+    from facerf_cli.batch.made_from import FolderIndex, check_outputs, keyed
 
     list(check_outputs(path.parent))
-    index = FolderIndex(path.parent, "segment", Shard(), lambda _: [{"verb": "segment", "files": {}}])
-    index.why_again(path, [path.parent / "x.png"])
-    index.open()
+    recipes, index = keyed([{"verb": "segment", "files": {}}]), FolderIndex(path.parent, "segment")
+    index.why_again(path, [path.parent / "x.png"], recipes)
+    index.open(recipes, has_work=True)
 
 
 def _report(path: Path) -> None:

@@ -1,10 +1,9 @@
-"""Recipes of outputs, and a folder's index of them, so that only stale ones are made again.
+"""Keys of outputs, and a folder's index of them, so that only stale ones are made again.
 
-A recipe is all that shapes an output, apart from its input.
-
-`.facerf-index.jsonl` holds three kinds of rows: files that were read (size, time, inode and SHA-256, so that
-an unchanged file is not read again), recipes, and outputs (their recipe, input and SHA-256). The last
-row of a name counts. With `--shard` each process writes an index of its own and reads all.
+A key joins the digests of an output's recipe (all options and files that shape it) and of its input.
+`.facerf-index.jsonl` has a row for each output (its key and SHA-256), for each recipe, and for each file
+that was read (size, time, inode and SHA-256: an unchanged one is not read again). The last row of a name
+counts. With `--shard` each process writes an index of its own and reads all.
 """
 
 import dataclasses
@@ -16,7 +15,7 @@ import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,48 +23,31 @@ from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256, is_regular, parse_json, regular_size, require_regular
+from facerf_cli.option import flag
 from facerf_cli.run.logs import json_line
 
 RESULTS_VERSION = 21  # raised where the same recipe gives other pixels
 SHIPPED = Path(__file__).parents[1] / "assets"
-
 # Entries of recipes that are not called as the option that sets them is.
 _OPTIONS = {
-    "colour": "the colour of --background",
     "colourspace": "--input-colourspace",
     "config": "--ocio",
-    "data": "the data",
     "dataset_format": "facerf's version of datasets",
-    "kind": "--background",
-    "leaders": "the first photo of --exposure-group",
-    "matte_model": "the model of --matte-from",
-    "names": "the layers of --light",
     "non_negative": "--signed",
-    "ocio_config": "--ocio",
-    "path": "the image of --background",
     "photo_of_stack": "--photo",
     "results": "facerf's version of results",
-    "pattern": "the pattern of the capture",
     "rig": "--lights",
     "sampling": "--envmap-sampling",
-    "size_px": "--size",
-    "stage_cameras": "the cameras of the capture",
-    "stage_lights": "the lights of the capture",
-    "stage_values": "the intensities, colours or --colour-chart of the capture",
     "texture_side": "--texture-size",
-    "width_px": "--width",
 }
 
+Row = dict[str, Any]
 Recipe = dict[str, Any]  # names and JSON values
 DigestOf = Callable[[Path], str]  # SHA-256 of a file
 RecipesOf = Callable[[DigestOf], Sequence[Recipe]]  # of each output of an item, or one for all of them
+Keyed = Sequence[tuple[str, Recipe]]  # recipes with their digests
 _INDEXES = ".facerf-index*.jsonl"
-Row = dict[str, Any]
-
-
-def one_recipe(settings: Any) -> RecipesOf:
-    """The recipe of all outputs of a verb: the fields of its settings."""
-    return lambda digest_of: [recipe_of(settings, digest_of)]
+_INPUT = 16  # digits of an input's digest in a key
 
 
 def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
@@ -84,22 +66,14 @@ def key_of(recipe: Recipe) -> str:
     return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]
 
 
-def differences(old: Recipe, new: Recipe) -> str:
-    """Say which options of a recipe changed, as they are typed; empty if none did."""
-    parts = []
-    for name in sorted(old.keys() | new.keys()):
-        before, now = old.get(name), new.get(name)
-        if before != now:
-            both = [_short(value) for value in (before, now)]
-            said = _OPTIONS.get(name, f"--{name.replace('_', '-')}")
-            parts.append(f"{said} is {both[1]}, was {both[0]}" if both[0] != both[1] else f"{said} changed")
-    return "; ".join(parts)
-
-
-def _short(value: Any) -> str:
-    text = "not set" if value is None else str(value)
-    is_content = isinstance(value, (list, dict)) or text.startswith("sha256:")
-    return "another" if is_content or len(text) > 40 else text
+def other_options(old: Recipe, new: Recipe) -> str:
+    """Name the options in which two recipes differ, as they are typed."""
+    names = sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
+    return (
+        "other options"
+        + (": " if old and names else "")
+        + ", ".join(_OPTIONS.get(name, flag(name)) for name in names if old)
+    )
 
 
 def _add_fields(recipe: Recipe, settings: Any, digest_of: DigestOf) -> None:
@@ -198,32 +172,10 @@ def lines_of(rows: Iterable[Mapping[str, Any]]) -> str:
     return "".join(json_line(row) + "\n" for row in rows)
 
 
-class _Rows:
-    """The rows of the indexes of a folder: files by path, recipes by key, outputs by path in the folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.files: dict[str, Row] = {}
-        self.recipes: dict[str, Recipe] = {}
-        self.outputs: dict[str, Row] = {}
-        for path in sorted(folder.glob(_INDEXES)):
-            for row in json_rows(path):
-                self._take(row)
-
-    def _take(self, row: Row) -> None:
-        if isinstance(row.get("of"), dict):
-            self.recipes[str(row.get("recipe"))] = row["of"]
-        elif "output" in row:
-            name = str(row["output"])
-            if not name.startswith("/") and ".." not in name.split("/"):
-                self.outputs[name] = row
-        elif "sha256" in row:
-            self.files[str(row.get("file"))] = row
-
-
 def require_same(before: Recipe, now: Recipe, said: str, advice: str) -> None:
-    """Raise UsageError, `SAID: --option is ..., was ...; ADVICE`, where two recipes differ."""
+    """Raise UsageError, `SAID: other options: --size; ADVICE`, where two recipes differ."""
     if before != now:
-        raise UsageError(f"{said}: {differences(before, now)}; {advice}")
+        raise UsageError(f"{said}: {other_options(before, now)}; {advice}")
 
 
 def text_of_state(path: Path) -> str:
@@ -245,7 +197,7 @@ def is_made_from(path: Path, text: str) -> bool:
 
 def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
     """Read all outputs in a folder's index; yield each, and `whole`, `missing`, `empty` or `changed`."""
-    for name, row in sorted(_Rows(folder).outputs.items()):
+    for name, row in sorted(FolderIndex(folder).outputs.items()):
         path = folder / name
         if not is_regular(path):
             yield path, "missing"
@@ -256,24 +208,35 @@ def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class FolderIndex:
-    """The index of one verb in an output folder, for the recipes of this run."""
+    """The index of an output folder: outputs, by their path in it, and their keys; files; recipes."""
 
-    def __init__(self, folder: Path, verb: str, shard: Shard, recipes_of: RecipesOf) -> None:
+    def __init__(self, folder: Path, verb: str = "", shard: Shard = Shard()) -> None:  # noqa: B008 (frozen)
         self._folder, self._verb = folder, verb
         self._prefix = os.path.join(folder, "")
-        self._rows = _Rows(folder)
-        self._new: list[Row] = []  # files read since the rows were last written
-        self.edited: list[Path] = []  # finished outputs that are not as they were written
         self.path = folder / f".facerf-index{shard.suffix}.jsonl"
-        self.want(recipes_of)
+        self.outputs: dict[str, Row] = {}
+        self._files: dict[str, Row] = {}
+        self._recipes: dict[str, Recipe] = {}
+        for path in sorted(folder.glob(_INDEXES)):
+            for row in json_rows(path):
+                self._take(row)
+        self._new: list[Row] = []  # files read since the rows were last written
 
-    def want(self, recipes_of: RecipesOf) -> None:
-        """Judge outputs by other recipes from now on."""
-        self._wanted = [(key_of(recipe), recipe) for recipe in recipes_of(self.digest_of)]
+    def _take(self, row: Row) -> None:
+        if isinstance(row.get("of"), dict):
+            self._recipes[str(row.get("recipe"))] = row["of"]
+        elif "output" in row:
+            name = str(row["output"])
+            if not name.startswith("/") and ".." not in name.split("/"):
+                self.outputs[name] = row
+                if "recipe" in row:  # of facerf 0.1
+                    row["key"] = _key(str(row["recipe"]), str(row.get("input")))
+        elif "sha256" in row:
+            self._files[str(row.get("file"))] = row
 
     def digest_of(self, path: Path) -> str:
         """SHA-256 of a file; an unchanged one that the index knows is not read. Raises InputError."""
-        known = self._rows.files.get(os.path.abspath(path))
+        known = self._files.get(os.path.abspath(path))
         try:
             state = os.stat(path)
             is_file = not stat.S_ISDIR(state.st_mode)  # a folder's own state says nothing of its files
@@ -285,84 +248,66 @@ class FolderIndex:
             self._note(known)
         return str(known["sha256"])
 
-    def why_again(self, input_path: Path, outputs: Sequence[Path]) -> tuple[str | None, frozenset[Path]]:
-        """Say why an item must be made, and which of its outputs; None if it is finished.
-
-        The reason is empty where they never were made.
-        """
-        stale: dict[Path, str] = {}
-        input_digest = cache(lambda: self._digest_or_none(input_path))
+    def why_again(self, read: Path, outputs: Sequence[Path], recipes: Keyed) -> dict[Path, str]:
+        """The outputs of an input that must be made, and why: '' where they never were."""
+        stale, digest = {}, None
         for number, path in enumerate(outputs):
-            reason = self._why(number, path, input_digest)
-            if reason is not None:
-                stale[path] = reason
-        self.edited += [path for path in outputs if path not in stale and self._is_edited(path)]
-        if not stale:
-            return None, frozenset()
-        return next(filter(None, stale.values()), ""), frozenset(stale)
+            row, size = self.outputs.get(self._name(path)), regular_size(path)
+            if size is None:
+                stale[path] = "" if row is None else "an output is missing"
+                continue
+            if row is None or row.get("verb") != self._verb:
+                stale[path] = "there is no record of what they were made from"
+                continue
+            key, recipe = _of_output(recipes, number)
+            before, _, read_before = str(row.get("key")).partition(" ")
+            digest = digest or self._digest_or_none(read)
+            if before != key:
+                stale[path] = f"made from {other_options(self._recipes.get(before, {}), recipe)}"
+            elif read_before != digest[:_INPUT]:
+                stale[path] = "made from another input"
+            elif size == 0:
+                stale[path] = "an output is empty"
+        return stale
 
-    def _why(self, number: int, path: Path, input_digest: Callable[[], str | None]) -> str | None:
-        row = self._rows.outputs.get(self._name(path))
-        size = regular_size(path)
-        if size is None:
-            return "" if row is None else "an output is missing"
-        if row is None or row.get("verb") != self._verb:
-            return "there is no record of what they were made from"
-        key, recipe = self._wanted_of(number)
-        if row.get("recipe") != key:
-            old = self._rows.recipes.get(str(row.get("recipe")), {})
-            return differences(old, recipe) or "other options" if old else "other options"
-        if input_digest() != row.get("input"):
-            return "the input changed"
-        if size == 0:
-            return "an output is empty"
-        return None
+    def is_edited(self, path: Path) -> bool:
+        """True if an output is not as it was written."""
+        return self._digest_or_none(path) != self.outputs[self._name(path)].get("sha256")
 
-    def _is_edited(self, path: Path) -> bool:
-        return self._digest_or_none(path) != self._rows.outputs[self._name(path)].get("sha256")
-
-    @property
-    def has_news(self) -> bool:
-        """True if files were read that the rows do not know."""
-        return bool(self._new)
-
-    def open(self) -> None:
-        """Write the rows, those that are known and those of this run's recipes."""
-        self._rows.recipes.update(self._wanted)
+    def open(self, recipes: Keyed, has_work: bool) -> None:
+        """Write the rows, for the outputs that follow, or since files were read that they do not know."""
+        if not (has_work or self._new):
+            return
+        self._recipes.update(recipes)
         self._new.clear()
-        rows: list[Mapping[str, Any]] = list(self._rows.files.values())
-        rows += [{"recipe": key, "of": recipe} for key, recipe in self._rows.recipes.items()]
-        rows += self._rows.outputs.values()
+        rows: list[Mapping[str, Any]] = list(self._files.values())
+        rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
+        rows += self.outputs.values()
         with atomic_path(self.path) as temporary:
             temporary.write_text(lines_of(rows), encoding="utf-8")
 
-    def add(self, made: Made, outputs: Sequence[Path]) -> None:
+    def add(self, made: Made, outputs: Sequence[Path], recipes: Keyed) -> None:
         """Add the rows of an item that was made; `outputs` are those that have a recipe, in their order."""
-        rows: list[Row] = []
         self._note(made.read)
-        keys = {self._name(path): self._wanted_of(number)[0] for number, path in enumerate(outputs)}
+        keys = {self._name(path): _of_output(recipes, number)[0] for number, path in enumerate(outputs)}
+        rows: list[Row] = []
         for row in made.outputs:
             self._note(row)
             name = self._name(Path(row["file"]))
-            made_from = {"input": made.read["sha256"], "recipe": keys.get(name)}
-            rows.append({"output": name, "verb": self._verb, "sha256": row["sha256"], **made_from})
-        rows += self._new
-        self._new.clear()
+            key = _key(keys.get(name, ""), made.read["sha256"])
+            rows.append({"output": name, "verb": self._verb, "sha256": row["sha256"], "key": key})
         with self.path.open("a", encoding="utf-8") as stream:
-            stream.write(lines_of(rows))
+            stream.write(lines_of([*rows, *self._new]))
+        self._new.clear()
 
-    def _wanted_of(self, number: int) -> tuple[str, Recipe]:
-        """Key and recipe of an item's output, or those of all of them."""
-        return self._wanted[number if len(self._wanted) > 1 else 0]
-
-    def _digest_or_none(self, path: Path) -> str | None:
+    def _digest_or_none(self, path: Path) -> str:
         try:
             return self.digest_of(path)
         except InputError:
-            return None  # its item says so
+            return "none"  # its item says so
 
     def _note(self, row: Row) -> None:
-        self._rows.files[str(row["file"])] = row
+        self._files[str(row["file"])] = row
         self._new.append(row)
 
     def _name(self, path: Path) -> str:
@@ -370,6 +315,20 @@ class FolderIndex:
         if text.startswith(self._prefix) and ".." not in text:  # as all of a verb's; ten times faster
             return text[len(self._prefix) :].replace(os.sep, "/")
         return Path(os.path.relpath(path, self._folder)).as_posix()
+
+
+def keyed(recipes: Sequence[Recipe]) -> Keyed:
+    """Recipes with their digests."""
+    return [(key_of(recipe), recipe) for recipe in recipes]
+
+
+def _of_output(recipes: Keyed, number: int) -> tuple[str, Recipe]:
+    """The recipe of an item's output, or that of all of them."""
+    return recipes[number if len(recipes) > 1 else 0]
+
+
+def _key(recipe: str, input_sha256: str) -> str:
+    return f"{recipe} {input_sha256[:_INPUT]}"
 
 
 def _state(state: os.stat_result) -> dict[str, int]:

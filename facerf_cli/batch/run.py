@@ -1,8 +1,7 @@
 """The contract of every verb that walks folders: what is read, skipped, written and reported.
 
-A verb passes functions to `run_items`: `outputs_of(item)` names the files of a finished item,
-`process(item)` makes them, and `recipes_of` says what else shapes them. `process` raises `InputError` for a
-faulty item (the run continues); any other `FacerfError` concerns the whole run and ends it.
+A verb passes a `Job` to `run_items`. It raises `InputError` for a faulty item (the run continues); any
+other `FacerfError` concerns the whole run and ends it.
 """
 
 import logging
@@ -13,14 +12,24 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from facerf_cli.batch.inputs import Item, NamePattern, file_pattern, files_read, refuse_read
-from facerf_cli.batch.made_from import FolderIndex, Made, RecipesOf, json_rows, lines_of, read_row
+from facerf_cli.batch.made_from import (
+    DigestOf,
+    FolderIndex,
+    Keyed,
+    Made,
+    Recipe,
+    json_rows,
+    keyed,
+    lines_of,
+    read_row,
+)
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
@@ -29,7 +38,7 @@ from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, escaped, printable_line, progress_bar, unexpected
 from facerf_cli.run.stopping import end_again
-from facerf_cli.run.workers import Workers, process_died, spread
+from facerf_cli.run.workers import Workers, ending, process_died, spread
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -38,9 +47,42 @@ REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
 log = logging.getLogger(LOGGER_NAME)
 
 
+class Job:
+    """The work of a verb on each of its items; a frozen dataclass, which workers get in other processes."""
+
+    @property
+    def verb(self) -> str:
+        """Its name, for the report and the index."""
+        raise NotImplementedError
+
+    def outputs_of(self, item: Item) -> Sequence[Path]:
+        """The files of a finished item."""
+        raise NotImplementedError
+
+    def recipes_of(self, digest_of: DigestOf) -> Sequence[Recipe]:
+        """List what shapes each output besides its input, or all; without recipes what exists is finished."""
+        return ()
+
+    def ready(self, dry_run: bool) -> Self:
+        """Load what all items need; not called where all is finished.
+
+        Returns the job, or one that lacks the outputs that cannot be made, which are then a failure.
+        """
+        return self
+
+    def __call__(self, item: Item) -> "Outcome":
+        """Make the outputs of an item, or those that are stale."""
+        raise NotImplementedError
+
+    @property
+    def process(self) -> Callable[[Item], "Outcome"]:
+        """A function that does that; picklable."""
+        return self
+
+
 @dataclass(frozen=True)
 class Outcome:
-    """The result of `process`: the files it wrote, and facts for the report's row."""
+    """The result of a `Job`: the files it wrote, and facts for the report's row."""
 
     outputs: Sequence[Path]
     facts: Mapping[str, Any] = field(default_factory=dict)
@@ -198,38 +240,14 @@ class BatchOptions:
         return Workers(jobs, self.ray, int(settings.device == "cuda"), self.in_a_row)
 
 
-def run_items(
-    verb: str,
-    items: Sequence[Item],
-    process: Callable[[Item], Outcome],
-    outputs_of: Callable[[Item], Sequence[Path]],
-    options: BatchOptions,
-    settings: Settings,
-    recipes_of: RecipesOf | None = None,
-    prepare: Callable[[], object] | None = None,
-    index: FolderIndex | None = None,
-) -> int:
+def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: Settings) -> int:
     """Process this process's share of the items; return the exit code: 0 all done, 1 some failed.
 
-    Args:
-        verb: Its name, for the report and the index.
-        items: Files (`collect_items`), or other inputs. A file that is missing is an error of its item.
-        process: Makes the outputs of an item; picklable, since workers may call it in other processes.
-        outputs_of: The files of a finished item. It is finished if they exist and, with `recipes_of`, were
-            made from the same input by the same recipe.
-        options: Where outputs go, what is made again, the number of jobs; the share, which has a report of
-            its own.
-        settings: The global options.
-        recipes_of: The recipes of the outputs.
-        prepare: Called once before the first item, in a dry run too, but not where everything is finished:
-            it loads what `process` needs, so that an error in that is reported once.
-        index: The index that was read already, in place of that of `recipes_of`.
-
-    Raises:
-        UsageError: The output folder cannot be used, or an output is a file to be read.
+    Raises UsageError where the output folder cannot be used, or an output is a file to be read.
     """
-    refuse_read((path for item in items for path in outputs_of(item)), files_read((items, process), items))
-    items = options.shard.share(items)
+    outputs = (path for item in items for path in job.outputs_of(item))
+    refuse_read(outputs, files_read((items, job), items))
+    items, verb = options.shard.share(items), job.verb
     is_new, lock_name = not options.output.exists(), f".facerf-lock{options.shard.suffix}"
     with ExitStack() as stack:
         if not options.dry_run:
@@ -237,64 +255,70 @@ def run_items(
                 stack.enter_context(alone_in(options.output, lock_name))
             except OSError as error:
                 raise unusable(options.output, error) from error
-        if index is None and recipes_of:
-            index = FolderIndex(options.output, verb, options.shard, recipes_of)
-        states = {item: _why_again(item, outputs_of(item), options, index) for item in items}
-        todo = [replace(item, stale=stale) for item, (reason, stale) in states.items() if reason is not None]
-        finished = [item for item, (reason, _) in states.items() if reason is None]
-        again = Counter(reason for reason, _ in states.values() if reason)
-        if todo and prepare:
-            prepare()
+        index = FolderIndex(options.output, verb, options.shard)
+        recipes = keyed(job.recipes_of(index.digest_of))
+        stale = _stale(job, items, recipes, options, index)
+        lacks = 0
+        if any(stale.values()):
+            usable = job.ready(options.dry_run)
+            if usable is not job:
+                lacks, job, recipes = 1, usable, keyed(usable.recipes_of(index.digest_of))
+                stale = _stale(job, items, recipes, options, index)
+        todo = [replace(item, stale=frozenset(paths)) for item, paths in stale.items() if paths]
+        finished = [item for item, paths in stale.items() if not paths]
+        again = Counter(next(filter(None, paths.values()), "") for paths in stale.values())
         if options.dry_run:
             _log_made_again(again)
-            return _list_what_would_be_done(todo, finished, outputs_of)
+            return max(lacks, _list_what_would_be_done(todo, finished, job))
         report = options.output / f"report{options.shard.suffix}.jsonl"
-        open_report(report, verb, todo, finished, outputs_of)
-        if index and (todo or index.has_news):
-            index.open()
+        open_report(report, verb, todo, finished, job.outputs_of)
+        if recipes:
+            index.open(recipes, bool(todo))
         if finished:
             advice = "" if options.overwrite == "never" else " from the same inputs and options"
             log.info("%d of %d already finished%s", len(finished), len(items), advice)
         _log_made_again(again)
-        if index and index.edited:
-            kept = "%d outputs were changed after they were written; they are kept (--overwrite always)"
-            log.warning(kept, len(index.edited))
+        if recipes and options.overwrite == "changed":
+            kept = [set(job.outputs_of(item)) - set(stale[item]) for item in items]
+            if edited := sum(map(index.is_edited, set().union(*kept))):
+                advice = "%d outputs were changed after they were written; they are kept (--overwrite always)"
+                log.warning(advice, edited)
         failures, workers = 0, options.workers(settings)
         at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
-        work = partial(_run_one, process, index is not None, settings.job_bytes(at_once))
+        work = partial(_run_one, job.process, bool(recipes), settings.job_bytes(at_once))
         memory.collect_as_usual()
         try:
-            with _progress(settings) as progress, closing(spread(work, todo, workers, _broken)) as results:
+            with _progress(settings) as progress, ending(spread(work, todo, workers, _broken)) as results:
                 task = progress.add_task(verb, total=len(todo))
                 for result in results:
                     if result.stops_the_run is not None:
                         raise result.stops_the_run
-                    if index and result.made:
-                        index.add(result.made, outputs_of(result.item))
+                    if result.made:
+                        index.add(result.made, job.outputs_of(result.item), recipes)
                     add_row(report, verb, result)
                     failures += _print_result(result, options)
                     progress.advance(task)
         finally:
             if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
-                for folder in {path.parent for item in todo for path in outputs_of(item)}:
+                for folder in {path.parent for item in todo for path in job.outputs_of(item)}:
                     sweep_leftovers(folder)
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
         elif failures and is_new:
-            records = [report, options.output / lock_name, *([index.path] if index else [])]
+            records = [report, options.output / lock_name, *([index.path] if recipes else [])]
             _remove_what_is_empty(options.output, records)
-        return 1 if failures else 0
+        return max(lacks, int(failures > 0))
 
 
-def all_finished(
-    items: Sequence[Item],
-    outputs_of: Callable[[Item], Sequence[Path]],
-    options: BatchOptions,
-    index: FolderIndex,
-) -> bool:
-    """True if this process's share of the items is finished, so that nothing needs to be loaded."""
-    share = options.shard.share(items)
-    return all(_why_again(item, outputs_of(item), options, index)[0] is None for item in share)
+def _stale(
+    job: Job, items: Sequence[Item], recipes: Keyed, options: BatchOptions, index: FolderIndex
+) -> dict[Item, dict[Path, str]]:
+    """The outputs of each item that must be made, and why; see `FolderIndex.why_again`."""
+    if options.overwrite == "changed" and recipes:
+        return {item: index.why_again(item.input_path, job.outputs_of(item), recipes) for item in items}
+    keep = options.overwrite != "always"
+    each = {item: job.outputs_of(item) for item in items}
+    return {item: {} if keep and _exist(paths) else dict.fromkeys(paths, "") for item, paths in each.items()}
 
 
 def sums_up(
@@ -350,17 +374,6 @@ def _broken(item: Item, error: Exception) -> ItemResult:
     return ItemResult(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
 
 
-def _why_again(
-    item: Item, outputs: Sequence[Path], options: BatchOptions, index: FolderIndex | None
-) -> tuple[str | None, frozenset[Path]]:
-    """Say why an item must be made, and which of its outputs; see `FolderIndex.why_again`."""
-    if options.overwrite == "always":
-        return "", frozenset(outputs)
-    if options.overwrite == "never" or index is None:
-        return (None, frozenset()) if _exist(outputs) else ("", frozenset(outputs))
-    return index.why_again(item.input_path, outputs)
-
-
 def _exist(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(map(_is_there, outputs))
 
@@ -381,14 +394,13 @@ def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
 
 def _log_made_again(reasons: Counter[str]) -> None:
     for reason, count in sorted(reasons.items()):
-        log.info("%d made again: %s", count, reason)
+        if reason:
+            log.info("%d made again: %s", count, reason)
 
 
-def _list_what_would_be_done(
-    todo: Sequence[Item], finished: Sequence[Item], outputs_of: Callable[[Item], Sequence[Path]]
-) -> int:
+def _list_what_would_be_done(todo: Sequence[Item], finished: Sequence[Item], job: Job) -> int:
     for item in todo:
-        for path in outputs_of(item):
+        for path in job.outputs_of(item):
             print_path(f"{item.input_path} -> {path}")
     log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
     missing = [item for item in (*todo, *finished) if item.is_file and not os.path.exists(item.input_path)]

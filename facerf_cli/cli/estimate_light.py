@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import typer
 
@@ -44,12 +45,14 @@ class EstimateLight(PhotoWork, LightOptions):
             )
         return replace(self, shots=Shots(shots)).run_on(whole_shots(items, shots), batch)
 
-    def prepare(self) -> None:
-        """Load the network whose features are compared."""
+    def ready(self, dry_run: bool) -> Self:
+        """Load what every photo needs, and the network whose features are compared."""
         from facerf_cli.work.light_of_photo import feature_network
 
-        if self.refine == "features":
+        super().ready(dry_run)
+        if self.refine == "features" and not dry_run:
             feature_network(self)
+        return self
 
     def write(self, item: Item) -> Written:
         """Estimate the light of every chosen face, or that of a shot."""

@@ -13,7 +13,10 @@ from facerf_cli.evaluation.options import EvaluateOptions, has_own_field_alone
 from facerf_cli.option import Only, Without
 from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptions
 
-app = typer.Typer(help="Measure the paper's tables on prepared data and photos, and other methods' images.")
+app = typer.Typer(
+    add_completion=False,
+    help="Measure the paper's tables on prepared data and photos, and other methods' images.",
+)
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
 _BATCH = ("output", "measures", "overwrite", "dry_run", "jobs", "shard", "ray")

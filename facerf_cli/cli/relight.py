@@ -3,24 +3,73 @@
 import itertools
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import typer
 
-from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, files_read, refuse_read
-from facerf_cli.batch.made_from import FolderIndex
-from facerf_cli.batch.run import BatchOptions, Outcome, all_finished, print_path, run_items
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, files_read, refuse_read
+from facerf_cli.batch.made_from import DigestOf, Recipe
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, print_path, run_items
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.option import Without
-from facerf_cli.work.light_setups import LightSetup, LightSources
-from facerf_cli.work.output_options import NEEDS, STDOUT, check_stdout, format_of_file
-from facerf_cli.work.relight_options import Relight
+from facerf_cli.work.light_setups import LightSetup, LightSources, PhotoLight
+from facerf_cli.work.output_options import NEEDS, STDOUT, SUFFIXES, check_stdout, format_of_file
+from facerf_cli.work.photo_options import networks_of
+from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
+
+
+@dataclass(frozen=True)
+class RelightJob(Job):
+    """The images of a plan, as a batch makes them."""
+
+    plan: RelightPlan
+    verb = "relight"
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """A file of each format for each setup."""
+        return self.plan.outputs_of(item)
+
+    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+        """The recipe of each file."""
+        return self.plan.recipes_of(digest_of)
+
+    def ready(self, dry_run: bool) -> Self:
+        """Load the models, and keep the setups whose maps can be read.
+
+        A dry run loads no networks, and so estimates no light of a photo.
+        """
+        from facerf_cli.work.lights import readable
+        from facerf_cli.work.outputs import check_output
+        from facerf_cli.work.photos import prepare_photos
+
+        check_output(self.plan.options.output)
+        maps = [setup.envmap.envmap for setup in self.plan.setups if setup.envmap]
+        lights = [envmap.options for envmap in maps if isinstance(envmap, PhotoLight)]
+        uses = networks_of([self.plan.options.reflectance]).union(*(light.networks for light in lights))
+        prepare_photos(self.plan.photo, uses, with_networks=not dry_run)
+        if self.plan.shots.all and not dry_run:
+            from facerf_cli.work.sequence import follow_all
+
+            follow_all(self.plan.shots.all, self.plan.photo)
+        if lights and dry_run:
+            return self
+        setups = readable(self.plan.setups)
+        if not setups:
+            raise FacerfError("none of the maps serves; give others, or procedural:8 to draw some")
+        return self if len(setups) == len(self.plan.setups) else RelightJob(replace(self.plan, setups=setups))
+
+    @property
+    def process(self) -> Callable[[Item], Outcome]:
+        """Relights an item."""
+        from facerf_cli.work.relight import relight_item
+
+        return partial(relight_item, self.plan)
 
 
 def relight(
@@ -38,7 +87,7 @@ def relight(
         ),
     ],
     sources: LightSources,
-    work: Relight,
+    options: RelightOptions,
     shots: ShotOptions,
     batch: Annotated[BatchOptions, Without("output", "name")],
 ) -> None:
@@ -53,12 +102,16 @@ def relight(
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
     --light between them is a sum of the three around it.
     """
-    file, formats = format_of_file(output), work.output.formats
-    film = None if file else film_output(output, work.fps)
+    file, formats = format_of_file(output), options.output.formats
+    film = None if file else film_output(output, options.fps)
     if file is not None:
         formats = (file,) if is_default(context, "formats") else formats
         refuse_given(context, ("ball", "name", "fps"), f"is not for -o {output}, one image; leave it out")
-        work, output = work.into_file(output, file, formats), output.parent
+        if [SUFFIXES[name] for name in formats] != [SUFFIXES[file]]:
+            raise UsageError(f"-o {output}: is not what --format says; leave that out, or give a folder")
+        one_file = replace(options.output, file_suffix=output.suffix)
+        options = replace(options, output=one_file, name=NamePattern.literal(output.stem))
+        output = output.parent
     elif film is not None:
         refuse_given(context, ("formats", "ball", "name"), f"is not for -o {output}; leave it out")
         formats, output = film.formats, film.folder
@@ -69,46 +122,35 @@ def relight(
     for name, needed in NEEDS.items():
         if not set(needed) & set(formats):
             refuse_given(context, (name,), f"is for {', '.join(needed)}; add that to --format")
-    work = replace(work, output=replace(work.output, formats=formats))
-    batch = replace(batch, output=output, name=work.name)
-    work = work.checked(sources, batch, film)
+    options = replace(options, output=replace(options.output, formats=formats))
+    plan = plan_relight(options, sources, output)
+    if (
+        film
+        and not film.holds_alpha
+        and (plan.options.background.kind == "none" or plan.options.composite == "face")
+    ):
+        raise UsageError(f"-o {film.path}: has no alpha; give FILE.mov, a folder, or --background COLOUR")
     if output == STDOUT:
-        _write_to_stdout(inputs, work)
+        _write_to_stdout(inputs, plan)
         return
-    if work.ball and not work.maps:
-        raise UsageError("--ball: shows maps; give --envmap, or leave it out")
-    items, taken = collect_frames(inputs, shots, batch, work.photo)
-    if work.photo_of_stack is not None and not _holds_a_stack(items):
+    batch = replace(batch, output=output, name=options.name)
+    items, taken = collect_frames(inputs, shots, batch, plan.photo)
+    if options.photo_of_stack is not None and not _holds_a_stack(items):
         raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
+    plan = plan.of_items(items, Shots(taken))
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
-    work = replace(work.with_leaders(items), shots=Shots(taken))
-    work.refuse_meeting(items)
-    images = [path for item in items for path in work.outputs_of(item)]
-    balls = [path for setup in work.maps if work.ball for path in _balls_of(setup, work, output)]
-    refuse_read([film.path] if film else images + balls, files_read((items, work, sources), items))
-    key = film.key_of_new(items, taken, images, work.recipes_of, batch) if film else ""
+    images = [path for item in items for path in plan.outputs_of(item)]
+    balls = [path for setup in plan.maps if options.ball for path in _balls_of(setup, plan, output)]
+    refuse_read([film.path] if film else balls, files_read((items, plan, sources), items))
+    key = film.key_of_new(items, taken, images, plan.recipes_of, batch) if film else ""
     if film is not None and not key:
         return
-    index = FolderIndex(output, "relight", batch.shard, work.recipes_of)
-    usable, finished = work, all_finished(items, work.outputs_of, batch, index)
-    index.edited.clear()  # they are judged again
-    if not finished:
-        usable = work.readable(batch.dry_run)
-        index.want(usable.recipes_of)
-    process, settings = partial(_relit, usable), work.photo.settings
-    code = run_items("relight", items, process, usable.outputs_of, batch, settings, index=index)
+    code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
     if film is not None:
-        raise typer.Exit(film.joined(images, taken, key, code))
-    if work.ball and not batch.dry_run and batch.shard.number == 1:
-        _write_balls(usable, batch)
-    raise typer.Exit(max(code, int(len(usable.setups) < len(work.setups))))
-
-
-def _relit(work: Relight, item: Item) -> Outcome:
-    """Relight an item under the lights of its stale images."""
-    from facerf_cli.work.relight import relight_item
-
-    return relight_item(item, work.for_stale(item))
+        code = film.joined(images, taken, key, code)
+    elif options.ball and not batch.dry_run and batch.shard.number == 1:
+        _write_balls(plan, batch)
+    raise typer.Exit(code)
 
 
 def _holds_a_stack(items: Sequence[Item]) -> bool:
@@ -117,31 +159,33 @@ def _holds_a_stack(items: Sequence[Item]) -> bool:
     return any(is_olat_stack(item.input_path) for item in items)
 
 
-def _write_to_stdout(inputs: Sequence[str], work: Relight) -> None:
+def _write_to_stdout(inputs: Sequence[str], plan: RelightPlan) -> None:
     """Write the one image of one photo as bytes; raises UsageError where there are several."""
     with tempfile.TemporaryDirectory() as folder:
         items = collect_items(inputs, Path(folder), PHOTO_SUFFIXES)
-        images = len(items) * len(work.setups)
-        check_stdout(images if work.photo.face != "all" else 2 * images, work.output.formats)
-        (path,) = _relit(work.readable(False), items[0]).outputs
+        images = len(items) * len(plan.setups)
+        check_stdout(images if plan.photo.face != "all" else 2 * images, plan.options.output.formats)
+        (path,) = RelightJob(plan).ready(dry_run=False).process(items[0]).outputs
         sys.stdout.buffer.write(path.read_bytes())
         sys.stdout.buffer.flush()
 
 
-def _balls_of(setup: LightSetup, work: Relight, folder: Path) -> list[Path]:
+def _balls_of(setup: LightSetup, plan: RelightPlan, folder: Path) -> list[Path]:
     """The files of the balls under a map, of each format."""
-    return [folder / "balls" / f"{setup.name}{setup.frame}{suffix}" for suffix in work.output.suffixes]
+    return [
+        folder / "balls" / f"{setup.name}{setup.frame}{suffix}" for suffix in plan.options.output.suffixes
+    ]
 
 
-def _write_balls(work: Relight, options: BatchOptions) -> None:
+def _write_balls(plan: RelightPlan, options: BatchOptions) -> None:
     """Write the balls under each map to `balls/NAME` in each format, unless they are there."""
-    files = {setup: _balls_of(setup, work, options.output) for setup in work.maps}
+    files = {setup: _balls_of(setup, plan, options.output) for setup in plan.maps}
     always = options.overwrite == "always"
     missing = [setup for setup, paths in files.items() if always or not all(map(Path.exists, paths))]
     if missing:
         from facerf_cli.work.lights import readable, write_balls
 
         drawn = readable(missing)
-        write_balls(drawn, [files[setup][0] for setup in drawn], work.exposure_rule, work.output)
+        write_balls(drawn, [files[setup][0] for setup in drawn], plan.options.exposure, plan.options.output)
         for path in itertools.chain.from_iterable(files[setup] for setup in drawn):
             print_path(path)

@@ -10,7 +10,7 @@ import numpy as np
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import Recipe, json_rows, require_same
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
@@ -94,7 +94,7 @@ def prepare_capture(
     elif not batch.dry_run:
         (output / DATASET_FILE).unlink(missing_ok=True)  # its subjects are about to be replaced
     work = Prepare(capture, how, checking.checks == "on")
-    code = run_items("prepare-dataset", items, work, work.outputs_of, batch, settings)
+    code = run_items(work, items, batch, settings)
     if not batch.dry_run and sums_up(items, work.outputs_of, batch):
         _write_dataset(capture, how, split, settings.seed, model_sha256)
     return code
@@ -201,8 +201,10 @@ def _judge_earlier(capture: Capture, output: Path, made_from: Recipe, dry_run: b
 
 
 @dataclass(frozen=True)
-class Prepare:
+class Prepare(Job):
     """Prepares one subject; settings only."""
+
+    verb = "prepare-dataset"
 
     capture: Capture
     how: Preparation

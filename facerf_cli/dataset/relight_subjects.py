@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facerf_cli.batch.inputs import MAP_SUFFIXES, Item, collect_items
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
 from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.cost import cost_of_sources, in_words, recipe_bytes
 from facerf_cli.dataset.dataset import Dataset, read_dataset
@@ -59,7 +59,7 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     work = _Relight(dataset, wanted.per_subject, overwrite)
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     items = [Item(folder / "olat" / name, batch.output / name, name) for name in subjects]
-    return run_items("relight-dataset", items, work, work.outputs_of, batch, settings)
+    return run_items(work, items, batch, settings)
 
 
 def _maps_of_splits(
@@ -103,8 +103,10 @@ def _envmap_names(option: str, envmaps: str, output: Path, seed: int, first: int
 
 
 @dataclass(frozen=True)
-class _Relight:
+class _Relight(Job):
     """Relights one subject."""
+
+    verb = "relight-dataset"
 
     dataset: Dataset
     per_subject: int

@@ -8,14 +8,14 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, recipe_of
-from facerf_cli.batch.run import Outcome, run_items, sums_up
+from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, keyed, recipe_of
+from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Comparison, Row, measure, perceptual_metric
@@ -51,7 +51,7 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Job):
     """A run of a protocol; settings only, sent to the processes that take the items.
 
     An item's rows are DIR/cases/ITEM.json, so finished items are skipped and an interrupted run continues. At
@@ -67,6 +67,7 @@ class Evaluation:
     reading: Any = None  # a dataclass of further options that shape the figures
     networks: tuple[tuple[str, Path], ...] = ()  # title and file of each that takes part
     face_model: Callable[[], MorphableModel] | None = None  # images and the summary name it
+    prepare: Callable[[], object] | None = None  # loads what the items need
 
     @property
     def verb(self) -> str:
@@ -79,22 +80,11 @@ class Evaluation:
         more = ("face_distance",) if self.options.measures.face_distance else ()
         return tuple(dict.fromkeys((*self.protocol.layout.metrics, *more)))
 
-    def run(self, prepare: Callable[[], object] | None = None) -> int:
-        """Measure the items and write their tables; return the exit code, 0 done, 1 some failed.
-
-        `prepare` loads what the items need; it is not called where all are finished.
-        """
-        items, options, measures = list(self.chosen.items), self.options, self.options.measures
+    def run(self) -> int:
+        """Measure the items and write their tables; return the exit code, 0 done, 1 some failed."""
+        items, options = list(self.chosen.items), self.options
         if not items:
             raise UsageError(f"{self.verb}: nothing to evaluate; give other inputs")
-
-        def begin() -> None:
-            if prepare:
-                prepare()
-            if not options.dry_run:
-                if measures.vgg_weights is not None:  # fails before anything is measured
-                    perceptual_metric(measures.lpips, measures.vgg_weights)
-                self._remove_summary()
 
         if options.overwrite == "never" and (other := self._made_otherwise()):
             raise UsageError(
@@ -102,10 +92,7 @@ class Evaluation:
                 "options, another checkpoint or other inputs; leave out --overwrite never, or give another "
                 "folder"
             )
-        batch = replace(options, print_outputs=False)
-        code = run_items(
-            self.verb, items, self, self.outputs_of, batch, self.settings, self.recipes_of, begin
-        )
+        code = run_items(self, items, replace(options, print_outputs=False), self.settings)
         if code:
             log.error(
                 "no summary is written while images are missing; finished items are kept, so run it again"
@@ -118,6 +105,17 @@ class Evaluation:
                 self._sum_up()
         return code
 
+    def ready(self, dry_run: bool) -> Self:
+        """Load what all items need, and remove the tables of an earlier run."""
+        measures = self.options.measures
+        if self.prepare:
+            self.prepare()
+        if not dry_run:
+            if measures.vgg_weights is not None:  # fails before anything is measured
+                perceptual_metric(measures.lpips, measures.vgg_weights)
+            self._remove_summary()
+        return self
+
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of all items."""
         recipe: Recipe = {"measuring": _MEASURING, "protocol": self.protocol.name}
@@ -127,12 +125,12 @@ class Evaluation:
 
     def _made_otherwise(self) -> list[Item]:
         """The finished items that were made from other inputs or by another recipe: one table has one way."""
-        index = FolderIndex(self.options.output, self.verb, self.options.shard, self.recipes_of)
+        index = FolderIndex(self.options.output, self.verb, self.options.shard)
+        recipes = keyed(self.recipes_of(index.digest_of))
         return [
             item
             for item in self.chosen.items
-            if (path := self.path_of(item)).exists()
-            and index.why_again(item.input_path, [path])[0] is not None
+            if (path := self.path_of(item)).exists() and index.why_again(item.input_path, [path], recipes)
         ]
 
     def path_of(self, item: Item) -> Path:

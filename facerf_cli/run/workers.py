@@ -190,20 +190,29 @@ def spread(
     items: Sequence[T],
     workers: Workers,
     broken: Callable[[T, Exception], R],
-) -> Generator[R]:
+) -> Iterator[R]:
     """Yield `work(item)` of each item in the items' order, computed by the workers.
 
     `broken` gives the result of an item whose worker died while it had it. Workers log through this process;
-    Ctrl-C here ends them. An exception of `work` is raised here.
+    Ctrl-C ends them, if it ends what is returned (`ending`). An exception of `work` is raised there.
     """
     if workers.ray is not None and items:
         from facerf_cli.run.ray_workers import in_ray
 
-        yield from in_order(in_ray(work, items, workers.ray, workers.jobs, workers.gpus, broken))
-    elif workers.jobs > 1 and len(items) > 1:
-        yield from in_order(in_processes(work, items, workers.jobs, broken, workers.in_a_row))
-    else:
-        yield from map(work, items)
+        return in_order(in_ray(work, items, workers.ray, workers.jobs, workers.gpus, broken))
+    if workers.jobs > 1 and len(items) > 1:
+        return in_order(in_processes(work, items, workers.jobs, broken, workers.in_a_row))
+    return map(work, items)
+
+
+@contextmanager
+def ending(results: Iterator[R]) -> Iterator[Iterator[R]]:
+    """End the workers of `spread` at the end of the block."""
+    try:
+        yield results
+    finally:
+        if isinstance(results, Generator):
+            results.close()
 
 
 def process_died(error: Exception) -> str:

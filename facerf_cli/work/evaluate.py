@@ -28,9 +28,8 @@ def evaluate(name: str, options: EvaluateOptions, photo: PhotoOptions, inputs: S
     bench, networks = partial(bench_of, options, photo), tuple(_networks_named(options, photo).items())
     if not options.reflectance:  # no method of ours takes part
         return Evaluation(protocol, chosen, options, photo.settings, bench, None, networks).run()
-    model = partial(face_model, photo)
-    run = Evaluation(protocol, chosen, options, photo.settings, bench, photo, networks, model)
-    return run.run(partial(_prepare, options, photo))
+    model, prepare = partial(face_model, photo), partial(_prepare, options, photo)
+    return Evaluation(protocol, chosen, options, photo.settings, bench, photo, networks, model, prepare).run()
 
 
 def _prepare(options: EvaluateOptions, photo: PhotoOptions) -> None:

@@ -12,15 +12,11 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.light_files import face_model_of_map, read_map_file
 from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import ball, lights_around, rotated_weights
-from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.map_keys import MapKeys, without_keys
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
-from facerf_cli.synth.sky.skies import draw_sky
-from facerf_cli.work.light_of_photo import light_of_photo
 from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
@@ -43,6 +39,7 @@ def _maps_of(setups: Sequence[LightSetup]) -> list[MapSource]:
     return [light.envmap for setup in setups for light in setup.lights if light.envmap is not None]
 
 
+@cache  # an error is logged once
 def _is_readable(envmap: MapSource) -> bool:
     try:
         if not isinstance(envmap, DrawnMap):
@@ -58,7 +55,11 @@ def read_map(envmap: MapSource) -> Tensor:
     if isinstance(envmap, PhotoLight):
         return _map_of_photo(envmap)
     if isinstance(envmap, DrawnMap):
+        from facerf_cli.synth.sky.skies import draw_sky
+
         return torch.from_numpy(draw_sky(envmap.index, envmap.seed, _DRAWN_WIDTH_PX)[0])
+    from facerf_cli.files.light_files import read_map_file
+
     assert isinstance(envmap, Path)
     return read_map_file(envmap)
 
@@ -66,6 +67,9 @@ def read_map(envmap: MapSource) -> Tensor:
 @cache
 def _map_of_photo(photo: PhotoLight) -> Tensor:
     """Estimated once a process, in the half floats of the file that `facerf estimate-light` writes."""
+    from facerf_cli.light.forms import rig_to_latlong
+    from facerf_cli.work.light_of_photo import light_of_photo
+
     return rig_to_latlong(light_of_photo(photo.path, photo.options), _LIGHT_WIDTH_PX // 2).half().float()
 
 
@@ -233,5 +237,7 @@ def _metadata_of(envmap: MapSource) -> dict[str, str | int]:
     """Metadata of an image that shows a light; an estimated light depends on the face model."""
     if isinstance(envmap, PhotoLight):
         return Provenance(envmap.name, **face_model(envmap.options.photo).stamp).attributes()
+    from facerf_cli.files.light_files import face_model_of_map
+
     made = Provenance(envmap.name).attributes()
     return {**made, **face_model_of_map(envmap)} if isinstance(envmap, Path) else made

@@ -1,11 +1,14 @@
-"""The models of rembg, an extra, that may make a person's matte: where they lie, their licences.
+"""The models of rembg, an extra, that may make a person's matte: places, licences, and the matte itself.
 
 facerf downloads none of them: a model is one that lies in rembg's folder already. Light to import.
 """
 
 import os
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from facerf_cli.errors import UsageError
 
@@ -66,3 +69,31 @@ def _places(name: str) -> list[Path]:
     newer = os.environ.get("REMBG_HOME") or (Path(data) / "rembg" if data else "~/.rembg")
     home = older if os.environ.get("U2NET_HOME") else Path(newer).expanduser()
     return [home / "models" / name / f"{name}.onnx", older / f"{name}.onnx"]
+
+
+def require_rembg(model: MatteModel) -> None:
+    """Raise UsageError where rembg is not installed."""
+    if find_spec("rembg") is None:
+        raise UsageError(
+            f"--matte-from {model.matte_from}: needs the package rembg; pip install 'facerf[rembg]', or give "
+            "--person"
+        )
+
+
+def matte_by_rembg(image_srgb: Any, model: MatteModel) -> Any:
+    """The matte [H, W] in 0..1 of what stands out in an sRGB uint8 image [H, W, 3]."""
+    import numpy as np
+    from rembg import remove
+
+    mask = np.asarray(remove(image_srgb, session=_session(model), only_mask=True))
+    return mask.astype(np.float32) / np.float32(255)
+
+
+@cache
+def _session(model: MatteModel) -> Any:
+    """The session of a model, opened once a process."""
+    from rembg import new_session
+
+    # with a checksum, versions that look in one folder fetch a file that is not theirs again
+    os.environ["MODEL_CHECKSUM_DISABLED"] = "1"
+    return new_session(model.name)

@@ -35,9 +35,9 @@ from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.run.threads import compute_apart
+from facerf_cli.work.matte_models import matte_by_rembg, require_rembg
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 from facerf_cli.work.plan import KEPT_PX, beside_photo, require_people
-from facerf_cli.work.rembg_matte import matte_by_rembg, require_rembg
 
 
 def companion(item: Item, given: Path, option: str) -> Path:

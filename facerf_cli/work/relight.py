@@ -1,9 +1,9 @@
-"""One photo, or one OLAT stack, under every light setup: relit, exposed and written (`relight_scenes.py`)."""
+"""One item of `facerf relight`: read, its people fitted, relit by every setup, exposed, written."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -13,70 +13,192 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
+from facerf_cli.face.landmarks import display_ev
+from facerf_cli.face.view import photo_camera
+from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.image.colour import most_exposure_ev
+from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.strips import Empty, rows_of
-from facerf_cli.relighting.relightable import RenderRequest
+from facerf_cli.person import Person, Target, person_of
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import with_room
+from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.outputs import OutputImage, write_output
-from facerf_cli.work.photos import facts_of, load_models_once
-from facerf_cli.work.plan import beside_people, image_canvas
-from facerf_cli.work.relight_options import Relight
-from facerf_cli.work.relight_scenes import LitScene, scenes_of
-from facerf_cli.work.sequence import open_at
+from facerf_cli.work.photos import (
+    FittedFace,
+    facts_of,
+    fit_each,
+    load_models_once,
+    naming,
+    provenance,
+    read_matte,
+    read_photo,
+    rotation_of,
+)
+from facerf_cli.work.plan import beside_people, image_canvas, prediction_bytes, require_face
+from facerf_cli.work.relight_options import RelightPlan
+from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces
 
 log = logging.getLogger(LOGGER_NAME)
 _digest_once = lru_cache(maxsize=256)(file_sha256)
 
 
-def relight_item(item: Item, work: Relight) -> Outcome:
+def relight_item(plan: RelightPlan, item: Item) -> Outcome:
     """Relight a photo or a stack under every setup."""
     written: dict[Path, dict[str, float]] = {}
     people: list[dict[str, Any]] = []
     facts: Mapping[str, Any] = {}
-    shared_ev = _shared_exposures(item, work)
-    for scene in scenes_of(item, work, together=work.composite == "photo"):
+    plan = replace(plan, setups=plan.setups_of(item))
+    shared_ev = _shared_exposures(item, plan)
+    for scene in scenes_of(item, plan, together=plan.options.composite == "photo"):
         with beside_people(len(scene.faces), scene.subject.size_px):
-            written |= _write_setups(item, scene, work, shared_ev)
+            written |= _write_setups(item, scene, plan, shared_ev)
         people[:0] = [face.described() for face in scene.people]
-        facts = facts_of(people, work.photo) if people else scene.facts
-    outputs = [path.with_suffix(suffix) for path in written for suffix in work.output.suffixes]
+        facts = facts_of(people, plan.photo) if people else scene.facts
+    outputs = [path.with_suffix(suffix) for path in written for suffix in plan.options.output.suffixes]
     names = dict.fromkeys(name for one in written.values() for name in one)
     each = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
     return Outcome(outputs, {**facts, **each})
 
 
-def _leader_of(item: Item, work: Relight) -> Item | None:
-    """The photo whose exposure an item shares; of a shot a frame of its middle."""
-    place = open_at(work.shots, item, work.photo, work.white)
-    if place is None:
-        return work.leader_of(item)
-    shot, number = place
-    return shot.shot.frames[shot.take_of(number).middle]
+def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScene]:
+    """All chosen people of a photo in one image, or each face alone, the last first; or a stack."""
+    if item.input_path.suffix.lower() == ".exr":
+        from facerf_cli.files.olat_stack import is_olat_stack
+
+        if is_olat_stack(item.input_path):
+            from facerf_cli.work.stack_composers import scene_of_stack
+
+            yield scene_of_stack(item, plan)
+            return
+    options, models = plan.options, load_models_once(plan.photo)
+    lights_of = partial(lights_over_rig, rig=options.rig, sampling=plan.sampling)
+    lights_of(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
+    in_photo, kind, alone = options.composite == "photo", options.reflectance, options.network_alone
+    if place := _in_shot(item, plan):
+        shot, frame = place
+        image, face = shot.fitted(frame, kind == "portrait")
+        faces = iter([face])
+    else:
+        image = read_photo(item, plan.photo)
+        faces = fit_each(item, image, plan.photo, together=in_photo)
+    photo, rotation = image.pixels, rotation_of(options.pose)
+    for number, people in enumerate([list(faces)[::-1]] if together else ([face] for face in faces)):
+        if not number:
+            check_faces(item, people[-1].number, plan)
+        nearest_first = sorted(people, key=lambda face: -face.fit.crop.side_px)
+        persons, targets = [], []
+        for face in nearest_first:
+            target = Target(None if rotation is None else replace(face.fit, rotation=rotation), "face")
+            if in_photo:
+                background, matte = options.background.kind, None
+                if options.matte is not None:
+                    matte = read_matte(item, options.matte, photo.shape[:2], face.steady is not None)
+                behind = background if background in ("photo", "none") else "given"
+                target = Target(None, "photo", matte, None if behind == "photo" else image.alpha, behind)
+            with naming(item.input_path):
+                require_face(models.face, target.fit or face.fit, photo.shape[:2])
+                person = person_of(
+                    models, photo, face.head, kind, alone, face.matte, options.white, face.steady,
+                    prediction_bytes(),
+                )  # fmt: skip
+                far = person.balance is not None and person.balance.is_far and face.steady is None
+                if far and options.white == "photo":
+                    log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
+                if in_photo and face.matte is None:
+                    face.see(person.segmentation)
+            persons.append(person)
+            targets.append(target)
+        scene = LitScene(
+            setups=plan.setups,
+            lights_of=lights_of,
+            metadata=_metadata(item, plan),
+            people=people,
+            faces=tuple(face.number for face in nearest_first),
+            evens=tuple(person.even_brightness for person in persons),
+            plate=plate_metadata(image.metadata),
+            subject=_subject(persons, targets),
+        )
+        if not in_photo:
+            yield replace(scene, tag=people[0].tag)
+            continue
+        camera = photo_camera(nearest_first[0].fit.crop, *photo.shape[:2])
+        yield replace(
+            scene,
+            alpha=image.alpha if options.background.kind == "photo" else None,
+            behind=backdrop(options.background, options.background_blur, camera),
+            identity=_identity_of(photo, nearest_first[0]) if options.identity else None,
+        )
 
 
-def _shared_exposures(item: Item, work: Relight) -> dict[str, float] | None:
-    """The exposures of an item's group; None where it has none, or is the one that it has them of."""
-    leader = _leader_of(item, work)
+def _subject(people: Sequence[Person], targets: Sequence[Target]) -> Relightable:
+    """People in their photo, or the face of the first alone."""
+    if targets[0].composite == "face":
+        return people[0].composed(targets[0])
+    each = [person.in_photo(target) for person, target in zip(people, targets, strict=True)]
+    return PeopleInPhoto(each, targets[0].background)
+
+
+def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
+    """The distance of an image [H, W, 3] from its photo by descriptors, both at the photo's landmarks."""
+    from facerf_cli.face.descriptor import face_descriptor
+
+    landmarks_px = face.fit.crop.to_photo(face.head.landmarks_px)
+
+    def descriptor(shown: np.ndarray) -> np.ndarray:
+        return face_descriptor(linear_to_srgb(shown.clip(0, 1)), landmarks_px)
+
+    own = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
+    return lambda shown: round(float(np.linalg.norm(descriptor(shown) - own)), 3)
+
+
+def _metadata(item: Item, plan: RelightPlan) -> dict[str, str | int]:
+    network = "diffuse_sh" if plan.options.reflectance == "diffuse-sh" else "reflectance"
+    metadata = provenance(item, plan.photo, load_models_once(plan.photo).checkpoint_name(network))
+    if plan.options.reflectance != "portrait":
+        metadata["facerf:reflectance"] = plan.options.reflectance
+    if plan.options.network_alone:
+        metadata["facerf:network_alone"] = 1
+    return metadata
+
+
+def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
+    """The exposures of an item's group; None where it has none, or is the one that it has them of.
+
+    Frames of a shot share that of one of its middle.
+    """
+    leader = plan.leader_of(item)
+    if place := _in_shot(item, plan):
+        shot, number = place
+        leader = shot.shot.frames[shot.take_of(number).middle]
     if leader is None or leader == item:
         return None
-    known = work.exposures_of_leaders.setdefault(leader.output_base, {})
-    if not {setup.name for setup in work.setups} <= set(known):
-        if isinstance(work.exposure_rule, float):
-            return dict.fromkeys((setup.name for setup in work.setups), work.exposure_rule)
-        scene = next(scenes_of(leader, work, together=True))
+    known = plan.exposures.setdefault(leader.output_base, {})
+    if not {setup.name for setup in plan.setups} <= set(known):
+        if isinstance(rule := plan.options.exposure, float):
+            return dict.fromkeys((setup.name for setup in plan.setups), rule)
+        scene = next(scenes_of(leader, plan, together=True))
         parts = batches(len(scene.setups), scene.subject.nbytes)
-        known |= _exposures_ev(scene, parts, scene.relit, work)
+        known |= _exposures_ev(scene, parts, scene.relit, plan)
     return known
+
+
+def _in_shot(item: Item, plan: RelightPlan) -> Any:
+    """The open shot of an item and its number there; None for a photo alone."""
+    if not plan.shots.all:
+        return None
+    from facerf_cli.work.sequence import open_at
+
+    return open_at(plan.shots, item, plan.photo, plan.options.white)
 
 
 def _write_setups(
     item: Item,
     scene: LitScene,
-    work: Relight,
+    plan: RelightPlan,
     shared_ev: Mapping[str, float] | None,
 ) -> dict[Path, dict[str, float]]:
     """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
@@ -90,40 +212,42 @@ def _write_setups(
     def relit_by(part: slice) -> list[Any]:
         return scene.relit(part) if whole is None else whole
 
-    exposures_ev = shared_ev or _exposures_ev(scene, parts, relit_by, work)
+    exposures_ev = shared_ev or _exposures_ev(scene, parts, relit_by, plan)
     written: dict[Path, dict[str, float]] = {}
     for part in parts:
         for setup, relit in zip(scene.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
-            path, ev = setup.output(item, scene.tag, ".exr", work.name), exposures_ev[setup.name]
-            with image_canvas(path, scene.subject.size_px, len(work.output.formats)) as empty:
-                image = _rendered(scene, setup, relit, ev, work, empty)
-                image = replace(image, header={**scene.plate, **_made_by(setup, work)})
-                write_output(path, image, ev, work.output, {**scene.metadata, "facerf:exposure_ev": ev})
+            path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
+            with image_canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
+                image = _rendered(scene, setup, relit, ev, plan, empty)
+                image = replace(image, header={**scene.plate, **_made_by(setup, plan)})
+                write_output(
+                    path, image, ev, plan.options.output, {**scene.metadata, "facerf:exposure_ev": ev}
+                )
                 written[path] = {"exposure_ev": ev}
                 if scene.identity is not None:
                     written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
                 del image
             group = " of its group" if shared_ev else ""
-            said = [f"exposure {ev:+.2f} EV{group}"] if work.output.shown_suffix else []
+            said = [f"exposure {ev:+.2f} EV{group}"] if plan.options.output.shown_suffix else []
             said += [f"in a room that sends {setup.room:g} back"] if setup.room else []
-            if said and not (shared_ev and work.shots):
+            if said and not (shared_ev and plan.shots.all):
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
             del relit  # of all of its part, beside the next
     return written
 
 
-def _made_by(setup: LightSetup, work: Relight) -> dict[str, str]:
+def _made_by(setup: LightSetup, plan: RelightPlan) -> dict[str, str]:
     """The lights, the options and the networks of an image, as JSON for its header; files by digests."""
-    served = load_models_once(work.photo).networks.served()
+    served = load_models_once(plan.photo).networks.served()
     networks = {name: {**file, "file": Path(file["file"]).name} for name, file in served.items()}
     lights = json_line(recipe_of(setup, _digest_once))
-    options = json_line(recipe_of(work, _digest_once))
+    options = json_line(recipe_of(plan, _digest_once))
     return {"facerf:lights": lights, "facerf:options": options, "facerf:networks": json_line(networks)}
 
 
 def _rendered(
-    scene: LitScene, setup: LightSetup, relit: Any, ev: float, work: Relight, empty: Empty
+    scene: LitScene, setup: LightSetup, relit: Any, ev: float, plan: RelightPlan, empty: Empty
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
@@ -137,13 +261,13 @@ def _rendered(
     for part in parts or [slice(0)]:
         each = scene.relit_by_each(setup, part) if lit.names else ()
         lights = dict(zip(lit.names[part], each, strict=True))
-        request = RenderRequest(None if arrays else relit, lights, work.aov, ev, behind)
+        request = RenderRequest(None if arrays else relit, lights, plan.options.aov, ev, behind)
         arrays |= subject.rendered(request, empty)
         del lights, request  # before others are relit
     pixels, alpha = arrays.pop("rgb"), subject.alpha(behind)
     matte = subject.person_matte
     layers = arrays if matte is None else {"person.A": matte, **arrays}
-    keeps = alpha is None and work.background.kind != "envmap"
+    keeps = alpha is None and plan.options.background.kind != "envmap"
     added = None
     if setup.has_own:
         others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
@@ -179,11 +303,11 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], work: Relight
+    scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], plan: RelightPlan
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
-    if isinstance(rule := work.exposure_rule, float):
-        return dict.fromkeys((setup.name for setup in work.setups), rule)
+    if isinstance(rule := plan.options.exposure, float):
+        return dict.fromkeys((setup.name for setup in plan.setups), rule)
     found: dict[str, float] = {}
     strengths = scene.lights[0].strengths()
     for part in parts:

@@ -16,24 +16,20 @@ from facerf_cli.batch.inputs import (
     split_frame,
 )
 from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import NOT_IN_RECIPE
-from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import EVEN, OWN, is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
     LightSetup,
     LightSources,
-    PhotoLight,
     Sampling,
     collect_setups,
     in_room,
 )
 from facerf_cli.work.output_options import (
-    SUFFIXES,
     Exposure,
-    Format,
     OutputOptions,
     parse_exposure,
 )
@@ -43,12 +39,10 @@ from facerf_cli.work.photo_options import (
     check_companion,
     for_other_photos,
     network_alone_option,
-    networks_of,
     parse_pose,
     white_option,
 )
 from facerf_cli.work.shots import (
-    FilmOutput,
     Shots,
     film_rate,
     recipe_of_shots,
@@ -57,6 +51,7 @@ from facerf_cli.work.shots import (
 Composite = Literal["photo", "face"]
 ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
+_FIELDS = ("field", "portrait")
 _LAYERS = ("matte", "albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
 _FORMS = "photo, envmap, none, an image file, black or another name, #RRGGBB or R,G,B"
@@ -120,7 +115,7 @@ def _linear(encoded: float) -> float:
 
 
 @dataclass(frozen=True)
-class Relight:
+class RelightOptions:
     """The options that images share.
 
     Attributes:
@@ -147,9 +142,7 @@ class Relight:
     """
 
     photo: PhotoOptions
-    setups: tuple[LightSetup, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # each in that of its images
     rig: str = option("150", metavar="N|FILE", flags=("--lights",), panel=LIGHT)
-    sampling: Sampling = "cell"
     pose: str | None = option(None, metavar="YAW,PITCH,ROLL", shown_default="the photo's", panel=IMAGE)
     reflectance: RelightKind = option("portrait", metavar="KIND", panel=METHOD)
     exposure: Exposure | None = option(
@@ -201,71 +194,38 @@ class Relight:
         parse=partial(NamePattern.parse, option="--name"),
         panel=BATCH,
     )
-    asked_for_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --composite photo
-    asked_for_room: bool = field(default=False, metadata=NOT_IN_RECIPE)  # by --room; a stack has none else
-    leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)  # the first photo of each group
+
+
+@dataclass(frozen=True)
+class RelightPlan:
+    """The images that each photo gets; see `plan_relight`.
+
+    Attributes:
+        options: With what depends on other options.
+        setups: The lights of each image; a recipe has its own.
+        sampling: How maps give a rig's lights their weights.
+        keeps_photo: True by --composite photo, which no stack can have.
+        has_room: True by --room; a stack has none else.
+        leaders: The first photo of each group that shares an exposure.
+        shots: The films and sequences among the inputs.
+        exposures: Of leaders by setup, by their place, as far as this process knows them.
+    """
+
+    options: RelightOptions
+    setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)
+    sampling: Sampling
+    keeps_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)
+    has_room: bool = field(default=False, metadata=NOT_IN_RECIPE)
+    leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
-    exposures_of_leaders: dict[Path, dict[str, float]] = field(
+    exposures: dict[Path, dict[str, float]] = field(
         default_factory=dict, metadata=NOT_IN_RECIPE, compare=False
-    )  # by place and setup, as far as this process knows them
-
-    def checked(self, sources: LightSources, batch: BatchOptions, film: FilmOutput | None) -> Self:
-        """These options with the setups, and with what depends on other options; raises UsageError."""
-        alone = self.composite == "face" or self.pose is not None
-        if self.pose is not None and self.composite == "photo":
-            raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
-        parse_pose(self.pose)
-        parse_lights(self.rig)
-        if self.network_alone and self.reflectance not in ("field", "portrait"):
-            raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
-        if self.white != "photo" and self.reflectance not in ("field", "portrait"):
-            raise UsageError("--white: is for the fields; leave it out, or use --reflectance field")
-        photo = replace(self.photo, ocio_config=self.output.config)
-        photo.check()
-        if self.background.kind != "photo" and alone:
-            raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
-        if film and not film.holds_alpha and (self.background.kind == "none" or alone):
-            raise UsageError(f"-o {film.path}: has no alpha; give FILE.mov, a folder, or --background COLOUR")
-        if self.identity and alone:
-            raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
-        check_companion(self.matte, "--matte")
-        check_companion(self.photo_of_stack, "--photo")
-        of_light: Kind = "field" if self.reflectance == "portrait" else self.reflectance
-        how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
-        setups = collect_setups(sources, batch.output, photo.settings.seed, how)
-        self._check_lights_by_photo(setups, alone)
-        if self.exposure is None:
-            setups = tuple(replace(one, exposure_ev=0.0) if one.by_photo else one for one in setups)
-        if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
-            raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
-        sweeps = sources.rotate is not None and is_sweep(sources.rotate)
-        return replace(
-            self,
-            photo=photo,
-            setups=tuple(in_room(one, sources.room, alone or self.background.is_dark(one)) for one in setups),
-            sampling=sources.sampling or ("smooth" if sweeps else "cell"),
-            composite="face" if alone else "photo",
-            asked_for_photo=self.composite == "photo",
-            asked_for_room=sources.room is not None,
-            exposure=self.exposure_rule,
-            reflectance="field" if alone and self.reflectance == "portrait" else self.reflectance,
-        )
-
-    def _check_lights_by_photo(self, setups: Sequence[LightSetup], alone: bool) -> None:
-        """Raise UsageError for what the photo's own light, or even light as bright, cannot shine on."""
-        if alone and any(setup.has_own for setup in setups):
-            raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
-        for light in (one for setup in setups for one in setup.by_photo):
-            if self.reflectance not in ("field", "portrait"):
-                word = OWN if light.own else EVEN
-                raise UsageError(
-                    f"--light {word}: is not for --reflectance {self.reflectance}; leave one out"
-                )
+    )
 
     @property
-    def exposure_rule(self) -> Exposure:
-        """EV, or the rule that chooses it."""
-        return "auto" if self.exposure is None else self.exposure
+    def photo(self) -> PhotoOptions:
+        """Settings of reading photos."""
+        return self.options.photo
 
     @property
     def maps(self) -> list[LightSetup]:
@@ -277,41 +237,19 @@ class Relight:
         return [path for setup in self.setups for path in self._images(item, setup)]
 
     def _images(self, item: Item, setup: LightSetup) -> list[Path]:
-        tag = "" if self.composite == "photo" else self.photo.first_tag
-        return [setup.output(item, tag, suffix, self.name) for suffix in self.output.suffixes]
+        options = self.options
+        tag = "" if options.composite == "photo" else self.photo.first_tag
+        return [setup.output(item, tag, suffix, options.name) for suffix in options.output.suffixes]
 
-    def for_stale(self, item: Item) -> Self:
-        """These settings with the lights of the item's stale images; a light has all of its frames."""
+    def setups_of(self, item: Item) -> tuple[LightSetup, ...]:
+        """The lights of an item's stale images; a light has all of its frames."""
         stale = {setup.name for setup in self.setups if not item.stale.isdisjoint(self._images(item, setup))}
-        setups = tuple(setup for setup in self.setups if setup.name in stale)
-        return replace(self, setups=setups) if item.stale else self
+        return tuple(setup for setup in self.setups if not item.stale or setup.name in stale)
 
-    def with_leaders(self, items: Sequence[Item]) -> Self:
-        """These settings with the first photo of each group of --exposure-group."""
-        groups = {self._group(item): item for item in reversed(items)}
-        return replace(self, leaders=tuple(groups.values())) if self.exposure_group != "photo" else self
-
-    def leader_of(self, item: Item) -> Item | None:
-        """The photo whose exposure an item shares; None without groups."""
-        group = self._group(item)
-        return next((leader for leader in self.leaders if self._group(leader) == group), None)
-
-    def _group(self, item: Item) -> Path:
-        if self.exposure_group == "folder":
-            return item.output_base.parent
-        return item.output_base.with_name(split_frame(item.output_base.name)[0])
-
-    def into_file(self, file: Path, format_of_it: Format, formats: tuple[Format, ...]) -> Self:
-        """These settings for one image, the file that `-o` names; raises UsageError for other formats."""
-        if [SUFFIXES[name] for name in formats] != [SUFFIXES[format_of_it]]:
-            raise UsageError(f"-o {file}: is not what --format says; leave that out, or give a folder")
-        output = replace(self.output, file_suffix=file.suffix)
-        return replace(self, output=output, name=NamePattern.literal(file.stem))
-
-    def refuse_meeting(self, items: Sequence[Item]) -> None:
-        """Raise UsageError where two images would have one path: that which -o names, or a --name makes."""
-        for path in self.outputs_of(items[0]) if self.output.file_suffix else ():
-            all_faces = self.photo.face == "all" and self.composite == "face"
+    def of_items(self, items: Sequence[Item], shots: Shots) -> Self:
+        """This plan for some photos, and frames of shots; UsageError where two images have one path."""
+        for path in self.outputs_of(items[0]) if self.options.output.file_suffix else ():
+            all_faces = self.photo.face == "all" and self.options.composite == "face"
             only_item(items, path, several=all_faces or len(self.setups) > 1)
         paths: set[Path] = set()
         for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
@@ -320,6 +258,19 @@ class Relight:
                     f"{item.input_path}: {path} would be the name of two images; give --name more fields"
                 )
             paths.add(path)
+        grouped = self.options.exposure_group != "photo"
+        groups = {self._group(item): item for item in reversed(items)} if grouped else {}
+        return replace(self, leaders=tuple(groups.values()), shots=shots)
+
+    def leader_of(self, item: Item) -> Item | None:
+        """The photo whose exposure an item shares; None without groups."""
+        group = self._group(item)
+        return next((leader for leader in self.leaders if self._group(leader) == group), None)
+
+    def _group(self, item: Item) -> Path:
+        if self.options.exposure_group == "folder":
+            return item.output_base.parent
+        return item.output_base.with_name(split_frame(item.output_base.name)[0])
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of every output, which holds the light of its own setup alone."""
@@ -328,28 +279,56 @@ class Relight:
             shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
         shared |= recipe_of_shots(self.shots.all, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
-        return [recipe | {"format": name} for recipe in lit for name in self.output.formats]
+        return [recipe | {"format": name} for recipe in lit for name in self.options.output.formats]
 
-    def readable(self, dry_run: bool) -> Self:
-        """Load the models, and keep the setups whose maps can be read.
 
-        A dry run loads no networks, and so estimates no light of a photo.
-        """
-        from facerf_cli.work.lights import readable
-        from facerf_cli.work.outputs import check_output
-        from facerf_cli.work.photos import prepare_photos
-        from facerf_cli.work.sequence import follow_all
-
-        check_output(self.output)
-        maps = [setup.envmap.envmap for setup in self.setups if setup.envmap]
-        lights = [envmap.options for envmap in maps if isinstance(envmap, PhotoLight)]
-        uses = networks_of([self.reflectance]).union(*(light.networks for light in lights))
-        prepare_photos(self.photo, uses, with_networks=not dry_run)
-        if not dry_run:
-            follow_all(self.shots.all, self.photo)
-        elif lights:
-            return self
-        setups = readable(self.setups)
-        if not setups:
-            raise FacerfError("none of the maps serves; give others, or procedural:8 to draw some")
-        return replace(self, setups=setups)
+def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -> RelightPlan:
+    """Give each photo its images: lights, and what depends on other options; raises UsageError."""
+    alone, is_field = options.composite == "face" or options.pose is not None, options.reflectance in _FIELDS
+    if options.pose is not None and options.composite == "photo":
+        raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
+    parse_pose(options.pose)
+    parse_lights(options.rig)
+    if options.network_alone and not is_field:
+        raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
+    if options.white != "photo" and not is_field:
+        raise UsageError("--white: is for the fields; leave it out, or use --reflectance field")
+    photo = replace(options.photo, ocio_config=options.output.config)
+    photo.check()
+    if options.background.kind != "photo" and alone:
+        raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
+    if options.identity and alone:
+        raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
+    check_companion(options.matte, "--matte")
+    check_companion(options.photo_of_stack, "--photo")
+    of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
+    how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
+    setups = collect_setups(sources, output, photo.settings.seed, how)
+    if alone and any(setup.has_own for setup in setups):
+        raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
+    by_photo = [light for setup in setups for light in setup.by_photo]
+    if by_photo and not is_field:
+        word = OWN if by_photo[0].own else EVEN
+        raise UsageError(f"--light {word}: is not for --reflectance {options.reflectance}; leave one out")
+    if options.exposure is None:
+        setups = tuple(replace(one, exposure_ev=0.0) if one.by_photo else one for one in setups)
+    if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
+        raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
+    if options.ball and all(setup.envmap is None for setup in setups):
+        raise UsageError("--ball: shows maps; give --envmap, or leave it out")
+    sweeps = sources.rotate is not None and is_sweep(sources.rotate)
+    dark = options.background.is_dark
+    filled = replace(
+        options,
+        photo=photo,
+        composite="face" if alone else "photo",
+        exposure="auto" if options.exposure is None else options.exposure,
+        reflectance="field" if alone and options.reflectance == "portrait" else options.reflectance,
+    )
+    return RelightPlan(
+        filled,
+        tuple(in_room(one, sources.room, alone or dark(one)) for one in setups),
+        sources.sampling or ("smooth" if sweeps else "cell"),
+        keeps_photo=options.composite == "photo",
+        has_room=sources.room is not None,
+    )

@@ -1,10 +1,12 @@
-"""OLAT stacks that are relit: sums of their lights, in their frame or on their photo."""
+"""OLAT stacks that are relit: sums of their lights, in their frame or on their photo; their scenes."""
 
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,13 +19,23 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera, view_face
-from facerf_cli.files.olat_stack import StackHeader, stream_olats
+from facerf_cli.files.olat_stack import StackHeader, read_olat_header, stream_olats
+from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
 from facerf_cli.image.strips import Resized, Rows, Scaled
 from facerf_cli.light.studio_points import Lights
+from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import weighted_sum
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
+from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
+from facerf_cli.work.lights import lights_over_stack, off_rig_deg
+from facerf_cli.work.photos import companion, face_model, fit_facts
+from facerf_cli.work.plan import KEPT_PX, beside_stack
+from facerf_cli.work.relight_options import RelightPlan
+from facerf_cli.work.relight_scenes import Behind, LitScene, backdrop, check_faces
 
+log = logging.getLogger(LOGGER_NAME)
+_OFF_RIG_DEG = 1.0  # from which on a light that a stack lacks is named
 _DARK = 1e-3  # keeps a change of light finite, as a share of the photo's mean
 
 
@@ -174,3 +186,79 @@ def _fit_of(item: Item) -> Iterator[None]:
         yield
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
+
+
+def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
+    """A stack under its own lights."""
+    _check_stack(item, plan)
+    check_faces(item, 0, plan)
+    header = read_olat_header(item.input_path)
+    own = torch.from_numpy(header.directions).float()
+    if (off_deg := off_rig_deg(plan.setups, own)) > _OFF_RIG_DEG:
+        said = (
+            "%s: lacks a light (its nearest is %.1f degrees off): mixed of those around it; or give the photo"
+        )
+        log.warning(said, item.input_path, off_deg)
+    lights_of = partial(lights_over_stack, directions=own, sampling=plan.sampling)
+    subject: Relightable
+    behind = None
+    if header.kind == "photo":
+        subject, behind, facts = _person_of_stack(item, header, plan)
+    elif plan.options.photo_of_stack is not None:
+        raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
+    elif header.kind == "image":
+        subject, facts = StackImages(header, item.input_path), {}
+    else:
+        subject, facts = _face_of_stack(item, header, plan)
+    lit = plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups)
+    metadata = attributes_of_sum(header.metadata, item.input_path.name)
+    return LitScene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
+
+
+def _check_stack(item: Item, plan: RelightPlan) -> None:
+    """Raise InputError for what only a photo can have."""
+    wrong, options = "", plan.options
+    if options.pose is not None or plan.keeps_photo:
+        wrong = "a stack holds one pose of a face without its photo; give the photo"
+    elif options.reflectance not in ("field", "portrait"):
+        wrong = f"a stack holds the field; for {options.reflectance} give its photo"
+    elif options.white != "photo":
+        wrong = "a stack holds the white with which it was predicted; give its photo"
+    elif options.network_alone:
+        wrong = "a stack holds the field as predicted; give its photo"
+    elif plan.photo.has_given_person:
+        wrong = "a stack holds its person's matte; give its photo"
+    elif options.photo_of_stack is None and any(setup.has_own for setup in plan.setups):
+        wrong = "the photo's own light (own) needs its photo; give that with --photo"
+    elif any(light.even for setup in plan.setups for light in setup.by_photo):
+        wrong = "even light (even) has the brightness of a photo; give that, or from=around"
+    elif any(light.at_m is not None for setup in plan.setups for light in setup.lights):
+        wrong = "a stack holds far lights; for near ones (at=) give its photo"
+    if wrong:
+        raise InputError(f"{item.input_path}: {wrong}")
+
+
+def _person_of_stack(
+    item: Item, header: StackHeader, plan: RelightPlan
+) -> tuple[StackImages, Behind | None, dict[str, Any]]:
+    """The images of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
+    fit, face = face_in_stack(item, header, face_model(plan.photo))
+    size_px, stack = header.seen.shape, StackImages(header, item.input_path, face)
+    if plan.options.photo_of_stack is None:
+        return stack, None, fit_facts(fit)
+    path = companion(item, plan.options.photo_of_stack, "--photo")
+    with beside_stack(size_px):
+        photo = read_image(path, plan.photo.colourspace, kept_px=KEPT_PX, layer=plan.photo.layer).pixels
+    scale = photo.shape[0] / size_px[0]
+    if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):
+        raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")
+    camera = photo_camera(fit.crop.of_scaled(scale), *photo.shape[:2])
+    on_photo = replace(stack, photo=photo, keeps_background=plan.options.background.kind == "photo")
+    return on_photo, backdrop(plan.options.background, plan.options.background_blur, camera), fit_facts(fit)
+
+
+def _face_of_stack(item: Item, header: StackHeader, plan: RelightPlan) -> tuple[FaceAlone, dict[str, Any]]:
+    """The face of a stack of textures in the frame of its crop, and facts of its fit."""
+    head = head_in_stack(item, header)
+    model, textures = face_model(plan.photo), StackTextures(item.input_path)
+    return FaceAlone(model, head, textures), fit_facts(head.fit)

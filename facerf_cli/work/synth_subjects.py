@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items, sums_up
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings
 from facerf_cli.run.workers import one_thread
 from facerf_cli.synth.bank.heads import cached_face_model
@@ -26,15 +26,17 @@ def photograph_people(
     photograph = _Photograph(stage, batch.output / "transport" if transport else None)
     if not batch.dry_run:
         open_capture(batch.output, stage)
-    code = run_items("synth-stage", items, photograph, photograph.outputs_of, batch, settings)
+    code = run_items(photograph, items, batch, settings)
     if not batch.dry_run and sums_up(items, photograph.outputs_of, batch):
         close_capture(batch.output, stage)
     return code
 
 
 @dataclass(frozen=True)
-class _Photograph:
+class _Photograph(Job):
     """Photographs one person."""
+
+    verb = "synth-stage"
 
     stage: StageSettings
     transport: Path | None

@@ -8,11 +8,11 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Literal, Self
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, only_item
-from facerf_cli.batch.made_from import DigestOf, Recipe, one_recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Outcome, folder_not_file, run_items
+from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, folder_not_file, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
@@ -63,13 +63,12 @@ Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the faces that were
 
 
 @dataclass(frozen=True, kw_only=True)
-class PhotoWork:
+class PhotoWork(Job):
     """A verb that writes files for each chosen face of a photo."""
 
     photo: PhotoOptions
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
-    verb: ClassVar[str]
 
     @property
     def endings(self) -> tuple[str, ...]:
@@ -95,9 +94,6 @@ class PhotoWork:
         self.photo.check()
         return self
 
-    def prepare(self) -> None:
-        """Load what every photo needs besides networks and the face model."""
-
     def run(self, inputs: Sequence[str], batch: BatchOptions, wanted: ShotOptions | None = None) -> int:
         """Process photos, and with `wanted` the frames of shots; return the exit code."""
         work, null_separated = self.checked(), self.photo.settings.null_separated
@@ -116,18 +112,17 @@ class PhotoWork:
             item = only_item(items, batch.output, several=self.photo.face == "all")
             work = replace(self, alone=batch.output.suffix)
             return work.run_on([item], replace(batch, output=batch.output.parent))
+        return run_items(self, items, batch, self.photo.settings)
 
-        def prepare() -> None:
-            from facerf_cli.work.photos import prepare_photos
-            from facerf_cli.work.sequence import follow_all
+    def ready(self, dry_run: bool) -> Self:
+        """Load what every photo needs, and follow the faces of shots."""
+        from facerf_cli.work.photos import prepare_photos
+        from facerf_cli.work.sequence import follow_all
 
-            prepare_photos(self.photo, self.networks, with_networks=not batch.dry_run)
-            if not batch.dry_run:
-                self.prepare()
-                follow_all(self.shots.all, self.photo)
-
-        settings = self.photo.settings
-        return run_items(self.verb, items, self, self.outputs_of, batch, settings, self.recipes_of, prepare)
+        prepare_photos(self.photo, self.networks, with_networks=not dry_run)
+        if not dry_run:
+            follow_all(self.shots.all, self.photo)
+        return self
 
     def files_of(self, item: Item, tag: str) -> list[Path]:
         """Every file of the face with a tag."""
@@ -240,7 +235,7 @@ def parse_forms(names: Sequence[str]) -> tuple[Form, ...]:
 
 
 @dataclass(frozen=True)
-class ConvertLight:
+class ConvertLight(Job):
     """`facerf convert-light`.
 
     Attributes:
@@ -273,6 +268,7 @@ class ConvertLight:
     )
     signed: bool = option(False, panel=LIGHT)
     alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
+    verb = "convert-light"
 
     def run(self, inputs: Sequence[str], batch: BatchOptions, settings: Settings) -> int:
         """Convert the inputs; return the exit code."""
@@ -286,15 +282,15 @@ class ConvertLight:
             items = [only_item(items, batch.output, several=len(ends) > 1)]
             work = replace(self, alone=batch.output.suffix)
             batch = replace(batch, output=batch.output.parent)
-        return run_items("convert-light", items, work, work.outputs_of, batch, settings, one_recipe(work))
+        return run_items(work, items, batch, settings)
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file for each form."""
         return [item.output(self.alone or _ENDINGS[form]) for form in self.forms]
 
-    def __call__(self, item: Item) -> Outcome:
-        """Write the light in every form."""
-        raise NotImplementedError
+    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+        """The recipe of all forms."""
+        return [recipe_of(self, digest_of)]
 
 
 def refuse_odd(name: str, width_px: int) -> None:

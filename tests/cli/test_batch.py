@@ -11,7 +11,7 @@ import pytest
 
 from facerf_cli.batch import made_from as folder_index
 from facerf_cli.batch.inputs import Item, collect_items
-from facerf_cli.batch.made_from import differences, recipe_of
+from facerf_cli.batch.made_from import DigestOf, Recipe, other_options, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
@@ -20,7 +20,7 @@ from facerf_cli.main import main
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
 from tests.cli.folders import rows
-from tests.cli.toy_batch import outputs_of, run
+from tests.cli.toy_batch import Copy, run
 from tests.kinds import Patch, Said
 from tests.processes import wait_until
 
@@ -131,27 +131,31 @@ SLOW_VERB = """
 import sys, time
 from pathlib import Path
 from facerf_cli.batch.inputs import collect_items
-from facerf_cli.batch.run import BatchOptions, run_items
-from facerf_cli.batch.run import Outcome
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
 from facerf_cli.batch.settings import Settings
-from facerf_cli.batch.made_from import Recipe
 from facerf_cli.files.atomic import atomic_path
 
-def outputs_of(item):
-    return [item.output(".bin")]
+class Slow(Job):
+    verb = "slow"
 
-def slow(item):
-    with atomic_path(outputs_of(item)[0]) as temporary:
-        temporary.write_bytes(b"half")
-        Path(sys.argv[2], "started").touch()
-        time.sleep(60)
-        temporary.write_bytes(b"whole")
-    return Outcome(outputs_of(item))
+    def outputs_of(self, item):
+        return [item.output(".bin")]
+
+    def recipes_of(self, digest_of):
+        return [{}]
+
+    def __call__(self, item):
+        with atomic_path(self.outputs_of(item)[0]) as temporary:
+            temporary.write_bytes(b"half")
+            Path(sys.argv[2], "started").touch()
+            time.sleep(60)
+            temporary.write_bytes(b"whole")
+        return Outcome(self.outputs_of(item))
 
 if __name__ == "__main__":
     options = BatchOptions(Path(sys.argv[2]), jobs=int(sys.argv[3]))
     items = collect_items([sys.argv[1]], Path(sys.argv[2]))
-    run_items("slow", items, slow, outputs_of, options, Settings(), lambda digest_of: [{}])
+    run_items(Slow(), items, options, Settings())
 """
 
 
@@ -191,7 +195,7 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
     assert run([two], tmp_path / "out") == 0
     said = capsys.readouterr()
     assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
-    assert "1 made again: the input changed" in said.err
+    assert "1 made again: made from another input" in said.err
     assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
     run([two], tmp_path / "out")
     two.rename(tmp_path / "moved")
@@ -203,9 +207,9 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
 def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, capsys: Said) -> None:
     run([two], tmp_path / "out", recipe={"lights": 150})
     run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
-    assert "2 made again: --lights is 200, was 150" in capsys.readouterr().err
+    assert "2 made again: made from other options: --lights" in capsys.readouterr().err
     run([two], tmp_path / "out", recipe={"lights": 300})
-    assert "2 made again: --lights is 300, was 150" in capsys.readouterr().err
+    assert "2 made again: made from other options: --lights" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
@@ -239,20 +243,20 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
     """As when a light is added: what was made, and then changed by hand, stays."""
     out, lights = tmp_path / "out", ["a"]
 
-    def files(item: Item) -> list[Path]:
-        return [item.output(f"_{light}.bin") for light in lights]
+    class Lit(Copy):
+        def outputs_of(self, item: Item) -> list[Path]:
+            return [item.output(f"_{light}.bin") for light in lights]
 
-    def write(item: Item) -> Outcome:
-        made = [path for path in files(item) if not item.stale or path in item.stale]
-        for path in made:
-            path.write_bytes(b"made")
-        return Outcome(made)
+        def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+            return [{"light": light} for light in lights]
+
+        def __call__(self, item: Item) -> Outcome:
+            for path in item.stale:
+                path.write_bytes(b"made")
+            return Outcome([path for path in self.outputs_of(item) if path in item.stale])
 
     def call() -> int:
-        recipes = [{"light": light} for light in lights]
-        options, settings = BatchOptions(out), Settings()
-        items = collect_items([str(two)], out)
-        return run_items("copy", items, write, files, options, settings, lambda digest_of: recipes)
+        return run_items(Lit(out), collect_items([str(two)], out), BatchOptions(out), Settings())
 
     assert call() == 0
     (out / "a_a.bin").write_bytes(b"retouched")
@@ -332,13 +336,14 @@ def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path:
     out = tmp_path / "out"
     (tmp_path / "a.png").touch()
 
-    def fail(item: Item) -> Outcome:
-        (out / "other").mkdir()
-        (out / "other" / "b_copy.bin").write_bytes(b"b")
-        raise InputError(f"{item.input_path}: is bad")
+    class Fail(Copy):
+        def __call__(self, item: Item) -> Outcome:
+            (out / "other").mkdir()
+            (out / "other" / "b_copy.bin").write_bytes(b"b")
+            raise InputError(f"{item.input_path}: is bad")
 
     given = collect_items([str(tmp_path / "a.png")], out)
-    run_items("copy", given, fail, outputs_of, BatchOptions(out), Settings(), lambda digest_of: [{}])
+    run_items(Fail(out), given, BatchOptions(out), Settings())
     assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
 
 
@@ -362,7 +367,7 @@ def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) 
     assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
-    assert differences(one, other) == "--lights is another, was 150; --matte changed"
+    assert other_options(one, other) == "other options: --lights, --matte"
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
     (tmp_path / "mattes").mkdir()
     (tmp_path / "mattes" / "a.png").write_bytes(b"1")

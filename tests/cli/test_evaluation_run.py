@@ -98,7 +98,7 @@ def test_items_evaluated_otherwise_are_measured_again(tmp_path: Path, notes: Pat
             evaluate(out, overwrite="never", **changed)  # type: ignore[arg-type]
     assert evaluate(out, jobs=1, dry_run=True) == 0 and (out / "summary.json").exists()
     assert evaluate(out, Toy(cases=3, notes=notes)) == 0
-    assert "--cases is 3, was 4" in capsys.readouterr().err and taken(notes) == list(PEOPLE)
+    assert "made from other options: --cases" in capsys.readouterr().err and taken(notes) == list(PEOPLE)
     assert json.loads((out / "summary.json").read_text())["pictures"] == 9
 
 

@@ -21,7 +21,7 @@ from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.synth.sky.skies import kind_of
-from facerf_cli.work.relight_options import Relight, parse_aov
+from facerf_cli.work.relight_options import RelightOptions, parse_aov
 from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
 from tests.kinds import Patch, Said
@@ -120,7 +120,7 @@ def test_layers_have_a_singular_and_a_plural_and_are_listed_as_in_the_help() -> 
     with pytest.raises(UsageError, match="--aov 'beauty': no such layer") as caught:
         parse_aov("normal,beauty")
     listed = str(caught.value).partition("give some of ")[2].split(", ")
-    text = attributes_of(Relight)["aov"]
+    text = attributes_of(RelightOptions)["aov"]
     assert listed == [word for word in re.findall(r"\w+", text) if word in listed] and "albedo" in listed
 
 

@@ -6,12 +6,12 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item, collect_items
-from facerf_cli.batch.made_from import Recipe
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items
+from facerf_cli.batch.made_from import DigestOf, Recipe
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
 from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
@@ -23,10 +23,18 @@ def outputs_of(item: Item) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class Copy:
+class Copy(Job):
     """Copies; each write of an output leaves a line in NOTES/written."""
 
     notes: Path
+    recipe: Recipe = field(default_factory=dict)
+    verb = "copy"
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        return outputs_of(item)
+
+    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
+        return [self.recipe]
 
     def __call__(self, item: Item) -> Outcome:
         data = item.input_path.read_bytes()
@@ -77,8 +85,7 @@ def run(
     configure_logging()
     batch = BatchOptions(output, shard=shard or Shard(), ray=ray, **options)  # type: ignore[arg-type]
     items = collect_items([str(path) for path in ([inputs] if isinstance(inputs, Path) else inputs)], output)
-    work, settings = Copy(output.parent), Settings()
-    return run_items("copy", items, work, outputs_of, batch, settings, lambda digest_of: [recipe or {}])
+    return run_items(Copy(output.parent, recipe or {}), items, batch, Settings())
 
 
 if __name__ == "__main__":
