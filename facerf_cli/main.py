@@ -107,6 +107,7 @@ def _command(name: str) -> Any:
         verbs = typer.Typer(add_completion=False)
         verbs.command(name, context_settings=HELP_NAMES)(with_groups(getattr(file, name.replace("-", "_"))))
     for one in verbs.registered_commands:
+        assert one.callback is not None
         own = one.name or one.callback.__name__.replace("_", "-")
         one.help = unwrapped(one.callback.__doc__ or "")
         one.epilog = epilog_of(own if own == name else f"{name} {own}", EPILOG)

@@ -2,6 +2,8 @@
 
 import os
 import platform
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from types import SimpleNamespace
@@ -9,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
 from facerf_cli.errors import InputError
 from facerf_cli.face import morphable
@@ -17,6 +20,7 @@ from facerf_cli.face.morphable import MAX_ARRAYS, load_face_model
 from facerf_cli.files.read import read_image
 from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
 from facerf_cli.run import memory
+from tests import astronaut
 from tests.kinds import Patch
 
 HEIGHT, WIDTH = 30, 50
@@ -144,3 +148,21 @@ def test_a_checkpoint_asks_for_its_networks(tmp_path: Path) -> None:
     memory.set_limit(3 * path.stat().st_size - 1)
     with pytest.raises(InputError, match=r"a\.safetensors: needs"):
         load_checkpoint(path)
+
+
+@pytest.mark.slow
+def test_a_large_photo_stays_under_its_ceiling(tmp_path: Path) -> None:
+    """The rule of `work/plan.py` holds: 12 megapixels, over what the process has at rest."""
+
+    def peak_bytes(width: int) -> int:
+        photo = tmp_path / f"{width}.jpg"
+        small = Image.fromarray((astronaut.photo()[:384].clip(0, 1) * 255).astype(np.uint8))
+        small.resize((width, width * 3 // 4)).save(photo)
+        line = [sys.executable, "-m", "facerf_cli", "relight", str(photo), "--light", "75,20"]
+        process = subprocess.Popen([*line, "-o", str(tmp_path / "out"), "--memory", "0.5"])
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        assert process.returncode == 0
+        return usage.ru_maxrss * 1024
+
+    assert peak_bytes(4000) - peak_bytes(590) < 0.5 * (1 << 30)

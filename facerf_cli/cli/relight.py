@@ -62,7 +62,11 @@ class RelightJob(Job):
         setups = readable(self.plan.setups)
         if not setups:
             raise FacerfError("none of the maps serves; give others, or procedural:8 to draw some")
-        return self if len(setups) == len(self.plan.setups) else RelightJob(replace(self.plan, setups=setups))
+        return (
+            self
+            if len(setups) == len(self.plan.setups)
+            else replace(self, plan=replace(self.plan, setups=setups))
+        )
 
     @property
     def process(self) -> Callable[[Item], Outcome]:
@@ -186,6 +190,6 @@ def _write_balls(plan: RelightPlan, options: BatchOptions) -> None:
         from facerf_cli.work.lights import readable, write_balls
 
         drawn = readable(missing)
-        write_balls(drawn, [files[setup][0] for setup in drawn], plan.options.exposure, plan.options.output)
+        write_balls(drawn, [files[setup][0] for setup in drawn], plan.exposure_rule, plan.options.output)
         for path in itertools.chain.from_iterable(files[setup] for setup in drawn):
             print_path(path)

@@ -31,7 +31,7 @@ log = logging.getLogger(LOGGER_NAME)
 
 def readable(setups: Sequence[LightSetup]) -> tuple[LightSetup, ...]:
     """The setups whose maps can be read; each map that cannot is logged in one line."""
-    good = {envmap: _is_readable(envmap) for envmap in dict.fromkeys(_maps_of(setups))}
+    good = {one: _is_readable(one) for one in dict.fromkeys(_maps_of(setups))}  # type: ignore[arg-type]
     return tuple(setup for setup in setups if all(good[envmap] for envmap in _maps_of([setup])))
 
 

@@ -37,7 +37,7 @@ from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.matte_models import matte_by_rembg, require_rembg
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
-from facerf_cli.work.plan import KEPT_PX, beside_photo, require_people
+from facerf_cli.work.plan import KEPT_PX, beside, require_people
 
 
 def companion(item: Item, given: Path, option: str) -> Path:
@@ -332,7 +332,7 @@ def _grey_or_alpha(path: Path, size_px: tuple[int, ...], white: float) -> np.nda
 
     Of black and one colour, less bright than `white`, the colour is a label, as of a palette: it reads white.
     """
-    with beside_photo(size_px):
+    with beside(size_px, images=1):
         image = read_image(path, "linear")
     alpha = image.alpha
     values = image.pixels if alpha is None or alpha.min() == alpha.max() else alpha[..., None]

@@ -23,7 +23,7 @@ from facerf_cli.person import Person, Target, person_of
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line
-from facerf_cli.run.memory import batches
+from facerf_cli.run.memory import batches, limit_bytes
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.outputs import OutputImage, write_output
@@ -38,7 +38,7 @@ from facerf_cli.work.photos import (
     read_photo,
     rotation_of,
 )
-from facerf_cli.work.plan import beside_people, image_canvas, prediction_bytes, require_face
+from facerf_cli.work.plan import beside_people, canvas, require_face
 from facerf_cli.work.relight_options import RelightPlan
 from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces
 
@@ -103,7 +103,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
                 require_face(models.face, target.fit or face.fit, photo.shape[:2])
                 person = person_of(
                     models, photo, face.head, kind, alone, face.matte, options.white, face.steady,
-                    prediction_bytes(),
+                    limit_bytes(),
                 )  # fmt: skip
                 far = person.balance is not None and person.balance.is_far and face.steady is None
                 if far and options.white == "photo":
@@ -178,7 +178,7 @@ def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
         return None
     known = plan.exposures.setdefault(leader.output_base, {})
     if not {setup.name for setup in plan.setups} <= set(known):
-        if isinstance(rule := plan.options.exposure, float):
+        if isinstance(rule := plan.exposure_rule, float):
             return dict.fromkeys((setup.name for setup in plan.setups), rule)
         scene = next(scenes_of(leader, plan, together=True))
         parts = batches(len(scene.setups), scene.subject.nbytes)
@@ -218,7 +218,7 @@ def _write_setups(
         for setup, relit in zip(scene.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
             path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
-            with image_canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
+            with canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
                 image = _rendered(scene, setup, relit, ev, plan, empty)
                 image = replace(image, header={**scene.plate, **_made_by(setup, plan)})
                 write_output(
@@ -306,7 +306,7 @@ def _exposures_ev(
     scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], plan: RelightPlan
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
-    if isinstance(rule := plan.options.exposure, float):
+    if isinstance(rule := plan.exposure_rule, float):
         return dict.fromkeys((setup.name for setup in plan.setups), rule)
     found: dict[str, float] = {}
     strengths = scene.lights[0].strengths()

@@ -228,6 +228,11 @@ class RelightPlan:
         return self.options.photo
 
     @property
+    def exposure_rule(self) -> Exposure:
+        """EV, or the rule that chooses it."""
+        return "auto" if self.options.exposure is None else self.options.exposure
+
+    @property
     def maps(self) -> list[LightSetup]:
         """The setups that are maps."""
         return [setup for setup in self.setups if setup.envmap is not None]

@@ -19,7 +19,7 @@ from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import as_in_photo, each_alone, on_face, read_map, with_room
 from facerf_cli.work.photos import FittedFace
-from facerf_cli.work.plan import beside_person
+from facerf_cli.work.plan import beside
 from facerf_cli.work.relight_options import BackgroundChoice, RelightPlan
 
 Behind = Callable[[LightSetup, float], Rows | None]  # the image behind a person, for a setup and an exposure
@@ -96,7 +96,7 @@ def backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:
     if choice.colour is not None:
         fixed = np.broadcast_to(np.array(choice.colour, np.float32), (*size_px, 3))
     elif choice.path is not None:
-        with beside_person(size_px, images=1):
+        with beside(size_px, images=3):
             fixed = covering(read_image(choice.path, with_alpha=False).pixels, *size_px)
 
     def behind(setup: LightSetup, ev: float) -> Rows | None:
@@ -104,7 +104,7 @@ def backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:
             return None if fixed is None else Scaled(fixed, np.float32(2.0**-ev))
         if (light := setup.envmap) is None or light.envmap is None:
             return np.broadcast_to(np.float32(0), (*size_px, 3))
-        with beside_person(size_px):
+        with beside(size_px, images=2):
             envmap = read_map(light.envmap)
         rays, colour = partial(rays_of_rows, camera), intensity_of(light).numpy()
         around = Backdrop(envmap, size_px, rays, light.rotate_deg, blur)

@@ -38,7 +38,7 @@ from facerf_cli.work.photos import (
     stamp,
     write_each,
 )
-from facerf_cli.work.plan import KEPT_OF_SEGMENTS_PX, segments_canvas
+from facerf_cli.work.plan import KEPT_PX, canvas
 from facerf_cli.work.sequence import open_at
 from facerf_cli.work.shots import Shots
 
@@ -59,7 +59,7 @@ def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[lis
         image, face, found = shot.segmented(number)
         _write_segment(item, "", image, to_display(image.pixels), face, found)
         return [""], facts_of_networks(options)
-    image = read_photo(item, options, KEPT_OF_SEGMENTS_PX)
+    image = read_photo(item, options, KEPT_PX + 4)  # a class, too
     display = to_display(image.pixels)
     people = find_people(item, image, options)
     networks, matte = load_models_once(options).networks.people, person_matte(item, image.pixels, options)
@@ -80,7 +80,7 @@ def _write_segment(
     metadata, found = stamp(item), found.cut(image.alpha)
     height, width = found.matte.shape
     colours = PersonColours(image.pixels, found.matte)[:]
-    with segments_canvas(path("_segment.exr"), (height, width)) as empty:
+    with canvas(path("_segment.exr"), (height, width), images=4) as empty:
         layers = {"person.A": found.matte, **in_strips(found.layers, height, width, empty)}
         write_exr(path("_segment.exr"), colours, found.matte, layers, metadata)
     write_display(path("_person.png"), colours, "auto", found.matte, metadata)

@@ -30,7 +30,7 @@ from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
 from facerf_cli.work.lights import lights_over_stack, off_rig_deg
 from facerf_cli.work.photos import companion, face_model, fit_facts
-from facerf_cli.work.plan import KEPT_PX, beside_stack
+from facerf_cli.work.plan import KEPT_PX, beside
 from facerf_cli.work.relight_options import RelightPlan
 from facerf_cli.work.relight_scenes import Behind, LitScene, backdrop, check_faces
 
@@ -247,7 +247,7 @@ def _person_of_stack(
     if plan.options.photo_of_stack is None:
         return stack, None, fit_facts(fit)
     path = companion(item, plan.options.photo_of_stack, "--photo")
-    with beside_stack(size_px):
+    with beside(size_px, images=11):  # of a stack with its writers
         photo = read_image(path, plan.photo.colourspace, kept_px=KEPT_PX, layer=plan.photo.layer).pixels
     scale = photo.shape[0] / size_px[0]
     if abs(photo.shape[1] - scale * size_px[1]) > max(2.0, scale):

@@ -29,6 +29,7 @@ from facerf_cli.person import Target, person_of
 from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.relightable import RenderRequest
+from facerf_cli.run import memory
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
@@ -40,12 +41,13 @@ from facerf_cli.work.photos import (
     rotation_of,
     write_each,
 )
-from facerf_cli.work.plan import prediction_bytes, require_face, require_web_images
+from facerf_cli.work.plan import IMAGE_PX, require_face
 from facerf_cli.work.verbs import PredictOlat, Written
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
 _FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
+_FEWER = "fewer --lights or a smaller --size"
 _LIGHTS_AT_ONCE = 4  # of a person in the photo's frame
 
 
@@ -90,7 +92,7 @@ def _from_in_front(item: Item, directions: Tensor) -> Tensor:
 def _write_relight_web(folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
     """Write the images, exposed alike so that the brightest is well shown."""
     lights, (height, width) = len(header.directions), header.seen.shape
-    require_web_images(lights, (height, width))
+    memory.require(f"--format relight of {lights} lights", lights * height * width * IMAGE_PX, _FEWER)
     halves, brightest = [], torch.zeros(height, width)
     for batch in olats:
         halves.append(batch.half())
@@ -119,10 +121,10 @@ def _of_person(
     alpha, matte = (
         None if one is None else resized(one, *photo.shape[:2]) for one in (image.alpha, face.matte)
     )
-    memory = prediction_bytes()
     with naming(item.input_path):
+        limit_bytes = memory.limit_bytes()
         person = person_of(
-            models, photo, head, "portrait", work.network_alone, matte, work.white, memory_bytes=memory
+            models, photo, head, "portrait", work.network_alone, matte, work.white, memory_bytes=limit_bytes
         )
     subject = person.composed(Target(alpha=alpha, background="none"))
 
@@ -169,7 +171,7 @@ def _of_face(
     def olats() -> Iterator[Tensor]:
         alone, bf16 = work.network_alone, work.precision == "bf16"
         for textures in predict_olat(
-            models, face.head, directions, rotation, alone, prediction_bytes(), bf16, work.white
+            models, face.head, directions, rotation, alone, memory.limit_bytes(), bf16, work.white
         ):
             tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
             yield render_face(textures, *large) if work.frame == "face" else textures

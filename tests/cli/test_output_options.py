@@ -167,12 +167,12 @@ def test_a_configuration_of_a_show_names_spaces_in_and_out(given: Path, tmp_path
 
 def test_layers_that_do_not_fit_are_files_that_go(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
-    with canvas(path, held_bytes=1 << 60) as empty:
+    with canvas(path, (1 << 30, 1 << 30), images=1) as empty:
         image, shadow = empty("rgb", (6, 8, 3)), empty("shadow", (6, 8, 3))
         assert isinstance(image, np.memmap) and (image.dtype, shadow.dtype) == (np.float32, np.float16)
         assert len(list(tmp_path.glob(".*/*"))) == 2
     assert not any(tmp_path.iterdir())
-    with canvas(path, held_bytes=0) as empty:
+    with canvas(path, (4, 6), images=0) as empty:
         assert not isinstance(empty("rgb", (6, 8, 3)), np.memmap) and not any(tmp_path.iterdir())
 
 
