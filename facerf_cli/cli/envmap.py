@@ -41,6 +41,6 @@ def envmap(
     """
     if maps.size_px % 2:
         raise UsageError(f"--size {maps.size_px}: the height is half of it; give an even number")
-    from facerf_cli.work.draw_envmaps import write_envmaps
+    from facerf_cli.synth.sky.maps import write_envmaps
 
     write_envmaps(batch, maps.count, maps.kind, maps.size_px, settings_of(context).seed)

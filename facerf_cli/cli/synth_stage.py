@@ -1,15 +1,47 @@
 """`facerf synth-stage`: photograph synthetic people in a virtual light stage."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import UsageError
 from facerf_cli.option import IMAGE, Without
 from facerf_cli.synth.stage_settings import StageSettings
+
+
+@dataclass(frozen=True)
+class Photograph(Job):
+    """Photographs people; the baked transport of each is kept in a folder, if one is given."""
+
+    stage: StageSettings
+    transport: Path | None
+    verb = "synth-stage"
+
+    def outputs_of(self, item: Item) -> list[Path]:
+        """The person's folder, and the baked transport if it is kept."""
+        transport = self._transport_path(item)
+        return [item.output_base] if transport is None else [item.output_base, transport]
+
+    def __call__(self, item: Item) -> Outcome:
+        """Draw and photograph a person."""
+        from facerf_cli.run.workers import one_thread
+        from facerf_cli.synth.bank.heads import cached_face_model
+        from facerf_cli.synth.stage import write_subject
+        from facerf_cli.synth.subjects import draw_subject
+
+        model = cached_face_model(self.stage.face_model)
+        with one_thread():
+            subject = draw_subject(model, int(item.name), self.stage.seed, self.stage.size_px)
+            write_subject(item.output_base, subject, self.stage, self._transport_path(item))
+        return Outcome(self.outputs_of(item), {"traits": subject.traits})
+
+    def _transport_path(self, item: Item) -> Path | None:
+        return self.transport / f"{item.name}.safetensors" if self.transport else None
 
 
 def synth_stage(
@@ -45,8 +77,21 @@ def synth_stage(
     """
     if transport and stage.renderer != "bake":
         raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")
-    from facerf_cli.work.synth_subjects import photograph_people
+    from facerf_cli.synth.bank.heads import cached_face_model
+    from facerf_cli.synth.path_tracer import load_mitsuba
+    from facerf_cli.synth.stage import close_capture, open_capture
 
     settings = settings_of(context)
     stage = replace(stage, seed=settings.seed)
-    raise typer.Exit(photograph_people(subjects, stage, transport, batch, settings))
+    cached_face_model(stage.face_model)  # raises for an invalid model before anything is written
+    if stage.renderer == "mitsuba":
+        load_mitsuba()
+    folders = [batch.output / f"{index:04d}" for index in range(subjects)]
+    items = [Item(folder, folder, folder.name) for folder in folders]
+    photograph = Photograph(stage, batch.output / "transport" if transport else None)
+    if not batch.dry_run:
+        open_capture(batch.output, stage)
+    code = run_items(photograph, items, batch, settings)
+    if not batch.dry_run and sums_up(items, photograph.outputs_of, batch):
+        close_capture(batch.output, stage)
+    raise typer.Exit(code)

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
-from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.entries import StudioLight, parse_lights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
@@ -21,6 +21,15 @@ _NEAREST_M = 0.05  # distance below which a light does not grow any more
 _FULL_CONE = 0.8  # share of a spot's cone in which it has its full strength; from there it falls to 0
 _WIDEST_DEG = 36.0  # side of a light, as seen from the face, from which on its shadows have no edges
 WHITE_K = 6504.0  # the correlated colour temperature of D65
+
+
+def rig_by_text(rig: str) -> Tensor:
+    """Unit directions [L, 3] of `--lights`."""
+    parsed = parse_lights(rig)
+    if isinstance(parsed, int):
+        return rig_directions(parsed)
+    azimuth, elevation = torch.tensor(parsed).T
+    return azel_to_direction(azimuth, elevation)
 
 
 def blackbody_rgb(kelvin: float) -> np.ndarray:

@@ -27,6 +27,7 @@ from facerf_cli.light.envmap import ball
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, rig_coefficients
 from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
+from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.network.checkpoint import load_vgg
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
@@ -36,7 +37,6 @@ from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import (
     FittedFace,
-    directions_of,
     facts_of_networks,
     fit_faces,
     load_models_once,
@@ -148,7 +148,7 @@ def _estimate(
             models,
             _unmasked(item, image, head, options),
             options.reflectance,
-            directions_of(options.rig),
+            rig_by_text(options.rig),
             Estimator(options.non_negative, features),
             options.keep_eyes,
             more,

@@ -15,12 +15,12 @@ from facerf_cli.errors import InputError
 from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import ball, lights_around, rotated_weights
 from facerf_cli.light.map_keys import MapKeys, without_keys
-from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow
+from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow, rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
-from facerf_cli.work.photos import directions_of, face_model
+from facerf_cli.work.photos import face_model
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map
 _LIGHT_WIDTH_PX = 512  # of the map of a photo's light
@@ -86,7 +86,7 @@ def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling
 @lru_cache(maxsize=1)
 def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
     """The maps of M setups over a rig's lights, and their keys, which the paper's sampling does not know."""
-    directions = directions_of(rig)
+    directions = rig_by_text(rig)
     weights, keys = _map_weights(setups, directions, sampling, with_keys=sampling != "paper")
     return _with_far(_far(len(setups), keys), Lights(directions, weights))
 

@@ -23,8 +23,6 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
-from facerf_cli.light.entries import parse_lights
-from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.files import serving_files
 from facerf_cli.pipeline import find_for, head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_of, face_facts, touched_sides
@@ -353,12 +351,3 @@ def rotation_of(pose: str | None) -> torch.Tensor | None:
     """The head_to_camera rotation [3, 3] of `--pose`; None keeps the photo's pose."""
     pose_deg = parse_pose(pose)
     return None if pose_deg is None else pose_to_rotation(*pose_deg)
-
-
-def directions_of(rig: str) -> torch.Tensor:
-    """Unit directions [L, 3] of `--lights`."""
-    parsed = parse_lights(rig)
-    if isinstance(parsed, int):
-        return rig_directions(parsed)
-    azimuth, elevation = torch.tensor(parsed).T
-    return azel_to_direction(azimuth, elevation)

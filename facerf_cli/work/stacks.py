@@ -24,7 +24,7 @@ from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
 from facerf_cli.image.strips import resized
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.studio_points import Lights, rig_by_text
 from facerf_cli.person import Target, person_of
 from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
@@ -33,7 +33,6 @@ from facerf_cli.run import memory
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
-    directions_of,
     load_models_once,
     naming,
     provenance,
@@ -53,7 +52,7 @@ _LIGHTS_AT_ONCE = 4  # of a person in the photo's frame
 
 def write_stacks(item: Item, work: PredictOlat) -> Written:
     """Predict and write the stack of each chosen face of a photo."""
-    directions = directions_of(work.lights)
+    directions = rig_by_text(work.lights)
     if work.format == "relight":
         directions = _from_in_front(item, directions)
     image = read_photo(item, work.photo)

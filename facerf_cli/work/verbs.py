@@ -13,7 +13,7 @@ from typing import Any, Literal, Self
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, only_item
 from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, folder_not_file, run_items
-from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
@@ -214,83 +214,7 @@ class PredictOlat(PhotoWork):
         return replace(self, frame=self.frame or ("photo" if self.pose is None else "face"))
 
 
-Form = Literal["latlong", "json", "sh", "blender", "mitsuba"]
-MOST_ORDER = 20
-LARGEST_MAP_PX = 8192
-_ENDINGS: dict[Form, str] = {
-    "latlong": "_latlong.exr",
-    "json": "_rig.json",
-    "sh": "_sh.json",
-    "blender": "_blender.exr",
-    "mitsuba": "_mitsuba.exr",
-}
-_LIGHT_SUFFIXES = frozenset({".exr", ".hdr", ".json"})
-
-
-def parse_forms(names: Sequence[str]) -> tuple[Form, ...]:
-    """The forms of `--to`, each once; raises UsageError for a name of none."""
-    if unknown := [name for name in names if name not in _ENDINGS]:
-        raise UsageError(f"--to {unknown[0]}: no such form; give one of {', '.join(_ENDINGS)}")
-    return tuple(form for form in dict.fromkeys(names) if form in _ENDINGS)
-
-
-@dataclass(frozen=True)
-class ConvertLight(Job):
-    """`facerf convert-light`.
-
-    Attributes:
-        forms: Write this form: latlong, json, sh, blender or mitsuba. Repeatable.
-        from_axes: Read input maps in the orientation of this program.
-        width_px: Write maps of this width; the height is half of it.
-        order: Write spherical harmonics of this order in json and sh.
-        lights: Write json over this rig: a number, 'az,el;az,el;...', or a file of such lines.
-        signed: Keep the plain series of spherical harmonics, negative in places (default: the nearest
-            non-negative light).
-    """
-
-    forms: tuple[Form, ...] = option(
-        ..., metavar="FORM", flags=("--to",), shown_default=False, typed=list[str], parse=parse_forms
-    )
-    from_axes: Literal["facerf", "blender", "mitsuba"] = option("facerf", panel=LIGHT)
-    width_px: int | None = option(
-        None,
-        metavar="PX",
-        shown_default="the map's own, else 512",
-        least=16,
-        most=LARGEST_MAP_PX,
-        panel=LIGHT,
-    )
-    order: int | None = option(
-        None, shown_default="the input's own, else 2", least=0, most=MOST_ORDER, panel=LIGHT
-    )
-    lights: str | None = option(
-        None, metavar="N|FILE", shown_default="the input's own, else 150", panel=LIGHT
-    )
-    signed: bool = option(False, panel=LIGHT)
-    alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
-    verb = "convert-light"
-
-    def run(self, inputs: Sequence[str], batch: BatchOptions, settings: Settings) -> int:
-        """Convert the inputs; return the exit code."""
-        if self.width_px is not None:
-            refuse_odd("--width", self.width_px)
-        if self.lights is not None:
-            parse_lights(self.lights)  # a wrong one fails the call, not every item
-        items = collect_items(inputs, batch.output, _LIGHT_SUFFIXES, null_separated=settings.null_separated)
-        work, ends = self, [_ENDINGS[form] for form in self.forms]
-        if end_of_file(batch.output, ends):
-            items = [only_item(items, batch.output, several=len(ends) > 1)]
-            work = replace(self, alone=batch.output.suffix)
-            batch = replace(batch, output=batch.output.parent)
-        return run_items(work, items, batch, settings)
-
-    def outputs_of(self, item: Item) -> list[Path]:
-        """A file for each form."""
-        return [item.output(self.alone or _ENDINGS[form]) for form in self.forms]
-
-    def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
-        """The recipe of all forms."""
-        return [recipe_of(self, digest_of)]
+LARGEST_MAP_PX, MOST_ORDER = 8192, 20
 
 
 def refuse_odd(name: str, width_px: int) -> None:

@@ -8,8 +8,8 @@ from facerf_cli.files.atomic import _machine
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
+from facerf_cli.synth.sky.maps import write_sheet
 from facerf_cli.synth.sky.skies import draw_sky
-from facerf_cli.work.draw_envmaps import write_sheet
 from facerf_cli.work.light_setups import LightSources, collect_setups
 from tests.kinds import Said
 
