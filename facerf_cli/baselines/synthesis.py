@@ -67,7 +67,7 @@ class LightPrior:
     modes: Tensor
 
 
-@cache
+@cache  # an asset that every fit needs
 def skin_prior() -> SkinPrior:
     """Load the shipped prior of skin."""
     tensors, _ = load_checkpoint(ASSET)
@@ -77,7 +77,7 @@ def skin_prior() -> SkinPrior:
     )
 
 
-@cache
+@cache  # an asset that every fit needs
 def light_prior(order: int) -> LightPrior:
     """Load the shipped prior of light, truncated to an order up to that of the asset; R <= 3 K."""
     tensors, _ = load_checkpoint(ASSET)

@@ -43,7 +43,7 @@ def undistorted(image: np.ndarray, camera: PosedCamera, coefficients: Coefficien
     return np.ascontiguousarray(flat[0].permute(1, 2, 0).numpy())
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=16)  # all frames of a camera share it
 def _grid(
     focal_px: tuple[float, float],
     centre_px: tuple[float, float],

@@ -144,7 +144,7 @@ class _Group:
         return self.kind(**given)
 
 
-@cache
+@cache  # verbs share groups, and --help is to be quick
 def _group_of(hint: Any) -> _Group | None:
     """The group that a parameter's annotation names; None where it is no group."""
     kind, *notes = (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)

@@ -210,7 +210,7 @@ class PairReader:
         return _lazy_sources(self.dataset, (pair,))[0].float()
 
 
-@lru_cache(maxsize=_LAZY_CACHED)
+@lru_cache(maxsize=_LAZY_CACHED)  # pairs of a stack follow each other
 def _lazy_sources(dataset: Dataset, pairs: tuple[Pair, ...]) -> list[Tensor]:
     """Sources [3, H, W] of pairs of one stack, summed from it."""
     rows, weights = load_pairs(dataset)[pairs[0].subject]
@@ -279,7 +279,7 @@ class _StackInfo:
         return image[:, face].mean(1).clamp_min(_DARKEST)
 
 
-@lru_cache(maxsize=_STACKS_CACHED)
+@lru_cache(maxsize=_STACKS_CACHED)  # every step of training needs some
 def _stack_info(path: Path) -> _StackInfo:
     header, fit = read_stack(path)
     return _StackInfo(

@@ -107,7 +107,7 @@ class _Face:
     exposure: float
 
 
-@lru_cache(maxsize=_FACES_KEPT)
+@lru_cache(maxsize=_FACES_KEPT)  # every step of training needs some
 def _face_of(path: Path, model: MorphableModel) -> _Face:
     header, fit = read_stack(path)
     exposure = MEAN_RADIANCE / lit_mean_of(path, header)  # raises where no row shows the face

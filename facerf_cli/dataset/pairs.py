@@ -234,7 +234,7 @@ class _ByFolder:
     folder: Path
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=1)  # large tables, one dataset at a time
 def _load_pairs(key: _ByFolder, changed_ns: int) -> dict[str, tuple[list[Pair], np.ndarray]]:
     pairs = read_pairs(key.dataset)
     weights = _load_weights(key.dataset, pairs)

@@ -149,7 +149,7 @@ class YaleSubject:
             yield from (Relighting("environment", source, environment) for environment in ENVIRONMENTS)
 
 
-@cache
+@cache  # cells of many points on the sphere
 def environment_weights(name: str, flashes: tuple[Flash, ...]) -> np.ndarray:
     """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L]; the sum is 1."""
     directions = _spiral(_SPHERE_POINTS)

@@ -40,7 +40,7 @@ def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndar
     return np.array(recognition.compute_face_descriptor(np.ascontiguousarray(image), shape))
 
 
-@cache
+@cache  # a network of 20 MB
 def _recognition() -> tuple[Any, Any]:
     """The library and its network; raises FacerfError where it is not installed."""
     path = descriptor_path()

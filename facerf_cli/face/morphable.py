@@ -129,7 +129,7 @@ def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
     return _builtin() if str(name_or_path) == BUILTIN else _read(Path(name_or_path))
 
 
-@cache
+@cache  # one object, by which other caches are keyed
 def _builtin() -> MorphableModel:
     return _read(BUILTIN_PATH)
 

@@ -115,7 +115,7 @@ def grid_uv() -> Tensor:
     return torch.stack([u, v], -1).reshape(-1, 2)
 
 
-@cache
+@cache  # for every render
 def grid_triangles() -> Tensor:
     """Vertex ids [F, 3], counter-clockwise seen from outside; diagonals mirrored about the midline."""
     row, col = torch.meshgrid(torch.arange(GRID - 1), torch.arange(GRID - 1), indexing="ij")
@@ -162,7 +162,7 @@ def landmark_weights() -> tuple[Tensor, Tensor]:
     return locate(LANDMARK_UV)
 
 
-@cache
+@cache  # slow at many texels, and for every photo
 def region_mask(name: str, side: int) -> Tensor:
     """The mask [T, T] in 0..1 of the region `name`; row 0 is the forehead; symmetric in u."""
     if name == "skin":

@@ -52,7 +52,7 @@ def checked(kind: type[Kind], value: Any, where: str) -> Kind:
         raise InputError(text.replace("\n", " ")) from None
 
 
-@cache
+@cache  # pydantic compiles it
 def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 

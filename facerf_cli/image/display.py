@@ -22,7 +22,7 @@ def check(config: str) -> None:
     _opened(config)
 
 
-@cache
+@cache  # hundreds, asked of OpenColorIO one by one
 def names(config: str = "") -> dict[str, str]:
     """Map case-folded names, aliases and roles of the configuration to their spelling."""
     found = _opened(config)
@@ -65,7 +65,7 @@ def displayed(
     return None if _error(result) else np.asarray(result.get_pixels(oiio.FLOAT))
 
 
-@cache
+@cache  # slow to open
 def _opened(config: str) -> oiio.ColorConfig:
     found = oiio.ColorConfig(config) if config else oiio.ColorConfig()
     if error := found.geterror():  # otherwise OpenImageIO continues with a few built-in names

@@ -72,7 +72,7 @@ def observer_weights() -> np.ndarray:
     return np.array(_TABLES["observer"], float) / 100
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=1)  # thousands of spectra
 def skin_table() -> Tensor:
     """Table [1, 3, steps of blood, steps of melanin] of linear Rec.709; steps are even in the square root."""
     step = np.linspace(0, 1, _STEPS) ** 2

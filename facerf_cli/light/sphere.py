@@ -87,7 +87,7 @@ def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
     return torch.from_numpy(_relaxed(n)).float()
 
 
-@cache
+@cache  # hundreds of steps
 def _relaxed(n: int) -> np.ndarray:
     points = golden_spiral(n)
     for step in range(_RELAX_STEPS if n > 1 else 0):

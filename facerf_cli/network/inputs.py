@@ -248,7 +248,7 @@ def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
     return torch.autocast(device.type, torch.bfloat16, enabled=wanted and _has_bf16(device.type))
 
 
-@cache
+@cache  # said once
 def _has_bf16(device_type: str) -> bool:
     has: bool = device_type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
     if not has:

@@ -74,7 +74,7 @@ class PeopleNetworks:
     body: StoredGraph
 
 
-@cache
+@cache  # loaded once a device
 def mediapipe_networks(device: torch.device) -> tuple[StoredGraph, ...]:
     """MediaPipe's networks on a device, in the order of `PeopleNetworks`."""
     names = [field.name for field in fields(PeopleNetworks)][1:]

@@ -219,7 +219,7 @@ def _reach(offset_px: Tensor, chosen: Tensor) -> np.ndarray:
     return reach
 
 
-@cache
+@cache  # an asset that every photo needs
 def _mean_person() -> _MeanPerson:
     tensors, metadata = load_checkpoint(ASSET)
     if metadata.get("layout_version") != LAYOUT_VERSION:

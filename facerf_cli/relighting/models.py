@@ -132,7 +132,7 @@ class Networks:
         return {name: described_file(path) for name, path in files.items()}
 
 
-@cache
+@cache  # loaded once a process
 def _networks_once(files: tuple[tuple[str, Path], ...], device: torch.device) -> Networks:
     return Networks(dict(files), device)
 
@@ -226,7 +226,7 @@ def _require_builtin_coefficients(path: Path, geometry: GeometryNetwork) -> None
         raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
 
 
-@cache
+@cache  # of many MB
 def described_file(path: Path) -> dict[str, str]:
     """Path and SHA-256 of a checkpoint, for reports; of a shipped one the name alone."""
     return {

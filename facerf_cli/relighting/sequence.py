@@ -309,6 +309,7 @@ class SteadyShot:
     """A person through the frames of a shot, each steadied by those around it.
 
     What frames see is kept for those around the last one that was asked for: in order each is looked at once.
+    What holds for the whole shot is found when it is first needed, and kept.
 
     Args:
         models: The face model and the networks.

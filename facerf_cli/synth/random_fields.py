@@ -69,7 +69,7 @@ def places_mm(window: Window) -> tuple[Tensor, Tensor]:
     return (u - 0.5) * float(UV_SIZE_MM[0]), v * float(UV_SIZE_MM[1])
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=64)  # all people of a run share it
 def inside(window: Window, region: str) -> Tensor:
     """Compute the signed distance [1, 1, T, T] in millimetres to the outline of a region, positive inside.
 
@@ -97,7 +97,7 @@ def smooth(ramp: Tensor) -> Tensor:
     return ramp * ramp * (3 - 2 * ramp)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=64)  # all people of a run share it
 def blob(window: Window, at: int | tuple[float, float], radius_mm: float, tall: float = 1.0) -> Tensor:
     """Compute a Gaussian bump [1, 1, T, T] of peak 1 at a landmark or (u, v); `tall` is height over width."""
     u, v = LANDMARK_UV[at] if isinstance(at, int) else at
@@ -144,7 +144,7 @@ def _enlarged(grid: Tensor, side: int) -> Tensor:
     return _bicubic(rows, side) @ (grid @ _bicubic(columns, side).T)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=256)  # every noise needs it
 def _bicubic(cells: int, side: int) -> Tensor:
     """Bicubic interpolation matrix [side, cells]."""
     each = torch.eye(cells)[None, None]

@@ -90,7 +90,7 @@ def _outward(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return triangles if six_volumes >= 0 else triangles[:, [0, 2, 1]]
 
 
-@cache
+@cache  # all steps of a search share it
 def _sparse_face() -> _SparseFace:
     model, (corners, weights) = load_face_model(), landmark_weights()
     grid = np.arange(GRID * GRID).reshape(GRID, GRID)[2:-2:_STEP, 2:-2:_STEP].ravel()

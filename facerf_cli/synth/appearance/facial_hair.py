@@ -112,7 +112,7 @@ def _below_edge(window: Window, edge: str, shift_mm: Tensor | float = 0) -> Tens
     return (y - edge_mm)[None, None] - shift_mm
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # all people share it
 def beard_density(window: Window) -> Tensor:
     """Density [1, 1, T, T] of a beard, about 0..1: thin toward the cheeks and on the neck."""
     x, y = places_mm(window)

@@ -75,7 +75,7 @@ def _pore_places(window: Window) -> Tensor:
     return 0.55 + (0.9 * blob(window, 30, 15) + 0.7 * cheeks + 0.4 * blob(window, 8, 14)).clamp(0, 1)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=1)  # all people share it
 def _fold_lines() -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """All K folds together: control points [P, 2], basis [N, P], taper [N], fold index [N] and depth [K].
 

@@ -304,7 +304,7 @@ def _mirrored(stored: dict[str, Tensor], crop_px: int) -> dict[str, Tensor]:
     }
 
 
-@cache
+@cache  # two pseudoinverses
 def _mirrored_coefficients() -> tuple[Tensor, Tensor]:
     """Matrices [Ki, Ki] and [Ke, Ke] from the built-in model's coefficients to those of the mirrored face."""
     model = load_face_model()

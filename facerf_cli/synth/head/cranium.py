@@ -43,7 +43,7 @@ def average_head_mm(u: np.ndarray, level: np.ndarray) -> np.ndarray:
     return np.stack([across * np.sin(azimuth), y, across * np.cos(azimuth)], -1)
 
 
-@cache
+@cache  # all heads share it
 def _profiles() -> tuple[RectBivariateSpline, RectBivariateSpline]:
     """Splines of distance from the axis and of height, in mm, over (arc length above `TOP_M`, azimuth)."""
     tables = {name: np.array(rows, float) for name, rows in tables_of(__file__).items()}

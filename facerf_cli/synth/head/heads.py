@@ -257,7 +257,7 @@ class _Plan:
     label: np.ndarray  # [W] index into `labels.CLASSES`
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=4)  # all heads of a model share it
 def _plan(head: HeadModel, names: tuple[str, ...], subdivisions: int) -> _Plan:
     """Subdivide a head model's mesh, cut it into parts and find its slits; names: of the expressions."""
     triangles = head.triangles.numpy()

@@ -395,6 +395,6 @@ def packed_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
     return vertices, tensors[f"{name}.triangles"].astype(np.int64)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=1)  # an asset of several MB
 def _tensors() -> dict[str, np.ndarray]:
     return load(files("facerf_cli.assets").joinpath("makehuman.safetensors").read_bytes())

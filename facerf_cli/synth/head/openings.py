@@ -40,7 +40,7 @@ class Sheet:
     same: np.ndarray
 
 
-@cache
+@cache  # all heads share it
 def skin_sheet(subdivisions: int, cut: tuple[str, ...]) -> Sheet:
     """Mesh the skin of the whole head, with the openings named in `cut` cut out."""
     columns = 128 * 2**subdivisions
@@ -98,7 +98,7 @@ class Lip:
         return inside & (_above(points, line) == self.upper)
 
 
-@cache
+@cache  # slow, and all heads share it
 def lips(name: str) -> tuple[Lip, Lip]:
     """The upper and the lower side of an opening, each extrapolated into it.
 

@@ -254,7 +254,7 @@ def _skin(face_mm: np.ndarray, sheet: Sheet, subdivisions: int, cut: tuple[str, 
     return skin[sheet.same]
 
 
-@cache
+@cache  # all heads share it
 def _surroundings(subdivisions: int) -> Surroundings:
     """The head outside the face, at the samples of the sheet."""
     u_level = skin_sheet(subdivisions, ()).u_level

@@ -45,7 +45,7 @@ class Grid:
         return np.asarray(np.clip(depth_rad / self.pixel_rad + 0.5, 0, 1))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=2)  # all maps of a run share it
 def make_grid(width_px: int) -> Grid:
     """Build the pixel grid of maps [width / 2, width, 3]."""
     height_px = width_px // 2
