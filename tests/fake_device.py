@@ -54,6 +54,19 @@ class OnDevice(Tensor):
     def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         return _computed(Counts(), function, args, kwargs or {})
 
+    def __getitem__(self, key: Any) -> Any:
+        return super().__getitem__(_index(key))
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        super().__setitem__(_index(key), value)
+
+
+def _index(key: Any) -> Any:
+    """An index whose lists and ranges are tensors: torch would make them without values, on meta."""
+    if isinstance(key, tuple):
+        return tuple(map(_index, key))
+    return torch.as_tensor(list(key)) if isinstance(key, list | range) else key
+
 
 def moved(module: nn.Module) -> nn.Module:
     """The module with its parameters and buffers on the fake device."""
@@ -90,6 +103,7 @@ def counted() -> Iterator[Counts]:
     with (
         _Counting(counts),
         patch("torch.tensor", tensor),
+        patch("torch.inference_mode", torch.no_grad),  # within it nothing is dispatched
         plain,
         patch("torch.Tensor.new_tensor", new_tensor),
     ):

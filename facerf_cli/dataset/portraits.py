@@ -62,7 +62,13 @@ class DatasetPortraits:
         everyone = list(range(len(self.views)))
         return everyone[: self.training], everyone[self.training :][:held_out]
 
-    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
+    def sides_px(self, people: Sequence[int]) -> list[int]:
+        """See `PortraitSource`: all are the same."""
+        return [SIDE_PX]
+
+    def draw(
+        self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
+    ) -> PortraitSample:
         """Draw one sample [1, ...] of one of some people, with `targets` lights."""
         views = self.views[people[int(torch.randint(len(people), (), generator=generator))]]
         seen = load_file(views[int(torch.randint(len(views), (), generator=generator))])

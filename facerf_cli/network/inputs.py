@@ -25,6 +25,8 @@ _ROOT_OFFSET = 0.02  # keeps the slope of the root finite at black
 _DECODER_CHANNELS = 220  # that a decoder holds at once for each light, at its working side
 _TEXTURE_CHANNELS = 16  # that its output holds at once for each light, at the side of the texture
 _ORDINARY_CAST = 2.0  # standard deviations within which a colour cast is left to the network
+_BF16_CAPABILITY = 8  # of an NVIDIA GPU that computes in bfloat16
+_NAMES = {"cpu": "processor", "cuda": "GPU"}
 _GREY = 1e-4  # difference of the channels of a grey image, of its mean, left by resampling
 _LEAST_DEVIATION = 0.02  # of a log ratio of colours: that of grey data would be 0
 
@@ -138,10 +140,12 @@ def head_rotation(mean_normals: Tensor, normals: Tensor) -> Tensor:
     mean_normals [3, S, S] in the head frame, normals [B, 3, T, T] in camera space. The solution is that of
     the orthogonal Procrustes problem.
     """
-    small = resize(normals, mean_normals.shape[-1]).cpu().double()  # Apple's GPUs have no doubles
-    moment = torch.einsum("bcij,dij->bcd", small, mean_normals.cpu().double())
+    small = resize(normals, mean_normals.shape[-1])
+    if small.device.type == "mps":  # Apple's GPUs have no doubles
+        small = small.cpu()
+    moment = torch.einsum("bcij,dij->bcd", small.double(), mean_normals.to(small.device).double())
     u, _, vt = torch.linalg.svd(moment)
-    signs = torch.ones(len(moment), 3, dtype=moment.dtype)
+    signs = moment.new_ones(len(moment), 3)
     signs[:, 2] = torch.det(u @ vt)
     return (u @ torch.diag_embed(signs) @ vt).to(normals)
 
@@ -242,15 +246,19 @@ class SavedNetwork(nn.Module):
 def mixed_precision(device: torch.device, wanted: bool) -> torch.autocast:
     """Context in which a network computes in bfloat16, if that is `wanted`.
 
-    A processor without instructions for bfloat16 emulates them and is a hundred times slower: there the
-    network stays in float32, and a line says so once.
+    A processor without instructions for bfloat16 emulates them and is a hundred times slower, and old GPUs
+    lack them, too: there the network stays in float32, and a line says so once.
     """
-    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and _has_bf16(device.type))
+    return torch.autocast(device.type, torch.bfloat16, enabled=wanted and _has_bf16(device))
 
 
 @cache  # said once
-def _has_bf16(device_type: str) -> bool:
-    has: bool = device_type != "cpu" or torch.ops.mkldnn._is_mkldnn_bf16_supported()
+def _has_bf16(device: torch.device) -> bool:
+    has: bool = device.type not in ("cpu", "cuda")
+    if device.type == "cpu":
+        has = torch.ops.mkldnn._is_mkldnn_bf16_supported()
+    if device.type == "cuda":
+        has = torch.cuda.get_device_capability(device)[0] >= _BF16_CAPABILITY
     if not has:
-        log.info("this processor has no instructions for bfloat16; networks stay in float32")
+        log.info("this %s has no instructions for bfloat16; networks stay in float32", _NAMES[device.type])
     return has

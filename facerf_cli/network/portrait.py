@@ -25,6 +25,7 @@ from facerf_cli.raster.texture import smoothstep
 
 SKIN = 1  # index of the class whose mean exposes the image
 HAIRY = (2, 6, 7)  # brows, hair and beard
+_EARS = 8
 _REACH = 3  # order of the spherical harmonics that summarise the proxy's visibility
 LIT_ORDER, SHADOW_ORDER = 3, 4  # of P and U; of W
 _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
@@ -33,7 +34,7 @@ _TURNED = 0.15  # n . l at which highlights begin to fade, and, below 0, end
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
 _NEAR_FACES = 0.1  # around the proxy, where hair and cloth may be that it lacks; so far on its layers fade
-_SIDES = 3.0  # faces: the square's side for which the scale is 0
+_FACE_PX = 64.0  # pixels along a face for which the scale is 0
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
 _COARSE = {  # maps at half the side
     "lit": (LIT_ORDER + 1) ** 2,
@@ -51,7 +52,7 @@ class PortraitSettings:
     blocks: Blocks = (1, 1, 2, 2, 2)
     classes: Classes = 14
     side: Side = 192
-    scaled: bool = False  # sees the square's scale, and nothing of the proxy where that has no surface near
+    sees_scale: bool = False  # is told pixels a face, and sees nothing of the proxy far from its surface
 
 
 @dataclass(frozen=True)
@@ -75,12 +76,17 @@ class PortraitInputs(Batch):
 
     @property
     def near_proxy(self) -> Tensor:
-        """Share [B, 1, S, S] that the proxy's layers have: 1 near the proxy, 0 far from it."""
-        return torch.cat([_around(*one) for one in zip(self.covered, self.sides.flatten(), strict=True)])
+        """Share [B, 1, S, S] that the proxy's layers have: 1 near the proxy and in ears, 0 far from it."""
+        near = torch.cat([_around(*one) for one in zip(self.covered, self.sides.flatten(), strict=True)])
+        return torch.maximum(near, self.classes[:, _EARS : _EARS + 1])
 
-    def emptied(self) -> "PortraitInputs":
-        """The same without what the proxy does not show."""
-        near = self.near_proxy
+    @property
+    def scale(self) -> Tensor:
+        """Pixels a face [B, 1, 1, 1], as a logarithm."""
+        return (self.image.shape[-1] / self.sides / _FACE_PX).log()
+
+    def emptied(self, near: Tensor) -> "PortraitInputs":
+        """The same without what the proxy does not show, where it is not `near` [B, 1, S, S]."""
         shown = {name: getattr(self, name) * near for name in ("normals", "depth", "reached")}
         return replace(self, **shown, own=1 + (self.own - 1) * near)
 
@@ -100,7 +106,7 @@ class PortraitInputs(Batch):
 
 def _around(covered: Tensor, sides: Tensor) -> Tensor:
     """1 within `_NEAR_FACES` of covered pixels [1, S, S] of a square of `sides`, 0 from thrice that on."""
-    fade = max(1, round(float(_NEAR_FACES * covered.shape[-1] / sides)))
+    fade = max(1, round(_NEAR_FACES * covered.shape[-1] / float(sides)))
     near, reach = covered[None], 2 * fade
     for kernel, padding in (((1, 2 * reach + 1), (0, reach)), ((2 * reach + 1, 1), (reach, 0))):
         near = F.max_pool2d(near, kernel, 1, padding)
@@ -225,7 +231,7 @@ class PortraitNetwork(UNet):
 
     def __init__(self, settings: PortraitSettings = PortraitSettings()) -> None:
         inputs = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1
-        super().__init__(settings, inputs + 2 * settings.scaled)
+        super().__init__(settings, inputs + 2 * settings.sees_scale)
         widths = settings.widths
         self.last = Residual(widths[0])
         self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
@@ -234,10 +240,10 @@ class PortraitNetwork(UNet):
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
         """Predict maps; sides are multiples of 32."""
         stacked, shown = inputs.stacked(), torch.ones_like(inputs.covered)
-        if self.settings.scaled:
-            inputs, shown = inputs.emptied(), inputs.near_proxy
-            scale = (inputs.sides / _SIDES).log().expand_as(shown)
-            stacked = torch.cat([inputs.stacked(), shown, scale], 1)
+        if self.settings.sees_scale:
+            shown = inputs.near_proxy
+            inputs = inputs.emptied(shown)
+            stacked = torch.cat([inputs.stacked(), shown, inputs.scale.expand_as(shown)], 1)
         predicted = self.predict(self.last(self.doubled(self.halved(stacked))[-1]))
         fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
@@ -252,9 +258,9 @@ class PortraitNetwork(UNet):
 
         Its new weights are 0: where the proxy is near it begins with the same maps.
         """
-        if self.settings.scaled:
+        if self.settings.sees_scale:
             return self
-        wider = PortraitNetwork(replace(self.settings, scaled=True, side=side))
+        wider = PortraitNetwork(replace(self.settings, sees_scale=True, side=side))
         weights = self.state_dict()
         weights["stem.enter.weight"] = F.pad(weights["stem.enter.weight"], (0, 0, 0, 0, 0, 2))
         wider.load_state_dict(weights)

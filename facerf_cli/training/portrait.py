@@ -6,23 +6,23 @@ others (Yeh et al., *Learning to relight portrait images via a virtual light sta
 adaptation*, 2022).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.network.inputs import concatenate
+from facerf_cli.network.inputs import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.synth.bank.portrait_samples import SMALL, PortraitSample, PortraitSource
-from facerf_cli.training.objective import Objective, Validation
+from facerf_cli.training.objective import Objective, Validation, seeded
 from facerf_cli.training.sheets import tiled
 
 _ROOT_OFFSET = 0.01  # keeps the slope of the root finite at black
 _SCALE = (0.4, 2.5)  # of exposure between prediction and truth that is forgiven
-_SHEET_ROWS = 8
+_SHEET_ROWS, _SHEET_TARGETS, _SHEET_PX = 8, 4, 128
 # Regions that are measured, as in the benchmark of whole heads.
 _REGIONS = {
     "face": ("skin", "brows", "lips", "eyes"),
@@ -31,6 +31,8 @@ _REGIONS = {
     "neck": ("neck",),
     "garment": ("garment",),
 }
+# Sides in faces of squares that are measured by themselves: of a face, of head and shoulders, and wider ones.
+_BANDS = {"close": (0.0, 2.5), "shoulders": (2.5, 3.6), "wide": (3.6, 99.0)}
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class PortraitObjectiveSettings:
     normals: float = 0.5
     contrast: float = 0.5
     scale: float = 0.05
-    targets: int = 4
+    targets: int = 12
     held_out_people: int = 16
     held_out_draws: int = 3
 
@@ -64,9 +66,14 @@ class PortraitObjective(Objective):
         self.settings = settings
         self.people, self.held_out = portraits.people(settings.held_out_people)
 
-    def draw_one(self, generator: torch.Generator) -> PortraitSample:
-        """Draw a sample of a random person."""
-        return self.portraits.draw(self.people, self.settings.targets, generator)
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
+        """Draw `count` samples of random people, all in squares of one side (see `Objective.draw`)."""
+        sides = self.portraits.sides_px(self.people)
+        side = sides[int(torch.randint(len(sides), (), generator=seeded(step)))]
+        targets = self.settings.targets
+        return concatenate(
+            [self.portraits.draw(self.people, targets, generator_of(i), side) for i in range(count)]
+        )
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitSample:
         """Draw a sample of a held-out person."""
@@ -105,28 +112,46 @@ class PortraitObjective(Objective):
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure held-out people: relative error by region under one scale of the head, and its SSIM."""
-        parts = [sample.to(self.device) for sample in self.held_out_samples()]
-        batch = concatenate(parts)
-        found = torch.cat([self._maps(p).olats(p.lights, _larger(p.visible, p.inputs.image)) for p in parts])
-        scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1], clamp=False)
-        squared = (found * scale - batch.targets).square().mean(2)
-        truth = batch.targets.square().mean(2)
-        metrics = {}
-        for name, classes in _REGIONS.items():
-            share = batch.shares[:, [class_index(one) for one in classes]].sum(1)[:, None]
-            metrics[name] = float((squared * share).sum() / (truth * share).sum())
-        alpha = (1 - batch.shares[:, :1])[:, None]
-        root = ((_root(found * scale) - _root(batch.targets)) * alpha).abs().mean() / alpha.mean()
-        metrics["error"] = float(root)
-        return Validation(metrics, self._sheet(batch, found * scale))
+        measured, rows = [], []
+        for held_out in self.held_out_samples():
+            sample = held_out.to(self.device)
+            found = self._maps(sample).olats(sample.lights, _larger(sample.visible, sample.inputs.image))
+            found = found * _best_scale(found, sample.targets, 1 - sample.shares[:, :1], clamp=False)
+            measured.append(_measured(found, sample))
+            if len(rows) < _SHEET_ROWS:
+                pairs = torch.stack([found[0], sample.targets[0]], 1)[:_SHEET_TARGETS].flatten(0, 1)
+                rows.append([_shrunk(image) for image in (sample.inputs.image[0], *pairs)])
+        table, sides = torch.stack(measured).cpu(), [float(x.inputs.sides) for x in self.held_out_samples()]
+        metrics = _summed(table, "")
+        for name, (low, high) in _BANDS.items():
+            metrics |= _summed(table[[low <= side < high for side in sides]], f"_{name}")
+        if "neck_shoulders" in metrics:  # in wider squares arms count as neck
+            metrics["neck"] = metrics["neck_shoulders"]
+        return Validation(metrics, tiled(rows))
 
-    def _sheet(self, batch: PortraitSample, found: Tensor) -> np.ndarray:
-        """Held-out photos, each with pairs of predicted and true images."""
-        rows = []
-        for index in range(min(_SHEET_ROWS, len(found))):
-            pairs = torch.stack([found[index], batch.targets[index]], 1).flatten(0, 1)
-            rows.append([batch.inputs.image[index], *pairs])
-        return tiled(rows)
+
+def _measured(found: Tensor, sample: PortraitSample) -> Tensor:
+    """Squared errors and squares of the truth [R + 1, 2] of a sample, by region; of all, roots and cover."""
+    squared = (found - sample.targets).square().mean(2)
+    truth = sample.targets.square().mean(2)
+    sums = []
+    for classes in _REGIONS.values():
+        share = sample.shares[:, [class_index(one) for one in classes]].sum(1)[:, None]
+        sums.append(torch.stack([(squared * share).mean(), (truth * share).mean()]))
+    alpha = (1 - sample.shares[:, :1])[:, None]
+    root = ((_root(found) - _root(sample.targets)) * alpha).abs().mean()
+    return torch.stack([*sums, torch.stack([root, alpha.mean()])])
+
+
+def _summed(table: Tensor, suffix: str) -> dict[str, float]:
+    """Relative errors of samples [N, R + 1, 2]; none of regions that nobody shows."""
+    sums = table.sum(0)
+    names = (*_REGIONS, "error")
+    return {f"{n}{suffix}": float(a / b) for n, (a, b) in zip(names, sums, strict=True) if b > 0}
+
+
+def _shrunk(image: Tensor) -> Tensor:
+    return F.interpolate(image[None], (_SHEET_PX, _SHEET_PX), mode="bilinear", antialias=True)[0]
 
 
 def _own(maps: PortraitMaps, batch: PortraitSample) -> Tensor:

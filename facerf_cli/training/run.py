@@ -205,7 +205,7 @@ class _TrainedStage:
     def parsing(self) -> Objective:
         """The Parsing Network on photos of synthetic people, which are taken first where they are missing."""
         options, folder, tiny = self.options, self._bank / "portraits", self.options.preset == "tiny"
-        people, models, provenance = self._whole_people()
+        people, models, provenance = self._whole_people(self.make.sizes.held_out_heads)
         settings = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
@@ -214,7 +214,7 @@ class _TrainedStage:
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""
-        options, targets = self.options, 2 if self.options.preset == "tiny" else 4
+        options, few = self.options, self.options.preset == "tiny"
         source: PortraitSource
         network = self.make.network("portrait")
         if options.dataset:
@@ -222,13 +222,14 @@ class _TrainedStage:
             source = open_dataset_portraits(options.dataset, backgrounds, self.networks, options.jobs)
         else:
             source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
-        settings = PortraitObjectiveSettings(held_out_people=self.make.sizes.held_out_heads, targets=targets)
+        settings = PortraitObjectiveSettings(held_out_people=self._held_out_of_few)
+        settings = replace(settings, targets=2) if few else settings
         return self._kind(PortraitObjective)(source, network, settings)
 
     def _stored_transport(self) -> StoredTransport:
         """Synthetic people; those that are missing in the bank are baked and looked at first."""
         options, folder = self.options, self._bank / "transport"
-        people, models, provenance = self._whole_people()
+        people, models, provenance = self._whole_people(self._held_out_of_few)
         tiny, seed = options.preset == "tiny", options.settings.seed
         settings = TINY_BANK if tiny else TransportBankSettings()
         add_transport(folder, models, people, options.jobs, seed, settings)
@@ -236,11 +237,16 @@ class _TrainedStage:
         add_proxies(folder, backgrounds, self.networks, options.jobs, seed)
         return StoredTransport(folder, backgrounds, provenance)
 
-    def _whole_people(self) -> tuple[range, list[str], dict[str, Any]]:
+    @property
+    def _held_out_of_few(self) -> int:
+        """How many people the stage portrait holds out: an eighth of a small bank."""
+        return min(self.make.sizes.held_out_heads, max(1, self.make.sizes.heads // 8))
+
+    def _whole_people(self, held_out: int) -> tuple[range, list[str], dict[str, Any]]:
         """Numbers of synthetic people, the face models that they take turns in, and their provenance."""
         sizes, models = self.make.sizes, self.options.heads_from.split(",")
-        if sizes.heads < sizes.held_out_heads + 1:
-            raise UsageError(f"--heads {sizes.heads}: {sizes.held_out_heads} people are held out; give more")
+        if sizes.heads <= held_out:
+            raise UsageError(f"--heads {sizes.heads}: {held_out} people are held out; give more")
         drawn = [load_face_model(model) for model in models]
         shapes = [f"the heads' shapes: {model.licence}" for model in drawn]
         provenance = {

@@ -174,14 +174,14 @@ def test_the_gain_starts_from_the_quotient_of_the_proxys_own_shading() -> None:
 
 
 def test_every_input_matters_and_every_scale_begins_with_the_same_maps() -> None:
-    network, given = PortraitNetwork(replace(TINY, scaled=True)), inputs()
+    network, given = PortraitNetwork(replace(TINY, sees_scale=True)), inputs()
     before = network(given).gain
     for name in PortraitInputs.__dataclass_fields__:
         changed = replace(given, **{name: getattr(given, name) * 0.5 + 0.1})
         assert not torch.allclose(network(changed).gain, before, atol=1e-4), name
     network, given = PortraitNetwork(TINY), inputs()
     wider = network.at_every_scale(SIDE)
-    assert wider.settings == replace(TINY, scaled=True) and wider.at_every_scale(64) is wider
+    assert wider.settings == replace(TINY, sees_scale=True) and wider.at_every_scale(64) is wider
     for sides in (1.5, 3.0):
         for own, other in zip(network(given), wider(replace(given, sides=0 * SIDES + sides)), strict=True):
             torch.testing.assert_close(own, other)
@@ -189,7 +189,7 @@ def test_every_input_matters_and_every_scale_begins_with_the_same_maps() -> None
 
 def test_far_from_the_proxy_nothing_of_it_is_seen() -> None:
     """A square of 3 faces; the proxy covers its left quarter, and ends three tenths of a face beyond."""
-    network, given = PortraitNetwork(replace(TINY, scaled=True)), inputs()
+    network, given = PortraitNetwork(replace(TINY, sees_scale=True)), inputs()
     edge = SIDE // 4 + 3
     given.covered[..., SIDE // 4 :] = 0
     other = replace(given, **{n: getattr(given, n).clone() for n in ("normals", "depth", "reached", "own")})

@@ -11,9 +11,9 @@ from tests.dataset.dataset_fixture import write_small_dataset
 CROP_PX, SIDE = 48, 32
 
 
-def write_joint_dataset(folder: Path) -> Dataset:
+def write_joint_dataset(folder: Path, crop_px: int = CROP_PX) -> Dataset:
     """Write the dataset and its sources."""
-    dataset = write_small_dataset(folder, lights=20, crop_px=CROP_PX)
+    dataset = write_small_dataset(folder, lights=20, crop_px=crop_px)
     maps = envmap_names(ProceduralMaps(3, 0, 32))
     write_pairs(dataset, draw_pairs(dataset, maps, 6, 0), overwrite=False)
     for rows, weights in load_pairs(dataset).values():

@@ -74,14 +74,23 @@ class Answer(nn.Module):
 
 
 class Portraits:
-    """A bank of one fixed sample."""
+    """A bank of one fixed sample; its squares have two sides."""
 
     provenance: dict[str, Any] = {"licence": "MIT"}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.asked: list[int | None] = []
 
     def people(self, held_out: int) -> tuple[list[int], list[int]]:
         return [1], [0]
 
-    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
+    def sides_px(self, people: Sequence[int]) -> list[int]:
+        return [SIDE, 2 * SIDE]
+
+    def draw(
+        self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
+    ) -> PortraitSample:
+        self.asked.append(side_px)
         return truth()
 
 
@@ -148,3 +157,31 @@ def test_validation_is_by_region_and_a_sample_moves_as_one() -> None:
     moved = sample.to(torch.device("cpu"))
     assert torch.equal(moved.inputs.image, sample.inputs.image)
     assert torch.equal(moved.inputs.own, sample.inputs.own)
+
+
+def test_arms_of_wide_squares_are_no_neck() -> None:
+    """Half of the person is neck; what is wrong in a wide square is counted there alone."""
+    wrong = objective(perfect()._replace(normals=whole(F.normalize(torch.tensor([0.5, 0.1, 1.0]), dim=0))))
+    shares, sides = truth().shares.clone(), truth().inputs.sides
+    shares[:, class_index("neck"), : SIDE // 2] = shares[:, class_index("skin"), : SIDE // 2]
+    shares[:, class_index("skin"), : SIDE // 2] = 0
+    shown = replace(truth(), shares=shares)
+    wide = replace(shown, inputs=replace(shown.inputs, sides=2 * sides), targets=shown.targets.flip(1))
+    wrong._held_out_samples = [shown, wide]
+    both = wrong.validate().metrics
+    assert both["neck"] == both["neck_shoulders"] != both["neck_wide"]
+    wrong._held_out_samples = [wide]
+    alone = wrong.validate().metrics
+    assert alone["error_wide"] == both["error_wide"] and "error_close" not in both
+    assert both["error_shoulders"] != both["error_wide"]
+
+
+def test_a_batch_has_squares_of_one_side() -> None:
+    stage = objective(perfect())
+    asked = []
+    for step in range(20):
+        stage.portraits.asked.clear()
+        stage.draw(2, lambda index, step=step: torch.Generator(), step)
+        (side,) = set(stage.portraits.asked)
+        asked.append(side)
+    assert set(asked) == {SIDE, 2 * SIDE}

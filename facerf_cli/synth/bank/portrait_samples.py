@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -32,8 +33,8 @@ _GREY = 0.2  # share of grey photos
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
-# Lights from behind: elevation and least azimuth, and how much likelier a target they are than one in front.
-_BACK_EL_DEG, _BACK_AZ_DEG, _BACK = (0.0, 40.0), 120.0, 2.0
+# Lights from behind: elevation and least azimuth, and the share of targets that they get beside their own.
+_BACK_EL_DEG, _BACK_AZ_DEG, _BACK = (0.0, 40.0), 120.0, 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +91,14 @@ class PortraitSource(Protocol):
         """Indices of the people to train on, and of at most `held_out` others."""
         ...
 
-    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
-        """Draw one sample [1, ...] of one of some people, with `targets` lights."""
+    def sides_px(self, people: Sequence[int]) -> list[int]:
+        """Sides of the squares of some people, of each square."""
+        ...
+
+    def draw(
+        self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
+    ) -> PortraitSample:
+        """Draw one sample [1, ...] of some people, with `targets` lights, of a side if one is given."""
         ...
 
 
@@ -99,10 +106,10 @@ class StoredTransport:
     """The bank's portraits, read when they are drawn."""
 
     def __init__(self, folder: Path, backgrounds: Tensor, provenance: dict[str, Any]) -> None:
-        people: dict[str, list[Path]] = {}
+        people: dict[str, dict[Path, int]] = {}
         for path in files_in(folder):
             if seen_path(path).exists() and seen_path(path).stat().st_size > _EMPTY_BYTES:
-                people.setdefault(path.stem.split("_")[0], []).append(path)
+                people.setdefault(path.stem.split("_")[0], {})[path] = _side_px(path)
         if not people:
             raise InputError(f"{folder}: no portraits; make them with `facerf train --stage portrait`")
         self.views = list(people.values())
@@ -113,9 +120,19 @@ class StoredTransport:
         """See `split_people`."""
         return split_people(len(self.views), held_out)
 
-    def draw(self, people: Sequence[int], targets: int, generator: torch.Generator) -> PortraitSample:
-        """Draw one sample [1, ...] of one of some people, with `targets` lights."""
-        views = self.views[people[_below(len(people), generator)]]
+    def sides_px(self, people: Sequence[int]) -> list[int]:
+        """See `PortraitSource`."""
+        return [side for one in people for side in self.views[one].values()]
+
+    def draw(
+        self, people: Sequence[int], targets: int, generator: torch.Generator, side_px: int | None = None
+    ) -> PortraitSample:
+        """See `PortraitSource`."""
+        of_side = (
+            [path for path, side in self.views[one].items() if side_px in (None, side)] for one in people
+        )
+        found = [paths for paths in of_side if paths]
+        views = found[_below(len(found), generator)]
         path = views[_below(len(views), generator)]
         view = load_view(path)
         surface = view.looks[_below(len(view.looks), generator)]
@@ -135,6 +152,12 @@ class StoredTransport:
             chosen=chosen,
         )
         return sample_of(lit, load_file(seen_path(path)), self.backgrounds, generator)
+
+
+def _side_px(path: Path) -> int:
+    """Side of the square of a view."""
+    with safe_open(path, framework="pt") as file:
+        return int(file.get_slice("classes").get_shape()[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +192,11 @@ def sample_of(
     stored = backgrounds[_below(len(backgrounds), generator)]
     background = 4 * background_of(stored, side, generator) * lit.behind
     photo = _as_taken(images[0] / _mean_over(images[0], skin) + background, generator)
+    rows = int(seen.get("rows", side))
+    photo = photo[:, torch.arange(side).clamp(max=rows - 1)]  # as a square beyond a photo's edge shows it
+    shares = lit.shares.clone()
+    shares[:, rows:] = 0
+    shares[0, rows:] = 1
     normals, sides = seen["normals"].float(), seen.get("sides", torch.tensor(SIDES))
     inputs = PortraitInputs(
         image=photo / _mean_over(photo, skin) * MEAN_RADIANCE,
@@ -191,7 +219,7 @@ def sample_of(
         own=images[0] * scale,
         albedo=albedo * scale,
         true_normals=normals if lit.normals is None else lit.normals,
-        shares=lit.shares,
+        shares=shares,
         labelled=torch.tensor(float(lit.normals is not None)),
     )
     batched = sample.each(lambda values: values[None])
@@ -212,11 +240,13 @@ def _below(count: int, generator: torch.Generator) -> int:
 
 
 def draw_targets(rig: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Draw indices [count] of lights of a rig [L, 3]: as in photos, and many that make rims."""
+    """Draw indices [count] of lights of a rig [L, 3]: as in photos, and some that make rims."""
     azimuth, elevation = direction_to_azel(rig)
     low, high = _BACK_EL_DEG
     behind = (azimuth.abs() > _BACK_AZ_DEG) & (elevation > low) & (elevation < high)
-    return torch.multinomial(in_front(rig) + _BACK * behind, count, generator=generator)
+    usual = in_front(rig)
+    more = _BACK * usual.sum() / behind.sum().clamp_min(1)
+    return torch.multinomial(usual + more * behind, count, generator=generator)
 
 
 def source_light(rig: Tensor, generator: torch.Generator) -> Tensor:

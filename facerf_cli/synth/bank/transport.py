@@ -54,8 +54,12 @@ _BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=10, b
 # Standard deviations of the camera's yaw, pitch and roll, and their largest values, in degrees.
 _POSE_STD_DEG, _POSE_MAX_DEG = (24.0, 9.0, 5.0), (65.0, 28.0, 18.0)
 _NEAREST, _FARTHEST_M = 0.17, 3.0  # of the camera: metres for each face that its squares show, and metres
-SIDE_PX, PHOTO_PX = 256, 448  # of the squares, and of the photo in which the person is found
-SCALES = (1.5, 7.0)  # sides of the squares in faces, the extents of the landmarks
+SIDE_PX, PHOTO_PX = 256, 448  # most of a square, and of the photo in which the person is found
+SCALES = (1.5, 7.0)  # sides of half of the squares in faces, the extents of the landmarks
+_FACE_PX = (58.0, 80.0)  # pixels along a face, as far as the square's side allows
+_LEAST_PX, _STEP_PX = 96, 32  # of a square's side
+_SIDES_STD = 0.06  # of the sides of the other squares, which show as much as those of photos
+_CUT, _CUT_FACES = 1 / 3, (0.7, 1.6)  # share of photos that end below the face's middle, and where
 _PHOTO_SIDES = (1.0, 1.25)  # of the photo, in sides of what its squares take; it is no smaller than `SIDES`
 _PHOTO = "photo_"  # before the names of photos
 _TRIES, _CROP_PX = 3, 256  # lights in which a face is looked for; side of the crop that it is fitted in
@@ -102,7 +106,8 @@ def transport_of(face_model: str, index: int, seed: int, settings: TransportBank
     A square has the fields of `BakedPortrait`, and its facets' materials in K looks: look_albedo [K, N, 3],
     look_specular and look_roughness [K, N], float16, see `Material`. The squares of a camera lie in its photo
     of side P: lit [T, 3, P, P] float16 over black, in the first look and T lights; alpha [P, P] uint8, of
-    255; squares [Q, 4], the fields of a `Crop` of the photo; directions [L, 3] of the lights.
+    255; squares [Q, 4], the fields of a `Crop` of the photo; rows [], of the photo from its top that are its
+    user's; directions [L, 3] of the lights.
     """
     random, generator = generators(seed, index, 5)
     subject = draw_subject(cached_face_model(face_model), index, seed, settings.side_px, arms=True)
@@ -113,7 +118,8 @@ def transport_of(face_model: str, index: int, seed: int, settings: TransportBank
     files: Files = {}
     for number, one in enumerate(drawn):
         first = number * settings.squares
-        files[f"{_PHOTO}{index:05d}_{first}"] = _photo(next(views), looks[0], one.crops, generator)
+        photo = _photo(next(views), looks[0], generator)
+        files[f"{_PHOTO}{index:05d}_{first}"] = photo | {"squares": one.crops, "rows": torch.tensor(one.rows)}
         for k in range(first, first + settings.squares):
             view = next(views)
             materials = _materials([materials_of(view, look) for look in looks])
@@ -121,15 +127,13 @@ def transport_of(face_model: str, index: int, seed: int, settings: TransportBank
     return files
 
 
-def _photo(
-    view: BakedPortrait, look: Appearance, crops: Tensor, generator: torch.Generator
-) -> dict[str, Tensor]:
+def _photo(view: BakedPortrait, look: Appearance, generator: torch.Generator) -> dict[str, Tensor]:
     """The person in a photo, in several lights; see `transport_of`."""
     weights = torch.stack([draw_light(view.directions, generator) for _ in range(_TRIES)])
     images = images_under(view, materials_of(view, look), weights)
     images = images / images.mean((1, 2, 3), keepdim=True).clamp_min(1e-6)
     alpha = 255 - view.classes[..., 0]
-    return {"lit": images.half(), "alpha": alpha, "squares": crops, "directions": view.directions}
+    return {"lit": images.half(), "alpha": alpha, "directions": view.directions}
 
 
 def _materials(looks: list[Material]) -> dict[str, Tensor]:
@@ -140,18 +144,22 @@ def _materials(looks: list[Material]) -> dict[str, Tensor]:
 
 
 class _Views(NamedTuple):
-    """A camera's photo and its squares, also [Q, 4] as the fields of a `Crop` of the photo."""
+    """A camera's photo and its squares, also [Q, 4] as the fields of a `Crop` of the photo, and its rows."""
 
     photo: StageCamera
     squares: list[StageCamera]
     crops: Tensor
+    rows: int
 
 
 def _draw_cameras(subject: Subject, random: Random, settings: TransportBankSettings) -> list[_Views]:
-    """Draw cameras; the scales of all their squares are spread over `SCALES`."""
+    """Draw cameras; half of their squares show what those of photos show, others are spread over `SCALES`."""
     count = settings.cameras * settings.squares
+    spread = count - count // 2
     low, high = np.log(SCALES)
-    scales = np.exp(low + (high - low) * (random.permutation(count) + random.uniform(size=count)) / count)
+    scales = np.exp(low + (high - low) * (np.arange(spread) + random.uniform(size=spread)) / spread)
+    usual = SIDES * np.exp(random.normal(0, _SIDES_STD, count // 2))
+    scales = random.permutation(np.concatenate([scales, usual]))
     return [_draw_views(subject, sides, random, settings) for sides in scales.reshape(settings.cameras, -1)]
 
 
@@ -173,21 +181,27 @@ def _draw_views(
         off = random.normal(0, _SHIFT_STD, 2) * sides + [0, down]
         return np.array([*(middle + (off - sides / 2) * face), sides * face])
 
+    def side_px(sides: float) -> int:
+        wanted = _STEP_PX * round(sides * random.uniform(*_FACE_PX) / _STEP_PX)
+        return int(min(max(wanted, _LEAST_PX), settings.side_px))
+
     def camera(square: np.ndarray, size_px: int) -> StageCamera:
         x, y = (size_px / square[2] * square[:2]).tolist()
         return StageCamera(Camera(size_px / square[2], size_px, size_px, -x, -y), rotation, towards)
 
-    squares = [window(sides) for sides in scales]
+    squares, sizes = [window(sides) for sides in scales], [side_px(sides) for sides in scales]
     corners = np.array([square[:2] for square in squares])
     ends = corners + np.array([square[2:] for square in squares])
     side = max(float((ends.max(0) - corners.min(0)).max()) * random.uniform(*_PHOTO_SIDES), SIDES * face)
     whole = np.array([*((ends.max(0) + corners.min(0)) / 2 - side / 2), side])
     px = settings.photo_px / side
-    crops = [[*((square[:2] - whole[:2]) * px), square[2] * px, settings.side_px] for square in squares]
+    crops = [[*((x[:2] - whole[:2]) * px), x[2] * px, size] for x, size in zip(squares, sizes, strict=True)]
+    cut = random.uniform(*_CUT_FACES) if random.uniform() < _CUT else math.inf
     return _Views(
         camera(whole, settings.photo_px),
-        [camera(square, settings.side_px) for square in squares],
+        [camera(*one) for one in zip(squares, sizes, strict=True)],
         torch.tensor(np.array(crops)),
+        round(min((middle[1] + cut * face - whole[1]) * px, settings.photo_px)),
     )
 
 
@@ -237,15 +251,22 @@ def seen_in(
     chosen = backgrounds[int(torch.randint(len(backgrounds), (), generator=generator))]
     behind = 1 - photo["alpha"].float() / 255
     squares = [Crop(x, y, side, int(size)) for x, y, side, size in photo["squares"].tolist()]
+    rows = int(photo.get("rows", torch.tensor(len(behind))))
     for image in photo["lit"].float():
-        scene = image * 0.1 + behind * background_of(chosen, len(behind), generator)
+        scene = (image * 0.1 + behind * background_of(chosen, len(behind), generator))[:, :rows]
         exposed = (scene / scene.mean().clamp_min(1e-6) * 0.2).permute(1, 2, 0).numpy()
         with suppress(InputError):
             person = person_in(people, exposed)
             found = [person.within(square, exposed) for square in squares]
             if all(float(one.classes[SKIN].sum()) > 1 for one in found):
-                return [layers_of(one, photo["directions"]) for one in found]
+                return [layers_of(one, photo["directions"]) | _rows_in(one.square, rows) for one in found]
     return []
+
+
+def _rows_in(square: Crop, rows: int) -> dict[str, Tensor]:
+    """How many rows [] of a square the photo has, which has so many rows."""
+    shown = round((rows - square.y0_px) * square.size_px / square.side_px)
+    return {"rows": torch.tensor(min(max(shown, 1), square.size_px))}
 
 
 def person_in(people: PeopleNetworks, photo: np.ndarray) -> SeenPerson:

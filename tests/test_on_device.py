@@ -1,0 +1,108 @@
+"""Relighting and a step of every training stage on a device that a CPU feigns: nothing is left on the CPU.
+
+tests/test_cuda.py runs them on a GPU.
+"""
+
+import copy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import facerf_cli as facerf
+from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from facerf_cli.network.features import LightNetwork, LightSettings
+from facerf_cli.network.inputs import head_rotation
+from facerf_cli.network.parsing import ParsingNetwork
+from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
+from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork
+from facerf_cli.network.stored_graph import PeopleNetworks, mediapipe_networks
+from facerf_cli.raster.camera import pose_to_rotation
+from facerf_cli.relighting.models import Networks
+from facerf_cli.synth.bank.heads import Bank
+from facerf_cli.training.diffuse_sh import DiffuseObjective
+from facerf_cli.training.light_features import LightFeaturesObjective
+from facerf_cli.training.objective import Objective, seeded
+from facerf_cli.training.parsing import ParsingObjective
+from facerf_cli.training.portrait import PortraitObjective
+from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
+from tests import fake_device
+from tests.synth.conftest import bank, bank_folder
+from tests.training import test_diffuse_sh_objective, test_parsing_objective, test_portrait_objective
+from tests.training.test_texture_objective import NETWORK
+
+__all__ = ["bank", "bank_folder"]
+ASTRONAUT = Path(__file__).parents[1] / "examples/astronaut.jpg"
+KINDS = ("reflectance", "geometry", "diffuse_sh", "light_features", "parsing", "portrait")
+
+
+def test_relighting_mixes_no_devices() -> None:
+    """The portrait field and the Reflectance Network's, from a photo to an image."""
+    models = facerf.load_models()
+    given = {kind: fake_device.moved(copy.deepcopy(getattr(models.networks, kind))) for kind in KINDS}
+    networks = Networks(models.networks.files, fake_device.DEVICE, given)
+    graphs = mediapipe_networks(torch.device("cpu"))  # of stored operators, which take their device's
+    networks.__dict__["people"] = PeopleNetworks(given["parsing"], *graphs)
+    photo, light = facerf.read_image(ASTRONAUT), facerf.Light.single(60, 30)
+    expected = facerf.fit(models, photo).relight(light)
+    with fake_device.counted() as counts:
+        relit = facerf.fit(replace(models, networks=networks), photo).relight(light)
+    assert counts.calls > 100
+    np.testing.assert_allclose(relit, expected, atol=1e-3)  # of bfloat16, if the processor has it
+
+
+def reflectance(bank: Bank) -> Objective:
+    settings = TextureObjectiveSettings(lights=3, held_out_heads=2, held_out_draws=1)
+    return TextureObjective(bank, DefaultReflectanceNetwork(NETWORK), None, settings)
+
+
+def light_features(bank: Bank) -> Objective:
+    settings = HeadsSettings(lights=4, held_out_heads=2, held_out_draws=1)
+    return LightFeaturesObjective(bank, LightNetwork(LightSettings(1 / 8, 4, 32)), settings)
+
+
+def diffuse_sh(bank: Bank) -> Objective:
+    network = DiffuseNetwork(test_diffuse_sh_objective.NETWORK)
+    return DiffuseObjective(bank, network, test_diffuse_sh_objective.SETTINGS)
+
+
+def parsing(bank: Bank) -> Objective:
+    source: Any = SimpleNamespace(
+        provenance={"licence": "MIT"},
+        people=lambda held_out: ([1], [0]),
+        draw=lambda people, side, generator: test_parsing_objective.truth(side),
+    )
+    network = ParsingNetwork(test_parsing_objective.TINY)
+    return ParsingObjective(source, network, test_parsing_objective.SETTINGS)
+
+
+def portrait(bank: Bank) -> Objective:
+    network = PortraitNetwork(PortraitSettings((8, 8, 8), (0, 1, 1), 14, 32, sees_scale=True))
+    return PortraitObjective(test_portrait_objective.Portraits(), network, test_portrait_objective.SETTINGS)
+
+
+@pytest.mark.parametrize("stage", [reflectance, light_features, diffuse_sh, parsing, portrait])
+def test_a_step_and_a_validation_mix_no_devices(bank: Bank, stage: Callable[[Bank], Objective]) -> None:
+    objective = stage(bank)
+    batch = objective.draw(2, lambda index, step=0: seeded(0, step, index), 0).each(fake_device.OnDevice)
+    fake_device.moved(objective)
+    with fake_device.counted():
+        torch.stack(list(objective(batch).values())).sum().backward()
+        metrics = objective.validate().metrics
+    assert all(parameter.grad is not None for parameter in objective.networks.parameters())
+    assert np.isfinite(metrics[objective.chooses_by])
+
+
+def test_a_heads_rotation_is_found_on_the_device() -> None:
+    turn = pose_to_rotation(20.0, 10.0, 5.0).float()
+    mean = torch.nn.functional.normalize(torch.randn(3, 8, 8), dim=0)
+    normals = torch.einsum("ij,jhw->ihw", turn, mean)[None]
+    with fake_device.counted() as counts:
+        found = head_rotation(fake_device.OnDevice(mean), fake_device.OnDevice(normals))
+    assert counts.waits.total() == counts.copies.total() == 0
+    torch.testing.assert_close(found.values[0], turn)
