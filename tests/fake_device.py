@@ -39,14 +39,15 @@ class OnDevice(Tensor):
 
     @staticmethod
     def __new__(cls, values: Tensor) -> "OnDevice":
-        made = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
-            cls,
-            values.size(),
-            strides=values.stride(),
-            storage_offset=values.storage_offset(),
-            dtype=values.dtype,
-            device=DEVICE,
-        )
+        with torch.inference_mode(False):  # a tensor of that mode could not be detached
+            made = torch.Tensor._make_wrapper_subclass(  # type: ignore[attr-defined]
+                cls,
+                values.size(),
+                strides=values.stride(),
+                storage_offset=values.storage_offset(),
+                dtype=values.dtype,
+                device=DEVICE,
+            )
         made.values = values
         return made  # type: ignore[no-any-return]
 
@@ -103,7 +104,6 @@ def counted() -> Iterator[Counts]:
     with (
         _Counting(counts),
         patch("torch.tensor", tensor),
-        patch("torch.inference_mode", torch.no_grad),  # within it nothing is dispatched
         plain,
         patch("torch.Tensor.new_tensor", new_tensor),
     ):
@@ -116,7 +116,13 @@ class _Counting(TorchDispatchMode):
         self.counts = counts
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _computed(self.counts, function, args, kwargs or {})
+        kwargs = kwargs or {}
+        if torch.is_inference_mode_enabled():  # in which operators are not taken apart before they come here
+            with self:
+                found = function.decompose(*args, **kwargs)
+            if found is not NotImplemented:
+                return found
+        return _computed(self.counts, function, args, kwargs)
 
 
 def _computed(counts: Counts, function: Any, args: Any, kwargs: dict[str, Any]) -> Any:

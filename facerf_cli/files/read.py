@@ -199,6 +199,15 @@ def decode(
     return Decoded(values, spec, colour, alpha if with_alpha else None, is_associated)
 
 
+def read_in_one_thread() -> None:
+    """Let images be read by the thread that asks, also in processes that are forked from now on.
+
+    A forked process has none of the threads that OpenImageIO has begun; on a machine of many cores it would
+    wait for them without end.
+    """
+    oiio.attribute("threads", 1)
+
+
 @contextmanager
 def open_image(path: Path, layer: str | None = None) -> Iterator[Opened]:
     """Open an image file at a layer, by default the image.

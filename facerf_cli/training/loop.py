@@ -23,6 +23,7 @@ from torch.utils.data import DataLoader, Dataset
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.read import read_in_one_thread
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.inputs import Batch
 from facerf_cli.run.logs import LOGGER_NAME
@@ -170,6 +171,8 @@ def drawn_batches(
     `workers` processes draw ahead. Each sample depends on (seed, step, index) alone.
     """
     steps = range(first_step, _ENDLESS)
+    if workers:
+        read_in_one_thread()
     loader = DataLoader(
         _Draws(objective, samples, seed),
         batch_size=None,

@@ -239,7 +239,7 @@ class _TrainedStage:
 
     @property
     def _held_out_of_few(self) -> int:
-        """How many people the stage portrait holds out: an eighth of a small bank."""
+        """Number of people that the stage portrait holds out: an eighth of a small bank."""
         return min(self.make.sizes.held_out_heads, max(1, self.make.sizes.heads // 8))
 
     def _whole_people(self, held_out: int) -> tuple[range, list[str], dict[str, Any]]:

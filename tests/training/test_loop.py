@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import OpenImageIO as oiio
 import pytest
 import torch
 import torch.distributed as dist
@@ -25,6 +26,18 @@ from facerf_cli.training.settings import PRESETS, Adadelta, TrainSettings
 from tests.toy_faces import toy_objective
 
 TINY = replace(PRESETS["tiny"], steps=24, validate_every=8)
+
+
+def test_workers_need_no_threads_that_read_images() -> None:
+    """A forked process has none of those that OpenImageIO begins on many cores, and would wait for them."""
+    before = oiio.get_int_attribute("threads")
+    try:
+        for workers, threads in ((0, 4), (1, 1)):
+            oiio.attribute("threads", 4)
+            next(drawn_batches(toy_objective(), 1, range(1), 0, workers))
+            assert oiio.get_int_attribute("threads") == threads
+    finally:
+        oiio.attribute("threads", before)
 
 
 def rows_of(folder: Path) -> list[dict[str, Any]]:

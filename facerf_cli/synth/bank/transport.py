@@ -264,7 +264,7 @@ def seen_in(
 
 
 def _rows_in(square: Crop, rows: int) -> dict[str, Tensor]:
-    """How many rows [] of a square the photo has, which has so many rows."""
+    """Rows [] of a square that a photo of so many rows shows."""
     shown = round((rows - square.y0_px) * square.size_px / square.side_px)
     return {"rows": torch.tensor(min(max(shown, 1), square.size_px))}
 
