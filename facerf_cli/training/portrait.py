@@ -112,7 +112,8 @@ class PortraitObjective(Objective):
     @torch.no_grad()
     def validate(self) -> Validation:
         """Measure held-out people: relative error by region under one scale of the head, and its SSIM."""
-        measured, rows = [], []
+        measured: list[Tensor] = []
+        rows: list[list[Tensor]] = []
         for held_out in self.held_out_samples():
             sample = held_out.to(self.device)
             found = self._maps(sample).olats(sample.lights, _larger(sample.visible, sample.inputs.image))
