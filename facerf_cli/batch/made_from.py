@@ -229,7 +229,7 @@ class FolderIndex:
             name = str(row["output"])
             if not name.startswith("/") and ".." not in name.split("/"):
                 self.outputs[name] = row
-                if "recipe" in row:  # of facerf 0.1
+                if "recipe" in row:  # as it was before there were keys
                     row["key"] = _key(str(row["recipe"]), str(row.get("input")))
         elif "sha256" in row:
             self._files[str(row.get("file"))] = row

@@ -76,7 +76,7 @@ class Job:
 
     @property
     def process(self) -> Callable[[Item], "Outcome"]:
-        """A function that does that; picklable."""
+        """A function that does that; picklable. Not asked for where all is finished."""
         return self
 
 
@@ -283,6 +283,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             if edited := sum(map(index.is_edited, set().union(*kept))):
                 advice = "%d outputs were changed after they were written; they are kept (--overwrite always)"
                 log.warning(advice, edited)
+        if not todo:
+            return lacks
         failures, workers = 0, options.workers(settings)
         at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
         work = partial(_run_one, job.process, bool(recipes), settings.job_bytes(at_once))

@@ -1,11 +1,13 @@
 """The contract of every verb that walks folders (docs/design.md), with a verb that only copies bytes."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Never
 
 import pytest
 
@@ -329,6 +331,34 @@ def test_a_single_photo_that_fails_leaves_no_folder(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     assert run([tmp_path / "a.png"], tmp_path / "out") == 1
     assert (tmp_path / "out" / "report.jsonl").exists()  # a folder that was there stays
+
+
+def test_an_index_with_recipes_and_inputs_apart_is_understood(
+    two: Path, tmp_path: Path, capsys: Said
+) -> None:
+    """As rows of outputs were before they had a key."""
+    run([two], tmp_path / "out")
+    index, older = tmp_path / "out/.facerf-index.jsonl", []
+    for row in map(json.loads, index.read_text().splitlines()):
+        if "key" in row:
+            photo = two / row["output"].replace("_copy.bin", ".png")
+            row |= {"recipe": row.pop("key").split()[0], "input": file_sha256(photo)}
+        older.append(json.dumps(row) + "\n")
+    index.write_text("".join(older))
+    capsys.readouterr()
+    run([two], tmp_path / "out")
+    assert made(capsys) == []
+
+
+def test_a_finished_folder_loads_nothing_for_its_work(two: Path, tmp_path: Path) -> None:
+    class Lazy(Copy):
+        @property
+        def process(self) -> Never:
+            raise AssertionError("torch is imported here")
+
+    assert run([two], tmp_path / "out") == 0
+    items = collect_items([str(two)], tmp_path / "out")
+    assert run_items(Lazy(tmp_path), items, BatchOptions(tmp_path / "out"), Settings()) == 0
 
 
 def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path: Path) -> None:
