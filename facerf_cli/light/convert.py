@@ -4,6 +4,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -20,7 +21,7 @@ log = logging.getLogger(LOGGER_NAME)
 
 def convert(
     path: Path,
-    forms: Mapping[str, Path],
+    forms: Mapping[Any, Path],
     order: int | None = None,
     rig: str | None = None,
     signed: bool = False,

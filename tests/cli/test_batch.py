@@ -19,6 +19,7 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
+from facerf_cli.run.logs import configure_logging
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
 from tests.cli.folders import rows
@@ -258,6 +259,7 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
             return Outcome([path for path in self.outputs_of(item) if path in item.stale])
 
     def call() -> int:
+        configure_logging()
         return run_items(Lit(out), collect_items([str(two)], out), BatchOptions(out), Settings())
 
     assert call() == 0
