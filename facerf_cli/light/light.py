@@ -13,6 +13,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import check_envmap, envmap_weights
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.map_keys import MapKeys, without_keys
+from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
 
@@ -76,6 +77,16 @@ class Light:
             weights if isinstance(envmap, Tensor) else weights.numpy(),
             keys=tuple(range(len(directions), len(weights))),
         )
+
+    @staticmethod
+    def from_picture(picture: Array, fov_deg: float = FOV_DEG, lights: int = 150) -> "Light":
+        """The light in a picture [H, W, 3] behind the person, scene-linear: a guess, on the picture's scale.
+
+        `fov_deg` is the angle of view across its width, 1 to 170 degrees. `light.picture.light_of_picture`
+        gives the map, and how far such guesses are off. Raises ValueError for another picture or angle.
+        """
+        guess = light_of_picture(linear_pixels("picture", picture).detach(), fov_deg)
+        return Light.from_envmap(guess.envmap.numpy(), lights=lights)
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
         """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""
