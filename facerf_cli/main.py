@@ -23,7 +23,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from facerf_cli._version import __version__
-from facerf_cli.batch.settings import DeviceName, Settings
+from facerf_cli.batch.settings import Settings, device_name
 from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, UsageError
@@ -155,7 +155,9 @@ def _global_options(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Log errors only; no progress bar.")] = False,
     log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr as JSON lines.")] = False,
-    device: Annotated[DeviceName, typer.Option(help="Compute on this device.")] = Settings.device,
+    device: Annotated[
+        str, typer.Option(metavar="auto|cpu|cuda|cuda:N|mps", help="Compute on this device.")
+    ] = Settings.device,
     checkpoint: Annotated[
         list[Path],
         typer.Option(
@@ -207,7 +209,7 @@ def _global_options(
     context.obj = Settings(
         verbosity,
         log_json,
-        device,
+        device_name(device),
         _checkpoints(context, checkpoint),
         not was_given(context, "checkpoint"),
         seed,

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar
 from facerf_cli.errors import UsageError
 from facerf_cli.run import memory
 
-DeviceName = Literal["auto", "cpu", "cuda", "mps"]
+_DEVICE = re.compile(r"auto|cpu|mps|cuda(:[0-9]{1,3})?")
 Overwrite = Literal["never", "changed", "always"]
 T = TypeVar("T")
 NOT_IN_RECIPE = {"in_recipe": False}  # metadata of a field that shapes no output
@@ -47,7 +47,7 @@ class Settings:
 
     verbosity: int = field(default=0, metadata=NOT_IN_RECIPE)  # -1 errors only, 0 notes, 1 everything
     log_json: bool = field(default=False, metadata=NOT_IN_RECIPE)
-    device: DeviceName = field(default="auto", metadata=NOT_IN_RECIPE)
+    device: str = field(default="auto", metadata=NOT_IN_RECIPE)  # as `device_name` takes it
     checkpoints: tuple[Path, ...] = ()  # files; the networks that they lack are the shipped ones
     checkpoints_by_default: bool = field(default=False, metadata=NOT_IN_RECIPE)  # of a configuration file
     seed: int = 0
@@ -64,9 +64,20 @@ def torch_device(settings: Settings) -> Any:
     import torch
 
     torch.manual_seed(settings.seed)
-    present = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available(), "cpu": True}
-    name = next(kind for kind in present if present[kind]) if settings.device == "auto" else settings.device
-    if not present[name]:
-        found = ", ".join(kind for kind in present if present[kind])
+    count = {"cuda": torch.cuda.device_count(), "mps": int(torch.backends.mps.is_available()), "cpu": 1}
+    present = [kind for kind in count if count[kind]]
+    name = present[0] if settings.device == "auto" else settings.device
+    kind, _, number = name.partition(":")
+    if int(number or 0) >= count[kind]:
+        numbered = [f"cuda:{gpu}" for gpu in range(1, count["cuda"])]
+        found = ", ".join([*present, *numbered])
         raise UsageError(f"--device {name}: torch finds no such device; give one of: {found}")
     return torch.device(name)
+
+
+def device_name(text: str) -> str:
+    """Return the text of `--device`; UsageError for what names none."""
+    if not _DEVICE.fullmatch(text):
+        advice = "give auto, cpu, cuda (cuda:1 is the second GPU) or mps"
+        raise UsageError(f"--device {text}: not the name of a device; {advice}")
+    return text

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 import typer
 
 from facerf_cli import main
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions, sums_up
-from facerf_cli.batch.settings import Settings, Shard
+from facerf_cli.batch.settings import Settings, Shard, torch_device
 from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import configure_logging
@@ -122,3 +123,11 @@ def test_the_last_shard_sums_up(tmp_path: Path, capsys: pytest.CaptureFixture) -
     assert "there is no summary" in capsys.readouterr().err
     assert sums_up(items, outputs_of, shard)
     assert not sums_up(items, outputs_of, replace(shard, overwrite="always"))
+
+
+def test_one_of_several_gpus_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    found = [str(torch_device(Settings(device=name))) for name in ("auto", "cuda", "cuda:1", "cpu")]
+    assert found == ["cuda", "cuda", "cuda:1", "cpu"]
+    with pytest.raises(UsageError, match=r"--device cuda:2: torch finds no such device; give .*cuda:1"):
+        torch_device(Settings(device="cuda:2"))
