@@ -306,7 +306,9 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
     """Yield the inputs, with the names on standard input in place of `-`, and files in place of frames."""
     for entry in inputs:
         if entry == "-":
-            yield from filter(None, _stdin_names(null_separated))
+            text = sys.stdin.read().removeprefix("\ufeff")
+            lines = text.split("\0") if null_separated else [one.rstrip("\r") for one in text.split("\n")]
+            yield from filter(None, lines)
         elif os.path.exists(entry) or len(entry) > _LONGEST_PATH:
             yield entry
         elif frames := _FRAMES.fullmatch(entry):
@@ -316,11 +318,6 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
             yield from _numbered(entry, before, int(digits or len(marks or "")), after)
         else:
             yield from sorted(glob.glob(entry)) or [entry]
-
-
-def _stdin_names(null_separated: bool) -> list[str]:
-    text = sys.stdin.read().removeprefix("\ufeff")
-    return text.split("\0") if null_separated else [line.rstrip("\r") for line in text.split("\n")]
 
 
 def _range(entry: str, before: str, first: str, last: str, after: str) -> list[str]:

@@ -139,8 +139,11 @@ def relight(
         return
     batch = replace(batch, output=output, name=options.name)
     items, taken = collect_frames(inputs, shots, batch, plan.photo)
-    if options.photo_of_stack is not None and not _holds_a_stack(items):
-        raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
+    if options.photo_of_stack is not None:
+        from facerf_cli.files.olat_stack import is_olat_stack
+
+        if not any(is_olat_stack(item.input_path) for item in items):
+            raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
     plan = plan.of_items(items, Shots(taken))
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
@@ -155,12 +158,6 @@ def relight(
     elif options.ball and not batch.dry_run and batch.shard.number == 1:
         _write_balls(plan, batch)
     raise typer.Exit(code)
-
-
-def _holds_a_stack(items: Sequence[Item]) -> bool:
-    from facerf_cli.files.olat_stack import is_olat_stack
-
-    return any(is_olat_stack(item.input_path) for item in items)
 
 
 def _write_to_stdout(inputs: Sequence[str], plan: RelightPlan) -> None:

@@ -30,10 +30,6 @@ _PUBLISHED_SUBJECTS = 21  # of Extended Yale B
 MakeBench = Callable[[], Bench]  # when a protocol needs it: it loads networks
 
 
-def _no_notes(options: EvaluateOptions, chosen: Chosen) -> Iterable[str]:
-    return ()
-
-
 @dataclass(frozen=True)
 class Protocol:
     """A verb of `facerf evaluate`.
@@ -50,7 +46,7 @@ class Protocol:
     choose: Callable[[EvaluateOptions, Sequence[str]], Chosen]
     compare: Callable[[EvaluateOptions, MakeBench, Any], Iterable[Comparison]]
     layout: Layout
-    notes: Callable[[EvaluateOptions, Chosen], Iterable[str]] = _no_notes
+    notes: Callable[[EvaluateOptions, Chosen], Iterable[str]] = lambda options, chosen: ()
 
 
 Faces = PersonPairs | Photo | Couple

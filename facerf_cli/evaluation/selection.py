@@ -223,13 +223,13 @@ def read_list(path: Path, dataset: Dataset, size: int) -> Groups:
                 f"{path}: groups[{number}] does not fit {dataset.folder} ({error}); prepare the dataset with "
                 "the people, splits, cameras and lights of the list"
             ) from None
-        groups.setdefault(group[0].subject, []).append(tuple(_with_map(pair, path.parent) for pair in group))
+        moved = []  # the maps of a list may lie beside it
+        for pair in group:
+            near = path.parent / Path(pair.envmap).name
+            is_near = near.is_file() and not Path(pair.envmap).is_file()
+            moved.append(replace(pair, envmap=str(near)) if is_near else pair)
+        groups.setdefault(group[0].subject, []).append(tuple(moved))
     return groups
-
-
-def _with_map(pair: Pair, folder: Path) -> Pair:
-    near = folder / Path(pair.envmap).name
-    return replace(pair, envmap=str(near)) if near.is_file() and not Path(pair.envmap).is_file() else pair
 
 
 def couples_of_photos(inputs: Sequence[str], output: Path) -> Iterator[tuple[str, tuple[Item, Item]]]:

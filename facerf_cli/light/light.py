@@ -11,7 +11,6 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import check_envmap, envmap_weights
-from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.map_keys import MapKeys, without_keys
 from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
@@ -92,6 +91,8 @@ class Light:
         """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""
         if self.own_rgb is not None:
             raise UsageError("to_envmap: the photo's own light has no directions; take person.light")
+        from facerf_cli.light.forms import rig_to_latlong
+
         light = self.on_cpu()
         return rig_to_latlong(RigLight(light.directions.detach(), light.weights.detach()), height).numpy()
 

@@ -228,7 +228,10 @@ def _write(
 ) -> dict[str, Any]:
     estimate, facts = _estimate(item, image, face.head, options, more)
     models = load_models_once(options.photo)
-    said = {f"facerf:light_{name}": _as_metadata(value) for name, value in facts.items()}
+    said = {f"facerf:light_{name}": value for name, value in facts.items()}
+    for name, value in said.items():
+        if not isinstance(value, (int, float, str)):  # a file's header holds words and numbers
+            said[name] = " ".join(map(str, value or ["none"]))
     metadata = provenance(item, options.photo, models.checkpoint_name()) | said
     envmap = rig_to_latlong(estimate.light, width_px // 2)
     base = item.output(f"{face.tag}_light")
@@ -240,8 +243,3 @@ def _write(
     shown = draw_estimate(face.head, models.face, estimate.explained, envmap)
     write_display(base.with_name(base.name + ".png"), shown, metadata=metadata)
     return face.described() | facts
-
-
-def _as_metadata(value: Any) -> str | int | float:
-    """A fact as a file's header can hold it: a word or a number."""
-    return value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))

@@ -209,7 +209,9 @@ def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
     elif header.kind == "image":
         subject, facts = StackImages(header, item.input_path), {}
     else:
-        subject, facts = _face_of_stack(item, header, plan)
+        head = head_in_stack(item, header)  # of textures, in the frame of its crop
+        subject = FaceAlone(face_model(plan.photo), head, StackTextures(item.input_path))
+        facts = fit_facts(head.fit)
     lit = plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups)
     metadata = attributes_of_sum(header.metadata, item.input_path.name)
     return LitScene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
@@ -255,10 +257,3 @@ def _person_of_stack(
     camera = photo_camera(fit.crop.of_scaled(scale), *photo.shape[:2])
     on_photo = replace(stack, photo=photo, keeps_background=plan.options.background.kind == "photo")
     return on_photo, backdrop(plan.options.background, plan.options.background_blur, camera), fit_facts(fit)
-
-
-def _face_of_stack(item: Item, header: StackHeader, plan: RelightPlan) -> tuple[FaceAlone, dict[str, Any]]:
-    """The face of a stack of textures in the frame of its crop, and facts of its fit."""
-    head = head_in_stack(item, header)
-    model, textures = face_model(plan.photo), StackTextures(item.input_path)
-    return FaceAlone(model, head, textures), fit_facts(head.fit)

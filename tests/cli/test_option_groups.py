@@ -10,6 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.convert_light import _ENDINGS
 from facerf_cli.cli.estimate_light import EstimateLight
 from facerf_cli.cli.fit_geometry import FitGeometry
 from facerf_cli.cli.options import with_groups
@@ -18,7 +19,6 @@ from facerf_cli.cli.segment import Segment
 from facerf_cli.cli.view import MakePage
 from facerf_cli.option import Only, Without, attributes_of, option
 from facerf_cli.work.photo_options import PhotoOptions
-from facerf_cli.work.verbs import _ENDINGS
 
 
 @dataclass(frozen=True)
