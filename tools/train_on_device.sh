@@ -22,4 +22,4 @@ learning_rate = 3e-4
 TOML
 "$python" -m facerf_cli --config "$run/recipe.toml" train --stage portrait -o "$run" --bank "$bank" \
     --heads "$people" --heads-from "$models" --start-from "$root/facerf_cli/assets/portrait.safetensors" \
-    --device "${DEVICE:-cuda}" --workers "$(nproc)" --max-time "${seconds}s" "$@"
+    --device "${DEVICE:-cuda}" --workers "$(nproc --all)" --max-time "${seconds}s" "$@"

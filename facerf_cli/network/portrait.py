@@ -25,7 +25,6 @@ from facerf_cli.raster.texture import smoothstep
 
 SKIN = 1  # index of the class whose mean exposes the image
 HAIRY = (2, 6, 7)  # brows, hair and beard
-_EARS = 8
 _REACH = 3  # order of the spherical harmonics that summarise the proxy's visibility
 LIT_ORDER, SHADOW_ORDER = 3, 4  # of P and U; of W
 _SHARPNESS = (8.0, 45.0)  # exponents of the highlights about normals
@@ -33,7 +32,6 @@ _STRAND_SHARPNESS = 30.0
 _TURNED = 0.15  # n . l at which highlights begin to fade, and, below 0, end
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
-_NEAR_FACES = 0.1  # around the proxy, where hair and cloth may be that it lacks; so far on its layers fade
 _FACE_PX = 64.0  # pixels along a face for which the scale is 0
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
 _COARSE = {  # maps at half the side
@@ -52,7 +50,7 @@ class PortraitSettings:
     blocks: Blocks = (1, 1, 2, 2, 2)
     classes: Classes = 14
     side: Side = 192
-    sees_scale: bool = False  # is told pixels a face, and sees nothing of the proxy far from its surface
+    sees_scale: bool = False  # pixels along a face are an input
 
 
 @dataclass(frozen=True)
@@ -75,20 +73,9 @@ class PortraitInputs(Batch):
     sides: Tensor
 
     @property
-    def near_proxy(self) -> Tensor:
-        """Share [B, 1, S, S] that the proxy's layers have: 1 near the proxy and in ears, 0 far from it."""
-        near = torch.cat([_around(*one) for one in zip(self.covered, self.sides.flatten(), strict=True)])
-        return torch.maximum(near, self.classes[:, _EARS : _EARS + 1])
-
-    @property
     def scale(self) -> Tensor:
         """Pixels a face [B, 1, 1, 1], as a logarithm."""
         return (self.image.shape[-1] / self.sides / _FACE_PX).log()
-
-    def emptied(self, near: Tensor) -> "PortraitInputs":
-        """The same without what the proxy does not show, where it is not `near` [B, 1, S, S]."""
-        shown = {name: getattr(self, name) * near for name in ("normals", "depth", "reached")}
-        return replace(self, **shown, own=1 + (self.own - 1) * near)
 
     def mirrored(self) -> "PortraitInputs":
         """The people as a mirror shows them."""
@@ -102,15 +89,6 @@ class PortraitInputs(Batch):
         own = (self.own.clamp(0, 4) + 0.02).sqrt() - 1
         layers = (root, self.classes, self.normals, self.depth, self.covered, self.reached, own)
         return torch.cat(layers, 1)
-
-
-def _around(covered: Tensor, sides: Tensor) -> Tensor:
-    """1 within `_NEAR_FACES` of covered pixels [1, S, S] of a square of `sides`, 0 from thrice that on."""
-    fade = max(1, round(_NEAR_FACES * covered.shape[-1] / float(sides)))
-    near, reach = covered[None], 2 * fade
-    for kernel, padding in (((1, 2 * reach + 1), (0, reach)), ((2 * reach + 1, 1), (reach, 0))):
-        near = F.max_pool2d(near, kernel, 1, padding)
-    return F.avg_pool2d(near, 2 * fade + 1, 1, fade, count_include_pad=False)
 
 
 def mirrored_x(vectors: Tensor) -> Tensor:
@@ -231,7 +209,7 @@ class PortraitNetwork(UNet):
 
     def __init__(self, settings: PortraitSettings = PortraitSettings()) -> None:
         inputs = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1
-        super().__init__(settings, inputs + 2 * settings.sees_scale)
+        super().__init__(settings, inputs + settings.sees_scale)
         widths = settings.widths
         self.last = Residual(widths[0])
         self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
@@ -239,11 +217,9 @@ class PortraitNetwork(UNet):
 
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
         """Predict maps; sides are multiples of 32."""
-        stacked, shown = inputs.stacked(), torch.ones_like(inputs.covered)
+        stacked = inputs.stacked()
         if self.settings.sees_scale:
-            shown = inputs.near_proxy
-            inputs = inputs.emptied(shown)
-            stacked = torch.cat([inputs.stacked(), shown, inputs.scale.expand_as(shown)], 1)
+            stacked = torch.cat([stacked, inputs.scale.expand_as(inputs.covered)], 1)
         predicted = self.predict(self.last(self.doubled(self.halved(stacked))[-1]))
         fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
@@ -251,24 +227,24 @@ class PortraitNetwork(UNet):
             *torch.split(shuffled, list(_FINE.values()), 1),
             *torch.split(coarse.float(), list(_COARSE.values()), 1),
         ]
-        return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs, shown)
+        return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs)
 
     def at_every_scale(self, side: int) -> "PortraitNetwork":
         """The same network for squares of any scale, to be trained at a side.
 
-        Its new weights are 0: where the proxy is near it begins with the same maps.
+        Its new weights are 0, so that it begins with the same maps.
         """
         if self.settings.sees_scale:
             return self
         wider = PortraitNetwork(replace(self.settings, sees_scale=True, side=side))
         weights = self.state_dict()
-        weights["stem.enter.weight"] = F.pad(weights["stem.enter.weight"], (0, 0, 0, 0, 0, 2))
+        weights["stem.enter.weight"] = F.pad(weights["stem.enter.weight"], (0, 0, 0, 0, 0, 1))
         wider.load_state_dict(weights)
         return wider
 
 
-def _maps(raw: dict[str, Tensor], inputs: PortraitInputs, shown: Tensor) -> PortraitMaps:
-    """Maps of the last layer's channels; where the proxy is not `shown`, its shadows count nothing."""
+def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:
+    """Maps of the last layer's channels."""
     gain = torch.exp(raw["gain"].clamp(-4, 4)) * (1 + _DIM) / (inputs.own + _DIM)
     bias = 0.1 * F.softplus(raw["bias"] - 3)
     return PortraitMaps(
@@ -281,6 +257,6 @@ def _maps(raw: dict[str, Tensor], inputs: PortraitInputs, shown: Tensor) -> Port
         hair=inputs.classes[:, list(HAIRY)].sum(1, keepdim=True).clamp(0, 1),
         lit=0.3 * raw["lit"],
         around=torch.cat([0.3 * raw["around"][:, :1] + 0.05, 0.3 * raw["around"][:, 1:]], 1),
-        trust=4 * F.softplus(raw["trust"] + 0.5) * shown,
+        trust=4 * F.softplus(raw["trust"] + 0.5),
         shadow=raw["shadow"] * 3,
     )

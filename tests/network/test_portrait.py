@@ -187,22 +187,6 @@ def test_every_input_matters_and_every_scale_begins_with_the_same_maps() -> None
             torch.testing.assert_close(own, other)
 
 
-def test_far_from_the_proxy_nothing_of_it_is_seen() -> None:
-    """A square of 3 faces; the proxy covers its left quarter, and ends three tenths of a face beyond."""
-    network, given = PortraitNetwork(replace(TINY, sees_scale=True)), inputs()
-    edge = SIDE // 4 + 3
-    given.covered[..., SIDE // 4 :] = 0
-    other = replace(given, **{n: getattr(given, n).clone() for n in ("normals", "depth", "reached", "own")})
-    for values in (other.normals, other.depth, other.reached, other.own):
-        values[..., edge:] = torch.rand(values[..., edge:].shape, generator=torch.Generator().manual_seed(1))
-    maps, changed = network(given), network(other)
-    for one, two in zip(maps, changed, strict=True):
-        assert torch.equal(one, two)
-    assert maps.trust[..., edge:].max() == 0 < maps.trust[..., :edge].min()
-    given.own[..., edge - 1] += 1
-    assert not torch.equal(network(given).gain, maps.gain)
-
-
 def test_exposure_is_that_of_the_skin_and_what_reaches_a_point_is_summed_over_the_rig() -> None:
     given = inputs()
     given.classes[:, SKIN, :, SIDE // 2 :] = 0
