@@ -28,7 +28,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.person import Person, Target
 from facerf_cli.pipeline import DEFAULT_ESTIMATOR, Estimator, explain, find_for, head_of, reflectance_of
-from facerf_cli.portrait.find import FaceBox
+from facerf_cli.portrait.find import FaceBox, NoFaceError
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.relighting.models import Models, Sides
@@ -174,10 +174,6 @@ class Portrait:
 def common_mask(views: Iterable[HeadView]) -> np.ndarray:
     """The mask [S, S] inside those of all views."""
     return np.minimum.reduce([view.mask for view in views])
-
-
-class NoFaceError(InputError):
-    """No face is found in an image of a dataset."""
 
 
 @dataclass(frozen=True, eq=False)

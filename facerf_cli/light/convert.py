@@ -60,7 +60,7 @@ def convert(
                 record = LightRecord(over.directions, over.weights, words, harmonics, attributes)
             write_light(target, record)
             continue
-        axes: MapAxes = "facerf" if form == "latlong" else form  # type: ignore[assignment]
+        axes: MapAxes = "facerf" if form == "latlong" else form
         envmap = light.latlong(None if width_px is None else width_px // 2)
         below = float((envmap < 0).any(-1).float().mean())
         if below:

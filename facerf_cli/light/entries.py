@@ -6,7 +6,7 @@ Wrong ones raise UsageError. Light to import, since the help does without numpy.
 import math
 import os.path
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -427,10 +427,13 @@ def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     return LitImage(frames, any(light.is_numbered for light in lights), names, image)
 
 
-def named_map(entry: str, turns: Sequence[float], is_numbered: bool) -> LitImage | None:
+def named_map(
+    entry: str, turns: Sequence[float], is_numbered: bool, source: Callable[[str], MapSource] = Path
+) -> LitImage | None:
     """Parse `NAME=FILE`, a map that shines with the lights that have names; None for a path alone."""
     name, equals, path = entry.partition("=")
     if not equals or not _NAME.fullmatch(name) or Path(entry).exists():
         return None
-    frames = tuple((StudioLight(envmap=Path(path), rotate_deg=degrees),) for degrees in turns)
+    envmap = source(path)
+    frames = tuple((StudioLight(envmap=envmap, rotate_deg=degrees),) for degrees in turns)
     return LitImage(frames, is_numbered, (name,), name)

@@ -38,6 +38,10 @@ _DARK = 100  # of 255: brightest percentile of a photo that is brightened before
 _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
 
 
+class NoFaceError(InputError):
+    """No face is found in an image."""
+
+
 @dataclass(frozen=True, eq=False)
 class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
@@ -103,11 +107,11 @@ def find_faces(
 ) -> list[Face]:
     """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
 
-    Raises InputError, with the image's name, where no face is found.
+    Raises NoFaceError, with the image's name, where there is none.
     """
     faces = detect_faces(people, to_display(pixels_linear), everyone=which != "largest")
     if not faces:
-        raise InputError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
+        raise NoFaceError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
     return choose_face(faces, which, name)
 
 

@@ -23,16 +23,17 @@ from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import labels
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
-from facerf_cli.light.envmap import ball
+from facerf_cli.light.envmap import ball, resampled
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, rig_coefficients
-from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
+from facerf_cli.light.sphere import brightest_direction, direction_to_azel
 from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.network.checkpoint import load_vgg
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
 from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
+from facerf_cli.portrait.find import NoFaceError
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import (
@@ -124,17 +125,27 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
     image = read_photo(item, options.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        return _write(item, image, face, options, width_px, sh_order)
+        return {"light_from": "face"} | _write(item, image, face, options, width_px, sh_order)
 
-    return write_each(item, image, options.photo, write)
+    try:
+        return write_each(item, image, options.photo, write)
+    except NoFaceError:
+        from facerf_cli.work.light_of_picture import write_guess
+
+        return [""], write_guess(item, image, options, width_px, sh_order)
 
 
-def light_of_photo(path: Path, options: LightOptions) -> RigLight:
-    """The light of the (largest) face of a photo on disk, estimated."""
+def map_of_photo(path: Path, options: LightOptions, height: int) -> Tensor:
+    """The light of the largest face of a photo, or of a picture without one: a map [height, 2 height, 3]."""
     item = Item(path, Path(path.stem), path.stem)
     image = read_photo(item, options.photo)
-    face = fit_faces(item, image, options.photo)[0]
-    return _estimate(item, image, face.head, options)[0].light
+    try:
+        face = fit_faces(item, image, options.photo)[0]
+    except NoFaceError:
+        from facerf_cli.work.light_of_picture import guessed_light
+
+        return resampled(guessed_light(item, image, options.fov_deg).envmap, height)
+    return rig_to_latlong(_estimate(item, image, face.head, options)[0].light, height)
 
 
 def _estimate(

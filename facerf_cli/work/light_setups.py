@@ -30,10 +30,11 @@ from facerf_cli.light.entries import (
 )
 from facerf_cli.option import LIGHT, option
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.work.photo_options import LightOptions
+from facerf_cli.work.photo_options import LightOptions, fov_option
 
 Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
+BACKGROUND = "background"  # the picture behind the person, as --light-from names it
 ROOM = "room"  # the name of a room's light, and of its layer
 _MOST_ROOM = 1.0
 log = logging.getLogger(LOGGER_NAME)
@@ -50,7 +51,9 @@ class LightSources:
         light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, own (the photo's), even
             (delight), a preset (rembrandt), a rig file, keys (at=, size=), NAME=LIGHT;stops=-1;
             docs/lights.md. Repeatable.
-        light_from: Relight under the light of another photo, as estimate-light finds it. Repeatable.
+        light_from: Relight under the light of another photo, or of the picture of --background (background),
+            as estimate-light finds it; NAME=PHOTO together with lights that have names. Repeatable.
+        fov_deg: The angle of view of a picture without face.
         room: Add what a room sends back to lights: a share of them, from all around; a map; or none.
         rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
         sampling: Give each light the map's integral over its cell; share it smoothly among lights; or, as in
@@ -60,6 +63,7 @@ class LightSources:
     envmap: list[str] | None = option(None, metavar="MAP|DIR", shown_default=False, panel=LIGHT)
     light: list[str] | None = option(None, metavar="LIGHT", shown_default=False, panel=LIGHT)
     light_from: list[str] | None = option(None, metavar="PHOTO|DIR", shown_default=False, panel=LIGHT)
+    fov_deg: float | None = fov_option()
     room: str | None = option(
         None, metavar="SHARE|MAP|none", shown_default="0.06; 0.03 before black", panel=LIGHT
     )
@@ -85,6 +89,7 @@ class PhotoLight:
     name: str
     path: Path
     options: LightOptions
+    is_background: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,6 +123,13 @@ class LightSetup:
         return any(light.own for light in self.lights)
 
     @property
+    def has_scale(self) -> bool:
+        """True where the lights are as bright as the photo, or as the picture behind it."""
+        maps = (light.envmap for light in self.lights)
+        behind = any(isinstance(envmap, PhotoLight) and envmap.is_background for envmap in maps)
+        return behind or bool(self.by_photo)
+
+    @property
     def by_photo(self) -> list[StudioLight]:
         """The lights that are as bright as the photo."""
         return [light for light in self.lights if light.own or light.even]
@@ -132,7 +144,11 @@ class LightSetup:
 
 
 def collect_setups(
-    sources: LightSources, output: Path, seed: int = 0, how: LightOptions | None = None
+    sources: LightSources,
+    output: Path,
+    seed: int = 0,
+    how: LightOptions | None = None,
+    background: Path | None = None,
 ) -> tuple[LightSetup, ...]:
     """List the light setups that the options name; maps are read, drawn or estimated later.
 
@@ -141,13 +157,25 @@ def collect_setups(
         output: The output folder, which is not searched for maps.
         seed: The seed of drawn maps.
         how: How the lights of photos are estimated.
+        background: The picture behind the person.
     """
     envmaps, rotate = sources.envmap or (), sources.rotate
-    lit = photo_lights(sources.light_from, output, how) if sources.light_from and how else []
     rotations = parse_rotations(rotate)
     turns, is_numbered = [degrees for _, _, degrees in rotations], is_sweep(rotate or "")
     together = {entry: named for entry in envmaps if (named := named_map(entry, turns, is_numbered))}
     envmaps = [entry for entry in envmaps if entry not in together]
+    lit: list[PhotoLight] = []
+    if sources.light_from and how:
+        photo = _PhotoLights(replace(how, fov_deg=sources.fov_deg), background)
+        alone = [entry for entry in sources.light_from if entry not in (BACKGROUND, *together)]
+        with_names = {
+            entry: image for entry in alone if (image := named_map(entry, turns, is_numbered, photo.one))
+        }
+        together |= with_names
+        lit = [photo.one(BACKGROUND)] if BACKGROUND in sources.light_from else []
+        lit += photo.each([entry for entry in alone if entry not in with_names], output)
+    elif sources.fov_deg is not None:
+        raise UsageError("--fov: is for --light-from; add it, or leave --fov out")
     words = [entry for entry in envmaps if entry.startswith(DRAWN)]
     paths = [entry for entry in envmaps if entry not in words]
     files = collect_items(paths, output, MAP_SUFFIXES) if paths else []
@@ -233,13 +261,30 @@ def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
     return [DrawnMap(f"{index:05d}_{kind_of(index, seed)}", index, seed) for index in range(most)]
 
 
-def photo_lights(entries: Sequence[str], output: Path, options: LightOptions) -> list[PhotoLight]:
-    """Name the lights of photos (files, folders, quoted patterns) as `estimate-light` names its maps."""
-    items = collect_items(entries, output, PHOTO_SUFFIXES) if entries else []
-    names = _short_names(items)
-    return [
-        PhotoLight(f"{name}_light", item.input_path, options) for name, item in zip(names, items, strict=True)
-    ]
+@dataclass(frozen=True)
+class _PhotoLights:
+    """Lights of photos that --light-from names, as `estimate-light` names its maps."""
+
+    options: LightOptions
+    background: Path | None
+
+    def one(self, name: str) -> PhotoLight:
+        """The light of one photo, or of the picture behind the person."""
+        if name != BACKGROUND:
+            (item,) = collect_items([name], Path(), PHOTO_SUFFIXES)
+            return PhotoLight(f"{Path(item.name).name}_light", item.input_path, self.options)
+        if self.background is None:
+            raise UsageError(
+                "--light-from background: no picture is behind the person; add --background FILE, or give "
+                "./background for a file of that name"
+            )
+        return PhotoLight(f"{self.background.stem}_light", self.background, self.options, is_background=True)
+
+    def each(self, entries: Sequence[str], output: Path) -> list[PhotoLight]:
+        """The lights of photos (files, folders, quoted patterns)."""
+        items = collect_items(entries, output, PHOTO_SUFFIXES) if entries else []
+        paths = zip(_short_names(items), items, strict=True)
+        return [PhotoLight(f"{name}_light", item.input_path, self.options) for name, item in paths]
 
 
 def _short_names(items: Sequence[Item]) -> list[str]:

@@ -67,10 +67,9 @@ def read_map(envmap: MapSource) -> Tensor:
 @cache
 def _map_of_photo(photo: PhotoLight) -> Tensor:
     """Estimated once a process, in the half floats of the file that `facerf estimate-light` writes."""
-    from facerf_cli.light.forms import rig_to_latlong
-    from facerf_cli.work.light_of_photo import light_of_photo
+    from facerf_cli.work.light_of_photo import map_of_photo
 
-    return rig_to_latlong(light_of_photo(photo.path, photo.options), _LIGHT_WIDTH_PX // 2).half().float()
+    return map_of_photo(photo.path, photo.options, _LIGHT_WIDTH_PX // 2).half().float()
 
 
 def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:

@@ -147,6 +147,19 @@ def photo_words(options: PhotoOptions, number: int = 0) -> list[str]:
     return words + [word for path in checkpoints for word in ("--checkpoint", str(path))]
 
 
+def fov_option() -> Any:
+    """`--fov`, the angle of view of pictures without a face."""
+    return option(
+        None,
+        flags=("--fov",),
+        metavar="DEG",
+        least=1.0,
+        most=170.0,
+        shown_default="its EXIF, or 60",
+        panel=LIGHT,
+    )
+
+
 @dataclass(frozen=True)
 class SolveOptions:
     """The solution for the light.
@@ -170,6 +183,7 @@ class LightOptions(SolveOptions):
         rig: Solve for the light of a rig of N lights, or of a file of directions.
         vgg_weights: Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.
         keep_eyes: Use the eyes, too (the paper leaves them out).
+        fov_deg: The angle of view of a picture without face.
         matte: Use only what a grey image, or its alpha, shows, such as skin alone; --person replaces the
             matte.
     """
@@ -184,6 +198,7 @@ class LightOptions(SolveOptions):
         panel=METHOD,
     )
     keep_eyes: bool = option(False, panel=FACE)
+    fov_deg: float | None = fov_option()
     matte: Path | None = option(None, metavar=COMPANION, shown_default="the photo's alpha", panel=FACE)
 
     @property

@@ -308,7 +308,7 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     check_companion(options.photo_of_stack, "--photo")
     of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
     how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
-    setups = collect_setups(sources, output, photo.settings.seed, how)
+    setups = collect_setups(sources, output, photo.settings.seed, how, options.background.path)
     if alone and any(setup.has_own for setup in setups):
         raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
     by_photo = [light for setup in setups for light in setup.by_photo]
@@ -316,7 +316,7 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
         word = OWN if by_photo[0].own else EVEN
         raise UsageError(f"--light {word}: is not for --reflectance {options.reflectance}; leave one out")
     if options.exposure is None:
-        setups = tuple(replace(one, exposure_ev=0.0) if one.by_photo else one for one in setups)
+        setups = tuple(replace(one, exposure_ev=0.0) if one.has_scale else one for one in setups)
     if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
         raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
     if options.ball and all(setup.envmap is None for setup in setups):

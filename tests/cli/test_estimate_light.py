@@ -113,3 +113,32 @@ def test_the_light_of_another_photo_is_that_of_the_two_commands(
         assert one.max() > 0 and (one == two).all()
     assert main([*relit, str(tmp_path / "no"), "--light-from", str(tmp_path / "none.jpg")]) == 1
     assert "none.jpg: no such file" in capsys.readouterr().err
+
+
+def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(
+    given: Path, tmp_path: Path, capsys: Said
+) -> None:
+    """A bright sky at the left, as a background and by name: the map of estimate-light, at 0 EV."""
+    beach = tmp_path / "beach.png"
+    sky = np.full((60, 90, 3), 0.1, np.float32)
+    sky[:30, :45] = (0.9, 0.8, 0.6)
+    write_display(beach, sky)
+    models = ["--checkpoint", str(given / "lambert.safetensors")]
+    assert main([*models, "estimate-light", str(beach), "-o", str(tmp_path), "--width", "512"]) == 0
+    row, shown = row_of(tmp_path), capsys.readouterr().err
+    assert row["light_from"] == "picture" and 0 < row["guess_error"] < 2
+    assert "beach.png: no face" in shown and "guess" in shown and "60 degrees" in shown
+    expected = read_image(tmp_path / "beach_light.exr").pixels
+    assert expected.shape == (256, 512, 3) and read_light(tmp_path / "beach_light.json").weights.min() >= 0
+    assert (expected[115, 500] > 3 * expected[115, 12]).all()  # u just below 1 is the picture's left
+    relit = [*models, "relight", str(PHOTO), "--landmarks", str(given / "astronaut.json"), "-o"]
+    line = ["--background", str(beach), "--light-from", "background", "--light-from", f"sky={beach}"]
+    options = ["--lights", "12", "--light", "own", "--reflectance", "field"]
+    assert main([*relit, str(tmp_path / "one"), *line, *options]) == 0
+    by_map = ["--envmap", str(tmp_path / "beach_light.exr"), "--background", str(beach), "--exposure", "0"]
+    assert main([*relit, str(tmp_path / "two"), *by_map, *options]) == 0
+    one, two = (read_image(tmp_path / name / "astronaut_beach_light.exr").pixels for name in ("one", "two"))
+    assert one.max() > 0 and (one == two).all()
+    assert (tmp_path / "one" / "astronaut_light_sky+own.exr").is_file()
+    assert main([*models, "estimate-light", str(beach), "-o", str(tmp_path), "--fov", "100"]) == 0
+    assert np.abs(read_image(tmp_path / "beach_light.exr").pixels - expected).max() > 0.05

@@ -77,6 +77,10 @@ WRONG: dict[str, dict[str, str]] = {
         "--envmap procedural:none": "write procedural:N",
     },
     "relight a.jpg --light 0,0": {
+        "--light-from background": "add --background FILE",
+        "--light-from sky=background": "add --background FILE",
+        "--fov 50": "--fov: is for --light-from",
+        "--fov 180 --light-from a.jpg": "170",
         "--rotate left": "give DEG or FROM:TO:N, a number",
         "--rotate 0:360": "give degrees, or FROM:TO:N",
         "--pose 1,2": "give YAW,PITCH,ROLL",
