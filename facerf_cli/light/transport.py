@@ -177,7 +177,7 @@ def on_disc(axis: np.ndarray, places: PlacesOnDisc) -> np.ndarray:
     `axis` is the direction to its middle, [3], or [N, 3] of a near one.
     """
     axis = axis.astype(np.float32)
-    tangent, bitangent = (side.astype(np.float32) for side in _tangents(np.atleast_2d(axis)))
+    tangent, bitangent = (side.astype(np.float32) for side in tangents(np.atleast_2d(axis)))
     radius, cosine, sine = places
     rays = axis + radius * (cosine * tangent + sine * bitangent)
     return (rays / np.sqrt((rays * rays).sum(-1, keepdims=True))).astype(np.float32)
@@ -185,14 +185,14 @@ def on_disc(axis: np.ndarray, places: PlacesOnDisc) -> np.ndarray:
 
 def over_hemisphere(normals: np.ndarray, share: np.ndarray, around: np.ndarray) -> np.ndarray:
     """A direction [N, 3] about each normal from two numbers [N, 1]; uniform in 0..1: a cosine lobe."""
-    tangent, bitangent = _tangents(normals)
+    tangent, bitangent = tangents(normals)
     radius = np.sqrt(share)
     turn = 2 * np.pi * around
     rays = np.sqrt(1 - radius**2) * normals + radius * (np.cos(turn) * tangent + np.sin(turn) * bitangent)
     return rays.astype(np.float32)
 
 
-def _tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tangents(normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two unit vectors [N, 3] each, orthogonal to unit normals [N, 3]."""
     helper = np.where(np.abs(normals[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
     tangent = np.cross(helper, normals)

@@ -130,6 +130,9 @@ def resize(x: Tensor, side: int) -> Tensor:
     if x.shape[-1] == side:
         return x
     if x.shape[-1] > side:
+        blocks = x.shape[-1] // side
+        if x.shape[-2:] == (side * blocks, side * blocks):  # the same, in half the time
+            return F.avg_pool2d(x, blocks)
         return F.interpolate(x, (side, side), mode="area")
     return F.interpolate(x, (side, side), mode="bilinear", align_corners=False)
 

@@ -52,9 +52,13 @@ class DefaultReflectanceSettings:
 
 @dataclass(frozen=True)
 class DefaultEncoded:
-    """B encoded faces: skip features from fine to coarse, and what the output needs of the source."""
+    """B encoded faces: what the decoder takes of them for any light, and what the output needs of the source.
 
-    features: list[Tensor]
+    `bottom` enters the decoder; `skips` join it from fine to coarse.
+    """
+
+    bottom: Tensor
+    skips: list[Tensor]
     source_root: Tensor  # [B, 3, T, T] square root of the source over its exposure
     exposure: Tensor  # [B, 1, 1, 1] what the source was divided by
 
@@ -136,7 +140,8 @@ class DefaultReflectanceNetwork(SavedNetwork):
         for down in self.down:
             x = down(x)
             features.append(x)
-        return DefaultEncoded(features, source_root, exposure)
+        skips = [up.skip(skip) for up, skip in zip(self.up, features, strict=True)]
+        return DefaultEncoded(self.bottleneck(x), skips, source_root, exposure)
 
     def decode(self, encoded: DefaultEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:
         """Decode OLAT textures [B, L, 3, T, T] for camera-space lights [B, L, 3], normals [B, 3, T, T]."""
@@ -147,8 +152,8 @@ class DefaultReflectanceNetwork(SavedNetwork):
         """Decode `to_root` of the textures over the source's exposure [B, L, 3, T, T]; may be negative."""
         faces, count, _ = lights.shape
         maps, base, code = self._light_inputs(self._normals_used(normals_target), lights)
-        x = self.bottleneck(encoded.features[-1]).repeat_interleave(count, 0)
-        for up, skip in zip(reversed(self.up), reversed(encoded.features), strict=True):
+        x = encoded.bottom.repeat_interleave(count, 0)
+        for up, skip in zip(reversed(self.up), reversed(encoded.skips), strict=True):
             x = up(x, skip, maps, code, count)
         gain, bias = self.head(x).float().chunk(2, 1)
         both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
@@ -202,7 +207,7 @@ class LitUp(nn.Module):
 
         Args:
             x: Features from below [B * lights, C, h, w].
-            skip: Features of the face [B, C, H, W].
+            skip: What the face's features add [B, C, H, W]: those of `skip`.
             maps: Maps of the lights [B * lights, C, h, w], of any side.
             code: Codes of the lights [B * lights, C].
             lights: Lights of each face.
@@ -212,7 +217,7 @@ class LitUp(nn.Module):
         if self.scale == 2:
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
         x = x + self.light(resize(maps, side))
-        x.view(-1, lights, *x.shape[1:]).add_(self.skip(skip)[:, None])
+        x.view(-1, lights, *x.shape[1:]).add_(skip[:, None])
         scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
         x = F.silu(torch.addcmul(shift, x, 1 + scale))
         x = F.silu(self.inner(x)).add_(x)

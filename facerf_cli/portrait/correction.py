@@ -67,9 +67,10 @@ class Correction:
         """Factors and additions [3, l, S, S] that correct images of single lights, grey ones [l, S, S]."""
         brightness = self._brightness(grey)
         power = self._likeness(grey, brightness) / self.mean_likeness
-        change = power.clamp(max=_LARGEST) * self.excess[:, None]
-        more, less, raised = change.clamp(min=0), change.clamp(max=0), self.floor * brightness
-        factor = 1 + more + less * (1 + raised / grey.clamp_min(1e-9))
+        power, raised = power.clamp(max=_LARGEST), self.floor * brightness
+        more, less = self.excess[:, None].clamp(min=0), self.excess[:, None].clamp(max=0)
+        more = power * more
+        factor = (1 + more).addcmul_(power * (1 + raised / grey.clamp_min(1e-9)), less)
         return factor.clamp_min_(0), more * raised
 
     def _brightness(self, grey: Tensor) -> Tensor:

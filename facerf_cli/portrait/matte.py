@@ -38,8 +38,7 @@ def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.n
     A guided filter (He et al., *Guided image filtering*, 2013) in its fast form (He and Sun, 2015): linear
     functions of the colour around each pixel, found at the small size and applied at the large one.
     """
-    slope, offset = local_lines(alpha, image, _REACH_PX, _SMOOTHNESS)
-    maps = np.concatenate([slope.transpose(2, 0, 1), offset[None]])
+    maps = np.concatenate(local_lines(alpha[..., None], image, _REACH_PX, _SMOOTHNESS))
     size = photo_srgb.shape[:2]
     lifted = np.empty(size, np.float32)
     for rows in strips(size):
@@ -52,21 +51,19 @@ def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.n
 def local_lines(
     values: np.ndarray, guide: np.ndarray, reach: int, smoothness: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes [h, w, 3] and offsets [h, w] of values [h, w] as a linear function of colour around each pixel.
+    """Slopes [3 K, h, w] and offsets [K, h, w] of values [h, w, K] as linear functions of colours nearby.
 
     `reach` is in pixels; where the variance of the colours is below `smoothness`, values are smoothed.
     """
     mean = partial(box_means, reach=reach)
     colour, share = mean(guide), mean(values)
-    products = guide[..., :, None] * guide[..., None, :]
-    covariance = mean(products.reshape(*values.shape, 9)).reshape(products.shape)
-    covariance = (
-        covariance - colour[..., :, None] * colour[..., None, :] + smoothness * np.eye(3, dtype=np.float32)
+    covariance, common = (
+        mean(guide[..., :, None] * other[..., None, :]) - colour[..., :, None] * of_other[..., None, :]
+        for other, of_other in ((guide, colour), (values, share))
     )
-    common = mean(guide * values[..., None]) - colour * share[..., None]
-    slope = np.linalg.solve(covariance, common[..., None])[..., 0]
-    offset = share - (slope * colour).sum(-1)
-    return mean(slope), mean(offset)
+    slope = np.linalg.solve(covariance + smoothness * np.eye(3, dtype=np.float32), common)  # [h, w, 3, K]
+    offset = share - (slope * colour[..., None]).sum(-2)
+    return mean(slope).transpose(3, 2, 0, 1).reshape(-1, *share.shape[:2]), mean(offset).transpose(2, 0, 1)
 
 
 def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:
@@ -152,7 +149,8 @@ def shrunk(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     flat = np.zeros((size[0], math.prod(image.shape[1:])), np.float32)
     for rows in strips(image.shape):
         part = np.ascontiguousarray(image[rows], np.float32)
-        flat += across[:, rows] @ part.reshape(len(part), -1)
+        into = slice(rows.start * size[0] // len(image), -(-rows.stop * size[0] // len(image)))
+        flat[into] += across[into, rows] @ part.reshape(len(part), -1)
     sides = np.moveaxis(flat.reshape(size[0], *image.shape[1:]), 1, 0)
     found = down @ np.ascontiguousarray(sides).reshape(image.shape[1], -1)
     return np.ascontiguousarray(np.moveaxis(found.reshape(size[1], size[0], *image.shape[2:]), 0, 1))

@@ -5,7 +5,7 @@ hair and head come from it; what it gets wrong, the Portrait Network corrects. I
 that explains the photo best is a first guess of the photo's light, from which that network starts.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -24,7 +24,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera
-from facerf_cli.light.transport import build_scene, occluded, on_disc, places_on_disc
+from facerf_cli.light.transport import build_scene, occluded, on_disc, places_on_disc, tangents
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.classes import class_index
@@ -149,29 +149,38 @@ class Shadows:
         numbers = np.random.default_rng(_SEED).random((_RAYS, 2, *self._inside.shape)).astype(np.float32)
         self.numbers = numbers[:, :, self._inside][..., None]
         self._places = [places_on_disc(RADIUS_DEG, *pair) for pair in self.numbers]
+        discs = (np.hstack([np.ones_like(r), r * cos, r * sin]) for r, cos, sin in self._places)
+        self._discs = [disc / np.linalg.norm(disc, axis=1, keepdims=True) for disc in discs]
 
     def along(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights from camera-space directions [L, 3] that arrives."""
-        return self._reached([(direction, None) for direction in directions.numpy()])
+        axes = directions.numpy()
+        frames = np.stack([axes, *tangents(axes)], 1).astype(np.float32)  # [L, 3, 3]
+        return self._reached(len(axes), lambda number: (disc @ frames[number] for disc in self._discs))
 
     def toward(self, places_m: Tensor) -> Tensor:
         """Share [P, s, s] of lights at camera-space places [P, 3] that arrives."""
         offsets = places_m.numpy()[:, None] - self.origins  # [P, N, 3]
         distances_m = np.linalg.norm(offsets, axis=2)
-        rays = offsets / distances_m[..., None].clip(min=1e-6)
-        return self._reached(list(zip(rays, distances_m, strict=True)))
+        axes = offsets / distances_m[..., None].clip(min=1e-6)
 
-    def _reached(self, lights: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> Tensor:
-        """Visibility [L, s, s] of lights, each given by unit rays [3] or [N, 3] to it and distances [N]."""
-        found = np.zeros((len(lights), *self._inside.shape), np.float32)
+        def rays(number: int) -> Iterator[np.ndarray]:
+            return (on_disc(axes[number], places) for places in self._places)
+
+        return self._reached(len(axes), rays, distances_m)
+
+    def _reached(
+        self, lights: int, rays: Callable[[int], Iterator[np.ndarray]], reach_m: np.ndarray | None = None
+    ) -> Tensor:
+        """Visibility [L, s, s] of lights, from the unit `rays` [N, 3] to each, within a reach [L, N]."""
+        found = np.zeros((lights, *self._inside.shape), np.float32)
 
         def trace(number: int) -> None:
-            axis, reach_m = lights[number]
-            rays = (on_disc(axis, places) for places in self._places)
-            blocked = [occluded(self._scene, self.origins, ray, reach_m) for ray in rays]
+            reach = None if reach_m is None else reach_m[number]
+            blocked = [occluded(self._scene, self.origins, ray, reach) for ray in rays(number)]
             found[number, self._inside] = 1 - np.mean(blocked, 0)
 
-        list(in_threads(trace, range(len(lights))))
+        list(in_threads(trace, range(lights)))
         filled = inpaint(torch.from_numpy(found), self.covered)
         return blurred(filled, _SOFT_PX)
 

@@ -76,9 +76,9 @@ class Enlarged:
         kept = self._trust * (1 - classes[class_index("garment")])
         self._edges = EdgeFill.of(self._colours, self._trust, self.own, kept)
         self._hair = torch.cat([self._filled(view.maps.albedo[0].mean(0, keepdim=True)), hair])
-        self._albedo_maps = torch.cat(
-            [self._gain_lines(), self._filled(self._edges.filled(view.maps.bias[0]))]
-        )
+        lines = self._gain_lines()
+        self._albedo_maps = torch.cat([lines, self._filled(self._edges.filled(view.maps.bias[0]))])
+        self._gain_maps = torch.cat([lines, self._filled(view.maps.gain[0])])
 
     @property
     def pixel_px(self) -> float:
@@ -126,9 +126,8 @@ class Enlarged:
 
     def flat(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
         """Luminances [h, w, 2] of the photo without its light, by the guided gain and by the coarse one."""
-        maps = torch.cat([self._albedo_maps, self._filled(self._view.maps.gain[0])])
-        wide = _enlarged(maps, self._grid(rows, columns))
-        gains = self._gain(pixels, wide), wide[_ALBEDO_MAPS:]
+        wide = _enlarged(self._gain_maps, self._grid(rows, columns))
+        gains = self._gain(pixels, wide), wide[12:]
         return np.stack([luminance(_by_pixel(gain) * pixels) for gain in gains], -1)
 
     def sharpened(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
@@ -183,9 +182,8 @@ class Enlarged:
         log_gain = self._filled(self._view.maps.gain[0].log())
         self._gain_range = float(log_gain.min()), float(log_gain.max())
         guide = to_display(self._view.person.image.permute(1, 2, 0).numpy()).astype(np.float32) / 255
-        lines = [local_lines(channel.numpy(), guide, _REACH_PX, _SMOOTHNESS) for channel in log_gain]
-        slopes = np.concatenate([slope.transpose(2, 0, 1) for slope, _ in lines])
-        return torch.from_numpy(np.concatenate([slopes, np.stack([offset for _, offset in lines])])).float()
+        lines = local_lines(_by_pixel(log_gain), guide, _REACH_PX, _SMOOTHNESS)
+        return torch.from_numpy(np.concatenate(lines)).float()
 
     def _smooth(self, light: Tensor) -> Tensor:
         """Shading and highlights [6, S, S], continued over the background; highlights are blurred."""
