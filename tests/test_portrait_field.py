@@ -297,7 +297,7 @@ def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(fie
     head, wide = field.views
     assert wide.person.square.side_px > head.person.square.side_px
     matte = head.person.segmentation.matte
-    columns, weight = Enlarged(head, matte.shape, 0.0).weight(slice(0, len(matte)))
+    columns, weight = Enlarged(head, matte.shape, 0.0).weight(slice(0, len(matte)), slice(0, matte.shape[1]))
     assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
     assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
     head, matte = Crop(40, 30, 60, SEEN_PX), np.zeros((300, 200), np.float32)

@@ -85,11 +85,11 @@ class Enlarged:
         """Side of the maps' pixels in those of the photo."""
         return 1 / self._view.person.square.scale
 
-    def weight(self, rows: slice) -> tuple[slice, np.ndarray]:
-        """Columns of the photo in which the square is seen in some rows, and its weight [h, w] there."""
-        square, width = self._view.person.square, self._size_px[1]
-        first, last = (round(x) for x in (square.x0_px, square.x0_px + square.side_px))
-        columns = slice(min(max(first, 0), width), min(max(last, 0), width))
+    def weight(self, rows: slice, among: slice) -> tuple[slice, np.ndarray]:
+        """Those among columns in which the square is seen in some rows, and its weight [h, w] there."""
+        square = self._view.person.square
+        ends = (round(x) for x in (square.x0_px, square.x0_px + square.side_px))
+        columns = slice(*(min(max(end, among.start), among.stop) for end in ends))
         x, y = self._places(rows, columns)
         away = torch.maximum(x.abs()[None], y.abs()[:, None])
         return columns, ((1 - away) / _FEATHER).clamp(0, 1).numpy()

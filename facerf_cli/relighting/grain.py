@@ -31,12 +31,13 @@ _STRIP_PX = 4 * STRIP_PX  # of the photo, whose detail is read at a time
 
 @dataclass(frozen=True, eq=False)
 class GrainRows:
-    """Rows of the photo, those around whose pixels reach into them, and where they are among these.
+    """Rows and columns of the photo, rows around that reach into them, and where they are among these.
 
-    `inside` [h, W] is the person there, and `reached` [h, W, 1] the share of the blur that is inside.
+    `inside` [h, w] is the person there, and `reached` [h, w, 1] the share of the blur that is inside.
     """
 
     rows: slice
+    columns: slice
     wide: slice
     own: slice
     inside: np.ndarray
@@ -62,7 +63,7 @@ class Grain:
     ) -> None:
         self._inside = share > 0
         self._reach = max(1, round(_BLUR * map_px))
-        self._margin = 2 * self._reach
+        self.margin = 2 * self._reach  # pixels that reach into one
         values = np.zeros((*share.shape, 2), np.float16)  # 0 where nobody is seen, as detail is
         unit, total, count = 0.0, 0.0, 0
         for rows in self._seen_strips(STRIP_PX):
@@ -77,10 +78,11 @@ class Grain:
         scale = np.float32((unit or 1) * max(count, 1) / max(total, _TINY))
         self._weight, self._detail = (np.zeros(share.shape, np.float16) for _ in range(2))
         for rows in self._seen_strips(_STRIP_PX):
-            wide, own = self._around(rows, 2 * self._margin)
-            sharp = sharpened(wide)[..., 0]
-            weight, detail = self._read(values[wide] * scale, share[wide], sharp, self._inside[wide])
-            self._weight[rows], self._detail[rows] = weight[own], detail[own]
+            wide, own = self._around(rows, 2 * self.margin)
+            at = wide, seen_columns(self._inside[wide], self.margin)
+            sharp = sharpened(wide)[:, at[1], 0]
+            weight, detail = self._read(values[at] * scale, share[at], sharp, self._inside[at])
+            self._weight[rows, at[1]], self._detail[rows, at[1]] = weight[own], detail[own]
 
     def _seen_strips(self, strip_px: int) -> Iterator[slice]:
         """The strips in which some of the person is seen: of a crowd's people few."""
@@ -106,16 +108,16 @@ class Grain:
         wide = slice(max(0, start - margin), min(len(self._inside), stop + margin))
         return wide, slice(start - wide.start, stop - wide.start)
 
-    def observe(self, rows: slice) -> GrainRows:
-        """Read the person in rows of the photo, and in those around them."""
-        wide, own = self._around(rows, self._margin)
-        inside = self._inside[wide]
-        return GrainRows(rows, wide, own, inside, self._reached(inside))
+    def observe(self, rows: slice, columns: slice = slice(None)) -> GrainRows:
+        """Read the person in rows of the photo, and in those around them; beyond the columns is nothing."""
+        wide, own = self._around(rows, self.margin)
+        inside = self._inside[wide, columns]
+        return GrainRows(rows, columns, wide, own, inside, self._reached(inside))
 
     def given(self, relit: np.ndarray, seen: GrainRows) -> np.ndarray:
-        """Observed rows [h, W, 3] of a relit image with the detail; `relit` are the pixels of `seen.wide`."""
+        """Observed pixels [h, w, 3] of a relit image with the detail; `relit` are those of `seen.wide`."""
         low, pixels = self._blurred(relit, seen.inside, seen.reached)[seen.own], relit[seen.own]
-        weight, detail = (values[seen.rows, :, None] for values in (self._weight, self._detail))
+        weight, detail = (values[seen.rows, seen.columns, None] for values in (self._weight, self._detail))
         return np.asarray(pixels + weight * (detail * low - pixels))
 
     def _blurred(self, values: np.ndarray, inside: np.ndarray, reached: np.ndarray) -> np.ndarray:
@@ -128,3 +130,10 @@ class Grain:
 
     def _means(self, values: np.ndarray) -> np.ndarray:
         return box_means(box_means(values, self._reach), self._reach)
+
+
+def seen_columns(shown: np.ndarray, margin: int) -> slice:
+    """Columns in which a part of an image [h, W] is not 0, with a margin around; at least one."""
+    at = np.flatnonzero(shown.any(0))
+    first, last = (int(at[0]), int(at[-1])) if len(at) else (0, 0)
+    return slice(max(0, first - margin), min(shown.shape[1], last + 1 + margin))

@@ -7,7 +7,7 @@ field's texture has the photo's detail (`photo_detail.py`); the rest has its gra
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ from facerf_cli.relighting.enlarged import Enlarged, ViewLight, ViewRows
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.face_alone import FACE_LAYERS, face_layer
 from facerf_cli.relighting.field import near_texture
-from facerf_cli.relighting.grain import Grain, GrainRows
+from facerf_cli.relighting.grain import Grain, GrainRows, seen_columns
 from facerf_cli.relighting.photo_detail import DetailRows, PhotoDetail, RelitDetail
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.relightable import Relit
@@ -47,16 +47,24 @@ _LIPS = 0.7  # cosine to the face's front from which on lips keep no light from 
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
 
 
+class _Part(NamedTuple):
+    """What shows of a view in some rows: its number, its columns and its weight [h, w] over wider ones."""
+
+    number: int
+    columns: slice
+    weight: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class PersonRows:
     """Values in some rows of the photo, and in those around them that grain reaches, that no light changes.
 
-    `weights` [h, w] are those of the narrower views over the widest, the last of `views`.
+    They are of the columns in which these rows show the person, and of its views there.
     """
 
     grain: GrainRows
+    parts: list[_Part]
     views: list[ViewRows]
-    weights: list[np.ndarray]
     inside: slice  # of the face's window
     detail: DetailRows | None
     face_share: np.ndarray
@@ -180,50 +188,48 @@ class PersonInPhoto:
 
     def observe(self, rows: slice) -> PersonRows:
         """Read rows of the photo, as far as no light changes them."""
-        grain = self._finish[0].observe(rows)
+        grain = self._finish[0].observe(rows, self._columns(rows, self._finish[0].margin))
         wide, inside = grain.wide, self.view.rows_inside(grain.wide)
-        pixels = self.own[wide].clip(min=0)
-        widest = slice(0, self.size_px[1])
-        views, weights = [self._views[-1].observe(pixels, wide, widest)], list[np.ndarray]()
-        for view in reversed(self._views[:-1]):
-            columns, weight = view.weight(wide)
-            if weight.any():
-                views.insert(0, view.observe(pixels[:, columns], wide, columns))
-                weights.insert(0, weight)
+        parts, own = self._parts(wide, grain.columns), self.own[wide]
+        views = [
+            self._views[part.number].observe(own[:, part.columns].clip(min=0), wide, part.columns)
+            for part in parts
+        ]
         detail, share = None, np.zeros(0, np.float32)
         if inside.start < inside.stop:
             detail = self._detail.observe(inside)
             bare = self._bare_face[self.view.in_photo(inside)][:, self.view.window[1]]
             share = self.view.mask[inside].numpy() * bare
-        return PersonRows(grain, views, weights, inside, detail, share)
+        return PersonRows(grain, parts, views, inside, detail, share)
 
     def pixels(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
-        """Pixels [h, W, 3] of observed rows, without the photo's own light."""
+        """Pixels [h, W, 3] of observed rows, without the photo's own light; 0 where nobody is."""
+        rows, among = seen.grain.rows, seen.grain.columns
         by_maps = pixels = self._by_maps(relit, seen)
-        for alone, shadow in relit.keys:
-            change = self._change(shadow, seen.grain.rows)
-            if (change != 1).any():
-                pixels = pixels + (by_maps if alone is None else self._by_maps(alone, seen)) * (change - 1)
-        return self._finish[1].lit(pixels, relit.mirrored, seen.grain.rows)
-
-    def _change(self, shadow: CastShadow, rows: slice) -> np.ndarray:
-        """Factor [h, W, 1] of a light's image in some rows, by its shadow in the narrower view."""
-        columns, weight = self._views[0].weight(rows)
-        factor = np.ones((len(weight), self.size_px[1], 1), np.float32)
+        columns, weight = self._views[0].weight(rows, among)
         if weight.any():
-            factor[:, columns, 0] += weight * (self._views[0].change(shadow, rows, columns) - 1)
-        return factor
+            pixels = by_maps.copy()
+            part = _within(columns, among)
+            for alone, shadow in relit.keys:  # a shadow is that of the narrower view
+                change = weight * (self._views[0].change(shadow, rows, columns) - 1)
+                if change.any():
+                    image = by_maps if alone is None else self._by_maps(alone, seen)
+                    pixels[:, part] += image[:, part] * change[..., None]
+        return self._finish[1].lit(self._spread(pixels, among), relit.mirrored, rows)
 
     def _by_maps(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
-        """Pixels [h, W, 3] without what only the photo's pixels show: shadows' edges, and eyes."""
+        """Observed pixels [h, w, 3] without what only the photo's pixels show: shadows' edges, and eyes."""
         rims = self._rims if relit.from_behind else None
-        used = self._used(relit.views, seen)
+        used, among = self._used(relit.views, seen), seen.grain.columns
         shown = [view.radiance(light, rows, rims) for view, light, rows in used]
-        person, behind = np.split(_joined(shown, seen), [3], -1)
+        person, behind = np.split(_joined(shown, seen.parts), [3], -1)
         if seen.detail is not None:  # the field of the face knows no hair around it
-            rows, columns = self.view.rows_of(seen.inside, seen.grain.wide), self.view.window[1]
-            part, detail = person[rows, columns], self._detail.pixels(relit.detail, seen.detail, seen.inside)
-            part += seen.face_share[..., None] * (detail - part)
+            rows, window = self.view.rows_of(seen.inside, seen.grain.wide), self.view.window[1]
+            start = max(window.start, among.start)
+            common = slice(start, max(start, min(window.stop, among.stop)))
+            part, own = person[rows, _within(common, among)], _within(common, window)
+            detail = self._detail.pixels(relit.detail, seen.detail, seen.inside)[:, own]
+            part += seen.face_share[:, own, None] * (detail - part)
         return self._finish[0].given(person + behind if behind.size else person, seen.grain)
 
     def layer(self, name: str, relit: PersonLight, seen: PersonRows) -> dict[str, np.ndarray]:
@@ -241,7 +247,8 @@ class PersonInPhoto:
             return face_layer(self.view, name, rows)
         if name in relit.layers:
             used = self._used(relit.layers[name], seen)
-            values = _joined([view.layer(name, maps, one) for view, maps, one in used], seen)[seen.grain.own]
+            shown = _joined([view.layer(name, maps, one) for view, maps, one in used], seen.parts)
+            values = self._spread(shown[seen.grain.own], seen.grain.columns)
         else:
             values = self._surface.depth_m(rows) if name == "depth" else self._surface.position_m(rows)
         share = self.matte[rows][..., None]
@@ -261,8 +268,26 @@ class PersonInPhoto:
 
     def _used(self, values: Sequence[T], seen: PersonRows) -> Iterator[tuple[Enlarged, T, ViewRows]]:
         """The views that are seen in rows, each with its value."""
-        first = len(self._views) - len(seen.views)
-        return zip(self._views[first:], values[first:], seen.views, strict=True)
+        for part, view in zip(seen.parts, seen.views, strict=True):
+            yield self._views[part.number], values[part.number], view
+
+    def _columns(self, rows: slice, margin: int) -> slice:
+        """Columns of the photo in which rows, and those in a margin, show the person, with that margin."""
+        return seen_columns(self.matte[max(0, rows.start - margin) : rows.stop + margin], margin)
+
+    def _parts(self, rows: slice, columns: slice) -> list[_Part]:
+        """What shows of the views in some rows and columns; the widest, the last, in all of them."""
+        seen = ((number, *view.weight(rows, columns)) for number, view in enumerate(self._views[:-1]))
+        parts = [_Part(*one) for one in seen if one[2].any()]
+        return [*parts, _Part(len(self._views) - 1, columns, np.ones(0))]
+
+    def _spread(self, values: np.ndarray, columns: slice) -> np.ndarray:
+        """Values [h, W, C] of those in some columns [h, w, C], 0 in the others."""
+        if values.shape[1] == self.size_px[1]:
+            return values
+        found = np.zeros((len(values), self.size_px[1], values.shape[2]), np.float32)
+        found[:, columns] = values
+        return found
 
     def _flat(self, rows: slice) -> np.ndarray:
         return self._read(rows, [view.flat for view in self._views])
@@ -271,15 +296,11 @@ class PersonInPhoto:
         return self._read(rows, [view.sharpened for view in self._views])
 
     def _read(self, rows: slice, reads: Sequence[Read]) -> np.ndarray:
-        """Values [h, W, C] of rows of the photo that each view reads; the widest lies below."""
-        pixels = self.own[rows].clip(min=0)
-        found = reads[-1](pixels, rows, slice(0, pixels.shape[1]))
-        for view, read in reversed(list(zip(self._views[:-1], reads[:-1], strict=True))):
-            columns, weight = view.weight(rows)
-            if weight.any():
-                part = found[:, columns]
-                part += weight[..., None] * (read(pixels[:, columns], rows, columns) - part)
-        return found
+        """Values [h, W, C] of rows of the photo that each view reads, 0 where nobody is."""
+        columns, own = self._columns(rows, 0), self.own[rows]
+        parts = self._parts(rows, columns)
+        shown = [reads[one.number](own[:, one.columns].clip(min=0), rows, one.columns) for one in parts]
+        return self._spread(_joined(shown, parts), columns)
 
 
 def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
@@ -287,10 +308,15 @@ def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
     return smoothstep(directions @ forward / _LIPS)
 
 
-def _joined(shown: Sequence[np.ndarray], seen: PersonRows) -> np.ndarray:
-    """Values [h, W, C] of what each view shows; the widest, the last, lies below."""
+def _joined(shown: Sequence[np.ndarray], parts: Sequence[_Part]) -> np.ndarray:
+    """Values [h, w, C] of what each view shows; the widest, the last, lies below."""
     found = shown[-1]
-    for values, rows, weight in reversed(list(zip(shown[:-1], seen.views[:-1], seen.weights, strict=True))):
-        part = found[:, rows.columns]
-        part += weight[..., None] * (values - part)
+    for values, one in reversed(list(zip(shown[:-1], parts[:-1], strict=True))):
+        part = found[:, _within(one.columns, parts[-1].columns)]
+        part += one.weight[..., None] * (values - part)
     return found
+
+
+def _within(columns: slice, among: slice) -> slice:
+    """Columns of an image as counted from the first of those among which they are."""
+    return slice(columns.start - among.start, columns.stop - among.start)
