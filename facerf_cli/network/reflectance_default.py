@@ -140,7 +140,7 @@ class DefaultReflectanceNetwork(SavedNetwork):
         for down in self.down:
             x = down(x)
             features.append(x)
-        skips = [up.skip(skip) for up, skip in zip(self.up, features, strict=True)]
+        skips = [up.get_submodule("skip")(one) for up, one in zip(self.up, features, strict=True)]
         return DefaultEncoded(self.bottleneck(x), skips, source_root, exposure)
 
     def decode(self, encoded: DefaultEncoded, normals_target: Tensor, lights: Tensor) -> Tensor:

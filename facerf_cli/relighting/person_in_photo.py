@@ -48,7 +48,7 @@ _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tai
 
 
 class _Part(NamedTuple):
-    """What shows of a view in some rows: its number, its columns and its weight [h, w] over wider ones."""
+    """A view as far as it shows in some rows: its number, columns, and weight [h, w] over wider views."""
 
     number: int
     columns: slice
@@ -276,7 +276,7 @@ class PersonInPhoto:
         return seen_columns(self.matte[max(0, rows.start - margin) : rows.stop + margin], margin)
 
     def _parts(self, rows: slice, columns: slice) -> list[_Part]:
-        """What shows of the views in some rows and columns; the widest, the last, in all of them."""
+        """The views as far as they show in some rows and columns; the widest, the last, in all of them."""
         seen = ((number, *view.weight(rows, columns)) for number, view in enumerate(self._views[:-1]))
         parts = [_Part(*one) for one in seen if one[2].any()]
         return [*parts, _Part(len(self._views) - 1, columns, np.ones(0))]
