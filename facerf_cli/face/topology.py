@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from facerf_cli.raster.rasterize import Fragments, front_facing
@@ -222,7 +221,22 @@ def _spline(points: np.ndarray, steps: int = 6) -> np.ndarray:
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
     knots = np.arange(len(points))
     at = np.interp(np.linspace(0, knots[-1], knots[-1] * steps + 1), knots, length)
-    return CubicSpline(length, points)(at)
+    gap = np.diff(length)[:, None]
+    slope = np.diff(points, axis=0) / gap
+    system, right = np.zeros((len(points), len(points))), np.zeros_like(points)  # of the slopes at knots
+    for i in knots[1:-1]:
+        system[i, i - 1 : i + 2] = gap[i, 0], 2 * (gap[i - 1, 0] + gap[i, 0]), gap[i - 1, 0]
+        right[i] = 3 * (gap[i] * slope[i - 1] + gap[i - 1] * slope[i])
+    for a, b in ((0, 1), (-1, -2)):  # the two pieces at an end are one polynomial
+        both = gap[a] + gap[b]
+        system[a, [a, b]] = gap[b, 0], both[0]
+        right[a] = ((gap[a] + 2 * both) * gap[b] * slope[a] + gap[a] ** 2 * slope[b]) / both
+    tangent = np.linalg.solve(system, right)
+    bend = (tangent[:-1] + tangent[1:] - 2 * slope) / gap
+    piece = (np.searchsorted(length, at, "right") - 1).clip(0, len(gap) - 1)
+    z = (at - length[piece])[:, None]
+    turn = ((slope - tangent[:-1]) / gap - bend)[piece]
+    return np.asarray(points[piece] + tangent[piece] * z + turn * z * z + (bend / gap)[piece] * (z * z * z))
 
 
 def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import ConvexHull, QhullError, cKDTree
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -22,6 +21,8 @@ from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong
 
 Sampling = Literal["cell", "smooth", "paper"]
 _DIRECTIONS_AT_ONCE = 1 << 12  # that are compared with all triangles of a rig
+_MANY_LIGHTS = 400  # from which on a tree finds the nearest sooner
+_TEXELS_AT_ONCE = 1 << 13  # that are compared with all lights of a rig
 _OUTSIDE = -1e-4  # a share below it: the rig does not surround this direction
 _FLAT = 1e-6  # the least distance of a triangle's plane from the middle
 _COLUMNS_AT_ONCE = 1 << 10  # of a map, which are integrated in float64
@@ -91,8 +92,13 @@ def cell_rows(lights: int) -> int:
 def nearest_light(directions: Tensor, height: int, width: int) -> Tensor:
     """Index of the light [L, 3] nearest to the centre of each texel of a lat-long map [H, W] int64."""
     texels = latlong_directions(height, width, torch.float64)
-    _, index = cKDTree(directions.double().cpu().numpy()).query(texels.numpy())
-    return torch.from_numpy(index).long()
+    lights = directions.double().cpu().numpy()
+    if len(lights) > _MANY_LIGHTS:
+        from scipy.spatial import cKDTree  # takes as long to import as a few hundred lights do without it
+
+        return torch.from_numpy(cKDTree(lights).query(texels.numpy())[1]).long()
+    parts = np.split(texels.view(-1, 3).numpy(), range(_TEXELS_AT_ONCE, height * width, _TEXELS_AT_ONCE))
+    return torch.from_numpy(np.concatenate([(part @ lights.T).argmax(1) for part in parts])).view(height, width)
 
 
 def texel_integrals(envmap: Tensor, height: int, width: int, rotate_deg: float = 0.0) -> Tensor:
@@ -206,6 +212,8 @@ def rig_triangles(lights: np.ndarray) -> np.ndarray:
 
     Of a rig that is open to a side, the triangles that close it are left out.
     """
+    from scipy.spatial import ConvexHull, QhullError  # a photo does without it
+
     try:
         hull = ConvexHull(lights.astype(float))
     except (QhullError, ValueError):  # fewer than four lights, or all in a plane

@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import nnls
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -150,7 +148,7 @@ def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray, held: 
     gram, moment = holding @ hold, holding @ held
     for _ in range(_ROUNDS):
         trusted = lights.T * trust
-        weights = _non_negative(trusted @ lights + gram, trusted @ target + moment)
+        weights = least_non_negative(trusted @ lights + gram, trusted @ target + moment)
         error = np.abs(lights @ weights - target)
         limit = _OUTLIER * np.median(error) + _TINY
         trust = np.minimum(1, limit / np.maximum(error, limit))
@@ -244,7 +242,7 @@ class _Channel:
         """Weights [L] that explain this channel and differ smoothly from the `wanted` ones."""
         hold = self.power * (_SMOOTH_CHANNEL**2 * roughness + _SHORT_CHANNEL**2 * np.eye(len(wanted)))
         for _ in range(_ROUNDS):
-            weights = _non_negative(self.gram() + hold, self.moment() + hold @ wanted)
+            weights = least_non_negative(self.gram() + hold, self.moment() + hold @ wanted)
             self.reweight(weights)
         return weights
 
@@ -266,7 +264,7 @@ def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> tuple[np.nda
         for channel, gain in zip(channels, colour, strict=True):
             gram += gain * gain * channel.gram()
             moment += gain * channel.moment()
-        grey = _non_negative(gram, moment)
+        grey = least_non_negative(gram, moment)
         hold = 1 / (1 + (from_near @ grey / max(_STANDS_OUT * grey.mean(), _TINY)) ** 2)
         for channel, gain in zip(channels, colour, strict=True):
             channel.reweight(gain * grey)
@@ -274,11 +272,28 @@ def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> tuple[np.nda
     return grey, colour
 
 
-def _non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
-    """argmin over x >= 0 of x' gram x - 2 moment' x, by Lawson and Hanson's NNLS on the Cholesky factor."""
+def least_non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
+    """argmin over x >= 0 of x' gram x - 2 moment' x, by the active sets of Lawson and Hanson's NNLS."""
     floor = 1e-9 * gram.trace() / len(gram) + _TINY  # a channel may be black throughout
-    factor = cholesky(gram + floor * np.eye(len(gram)), lower=True)
-    return np.asarray(nnls(factor.T, solve_triangular(factor, moment, lower=True))[0])
+    gram = gram + floor * np.eye(len(gram))
+    found, free = np.zeros(len(gram)), np.zeros(len(gram), bool)
+    least = 1e-12 * np.abs(moment).max()
+    for _ in range(3 * len(gram)):
+        gain = np.where(free, -np.inf, moment - gram @ found)
+        if gain.max() <= least:
+            break
+        free[gain.argmax()] = True
+        while True:
+            solved = np.zeros(len(gram))
+            solved[free] = np.linalg.solve(gram[np.ix_(free, free)], moment[free])
+            under = np.flatnonzero(free & (solved <= 0))
+            if not len(under):
+                break
+            steps = found[under] / (found[under] - solved[under])
+            found += steps.min() * (solved - found)
+            free[under[steps == steps.min()]] = False
+        found = solved
+    return found
 
 
 def _difference_from_neighbours(directions: np.ndarray) -> np.ndarray:

@@ -6,11 +6,10 @@ Axes here are the camera's: x right, y up, z toward the camera; the centre of a 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from facerf_cli.light.envmap import cell_rows, envmap_weights, nearest_light, resampled
@@ -27,6 +26,9 @@ from facerf_cli.light.sphere import (
     latlong_directions,
     rig_directions,
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 _NEIGHBOURS = 8  # lights around a texel
 _WIDTH = 0.35  # standard deviation of a light's Gaussian, in spacings of the lights
@@ -62,6 +64,8 @@ def rig_to_latlong(light: RigLight, height: int) -> Tensor:
     directions = light.directions.double().cpu()
     with_cell = np.unique(nearest_light(directions, coarse, 2 * coarse).numpy())
     lights = directions[with_cell]
+    from scipy.spatial import cKDTree  # a photo does without it
+
     tree = cKDTree(lights.numpy())
     _, nearest = tree.query(directions.numpy())
     weights = torch.zeros(len(lights), 3).index_add_(0, torch.from_numpy(nearest), light.weights.cpu())
@@ -77,7 +81,7 @@ def rig_to_latlong(light: RigLight, height: int) -> Tensor:
     return envmap if rows == height else resampled(envmap, height)
 
 
-def _splat(gains: Sequence[Tensor], lights: cKDTree, rows: int) -> Tensor:
+def _splat(gains: Sequence[Tensor], lights: "cKDTree", rows: int) -> Tensor:
     """Product [rows, 2 rows, 3] of gains [L, 3] of lights, each a mean of those around a texel."""
     envmap = torch.ones(rows, 2 * rows, 3)
     for row, texels in zip(envmap, latlong_directions(rows, 2 * rows, torch.float64).numpy(), strict=True):

@@ -8,16 +8,17 @@ u = 0.25 is +x, v = 0 is +y; u runs right and v down over [0, 1], pixel centres 
 import math
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 RIG_LIGHTS = 150  # of the paper's light stage
 _RELAX_STEPS = 200  # in which a rig's lights repel each other
 _RELAX_NEIGHBOURS = 18  # that repel a light
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec.709
+_STORED_RIGS = Path(__file__).parent.parent / "assets" / "rigs.npz"
 _BLUR_DEG = 12.0  # of the light whose brightest direction is sought; less than the rig's spacing, 18 degrees
 _BLUR_ROWS = 90  # of the grid of directions on which it is sought
 
@@ -89,6 +90,13 @@ def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
 
 @cache  # hundreds of steps
 def _relaxed(n: int) -> np.ndarray:
+    """Directions [n, 3] of a rig: stored for the numbers that a photo needs, or else computed."""
+    with np.load(_STORED_RIGS) as stored:
+        return np.asarray(stored[str(n)]) if str(n) in stored else repelled(n)
+
+
+def repelled(n: int) -> np.ndarray:
+    """Compute the directions [n, 3] of a rig."""
     points = golden_spiral(n)
     for step in range(_RELAX_STEPS if n > 1 else 0):
         points = _repel(points, 0.2 * (1 - step / _RELAX_STEPS))
@@ -106,6 +114,8 @@ def golden_spiral(points: int) -> np.ndarray:
 
 def _repel(points: np.ndarray, step: float) -> np.ndarray:
     """Move unit vectors [L, 3] apart by at most `step` of their mean spacing."""
+    from scipy.spatial import cKDTree  # a photo does without it
+
     spacing = math.sqrt(4 * math.pi / len(points))
     distance, neighbour = cKDTree(points).query(points, k=min(_RELAX_NEIGHBOURS + 1, len(points)))
     away = points[:, None] - points[neighbour[:, 1:]]

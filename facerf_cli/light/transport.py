@@ -10,7 +10,6 @@ import numpy as np
 from embreex import rtcore_scene
 from embreex.mesh_construction import TriangleMesh
 from scipy.ndimage import gaussian_filter
-from scipy.spatial import cKDTree
 
 OFFSET_M = 2e-4  # by which rays start off the surface: more than a step of float32 at the size of a head
 
@@ -110,6 +109,8 @@ def _one_bounce(
     random: np.random.Generator,
 ) -> np.ndarray:
     """Mean [L, N] of the direct irradiance [L, N] over the hits of a cosine-weighted hemisphere."""
+    from scipy.spatial import cKDTree  # a photo does without it
+
     nearest_texel = cKDTree(positions)
     origins = positions + normals * OFFSET_M
     bounce = np.zeros_like(direct)

@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from scipy.ndimage import binary_dilation
-from scipy.spatial import Delaunay
 
 from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
@@ -24,6 +23,7 @@ Word = Literal["sure", "unsure", "doubtful"]
 _SURE, _UNSURE = 0.6, 0.35  # least scores of the words
 _LOSES = 0.9  # a factor below it is named as a reason
 _GRID = 64  # samples along a side of the square around a face
+_ON_LINE = 1e-12  # of what is rounded, in sides of the square squared
 _WHITE = 0.95  # of the brightest value of a photo, from which on a channel is clipped
 _AROUND_PX = (2, 6)  # of a small image: how far from a person its neighbours are looked for
 _NEAR = 1.5  # heights of the head from its middle, where all networks know a person well
@@ -112,11 +112,20 @@ def face_facts(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     }
 
 
+def _in_hull(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Mark the points [N, 2] in the convex hull of corners [C, 2]: on one side of all lines that bound it."""
+    along = corners[:, None] - corners  # [C, C, 2]
+    across = np.stack([along[..., 1], -along[..., 0]], -1)
+    offset = np.einsum("ijk,jk->ij", across, corners)
+    bounds = (across @ corners.T <= offset[..., None] + _ON_LINE).all(-1) & along.any(-1)
+    return np.asarray((points @ across[bounds].T <= offset[bounds] + _ON_LINE).all(-1))
+
+
 def _facts_of_pixels(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     """Facts of the pixels between the landmarks."""
     at = (np.arange(_GRID) + PIXEL_CENTRE) / _GRID
     shares = np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
-    shares = shares[Delaunay(view.square.to_share(view.landmarks_px[:68])).find_simplex(shares) >= 0]
+    shares = shares[_in_hull(shares, view.square.to_share(view.landmarks_px[:68]))]
     columns, rows = np.floor(view.square.to_photo(shares)).astype(int).T
     height, width = photo.shape[:2]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)

@@ -7,7 +7,6 @@ from functools import partial
 import numpy as np
 from scipy.ndimage import binary_dilation, distance_transform_edt, maximum_filter, uniform_filter
 from scipy.sparse import csr_array, dia_array
-from scipy.sparse.linalg import cg
 
 from facerf_cli.image.strips import between, box_means, enlarged, fitted, strips
 
@@ -205,10 +204,26 @@ def solve_matte(image_srgb: np.ndarray, expected: np.ndarray, unknown: np.ndarra
     right = -np.bincount(rows[border], affinity[border] * known[border], count)
     start = alpha[unknown]
     system = laplacian + dia_array((np.full((1, count), _PULL), [0]), (count, count))
-    scaled = dia_array((1 / system.diagonal()[None], [0]), (count, count))
-    solved, _ = cg(system, right + _PULL * start, start, rtol=_TOLERANCE, maxiter=_MOST_STEPS, M=scaled)
-    alpha[unknown] = solved.clip(0, 1)
+    alpha[unknown] = _conjugate_gradients(system, right + _PULL * start, start).clip(0, 1)
     return alpha.astype(np.float32)
+
+
+def _conjugate_gradients(system: csr_array, right: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """Solve a symmetric positive definite system [N, N], preconditioned by its diagonal."""
+    found, rest = start.copy(), right - system @ start
+    inverse, along, before = 1 / system.diagonal(), np.zeros_like(right), np.inf
+    for _ in range(_MOST_STEPS):
+        if np.linalg.norm(rest) < _TOLERANCE * np.linalg.norm(right):
+            break
+        scaled = inverse * rest
+        now = rest @ scaled
+        along = scaled + now / before * along
+        moved = system @ along
+        step = now / (along @ moved)
+        found += step * along
+        rest -= step * moved
+        before = now
+    return found
 
 
 def _windows(unknown: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from scipy.ndimage import gaussian_filter1d
-from scipy.optimize import nnls
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -24,6 +23,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import photo_camera
+from facerf_cli.light.estimate import least_non_negative
 from facerf_cli.light.transport import build_scene, occluded, on_disc, places_on_disc, tangents
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.portrait import SKIN
@@ -266,8 +266,9 @@ def own_shading(
     columns = olats[:, sure].T
     ridge = _RIDGE * len(columns) ** 0.5 * torch.eye(len(olats))
     padded = torch.cat([wanted, torch.zeros(len(olats))])
-    weights, _ = nnls(torch.cat([columns, ridge]).double().numpy(), padded.double().numpy())
-    weights = torch.from_numpy(weights).float()
+    system = torch.cat([columns, ridge]).double().numpy()
+    solved = least_non_negative(system.T @ system, system.T @ padded.double().numpy())
+    weights = torch.from_numpy(solved).float()
     coarse = torch.einsum("l,lij->ij", weights, _olats(_at(normals, visible.shape[-1]), rig, visible))
     shading = _at(coarse[None], side)
     share = classes[SKIN]
