@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, overload
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from facerf_cli import pipeline
@@ -408,6 +407,7 @@ class Person:
     def mesh(self) -> "trimesh.Trimesh":
         """The fitted face with its texture, head frame, m: `.vertices` [V, 3], `.faces`, `.export(path)`."""
         import trimesh  # takes as long as the rest of a relight's imports
+        from PIL import Image
 
         fit, (u, v) = self.head.fit, grid_uv().numpy().T
         texture = Image.fromarray(to_display(_by_pixel(self.head.face.texture).detach().numpy()))

@@ -50,6 +50,7 @@ from facerf_cli.relighting.source_light import (
     share_of_lamp,
     source_light,
 )
+from facerf_cli.run.logs import step
 from facerf_cli.run.threads import both
 
 
@@ -83,6 +84,7 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
     return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
 
 
+@step("find")
 def find_for(
     people: PeopleNetworks,
     geometry: Geometry,
@@ -98,6 +100,7 @@ def find_for(
     return [face.box for face in faces] if geometry == "network" else faces
 
 
+@step("fit")
 def head_of(
     models: Models,
     photo: np.ndarray,
@@ -136,6 +139,7 @@ def regress_head(models: Models, cropped: np.ndarray) -> FitStart:
     return FitStart(*found, model=None if name == BUILTIN else models.face)
 
 
+@step("reflectance")
 def reflectance_of(
     models: Models,
     head: Head,

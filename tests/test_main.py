@@ -118,6 +118,20 @@ def test_help_does_not_import_what_is_heavy() -> None:
     assert result.stderr == "0 []\n"
 
 
+def test_a_relight_imports_what_it_needs(tmp_path: Path) -> None:
+    lights = ["--light", "60,30", "--envmap", str(ROOT / "examples/maps/studio.exr")]
+    line = ["relight", str(ROOT / "examples/astronaut.jpg"), *lights, "-o", str(tmp_path)]
+    result = run(
+        f"import sys\nfrom facerf_cli import main\nprint(main.main({line}), file=sys.stderr)\n"
+        "unneeded = ('scipy.interpolate', 'scipy.spatial', 'scipy.optimize', 'scipy.linalg', 'scipy.fft',"
+        " 'scipy.sparse.linalg', 'trimesh', 'PIL', 'jinja2', 'colour',"
+        " 'facerf_cli.synth', 'facerf_cli.training', 'facerf_cli.evaluation', 'facerf_cli.dataset',"
+        " 'facerf_cli.capture', 'facerf_cli.files.downloads', 'facerf_cli.files.meshes')\n"
+        "print([name for name in sorted(sys.modules) if name.startswith(unneeded)], file=sys.stderr)"
+    )
+    assert result.stderr.splitlines()[-2:] == ["0", "[]"]
+
+
 def test_a_reader_that_goes_away_is_no_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)

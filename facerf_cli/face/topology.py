@@ -207,16 +207,16 @@ def _outline_mm(name: str) -> np.ndarray:
         arcs = [np.stack(ellipse, -1) + np.array(_NOSTRIL_CENTRE_UV) * UV_SIZE_MM]
     elif name == "neck":
         corners = np.array([(2, LANDMARK_UV[16, 1]), (2, 2), (-1, 2), (-1, LANDMARK_UV[0, 1])]) * UV_SIZE_MM
-        return np.concatenate([_spline(landmarks[:17]), corners])
+        return np.concatenate([cubic_spline(landmarks[:17]), corners])
     elif name == "face":
         forehead = [*_FOREHEAD_UV, *((1 - u, v) for u, v in _FOREHEAD_UV[-2::-1])]
         arcs = [landmarks[:17], np.array([LANDMARK_UV[16], *forehead, LANDMARK_UV[0]]) * UV_SIZE_MM]
     else:
         raise ValueError(f"{name!r}: not a region of the face; choose one of {', '.join(REGIONS)}")
-    return np.concatenate([_spline(arc) for arc in arcs])
+    return np.concatenate([cubic_spline(arc) for arc in arcs])
 
 
-def _spline(points: np.ndarray, steps: int = 6) -> np.ndarray:
+def cubic_spline(points: np.ndarray, steps: int = 6) -> np.ndarray:
     """Sample a cubic spline [N, 2] through `points`, parametrised by chord length."""
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
     knots = np.arange(len(points))

@@ -97,8 +97,9 @@ def nearest_light(directions: Tensor, height: int, width: int) -> Tensor:
         from scipy.spatial import cKDTree  # takes as long to import as a few hundred lights do without it
 
         return torch.from_numpy(cKDTree(lights).query(texels.numpy())[1]).long()
-    parts = np.split(texels.view(-1, 3).numpy(), range(_TEXELS_AT_ONCE, height * width, _TEXELS_AT_ONCE))
-    return torch.from_numpy(np.concatenate([(part @ lights.T).argmax(1) for part in parts])).view(height, width)
+    parts = torch.split(texels.view(-1, 3), _TEXELS_AT_ONCE)
+    index = np.concatenate([(part.numpy() @ lights.T).argmax(1) for part in parts])
+    return torch.from_numpy(index).view(height, width)
 
 
 def texel_integrals(envmap: Tensor, height: int, width: int, rotate_deg: float = 0.0) -> Tensor:

@@ -112,7 +112,7 @@ def face_facts(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     }
 
 
-def _in_hull(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+def in_hull(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Mark the points [N, 2] in the convex hull of corners [C, 2]: on one side of all lines that bound it."""
     along = corners[:, None] - corners  # [C, C, 2]
     across = np.stack([along[..., 1], -along[..., 0]], -1)
@@ -125,7 +125,7 @@ def _facts_of_pixels(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     """Facts of the pixels between the landmarks."""
     at = (np.arange(_GRID) + PIXEL_CENTRE) / _GRID
     shares = np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
-    shares = shares[_in_hull(shares, view.square.to_share(view.landmarks_px[:68]))]
+    shares = shares[in_hull(shares, view.square.to_share(view.landmarks_px[:68]))]
     columns, rows = np.floor(view.square.to_photo(shares)).astype(int).T
     height, width = photo.shape[:2]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)

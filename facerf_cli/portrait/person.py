@@ -32,6 +32,7 @@ from facerf_cli.portrait.proxy import (
 )
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
+from facerf_cli.run.logs import step
 
 SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network is trained on
 SEEN_PX = 224  # and in which it sees a photo: face and hair come out better, ears and neck a little worse
@@ -162,6 +163,7 @@ def _bounds(landmarks_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return landmarks_px.min(0), landmarks_px.max(0)
 
 
+@step("look")
 def look_at_person(
     people: PeopleNetworks,
     model: MorphableModel,

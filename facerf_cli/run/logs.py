@@ -4,7 +4,9 @@ import json
 import logging
 import math
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -124,6 +126,7 @@ class JsonFormatter(logging.Formatter):
             "level": record.levelname.lower(),
             "message": printable_line(record.getMessage()),
         }
+        row |= getattr(record, "spent", {})
         if record.exc_info:
             row["traceback"] = self.formatException(record.exc_info)
         return json_line(row)
@@ -180,6 +183,22 @@ def log_to_queue(queue: Any, level: int) -> None:
     logger.handlers[:] = [QueueHandler(queue)]
     logger.propagate = False
     logger.setLevel(level)
+
+
+@contextmanager
+def step(name: str) -> Iterator[None]:
+    """Log the seconds that a step of the work takes (`-v`), and those of all threads on the processors."""
+    log = logging.getLogger(LOGGER_NAME)
+    if not log.isEnabledFor(logging.DEBUG):
+        yield
+        return
+    start_s, used_s = time.perf_counter(), time.process_time()
+    yield
+    taken = {"seconds": time.perf_counter() - start_s, "processor_seconds": time.process_time() - used_s}
+    spent = {"step": name, **{key: round(value, 3) for key, value in taken.items()}}
+    log.debug(
+        "step %(step)s: %(seconds)g s, %(processor_seconds)g s of processors", spent, extra={"spent": spent}
+    )
 
 
 def unexpected(error: Exception) -> str:

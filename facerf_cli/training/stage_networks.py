@@ -13,8 +13,9 @@ from facerf_cli.dataset.textures import model_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.network.checkpoint import form_of, load_vgg, new_network
+from facerf_cli.network.checkpoint import form_of, new_network
 from facerf_cli.network.geometry import GeometryNetworkSettings
+from facerf_cli.network.vgg import load_vgg
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.bank.heads import HeadBakeSettings
 from facerf_cli.training.losses import load_features

@@ -28,7 +28,6 @@ from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, rig_coefficients
 from facerf_cli.light.sphere import brightest_direction, direction_to_azel
 from facerf_cli.light.studio_points import rig_by_text
-from facerf_cli.network.checkpoint import load_vgg
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
@@ -223,6 +222,8 @@ def feature_network(options: LightOptions) -> tuple[FeatureNetwork, str]:
     """V_f if its weights were given, else S_f; and its name for the report."""
     networks = load_models_once(options.photo).networks
     if options.vgg_weights is not None:
+        from facerf_cli.network.vgg import load_vgg  # a relight does without it
+
         return load_vgg(options.vgg_weights).to(networks.device), "V_f (VGG-16, ImageNet)"
     path = networks.files["light_features"]
     return networks.light_features, f"S_f ({'shipped' if path == SHIPPED['light_features'] else path.name})"

@@ -16,7 +16,7 @@ from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import ball, lights_around, rotated_weights
 from facerf_cli.light.map_keys import MapKeys, without_keys
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow, rig_by_text
-from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
@@ -72,6 +72,7 @@ def _map_of_photo(photo: PhotoLight) -> Tensor:
     return map_of_photo(photo.path, photo.options, _LIGHT_WIDTH_PX // 2).half().float()
 
 
+@step("light")
 def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
     """The lights of M setups: maps integrated over the rig's lights, their keys, and single lights."""
     single = single_lights(setups)

@@ -13,7 +13,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
 from facerf_cli.image.strips import Rows
-from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.work.output_options import Format, OutputOptions
 
 Exposure = float | Literal["auto"]
@@ -43,6 +43,7 @@ def check_output(options: OutputOptions) -> None:
     _view_of(options)
 
 
+@step("write")
 def write_output(
     path: Path,
     image: OutputImage,

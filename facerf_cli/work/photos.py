@@ -31,7 +31,7 @@ from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
-from facerf_cli.run.logs import LOGGER_NAME, Provenance
+from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.matte_models import matte_by_rembg, require_rembg
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
@@ -108,6 +108,7 @@ class FittedFace(PhotoFace):
         return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated()}
 
 
+@step("load")
 def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: bool = True) -> None:
     """Load what every photo needs, and the networks of some names.
 
@@ -140,6 +141,7 @@ def face_model(options: PhotoOptions) -> MorphableModel:
     return load_face_model(options.face_model)
 
 
+@step("read")
 def read_photo(
     item: Item, options: PhotoOptions, kept_px: int = KEPT_PX, in_shot: bool = False
 ) -> LinearImage:

@@ -22,7 +22,7 @@ from facerf_cli.image.strips import Empty, rows_of
 from facerf_cli.person import Person, Target, person_of
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
-from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.run.logs import LOGGER_NAME, json_line, step
 from facerf_cli.run.memory import batches, limit_bytes
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import lights_over_rig, with_room
@@ -246,6 +246,7 @@ def _made_by(setup: LightSetup, plan: RelightPlan) -> dict[str, str]:
     return {"facerf:lights": lights, "facerf:options": options, "facerf:networks": json_line(networks)}
 
 
+@step("render")
 def _rendered(
     scene: LitScene, setup: LightSetup, relit: Any, ev: float, plan: RelightPlan, empty: Empty
 ) -> OutputImage:

@@ -16,6 +16,7 @@ from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable
+from facerf_cli.run.logs import step
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import as_in_photo, each_alone, on_face, read_map, with_room
 from facerf_cli.work.photos import FittedFace
@@ -64,6 +65,7 @@ class LitScene:
         """The lights of all setups on each of the people."""
         return [self.lights_of(one) for one in self._as_lit(self.setups)]
 
+    @step("render")
     def relit(self, part: slice) -> list[Any]:
         """The people under some of the setups."""
         return list(self._relit([lights[part] for lights in self.lights]))

@@ -13,6 +13,7 @@ from facerf_cli.light.estimate import (
     estimate_signed_weights,
     estimate_smooth_weights,
     lamp_error,
+    least_non_negative,
     refine_light,
 )
 from facerf_cli.light.quotient import Quotient
@@ -288,3 +289,11 @@ def test_unseen_and_black_texels_are_left_alone_and_ratios_are_bounded() -> None
     quotient = Quotient.of(torch.zeros_like(photo), torch.zeros_like(explained), SEEN)
     corrected = quotient.corrected(torch.zeros(2, 3, 64, 64))
     assert corrected.shape == (2, 3, 64, 64) and (corrected == 0).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_least_non_negative_is_that_of_scipy(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    system, wanted = random.standard_normal((60, 4 * (seed + 1))), random.standard_normal(60)
+    found = least_non_negative(system.T @ system, system.T @ wanted)
+    np.testing.assert_allclose(found, nnls(system, wanted)[0], atol=1e-7)  # the floor of the gram is 1e-9

@@ -12,6 +12,7 @@ from facerf_cli.light.sphere import (
     direction_to_uv,
     latlong_directions,
     latlong_solid_angles,
+    repelled,
     rig_directions,
     uv_to_direction,
 )
@@ -22,6 +23,12 @@ FIRST, LAST = [0.0327, 0.9846, 0.172], [-0.1174, -0.9846, 0.1299]
 def nearest_neighbour_deg(rig: torch.Tensor) -> torch.Tensor:
     chord = torch.from_numpy(cKDTree(rig.numpy()).query(rig.numpy(), k=2)[0][:, 1])
     return torch.rad2deg(2 * torch.asin(chord / 2))
+
+
+@pytest.mark.parametrize("lights", [16, 24, 32, 48, 150])
+def test_a_stored_rig_is_as_computed(lights: int) -> None:
+    computed = torch.from_numpy(repelled(lights)).float()
+    torch.testing.assert_close(rig_directions(lights), computed, atol=1e-6, rtol=0)  # of float32
 
 
 def test_the_rig_is_uniform_and_never_changes() -> None:

@@ -7,6 +7,7 @@ import pytest
 import skimage.data
 import torch
 from scipy.ndimage import gaussian_filter
+from scipy.spatial import Delaunay
 
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import LANDMARKS_M
@@ -16,6 +17,7 @@ from facerf_cli.portrait.confidence import (
     Confidence,
     confidence_of,
     face_facts,
+    in_hull,
     matte_facts,
     touched_sides,
 )
@@ -138,3 +140,9 @@ def test_a_photo_that_is_spoiled_is_not_sure_and_says_why() -> None:
     covered = photo.copy()
     covered[110:150, 140:190] = 128
     assert sound["unsteady"] < 0.012 and facts_in(covered)["unsteady"] > 1.5 * sound["unsteady"]
+
+
+def test_the_hull_of_landmarks_is_that_of_their_triangles() -> None:
+    random = np.random.default_rng(0)
+    corners, points = random.random((68, 2)) * 0.6 + 0.2, random.random((4000, 2))
+    assert np.array_equal(in_hull(points, corners), Delaunay(corners).find_simplex(points) >= 0)

@@ -8,10 +8,11 @@ from safetensors.torch import save_file
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.downloads import PublishedFile
-from facerf_cli.network import checkpoint as feature_networks
-from facerf_cli.network.checkpoint import VGG16, load_vgg, save_networks
+from facerf_cli.network import vgg as feature_networks
+from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.features import LightNetwork, LightSettings, VggFeatures
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
+from facerf_cli.network.vgg import VGG16, load_vgg
 from facerf_cli.training.losses import load_features
 from tests.kinds import Patch, Said
 
