@@ -32,6 +32,7 @@ from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
 from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
+from facerf_cli.portrait.confidence import confidence_of
 from facerf_cli.portrait.find import NoFaceError
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
@@ -124,6 +125,7 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
     image = read_photo(item, options.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
+        _require_light_on(face)
         return {"light_from": "face"} | _write(item, image, face, options, width_px, sh_order)
 
     try:
@@ -140,11 +142,18 @@ def map_of_photo(path: Path, options: LightOptions, height: int) -> Tensor:
     image = read_photo(item, options.photo)
     try:
         face = fit_faces(item, image, options.photo)[0]
+        _require_light_on(face)
     except NoFaceError:
         from facerf_cli.work.light_of_picture import guessed_light
 
         return resampled(guessed_light(item, image, options.fov_deg).envmap, height)
     return rig_to_latlong(_estimate(item, image, face.head, options)[0].light, height)
+
+
+def _require_light_on(face: FittedFace) -> None:
+    """Raise NoFaceError for a face that is too small, dark or doubtful to read light from."""
+    if confidence_of(face.facts).word == "doubtful":
+        raise NoFaceError(f"{face.name}: its face is doubtful")
 
 
 def _estimate(

@@ -10,6 +10,7 @@ import torch
 from facerf_cli.files.light_files import read_light
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
+from facerf_cli.image.strips import resized
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, rig_directions
@@ -127,7 +128,7 @@ def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(
     assert main([*models, "estimate-light", str(beach), "-o", str(tmp_path), "--width", "512"]) == 0
     row, shown = row_of(tmp_path), capsys.readouterr().err
     assert row["light_from"] == "picture" and 0 < row["guess_error"] < 2
-    assert "beach.png: no face" in shown and "guess" in shown and "60 degrees" in shown
+    assert "beach.png: no face that shows its light" in shown and "guess" in shown and "60 degrees" in shown
     expected = read_image(tmp_path / "beach_light.exr").pixels
     assert expected.shape == (256, 512, 3) and read_light(tmp_path / "beach_light.json").weights.min() >= 0
     assert (expected[115, 500] > 3 * expected[115, 12]).all()  # u just below 1 is the picture's left
@@ -140,5 +141,11 @@ def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(
     one, two = (read_image(tmp_path / name / "astronaut_beach_light.exr").pixels for name in ("one", "two"))
     assert one.max() > 0 and (one == two).all()
     assert (tmp_path / "one" / "astronaut_light_sky+own.exr").is_file()
+    tiny = np.tile(sky, (8, 8, 1))  # a face of 20 pixels counts as none
+    photo = read_image(PHOTO).pixels
+    tiny[200:264, 300:364] = resized(photo, 64, 64)
+    write_display(tmp_path / "tiny.png", tiny)
+    assert main([*models, "estimate-light", str(tmp_path / "tiny.png"), "-o", str(tmp_path)]) == 0
+    assert row_of(tmp_path)["light_from"] == "picture"
     assert main([*models, "estimate-light", str(beach), "-o", str(tmp_path), "--fov", "100"]) == 0
     assert np.abs(read_image(tmp_path / "beach_light.exr").pixels - expected).max() > 0.05
