@@ -5,6 +5,7 @@ map's light: the texels about the brightest one that are at least `_BRIGHT` time
 as bright in the ring around them. It shines from its middle as one single light.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -75,4 +76,4 @@ def without_keys(envmap: Tensor) -> MapKeys:
 
 def _within(towards: Tensor, middle: Tensor, reach_deg: float) -> Tensor:
     """Which of directions [H, W, 3] lie within an angle of the middle [3]."""
-    return torch.rad2deg((towards @ middle).clamp(-1, 1).acos()) <= reach_deg
+    return towards @ middle >= math.cos(math.radians(reach_deg))

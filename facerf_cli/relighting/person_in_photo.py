@@ -276,9 +276,13 @@ class PersonInPhoto:
         return seen_columns(self.matte[max(0, rows.start - margin) : rows.stop + margin], margin)
 
     def _parts(self, rows: slice, columns: slice) -> list[_Part]:
-        """The views as far as they show in some rows and columns; the widest, the last, in all of them."""
-        seen = ((number, *view.weight(rows, columns)) for number, view in enumerate(self._views[:-1]))
-        parts = [_Part(*one) for one in seen if one[2].any()]
+        """The views as far as they show in some rows and columns; the last in all of them."""
+        parts = []
+        for number, view in enumerate(self._views[:-1]):
+            part = _Part(number, *view.weight(rows, columns))
+            parts += [part] if part.weight.any() else []
+            if part.columns == columns and part.weight.min() == 1:  # it hides wider ones
+                return parts
         return [*parts, _Part(len(self._views) - 1, columns, np.ones(0))]
 
     def _spread(self, values: np.ndarray, columns: slice) -> np.ndarray:
