@@ -1,6 +1,7 @@
 """Reflectance networks: the interface that every form has, and the forms by name.
 
-A new form is one file with a class that fits `ReflectanceNetwork`, and one line in `REFLECTANCE_FORMS`.
+A new form is one file with a `SavedNetwork` (`inputs.py`) that fits `ReflectanceNetwork`, and one line in
+`REFLECTANCE_FORMS`; `reflectance_paper.py` is the shortest.
 """
 
 from typing import Any, Protocol, Self
@@ -14,8 +15,9 @@ from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork
 class ReflectanceNetwork(Protocol):
     """Predict OLAT textures from a texture, its normals and lights (paper, 'Network Architecture').
 
-    A form is also a `torch.nn.Module`. Its encoder runs once a face, its decoder once a light. Lights and
-    normals are in camera space; all textures are scene-linear.
+    A form is also a `torch.nn.Module`; `SavedNetwork` has the last two members, for a dataclass of settings.
+    Its encoder runs once a face, its decoder once a light. Lights and normals are in camera space; all
+    textures are scene-linear.
     """
 
     @property

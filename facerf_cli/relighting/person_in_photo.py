@@ -250,7 +250,7 @@ class PersonInPhoto:
             shown = _joined([view.layer(name, maps, one) for view, maps, one in used], seen.parts)
             values = self._spread(shown[seen.grain.own], seen.grain.columns)
         else:
-            values = self._surface.depth_m(rows) if name == "depth" else self._surface.position_m(rows)
+            values = {"depth": self._surface.depth_m, "position": self._surface.position_m}[name](rows)
         share = self.matte[rows][..., None]
         values = values * (share if name in COLOURS else share > _LEAST)
         if name == "normal":
