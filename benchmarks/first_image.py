@@ -5,7 +5,7 @@
 Each line is a new process with one thread for each of torch's pools; the lines, and those of the commit REV
 in a worktree, take turns, and the least of the rounds counts. Bytecode is cached, as in an installation.
 Steps are those that `facerf -v --log-json` prints; `look`, a part of reflectance that runs beside the rest of
-it, stands alone as well. What is in no step is the command line and imports. `--help` is over
+it, stands alone as well. What is in no step is the command line and imports. `help`, `facerf --help`, is over
 `import typer, rich`.
 """
 
@@ -31,7 +31,7 @@ _CASES = {
     "1024 px, a map": (1024, _MAP),
     "12 megapixels, a map": (0, _MAP),
 }
-_HELP = "--help"
+_HELP = "help"
 _STEPS = ("load", "read", "find", "fit", "look", "reflectance", "light", "render", "write")
 
 

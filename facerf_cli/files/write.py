@@ -47,6 +47,7 @@ JPEG_QUALITY = 95
 _D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the connection space of ICC profiles
 _FIXED = 65536  # s15Fixed16Number
 _PNG_LEVEL = 4  # of zlib: half the time of 6 for two hundredths more bytes
+_PNG_FILTER = 32  # libpng's PNG_FILTER_UP: half the time of a choice for each row, and no more bytes
 _OIIO_NAMES = {
     LINEAR: "lin_rec709_scene",
     LINEAR_REC2020: "lin_rec2020_scene",
@@ -272,6 +273,7 @@ def write_display(
     spec.attribute("CompressionQuality", quality)
     spec.attribute("jpeg:subsampling", "4:4:4")
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
+    spec.attribute("png:filter", _PNG_FILTER)
     gain = np.float32(2.0**chosen_ev)
     with writing(path, [spec], {"facerf:exposure_ev": chosen_ev, **(metadata or {})}) as file:
         for rows in file.next_part():

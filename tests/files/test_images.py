@@ -2,6 +2,7 @@
 
 import logging
 import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -306,6 +307,16 @@ def test_tiff_has_floats_their_profile_and_what_made_it(tmp_path: Path, name: st
     stored = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)
     multiplied = colour.from_linear_rec709(RGB * 3 - 0.5, space) * ALPHA[..., None]  # by OpenImageIO
     np.testing.assert_allclose(stored[..., :3], multiplied, atol=1e-6)
+
+
+def test_rows_of_a_png_are_less_those_above(tmp_path: Path) -> None:
+    write_display(tmp_path / "a.png", RGB)
+    data, at, packed = (tmp_path / "a.png").read_bytes(), 8, b""
+    while at < len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        packed += data[at + 8 : at + 8 + length] if kind == b"IDAT" else b""
+        at += 12 + length
+    assert set(zlib.decompress(packed)[:: 1 + 3 * RGB.shape[1]]) == {2}  # of each row the first byte
 
 
 def test_png_of_16_bits(tmp_path: Path) -> None:
