@@ -23,11 +23,11 @@ from facerf_cli.capture.chart import (
     delta_e_2000,
     fit_colours,
     neutral_matrix,
+    outline_patches,
     published_colours,
     sample,
     squares_px,
 )
-from facerf_cli.capture.chart_photo import outline_patches
 from facerf_cli.files.sheets import contact_sheet
 from facerf_cli.files.write import write_display
 

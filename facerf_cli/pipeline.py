@@ -25,11 +25,11 @@ from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.image.colour import without_fireflies
 from facerf_cli.light.estimate import LightEvidence, RefinedLight, joined, refine_light
-from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
+from facerf_cli.portrait.correction import Quotient
 from facerf_cli.portrait.find import Face, FaceBox, find_faces
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square

@@ -1,4 +1,4 @@
-"""The ColorChecker Classic: its colours and geometry, and the matrix from measured to published colours.
+"""Colour corrections of a capture's cameras from photographs of a ColorChecker Classic.
 
 Patches are numbered in reading order: six per row, from dark skin to black. Pixel centres lie at index + 0.5.
 
@@ -6,16 +6,30 @@ The matrix is the least-squares solution among those that keep neutral colours n
 1997, 'Constrained least-squares regression in color spaces'). The falloff of light over the chart is fitted
 in alternation with it, as a plane in the logarithm of brightness, after Finlayson et al. 2015, 'The
 alternating least squares technique for nonuniform intensity color correction'.
+
+A chart's image is treated like a frame: decoded by the capture's colour space, less the black level, divided
+by the lights' rgb. The light on the chart counts as that of all lights, so it has their mean rgb at luminance
+1. Implausible charts are refused.
 """
 
+import hashlib
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from skimage.draw import polygon
 from skimage.transform import estimate_transform
 
+from facerf_cli.capture.capture import Capture, ChartCorrection, correct_colours, read_frame
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.image_metadata import read_header
+from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import colour_science, lab_d65, luminance
+from facerf_cli.image.strips import block_means
+from facerf_cli.run.logs import counted
 
 CHART_NAME = "ColorChecker24 - After November 2014"
 _ITERATIONS = 12  # of matrix and light; the next one changes them by less than a thousandth
@@ -30,9 +44,19 @@ LARGEST_DELTA_E = 8.0  # mean of the 24 patches; good photographs of a chart hav
 _SIGMA_OF_MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 _AT_WHITE = 1e-4  # from 1, within which a value counts as the largest of an integer format
 
-homography = partial(
-    estimate_transform, "projective"
-)  # from points [N, 2] to points [N, 2], by least squares
+# A map from points [N, 2] to points [N, 2], by least squares.
+homography = partial(estimate_transform, "projective")
+CAMERA_FIELD = "{camera}"
+# Thresholds beyond which a chart's image is refused.
+_LEAST_PX = 25  # in the middle of a patch
+_LARGEST_NOISE = 0.25  # of a pixel, as a share of the white patch
+_LEAST_CHROMA = 0.02  # of a chart's colours; red and blue reach 1 and more
+_CLIPPED_SHARE = 0.3  # of a patch's pixels
+_CLIPPED_WHITE, _CLIPPED_CHANNEL = 0.85, 0.93  # of the white by the darker greys; of another channel
+_EXPONENTS = (0.8, 1.25)  # of the greys' brightness over the published one
+# Control images.
+_SIDE_PX = 1024  # fits a screen
+_SQUARES = (MIDDLE_SIDE + 0.08, MIDDLE_SIDE, MIDDLE_SIDE / 2)  # sides of outline, sample and published colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,3 +173,136 @@ def is_convex(corners_px: np.ndarray) -> bool:
     ahead = np.roll(edges, -1, 0)
     bends = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
     return bool((bends > 0).all() or (bends < 0).all())
+
+
+def read_charts(capture: Capture, image: str, corners_px: Sequence[np.ndarray]) -> Iterator[ChartCorrection]:
+    """Yield the corrections from one image for all cameras, or from one per camera with {camera} in its name.
+
+    corners_px has, for each image, the corners [4, 2] of the patches' area, in order around it. InputError
+    for an image without a usable chart, UsageError for corners of another number of images.
+    """
+    each = CAMERA_FIELD in image
+    if len(corners_px) != (wanted := len(capture.cameras) if each else 1):
+        raise UsageError(
+            f"--chart-corners: has corners of {counted(len(corners_px), 'image')}, and --colour-chart names "
+            f"{wanted}; give 'x,y x,y x,y x,y' for each, separated by ;"
+        )
+    if not each:
+        yield _read_chart(capture, Path(image), list(capture.cameras), corners_px[0], "colour_chart.png")
+        return
+    for camera, corners in zip(capture.cameras, corners_px, strict=True):
+        named = Path(image.replace(CAMERA_FIELD, camera))
+        yield _read_chart(capture, named, [camera], corners, f"colour_chart_{camera}.png")
+
+
+def _normalise(capture: Capture, decoded: np.ndarray) -> np.ndarray:
+    """Subtract the black level from values [..., 3], and divide by the lights' mean rgb at luminance 1."""
+    mean = capture.intensities.mean(0)
+    return (decoded - capture.black_level) / (mean / luminance(mean)).astype(decoded.dtype)
+
+
+def _read_chart(
+    capture: Capture, image: Path, cameras: list[str], corners_px: np.ndarray, overlay: str
+) -> ChartCorrection:
+    raw = read_frame(image, capture.colour_space)
+    height, width = raw.shape[:2]
+    if not ((corners_px >= 0) & (corners_px <= [width, height])).all():
+        raise InputError(f"{image}: --chart-corners lie outside its {width} x {height} pixels; correct them")
+    if not is_convex(corners_px):
+        advice = "give them in order around the chart"
+        raise InputError(f"{image}: --chart-corners make no convex quadrilateral; {advice}")
+    tries = []
+    for turned in four_turns(corners_px):
+        patches = sample(raw, turned)
+        fit = fit_colours(_normalise(capture, patches.colours))
+        tries.append((float(fit.delta_e_after.mean()), turned, patches, fit))
+    _, corners_px, patches, fit = min(tries, key=lambda found: found[0])
+    _refuse(image, _faults_of_light(image, patches, capture.black_level))
+    _refuse(image, _faults_of_colours(fit, capture.colour_space))
+    record = {
+        "picture": image.name,
+        "picture_sha256": hashlib.sha256(image.read_bytes()).hexdigest(),
+        "cameras": cameras,
+        "corners_px": corners_px.round(2).tolist(),
+        "matrix": fit.matrix.round(6).tolist(),  # rounded, so that datasets agree between processors
+        "delta_e_2000": {
+            when: {"mean": round(float(of.mean()), 2), "max": round(float(of.max()), 2)}
+            for when, of in (("before", fit.delta_e_before), ("after", fit.delta_e_after))
+        },
+        "light_span": round(float(fit.light.max() / fit.light.min()), 3),
+        "overlay": overlay,
+    }
+    return ChartCorrection(image, record)
+
+
+def _refuse(image: Path, faults: Iterator[str]) -> None:
+    for fault in faults:
+        raise InputError(f"{image}: {fault}")
+
+
+def _faults_of_light(image: Path, patches: Patches, black_level: float) -> Iterator[str]:
+    """Faults of patches that are too small, dark, noisy, clipped or grey to measure."""
+    if patches.counts.min() < _LEAST_PX:
+        yield (
+            f"a patch of the chart has only {patches.counts.min()} pixels in its middle; "
+            f"photograph it larger, {_LEAST_PX} are needed"
+        )
+    greys = patches.colours[GREYS]
+    brightest = (greys - black_level).max(0)
+    if brightest.min() <= 0 or patches.noise[GREYS].max() > _LARGEST_NOISE * brightest[1]:
+        yield "the chart is too dark, or too noisy; expose it longer"
+    clipped = int((patches.at_white > _CLIPPED_SHARE).sum())
+    header = read_header(image) if clipped else None
+    if header and not header.is_floating:  # floating-point values may exceed 1
+        yield f"{clipped} of the chart's patches are clipped at white; expose it less"
+    if (np.ptp(patches.colours, -1) / greys.max()).max() < _LEAST_CHROMA:
+        yield "is grey; give a photograph in colour"
+
+
+def _faults_of_colours(fit: ColourFit, colour_space: str) -> Iterator[str]:
+    """Faults of colours that are not those of a chart, not linear, or clipped."""
+    if (mean := fit.delta_e_after.mean()) > LARGEST_DELTA_E:
+        yield (
+            f"the patches' colours differ from a ColorChecker Classic's by a mean CIE delta E 2000 "
+            f"of {mean:.0f}; check the corners and the colour space '{colour_space}'"
+        )
+    values, wanted = fit.even[GREYS], published_colours()[GREYS]
+    greys, published = (luminance(colours[:-1]) for colours in (values, wanted))  # stray light distorts black
+    exponent = np.polyfit(np.log(published), np.log(greys.clip(1e-6)), 1)[0]
+    if not _EXPONENTS[0] < exponent < _EXPONENTS[1]:
+        yield (
+            f"the chart's greys are not linear (they follow their power {exponent:.2f}); check the "
+            f"colour space '{colour_space}', and look for a shadow or highlight on them"
+        )
+    slopes = (values[1:4] * wanted[1:4]).sum(0) / (wanted[1:4] ** 2).sum(0)
+    white = values[0] / (slopes * wanted[0])  # [3]; 1 in proportion to the darker greys
+    if white.min() < max(_CLIPPED_WHITE, _CLIPPED_CHANNEL * white.max()):
+        yield "the chart's white patch is clipped; expose it less"
+
+
+def write_chart_overlays(capture: Capture, folder: Path) -> None:
+    """Write each chart's image, corrected and of screen size, with its samples outlined, by its record."""
+    for chart in capture.charts:
+        linear = _normalise(capture, read_frame(chart.image, capture.colour_space))
+        corrected = correct_colours([chart], chart.record["cameras"][0], linear)
+        scale = min(math.ceil(max(corrected.shape[:2]) / _SIDE_PX), *corrected.shape[:2])
+        small = block_means(corrected, scale)
+        outlined = outline_patches(small, np.array(chart.record["corners_px"]) / scale)
+        write_display(folder / chart.record["overlay"], outlined)
+
+
+def outline_patches(pixels: np.ndarray, corners_px: np.ndarray) -> np.ndarray:
+    """Scale an image [H, W, 3] to the published white, and outline the sampled middles of the patches.
+
+    The published colour fills the centre of each outline, so a good correction makes it hard to see.
+    """
+    white, published = sample(pixels, corners_px).colours[GREYS][0], published_colours()
+    plain = pixels * (luminance(published[GREYS][0]) / luminance(white))
+    shown = plain.copy()
+    squares = np.stack([squares_px(corners_px, side) for side in _SQUARES], 1) - 0.5
+    for nested, colour in zip(squares, published, strict=True):
+        outer, middle, inner = (polygon(one[:, 1], one[:, 0], shown.shape[:2]) for one in nested)
+        shown[outer] = 0 if luminance(colour) > 0.2 else 0.8
+        shown[middle] = plain[middle]
+        shown[inner] = colour
+    return shown

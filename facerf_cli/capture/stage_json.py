@@ -31,8 +31,7 @@ import numpy as np
 import torch
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
-from facerf_cli.capture.capture import FIELDS, Capture, find_subjects, require_pattern
-from facerf_cli.capture.distortion import Coefficients, folds
+from facerf_cli.capture.capture import FIELDS, Capture, Coefficients, find_subjects, folds, require_pattern
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.yale_b import read_yale_capture
 from facerf_cli.errors import InputError, UsageError

@@ -166,7 +166,7 @@ def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
     values = {}
     for key, value in table.items():
         name = key.replace("-", "_")
-        if verb == "train" and name in KINDS:  # which `training/config_file.py` reads
+        if verb == "train" and name in KINDS:  # which `training/settings.py` reads
             values[name] = value
             continue
         if name not in names:

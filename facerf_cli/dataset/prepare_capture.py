@@ -13,23 +13,21 @@ from facerf_cli.batch.made_from import Recipe, json_rows, require_same
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
+from facerf_cli.capture.chart import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import (
+    FINDINGS_FILE,
     Finding,
     Selection,
+    collect_findings,
     frames_left_out,
     has_new_frames,
-    select_frames,
-    stopping,
-)
-from facerf_cli.capture.findings_report import (
-    FINDINGS_FILE,
-    collect_findings,
     keep_findings,
     require_sound,
+    select_frames,
     show_findings,
+    stopping,
     write_findings,
 )
 from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings

@@ -26,13 +26,14 @@ from facerf_cli.evaluation.protocols import Protocol
 from facerf_cli.evaluation.report import (
     FORMAT,
     ItemFigures,
+    Strip,
     choose_cases,
+    draw_strip,
     images_csv,
     page,
     read_figures,
     write_figures,
 )
-from facerf_cli.evaluation.strips import Strip, draw_strip
 from facerf_cli.evaluation.summary import print_tables, published, summarise
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.files.atomic import atomic_path

@@ -2,8 +2,8 @@
 
     read_image ─ decode ─ open_image (a layer) ─ _stored ─ upright ─ spaces.stated_space ─ to_linear_rec709
 
-OpenImageIO reads all formats but HEIC and AVIF (`isobmff.py`); what it leaves out of some is in `quirks.py`
-and `radiance.py`. Data and display windows are EXR's alone: elsewhere an offset places a page or a stamp.
+OpenImageIO reads all formats but HEIC and AVIF (`isobmff.py`); what it leaves out of some is in `quirks.py`.
+Data and display windows are EXR's alone: elsewhere an offset places a page or a stamp.
 """
 
 import logging
@@ -18,7 +18,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files import isobmff, quirks, radiance
+from facerf_cli.files import isobmff, quirks
 from facerf_cli.files.layers import ImageLayer, chosen_layer, first_channels
 from facerf_cli.files.spaces import default_space, is_floating, is_ultra_hdr, stated_space
 from facerf_cli.files.texts import require_regular
@@ -77,7 +77,7 @@ class Opened(NamedTuple):
     spec: oiio.ImageSpec
     layer: ImageLayer
     choice: str  # says which layer is read, where it is not what any program shows
-    hdr: radiance.RadianceHeader | None
+    hdr: quirks.RadianceHeader | None
     said: str
 
 
@@ -221,7 +221,7 @@ def open_image(path: Path, layer: str | None = None) -> Iterator[Opened]:
     stream = oiio.ImageInput.open(utf8_path(path), settings)
     if stream is None:
         said = _reason(path, oiio_error())
-        radiance.require_rgb(path)
+        quirks.require_rgb_radiance(path)
         raise InputError(f"{path}: not a readable image; save it again as EXR, PNG or JPEG ({said})")
     try:
         form = stream.format_name()
@@ -239,7 +239,7 @@ def open_image(path: Path, layer: str | None = None) -> Iterator[Opened]:
             raise InputError(f"{path}: a deep image is not read; flatten it, as by oiiotool --flatten")
         stream.seek_subimage(chosen.part, 0)
         spec = oiio.ImageSpec(specs[chosen.part])
-        hdr = radiance.read_radiance_header(path, spec) if form == "hdr" else None
+        hdr = quirks.read_radiance_header(path, spec) if form == "hdr" else None
         if form not in _HAVE_WINDOWS:
             spec.x = spec.y = spec.full_x = spec.full_y = 0
             spec.full_width, spec.full_height = spec.width, spec.height
@@ -302,7 +302,7 @@ def _stored(path: Path, opened: Opened, first: int, past: int, kind: oiio.TypeDe
     stream, hdr, spec = opened.stream, opened.hdr, opened.spec
     if stream.format_name() == "cineon":
         quirks.require_whole_cineon(path, spec)
-    values = radiance.read_old_runs(path, hdr) if hdr else None
+    values = quirks.read_old_runs(path, hdr) if hdr else None
     if values is None:
         values = stream.read_image(opened.layer.part, 0, first, past, kind)
     said = f"{opened.said}\n{oiio_error(stream)}"

@@ -3,11 +3,16 @@
 A light of weight 1 gives a white Lambertian surface that faces it radiance 1. So the weight of a light is
 (1 / pi) times the integral of the map's radiance over the light's cell: the directions that are nearer to it
 than to any other light of the rig.
+
+The key of a map, a sun or a small lamp, whose shadows have edges that cells blur, is a compact cluster of
+texels, at most `2 * _REACH_DEG` wide, that holds more than `_SHARE` of the map's light: the texels about the
+brightest one that are at least `_BRIGHT` times as bright, with hardly any as bright in the ring around them.
+It shines from its middle as one single light.
 """
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +21,9 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Resized, in_strips
-from facerf_cli.light.sphere import direction_to_uv, latlong_directions, latlong_solid_angles
+from facerf_cli.light.sphere import RigLight, direction_to_uv, latlong_directions, latlong_solid_angles
 
 Sampling = Literal["cell", "smooth", "paper"]
 _DIRECTIONS_AT_ONCE = 1 << 12  # that are compared with all triangles of a rig
@@ -31,6 +37,12 @@ _BALL_SAMPLES = 3  # along each side of a pixel of a ball
 _IRRADIANCE_ROWS, _SOURCE_ROWS = 32, 64  # of the diffuse ball's maps: both far finer than the cosine lobe
 _SHARP_PX = 3.0  # standard deviation of a blur up to which an image is drawn at its full size
 _TURN = 2 * math.pi
+_SHARE = 0.2  # of a map's light
+_REACH_DEG, _RING_DEG = 6.0, 12.0  # from its middle: of a key, and to which nothing else is as bright
+_BRIGHT = 0.1  # of the brightest texel
+_AROUND = 0.1  # of the key's light, in the ring
+_ROWS = 256  # at most, of the map in which keys are found
+_MOST = int(1 / _SHARE)
 
 
 def check_envmap(envmap: Tensor) -> None:
@@ -291,3 +303,58 @@ class Backdrop:
     def _drawn(self, rows: slice) -> np.ndarray:
         directions = self._towards(rows)
         return np.asarray(look_up(self._mean, directions.reshape(-1, 3)).view(directions.shape).numpy())
+
+
+class MapKeys(NamedTuple):
+    """A map [H, W, 3] without its keys, and these: unit directions [K, 3] and rgb weights [K, 3]."""
+
+    rest: Tensor
+    directions: Tensor
+    weights: Tensor
+
+    @staticmethod
+    def none(envmap: Tensor) -> "MapKeys":
+        """A map all of which is the rest."""
+        return MapKeys(envmap, torch.zeros(0, 3), torch.zeros(0, 3))
+
+    def turned(self, rotate_deg: float) -> RigLight:
+        """The keys of the map with `rotate_deg` added to every azimuth."""
+        turn = torch.deg2rad(torch.tensor(rotate_deg))
+        x, y, z = self.directions.unbind(1)
+        turned = torch.stack([x * turn.cos() + z * turn.sin(), y, z * turn.cos() - x * turn.sin()], 1)
+        return RigLight(turned, self.weights)
+
+
+def without_keys(envmap: Tensor) -> MapKeys:
+    """Take the keys out of a lat-long map [H, W, 3]; a map without keys stays as it is."""
+    rows = min(_ROWS, len(envmap))
+    if 180 / rows > 2 * _REACH_DEG:  # a texel is no key
+        return MapKeys.none(envmap)
+    small = resampled(envmap, rows)
+    towards, solid = latlong_directions(rows, 2 * rows), latlong_solid_angles(rows, 2 * rows, torch.float32)
+    shown = torch.from_numpy(luminance(small.detach().numpy())).clamp_min(0)
+    light = shown * solid
+    left, keys = torch.ones_like(light), list[Tensor]()
+    for _ in range(_MOST):
+        seen = shown * left
+        bright = light * left * (seen >= _BRIGHT * seen.max())
+        near = bright * _within(towards, towards.view(-1, 3)[seen.argmax()], _RING_DEG)
+        middle = F.normalize(torch.einsum("ij,ijc->c", near, towards), dim=0)
+        key = (_within(towards, middle, _REACH_DEG) & (bright > 0)).float()
+        held = (light * key).sum()
+        around = (bright * _within(towards, middle, _RING_DEG)).sum() - held
+        if held <= _SHARE * light.sum() or around > _AROUND * held:
+            break
+        keys.append(key)
+        left = left * (1 - key)
+    if not keys:
+        return MapKeys.none(envmap)
+    found = torch.stack(keys)
+    middles = torch.einsum("kij,ij,ijc->kc", found, light, towards)
+    weights = torch.einsum("kij,ij,ijc->kc", found, solid, small) / torch.pi
+    return MapKeys(small * left[..., None], F.normalize(middles, dim=1), weights)
+
+
+def _within(towards: Tensor, middle: Tensor, reach_deg: float) -> Tensor:
+    """Which of directions [H, W, 3] lie within an angle of the middle [3]."""
+    return towards @ middle >= math.cos(math.radians(reach_deg))

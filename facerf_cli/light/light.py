@@ -10,8 +10,7 @@ from torch import Tensor
 
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.envmap import check_envmap, envmap_weights
-from facerf_cli.light.map_keys import MapKeys, without_keys
+from facerf_cli.light.envmap import MapKeys, check_envmap, envmap_weights, without_keys
 from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples

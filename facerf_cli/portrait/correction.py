@@ -1,8 +1,12 @@
-"""The correction of a portrait's transport by its photo, so that the photo's own light gives the photo back.
+"""Corrections of a model by its photo, so that the photo's own light gives the photo back.
 
-As in `light/quotient.py`, the error of the model is known under the photo's light, and about the same under
-lights that shade the person alike. With the model's image s_l of light l, the photo P and its explanation
-E = sum_l w_l s_l, the corrected image of a light is
+Errors of a network (the white of an eye too bright, a crease too shallow) are about the same under lights
+that shade the person alike. Under the photo's light they are known: the photo divided by its explanation is a
+quotient image (Riklin-Raviv and Shashua, *The quotient image*, 2001). `Quotient` is for the field of a face,
+`Correction` for the transport of a portrait.
+
+For that, with the model's image s_l of light l, the photo P and its explanation E = sum_l w_l s_l, the
+corrected image of a light is
 
     s_l + (p_l / p) (Q - 1) (s_l + f k_l),    Q = (P + f) / (E + f),    k_l = mean s_l / mean E,
 
@@ -30,6 +34,9 @@ _DARK = 4.0  # floors: the radiance below which a photo's colours are noise
 SHARPNESS = 20.0  # exponent of the likeness
 _LARGEST = 1.5  # of p_l / p
 _SMALL_PX = 48  # side at which likeness is measured
+_FACE_FLOOR = 0.2  # as a share of the photo's mean radiance: keeps quotients in shadows near 1
+_FACE_RANGE = (0.3, 3.0)  # of the quotients
+_FACE_SHARPNESS = 8.0  # exponent of the likeness: the higher, the more alike a light must shade the face
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,3 +108,41 @@ def _small(grey: Tensor, person: Tensor) -> Tensor:
     """Grey images [n, s, s] of grey ones [n, S, S] or [S, S], over the person."""
     shown = (grey * person).reshape(1, -1, *person.shape)
     return F.interpolate(shown, (_SMALL_PX, _SMALL_PX), mode="area")[0]
+
+
+@dataclass(frozen=True)
+class Quotient:
+    """Photo over its reconstruction [3, t, t], and the visible reconstruction, grey [t, t].
+
+    `albedo` [3, t, t], if not None, are factors of the field's albedo, which the reconstruction has.
+    """
+
+    ratio: Tensor
+    explained: Tensor
+    albedo: Tensor | None = None
+
+    @staticmethod
+    def of(photo: Tensor, explained: Tensor, visible: Tensor, albedo: Tensor | None = None) -> "Quotient":
+        """Divide a photo by its reconstruction, scene-linear textures [3, t, t]; visible [t, t] in 0..1."""
+        explained = explained if albedo is None else explained * albedo
+        floor = _FACE_FLOOR * (photo.mean(0) * visible).sum() / visible.sum().clamp_min(1e-6)
+        ratio = ((photo + floor) / (explained + floor).clamp_min(1e-12)).clamp(*_FACE_RANGE)
+        return Quotient(1 + visible * (ratio - 1), explained.mean(0) * visible, albedo)
+
+    def corrected(self, olats: Tensor) -> Tensor:
+        """Multiply OLAT textures [l, 3, T, T] by the quotient, to a power that is each light's likeness.
+
+        The factors of albedo are the same for all.
+
+        Likeness is the cosine between the OLAT and the reconstruction. It compares the shading of the face,
+        not light directions: a photo under a dome of light hardly corrects a light from the side.
+        """
+        side = olats.shape[-2:]
+        if self.albedo is not None:
+            olats = olats * F.interpolate(self.albedo[None], side, mode="bilinear", align_corners=False)
+        small = F.interpolate(olats, self.explained.shape, mode="area").mean(1)
+        lengths = (small * (self.explained > 0)).flatten(1).norm(dim=1) * self.explained.norm()
+        likeness = (small * self.explained).sum((1, 2)) / lengths.clamp_min(1e-12)
+        power = likeness.clamp(0, 1)[:, None, None, None] ** _FACE_SHARPNESS
+        ratio = F.interpolate(self.ratio[None].log(), side, mode="bilinear", align_corners=False)
+        return olats * torch.exp(power * ratio)

@@ -17,8 +17,8 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import region_mask
 from facerf_cli.light.envmap import lights_around
 from facerf_cli.light.estimate import estimate_lamps, lamp_error
-from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.portrait.correction import Quotient
 from facerf_cli.relighting.baked_in import without_baked_in
 from facerf_cli.relighting.field import SEEN_WELL, Field, shrunk, weighted_sum
 from facerf_cli.relighting.models import Models

@@ -9,8 +9,7 @@ from typing import Any, Literal, get_args
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.option import DATA, LENGTH, LOSSES, RUN, SPEED, option
-from facerf_cli.training.config_file import with_tables
-from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of
+from facerf_cli.training.settings import PRESETS, Preset, Stage, TrainSettings, preset_of, with_tables
 
 _UNITS_S = {"s": 1, "m": 60, "h": 3600}
 _DEFAULT_TIME = "2h"

@@ -50,7 +50,6 @@ from facerf_cli.synth.bank.transport import (
     add_transport,
 )
 from facerf_cli.synth.head.mesh import MAKEHUMAN_LICENCE
-from facerf_cli.training.config_file import CONFIG, write_config
 from facerf_cli.training.diffuse_sh import DiffuseObjective, SumSettings
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.joint import JointObjective, JointSettings
@@ -62,7 +61,7 @@ from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettin
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
 from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
-from facerf_cli.training.settings import Stage, TrainSettings
+from facerf_cli.training.settings import CONFIG, Stage, TrainSettings, write_config
 from facerf_cli.training.stage_networks import TINY_LIGHTS, StageNetworks, say_cost
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
 

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.light.entries import MapSource, StudioLight
-from facerf_cli.light.envmap import ball, lights_around, rotated_weights
-from facerf_cli.light.map_keys import MapKeys, without_keys
+from facerf_cli.light.envmap import MapKeys, ball, lights_around, rotated_weights, without_keys
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow, rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling

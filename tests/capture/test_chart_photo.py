@@ -10,8 +10,13 @@ import pytest
 from skimage import data
 
 from facerf_cli.capture.capture import Capture, ChartCorrection, correct_colours
-from facerf_cli.capture.chart import four_turns, published_colours, squares_px
-from facerf_cli.capture.chart_photo import read_charts, write_chart_overlays
+from facerf_cli.capture.chart import (
+    four_turns,
+    published_colours,
+    read_charts,
+    squares_px,
+    write_chart_overlays,
+)
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.read import read_image

@@ -4,8 +4,7 @@ import io
 
 from rich.console import Console
 
-from facerf_cli.capture.findings import Finding
-from facerf_cli.capture.findings_report import show_findings, summary
+from facerf_cli.capture.findings import Finding, show_findings, summary
 
 STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
 WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")

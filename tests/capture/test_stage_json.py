@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.capture.distortion import distorted
+from facerf_cli.capture.capture import distorted
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError

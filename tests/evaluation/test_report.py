@@ -14,8 +14,7 @@ from PIL import Image
 
 from facerf_cli.evaluation.measure import Row, measure
 from facerf_cli.evaluation.options import Measures
-from facerf_cli.evaluation.report import choose_cases, page
-from facerf_cli.evaluation.strips import ERROR_COLOURS, Strip, draw_strip
+from facerf_cli.evaluation.report import ERROR_COLOURS, Strip, choose_cases, draw_strip, page
 from facerf_cli.evaluation.summary import summarise
 from tests.evaluation.toy_protocol import LAYOUT, NOISE, comparison, evaluate
 

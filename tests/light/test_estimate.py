@@ -16,8 +16,8 @@ from facerf_cli.light.estimate import (
     least_non_negative,
     refine_light,
 )
-from facerf_cli.light.quotient import Quotient
 from facerf_cli.light.sphere import rig_directions
+from facerf_cli.portrait.correction import Quotient
 
 LIGHTS = 24
 

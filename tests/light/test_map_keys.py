@@ -5,8 +5,7 @@ import math
 import pytest
 import torch
 
-from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.map_keys import without_keys
+from facerf_cli.light.envmap import envmap_weights, without_keys
 from facerf_cli.light.sphere import (
     azel_to_direction,
     latlong_directions,
