@@ -66,7 +66,10 @@ def main() -> None:
         now = best[ROOT, name]
         unit = best[ROOT, "typer, rich" if name == _HELP else "torch"].seconds
         before = "" if other is None else f"{now.seconds / best[other, name].seconds:.2f}"
-        print_row(name, f"{now.seconds / unit:.2f}", before, f"{now.peak_mb:.0f}")
+        peak = (
+            "" if name == _HELP else f"{now.peak_mb:.0f}"
+        )  # below the peak of this process, which starts it
+        print_row(name, f"{now.seconds / unit:.2f}", before, peak)
     print()
     print_header("", "in no step", *_STEPS)
     torch_s = best[ROOT, "torch"].seconds
