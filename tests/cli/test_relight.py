@@ -16,9 +16,10 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
 from facerf_cli.option import attributes_of
-from facerf_cli.relighting.face_alone import FaceAlone
+from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.person_in_photo import PERSON_LAYERS
 from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.synth.sky.skies import kind_of
 from facerf_cli.work.relight_options import RelightOptions, parse_aov
@@ -120,6 +121,7 @@ def test_layers_have_a_singular_and_a_plural_and_are_listed_as_in_the_help() -> 
     with pytest.raises(UsageError, match="--aov 'beauty': no such layer") as caught:
         parse_aov("normal,beauty")
     listed = str(caught.value).partition("give some of ")[2].split(", ")
+    assert {*listed} == {"matte", *FACE_LAYERS, *PERSON_LAYERS}
     text = attributes_of(RelightOptions)["aov"]
     assert listed == [word for word in re.findall(r"\w+", text) if word in listed] and "albedo" in listed
 
