@@ -138,7 +138,9 @@ def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Pat
     try:
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.save(file, transfer.numpy())
-        _remove_oldest(path.parent)
+        with suppress(FileNotFoundError):  # other processes may remove files at the same time
+            for old in sorted(path.parent.glob("*.npy"), key=lambda p: p.stat().st_mtime_ns)[:-_MOST_FILES]:
+                old.unlink()
     except FacerfError as error:
         log.warning("%s; the next run bakes the transfer again", error)
     return transfer.float()
@@ -185,10 +187,3 @@ def _read(path: Path, settings: TransferSettings) -> Tensor | None:
     if kept.shape != shape or kept.dtype != np.float16 or not np.isfinite(kept).all():
         return None
     return torch.from_numpy(kept).float()
-
-
-def _remove_oldest(folder: Path) -> None:
-    """Remove the files that were not used for longest, where there are too many."""
-    with suppress(FileNotFoundError):  # other processes may remove files at the same time
-        for path in sorted(folder.glob("*.npy"), key=lambda path: path.stat().st_mtime_ns)[:-_MOST_FILES]:
-            path.unlink()

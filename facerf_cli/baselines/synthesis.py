@@ -251,7 +251,8 @@ def _minimise(problem: _Problem, steps: int) -> Tensor:
         reach = torch.maximum(image, problem.radiance) + _FLOOR
         weight = problem.evidence / reach.square()
         if step >= _FIRM_STEPS:
-            weight = weight * _robust(error / reach)
+            relative = (error / reach).abs().mean(0)  # Cauchy weights, scaled by the median
+            weight = weight * (1 / (1 + (relative / (_OUTLIER * relative.median() + 1e-9)).square()))
         cost = _cost(error, weight, state, prior)
         flat = slopes.flatten(1)
         weighted = flat * weight.flatten()
@@ -284,12 +285,6 @@ def _synthesise(problem: _Problem, state: Tensor, with_slopes: bool = True) -> t
     by_light = by_light + torch.einsum("nk,rkc->rcn", problem.mirror, lights) * gloss
     by_gloss = problem.gloss[1][:, None] * shining
     return image, torch.cat([image[None], by_light, problem.albedo[1] * lit, by_gloss])
-
-
-def _robust(relative: Tensor) -> Tensor:
-    """Cauchy weights [N] of the texels' relative errors [3, N], scaled by their median."""
-    size = relative.abs().mean(0)
-    return 1 / (1 + (size / (_OUTLIER * size.median() + 1e-9)).square())
 
 
 def _cost(error: Tensor, weight: Tensor, state: Tensor, prior: Tensor) -> float:

@@ -16,7 +16,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from facerf_cli.batch.inputs import Item, NamePattern, file_pattern, files_read, refuse_read
 from facerf_cli.batch.made_from import (
@@ -36,7 +36,7 @@ from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_le
 from facerf_cli.files.texts import is_regular, require_regular
 from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
-from facerf_cli.run.logs import LOGGER_NAME, escaped, printable_line, progress_bar, unexpected
+from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, printable_line, progress_bar, unexpected
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, ending, process_died, spread
 
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
+T = TypeVar("T")
+R = TypeVar("R")
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -434,3 +436,19 @@ def _progress(settings: Settings) -> "Progress":
     from rich.progress import MofNCompleteColumn  # --help does without it
 
     return progress_bar(MofNCompleteColumn(), shown=settings.verbosity >= 0 and not settings.log_json)
+
+
+def with_bar(
+    work: Callable[[T], R],
+    items: Sequence[T],
+    title: str,
+    batch: BatchOptions,
+    settings: Settings,
+    died: Callable[[T, Exception], R],
+) -> Iterator[R]:
+    """Map items by the workers of --jobs or --ray, with a progress bar."""
+    from rich.progress import track  # --help does without it
+
+    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
+    results = spread(work, items, batch.workers(settings), died)
+    return iter(track(results, title, len(items), console=STDERR, transient=True, disable=not shown))

@@ -131,8 +131,11 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
         raise UsageError(f"{folder}: {error}") from None
     directions, about_list = _read_directions(folder, lists, frames)
     content = _content(folder, pattern, frames, headers, directions)
+    words = ", ".join(counted(len(frames.ids(field)), field) for field in FIELDS)
+    missing, expected = frames.expected - len(frames.paths), frames.expected
+    exist = f"{missing} of {expected} frames are missing" if missing else f"all {expected} frames exist"
     notes = [
-        _summary(pattern, frames),
+        f"{pattern}: {words}; {exist}",
         *(f"fill in: {note}" for note in _gaps(content)),
         *([about_list] if about_list else []),
         *(f"check: {note}" for note in _assumptions(headers, content)),
@@ -234,13 +237,6 @@ def _camera(name: str, sizes: list[tuple[int, int]], alone: bool) -> dict[str, o
         k = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
         entry |= {"width": width, "height": height, "K": k}
     return entry | {"world_to_camera": FACING if alone else None}
-
-
-def _summary(pattern: str, frames: Frames) -> str:
-    words = ", ".join(counted(len(frames.ids(field)), field) for field in FIELDS)
-    missing, expected = frames.expected - len(frames.paths), frames.expected
-    exist = f"{missing} of {expected} frames are missing" if missing else f"all {expected} frames exist"
-    return f"{pattern}: {words}; {exist}"
 
 
 def _gaps(content: Mapping[str, Any]) -> Iterator[str]:

@@ -131,7 +131,15 @@ def select_frames(
 
     With `strict`, a missing frame that is not marked as damaged is an InputError too.
     """
-    broken = {camera: _absent(capture, subject, camera) for camera in capture.cameras}
+    marked = capture.marked.get(subject, frozenset())
+    broken = {  # by camera, reasons by light whose frame does not exist
+        camera: {
+            light: MARKED if light in marked else MISSING
+            for light in capture.light_ids
+            if not capture.frame_path(subject, camera, light).is_file()
+        }
+        for camera in capture.cameras
+    }
     missing = {f"{camera}/{light}": why for camera, lights in broken.items() for light, why in lights.items()}
     if strict and (unmarked := [name for name, why in missing.items() if why == MISSING]):
         first = f"{subject}/{unmarked[0]}"
@@ -160,16 +168,6 @@ def select_frames(
             f"({_list(left_out)}); add the frames, or take a camera out of the capture"
         )
     return Selection(kept, cameras, left_out, dropped, tuple(missing))
-
-
-def _absent(capture: Capture, subject: str, camera: str) -> dict[str, str]:
-    """Reasons by light whose frame does not exist."""
-    marked = capture.marked.get(subject, frozenset())
-    return {
-        light: MARKED if light in marked else MISSING
-        for light in capture.light_ids
-        if not capture.frame_path(subject, camera, light).is_file()
-    }
 
 
 def _list(reasons: Mapping[str, str]) -> str:

@@ -165,17 +165,13 @@ class StageDocument(Document):
             raise ValueError(f"camera {without[0]} has no 'world_to_camera'; only a single camera needs none")
         return self
 
-    def needed_fields(self) -> set[str]:
-        """Fields that a pattern must name: all but those with a single value."""
-        single = {"camera": len(self.cameras) == 1, "subject": len(self.subjects or ()) == 1}
-        return {field for field in FIELDS if not single.get(field)}
-
 
 def read_stage(folder: Path) -> Capture:
     """Read the capture that `stage.json` in a folder describes; InputError names the first wrong entry."""
     path = folder / STAGE_FILE
     stage = read_document(path, StageDocument, "--describe drafts one from the images")
-    needed = stage.needed_fields()
+    single = {"camera": len(stage.cameras) == 1, "subject": len(stage.subjects or ()) == 1}
+    needed = {field for field in FIELDS if not single.get(field)}  # in a pattern
     pattern = require_pattern(stage.pattern, f"{path}: pattern", needed)
     light_ids, camera_ids = ([entry.id for entry in entries] for entries in (stage.lights, stage.cameras))
     return Capture(

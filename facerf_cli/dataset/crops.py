@@ -141,19 +141,16 @@ class PairReader:
         for i in range(count):
             generator, source = generator_of(i), None
             if self._lazy:
-                pair, source = self._draw_lazy(generator_of(i, step - turn * _STACKS_OPEN), turn)
+                lazy = generator_of(i, step - turn * _STACKS_OPEN)
+                any_pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=lazy))]
+                of_stack = self._by_stack[any_pair.subject, any_pair.source_camera]
+                chosen = torch.randint(len(of_stack), (_SOURCES_EACH,), generator=lazy).tolist()
+                pairs = tuple(of_stack[place] for place in chosen)
+                pair, source = pairs[turn], _lazy_sources(self.dataset, pairs)[turn].float()
             else:
                 pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
             drawn.append(self.read(pair, (CropMove.draw(generator), CropMove.draw(generator)), source))
         return concatenate(drawn)
-
-    def _draw_lazy(self, generator: torch.Generator, turn: int) -> tuple[Pair, Tensor]:
-        """The pair and source of a turn, of a random stack that gives as many as there are turns."""
-        any_pair = self.pairs[int(torch.randint(len(self.pairs), (), generator=generator))]
-        of_stack = self._by_stack[any_pair.subject, any_pair.source_camera]
-        chosen = torch.randint(len(of_stack), (_SOURCES_EACH,), generator=generator).tolist()
-        pairs = tuple(of_stack[place] for place in chosen)
-        return pairs[turn], _lazy_sources(self.dataset, pairs)[turn].float()
 
     def read(
         self,

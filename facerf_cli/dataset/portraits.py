@@ -101,22 +101,18 @@ def open_dataset_portraits(
     dataset = read_dataset(folder)
     people = {split: people_of(dataset, split) for split in ("train", "validation")}
     _make_missing(dataset, networks, jobs)
-    views = {split: _views_of(dataset, subjects) for split, subjects in people.items()}
-    for split, found in views.items():
-        if not found:
+    views: dict[str, list[list[Path]]] = {}
+    for split, subjects in people.items():
+        paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in subjects]
+        with_a_face = [[path for path in of_one if _shows_a_face(path)] for of_one in paths]
+        views[split] = [of_one for of_one in with_a_face if of_one]
+        if not views[split]:
             raise InputError(
                 f"{folder}: no face was found in the split {split}; run prepare-dataset with another --split"
             )
     provenance = provenance_of(dataset, load_face_model(dataset.face_model))
     everyone = [*views["train"], *views["validation"]]
     return DatasetPortraits(dataset, everyone, len(views["train"]), backgrounds, provenance)
-
-
-def _views_of(dataset: Dataset, subjects: Sequence[str]) -> list[list[Path]]:
-    """Portraits of each of some people, of those who have some."""
-    paths = [[_path(dataset, *view) for view in _of(dataset, [who])] for who in subjects]
-    shown = [[path for path in views if _shows_a_face(path)] for views in paths]
-    return [views for views in shown if views]
 
 
 def _shows_a_face(path: Path) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import Recipe, json_rows, require_same
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up, with_bar
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.chart import read_charts, write_chart_overlays
@@ -48,7 +48,6 @@ from facerf_cli.dataset.prepare import (
     prepared_subjects,
     subject_outputs,
 )
-from facerf_cli.dataset.progress import with_bar
 from facerf_cli.dataset.settings import DatasetSettings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.joint_fit import CROP_STEP_PX

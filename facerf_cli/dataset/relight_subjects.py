@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facerf_cli.batch.inputs import MAP_SUFFIXES, Item, collect_items
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, with_bar
 from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.cost import cost_of_sources, in_words, recipe_bytes
 from facerf_cli.dataset.dataset import Dataset, read_dataset
@@ -21,7 +21,6 @@ from facerf_cli.dataset.pairs import (
     relight_subject,
     write_pairs,
 )
-from facerf_cli.dataset.progress import with_bar
 from facerf_cli.dataset.settings import PairSettings
 from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import UsageError

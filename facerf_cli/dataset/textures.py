@@ -87,8 +87,11 @@ class DatasetTextures:
         row = int(torch.randint(len(pairs), (), generator=generator))
         pair = pairs[row]
         with self._open(subject, pair.source_camera) as file:
-            source, texture = UnwrappedView.read(file), self._written_source(subject, row)
-            if texture is None:
+            source = UnwrappedView.read(file)
+            if subject in self.sources:
+                rows = np.load(self.sources[subject], mmap_mode="r")
+                texture = torch.from_numpy(rows[row].astype(np.float32))
+            else:  # a lazy pair
                 texture = _weighted_sum(file, torch.from_numpy(np.array(weights[row])))
         return self._face(subject, pair.target_camera, source, texture, pair.target_light, lights, generator)
 
@@ -137,12 +140,6 @@ class DatasetTextures:
 
     def _open(self, subject: str, camera: str) -> Any:
         return safe_open(texture_path(self.dataset, self.side, subject, camera), framework="pt")
-
-    def _written_source(self, subject: str, row: int) -> Tensor | None:
-        """The unwrapped source [3, T, T] of a subject's pair; None for lazy pairs."""
-        if subject not in self.sources:
-            return None
-        return torch.from_numpy(np.load(self.sources[subject], mmap_mode="r")[row].astype(np.float32))
 
 
 @dataclass(frozen=True)

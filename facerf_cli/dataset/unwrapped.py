@@ -73,7 +73,9 @@ def missing_parts(dataset: Dataset, side: int, subject: str) -> Iterator[tuple[s
     for camera in dataset.cameras[subject]:
         if not is_made_from(texture_path(dataset, side, subject, camera), stamp(dataset, subject, camera)):
             yield subject, camera
-    if _has_sources(dataset, subject) and not sources_path(dataset, side, subject).exists():
+    pairs = _pairs(dataset, subject)
+    written = bool(pairs) and all(image_path(dataset, *pair.key).is_file() for pair in pairs)
+    if written and not sources_path(dataset, side, subject).exists():  # others are summed as they are drawn
         yield subject, ""
 
 
@@ -99,12 +101,6 @@ def _pairs(dataset: Dataset, subject: str) -> list[Pair]:
 def stamp(dataset: Dataset, subject: str, camera: str) -> str:
     """Text that changes when a stack is written again, or the UV layout changes."""
     return f"{LAYOUT_VERSION}-{text_of_state(dataset.stack_path(subject, camera))}"
-
-
-def _has_sources(dataset: Dataset, subject: str) -> bool:
-    """Tell whether all sources of a subject were written; otherwise they are summed as they are drawn."""
-    pairs = _pairs(dataset, subject)
-    return bool(pairs) and all(image_path(dataset, *pair.key).is_file() for pair in pairs)
 
 
 def _unwrap_stack(dataset: Dataset, model: MorphableModel, side: int, subject: str, camera: str) -> None:

@@ -160,7 +160,9 @@ def relit_images(path: Path, weights: Tensor, memory_bytes: int = DEFAULT_MEMORY
     (height, width), lights = header.seen.shape, len(header.directions)
     if weights.shape[1] != lights:
         raise InputError(f"{path}: {lights} lights, the dataset has {weights.shape[1]}; {PREPARE_AGAIN}")
-    rows = _strip_rows(lights, height, width, memory_bytes // 2)
+    rows = memory_bytes // 2 // (6 * lights * width)
+    if rows < height:  # as many whole tiles and compressed blocks as fit
+        rows = max(_power_of_two(rows), _tile_rows(lights, width))
     whole = read_olats(path) if rows >= height else None
     batch = max(1, memory_bytes // (4 * 6 * height * width))
     batch = batch if batch < TILE_IMAGES else batch // TILE_IMAGES * TILE_IMAGES
@@ -190,12 +192,6 @@ def multiply(olats: Tensor, weights: Tensor, images: Tensor) -> None:
 def _tile_rows(lights: int, width: int) -> int:
     """Rows of a tile, a power of two."""
     return _power_of_two(min(_TILE_PX, _TILE_VALUES // lights) // width)
-
-
-def _strip_rows(lights: int, height: int, width: int, memory_bytes: int) -> int:
-    """Rows of a stack in memory at once: all, or as many whole tiles and compressed blocks as fit."""
-    rows = memory_bytes // (6 * lights * width)
-    return height if rows >= height else max(_power_of_two(rows), _tile_rows(lights, width))
 
 
 def _power_of_two(number: int) -> int:

@@ -75,7 +75,13 @@ def perceptual_metric(
     `--vgg-weights`. Raises UsageError or InputError for weights that are missing or others.
     """
     network = Lpips()
-    _load_heads(network, heads or _installed_heads())
+    path = heads or _installed_heads()
+    try:
+        network.load_heads(read_tensors(path, _ADVICE))
+    except ValueError as error:
+        raise InputError(f"{path}: no heads of LPIPS on VGG ({error}); {_ADVICE}") from None
+    if _digest(network) != _DIGEST:
+        raise InputError(f"{path}: not the published heads of LPIPS v0.1 on VGG; {_ADVICE}")
     load_vgg(vgg_weights, network.trunk)
     network.eval().requires_grad_(False)
 
@@ -96,15 +102,6 @@ def _installed_heads() -> Path:
     if path is None or not path.is_file():
         raise UsageError(f"LPIPS: its own weights are missing; install the package {_PACKAGE}, or {_ADVICE}")
     return path
-
-
-def _load_heads(network: Lpips, path: Path) -> None:
-    try:
-        network.load_heads(read_tensors(path, _ADVICE))
-    except ValueError as error:
-        raise InputError(f"{path}: no heads of LPIPS on VGG ({error}); {_ADVICE}") from None
-    if _digest(network) != _DIGEST:
-        raise InputError(f"{path}: not the published heads of LPIPS v0.1 on VGG; {_ADVICE}")
 
 
 def _digest(network: Lpips) -> str:

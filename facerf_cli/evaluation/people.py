@@ -210,7 +210,9 @@ class DatasetPerson:
         header = self.header(camera)
         face: FaceBox | FaceFit
         if self.reading.geometry is None:
-            face = _in_own_frame(fit_from_arrays(header.fit))
+            fit = fit_from_arrays(header.fit)
+            side_px = fit.crop.size_px  # the crop's pixels are the photo's
+            face = replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px))
         else:
             try:
                 face = self.reading.find(image, name)
@@ -335,9 +337,3 @@ class Couple:
 
 def _name(pair: Pair) -> str:
     return f"{pair.subject}/{pair.index:05d}"
-
-
-def _in_own_frame(fit: FaceFit) -> FaceFit:
-    """The fit with its crop as a separate image: the crop's pixels are the photo's."""
-    side_px = fit.crop.size_px
-    return replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px))

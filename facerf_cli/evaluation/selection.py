@@ -53,7 +53,9 @@ def choose_people(
     else:
         groups = choose(pairs_of_split(dataset, options.split), options)
     if not options.dry_run:
-        write_list(options.output / PAIRS_LIST, groups)
+        # Freezes the pairs of a run, with the recipes of their sources, for `--pairs` of any other run.
+        rows = [[asdict(pair) for pair in group] for members in groups.values() for group in members]
+        write_document(options.output / PAIRS_LIST, {"format": LIST_FORMAT, "groups": rows})
     items = {
         options.item(options.dataset / "olat" / name, name): PersonPairs(
             dataset, name, groups[name], strangers
@@ -190,12 +192,6 @@ class _PairList(Document):
     groups: Annotated[
         list[Annotated[list[dict[str, Any]], Field(min_length=1, max_length=2)]], Field(min_length=1)
     ]
-
-
-def write_list(path: Path, groups: Groups) -> None:
-    """Freeze the pairs of a run, with the recipes of their sources, for `--pairs` of any other run."""
-    rows = [[asdict(pair) for pair in group] for members in groups.values() for group in members]
-    write_document(path, {"format": LIST_FORMAT, "groups": rows})
 
 
 def read_list(path: Path, dataset: Dataset, size: int) -> Groups:

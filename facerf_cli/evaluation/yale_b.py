@@ -152,19 +152,15 @@ class YaleSubject:
 @cache  # cells of many points on the sphere
 def environment_weights(name: str, flashes: tuple[Flash, ...]) -> np.ndarray:
     """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L]; the sum is 1."""
-    directions = _spiral(_SPHERE_POINTS)
+    # Directions on a golden spiral about +y, as in the benchmark: the cells depend on them.
+    index = np.arange(_SPHERE_POINTS) + 0.5
+    y = 1 - 2 * index / _SPHERE_POINTS
+    ring, angle = np.sqrt(1 - y * y), np.pi * (1 + 5**0.5) * index
+    directions = np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], 1)
     nearest = np.argmax(directions @ np.stack([flash.direction for flash in flashes]).T, 1)
     radiance = sum(share * part(directions) for share, part in _RADIANCES[name])
     summed = np.bincount(nearest, weights=radiance, minlength=len(flashes))
     return summed / summed.sum()
-
-
-def _spiral(points: int) -> np.ndarray:
-    """Directions [N, 3] on a golden spiral about +y, as in the benchmark: the cells depend on them."""
-    index = np.arange(points) + 0.5
-    y = 1 - 2 * index / points
-    ring, angle = np.sqrt(1 - y * y), np.pi * (1 + 5**0.5) * index
-    return np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], 1)
 
 
 def face_mask() -> np.ndarray:

@@ -101,7 +101,9 @@ class DiffuseObjective(HeadsObjective):
             turned = (batch.normals_source - batch.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(batch, estimate, own, relit)] if len(rows) < _SHEET_FACES else []
-        return Validation(_metrics(torch.tensor(errors), torch.tensor(same_pose)), np.concatenate(rows))
+        of_targets, of_sources = torch.tensor(errors).T
+        metrics = metrics_by_pose(of_targets, torch.tensor(same_pose))
+        return Validation({**metrics, "si_mse_source": float(of_sources.mean())}, np.concatenate(rows))
 
 
 def draw_sums(sums: int, lights: int, generator: torch.Generator) -> Tensor:
@@ -132,11 +134,6 @@ def predicted_images(estimate: DiffuseEstimate, batch: DiffuseBatch) -> tuple[Te
     albedo = estimate.albedo[:, None]
     own = shading(batch.normals_source, estimate.coefficients[:, None])
     return albedo * own, albedo * shading(batch.normals_target, batch.coefficients)
-
-
-def _metrics(errors: Tensor, same_pose: Tensor) -> dict[str, float]:
-    """Metrics of errors [N, 2] of relit targets and of sources."""
-    return {**metrics_by_pose(errors[:, 0], same_pose), "si_mse_source": float(errors[:, 1].mean())}
 
 
 def _sheet_rows(batch: DiffuseBatch, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:

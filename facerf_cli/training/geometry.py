@@ -114,9 +114,12 @@ class GeometryObjective(Objective):
 
         The eyes of a turned head lie close together in the image; their distance would give it more weight.
         """
-        predicted = self.landmarks_px(estimate, batch.crops.shape[-1])
-        unit_px = _frontal_iod_px(self.mean_m, batch)
-        return (predicted - batch.landmarks_px).norm(dim=-1) / unit_px[:, None]
+        side, (left, right) = batch.crops.shape[-1], OUTER_EYE_CORNERS
+        predicted = self.landmarks_px(estimate, side)
+        depth_m = -(self.mean_m[[left, right]].mean(0) @ batch.rotation.mT + batch.translation_m)[:, 2]
+        iod_m: Any = (self.mean_m[left] - self.mean_m[right]).norm()
+        frontal_px = crop_camera(side).focal_px * iod_m / depth_m  # [B]
+        return (predicted - batch.landmarks_px).norm(dim=-1) / frontal_px[:, None]
 
     @torch.no_grad()
     def validate(self) -> Validation:
@@ -148,11 +151,3 @@ class GeometryObjective(Objective):
             mark(image, true_px * size / side, TRUE_COLOUR)
             mark(image, found_px * size / side, FOUND_COLOUR)
         return tiled(in_rows([*images], _SHEET_COLUMNS))
-
-
-def _frontal_iod_px(mean_m: Tensor, batch: FaceCrops) -> Tensor:
-    """Inter-ocular distance of the mean face at each head's depth, in pixels [B]."""
-    left, right = OUTER_EYE_CORNERS
-    depth_m = -(mean_m[[left, right]].mean(0) @ batch.rotation.mT + batch.translation_m)[:, 2]
-    iod_m: Any = (mean_m[left] - mean_m[right]).norm()
-    return crop_camera(batch.crops.shape[-1]).focal_px * iod_m / depth_m

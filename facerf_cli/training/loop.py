@@ -267,7 +267,13 @@ def _write(run: _Run, row: Row, validate: bool, save: bool) -> None:
     last = run.folder / "last.safetensors"
     with averaged(run.state) if save else nullcontext():
         if validate:
-            row["validation"] = _validate(run, row["step"])
+            run.objective.networks.eval()
+            with torch.no_grad():
+                validation = run.objective.validate()
+            run.objective.networks.train()
+            if validation.sheet is not None and run.log:
+                run.log.sheet(row["step"], validation.sheet)
+            row["validation"] = validation.metrics
         if save:
             save_networks(last, {**run.carried, **run.objective.networks}, _metadata(run, row))
     metric = row.get("validation", {}).get(run.objective.chooses_by, math.inf)
@@ -280,16 +286,6 @@ def _write(run: _Run, row: Row, validate: bool, save: bool) -> None:
     if save:
         save_state(run.folder / "state.pt", run.state, run.settings)
     run.report(row)
-
-
-@torch.no_grad()
-def _validate(run: _Run, step: int) -> dict[str, float]:
-    run.objective.networks.eval()
-    validation = run.objective.validate()
-    run.objective.networks.train()
-    if validation.sheet is not None and run.log:
-        run.log.sheet(step, validation.sheet)
-    return validation.metrics
 
 
 def _metadata(run: _Run, row: Row) -> dict[str, Any]:

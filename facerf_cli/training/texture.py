@@ -86,10 +86,20 @@ class TextureObjective(HeadsObjective):
     ) -> None:
         network = network or new_network("reflectance", "default", {})
         if network.rig_lights:
-            _set_mean_face(network, source)
+            try:
+                network.set_mean_face(*source.mean_face())
+            except ValueError as error:
+                advice = "give another --bank or --start-from"
+                raise InputError(f"{error}, as the heads were baked; {advice}") from None
         super().__init__("reflectance", network, source, settings)
         self.light = light
-        self.source_colours = _measure_colours(source, self.heads)
+        colours = []  # of sources of the training heads
+        for index in range(_COLOURS_MEASURED):
+            generator = seeded(_COLOUR_SEED, index)
+            head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
+            sample = source.draw(head, 1, generator)
+            colours.append(mean_colours(sample.source, sample.visible))
+        self.source_colours = SourceColours.of(torch.cat(colours))
 
     def draw_head(self, head: Tensor, generator: torch.Generator) -> TextureBatch:
         """Draw a face."""
@@ -138,24 +148,6 @@ class TextureObjective(HeadsObjective):
     def _encoded(self, sample: Sample) -> Any:
         source = without_cast(sample.source, sample.visible, self.source_colours)
         return self.network.encode(source, sample.normals_source, sample.visible)
-
-
-def _measure_colours(source: SampleSource, heads: Tensor) -> SourceColours:
-    """Measure the colours of sources of the training heads."""
-    colours = []
-    for index in range(_COLOURS_MEASURED):
-        generator = seeded(_COLOUR_SEED, index)
-        head = heads[torch.randint(len(heads), (1,), generator=generator)]
-        sample = source.draw(head, 1, generator)
-        colours.append(mean_colours(sample.source, sample.visible))
-    return SourceColours.of(torch.cat(colours))
-
-
-def _set_mean_face(network: Any, source: SampleSource) -> None:
-    try:
-        network.set_mean_face(*source.mean_face())
-    except ValueError as error:
-        raise InputError(f"{error}, as the heads were baked; give another --bank or --start-from") from None
 
 
 def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:

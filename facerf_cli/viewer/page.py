@@ -76,6 +76,8 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
     """
     height, width = plate.matte.shape
     background = np.zeros_like(plate.before) if plate.background is None else plate.background
+    # Shares of a room's light, before a bright background and before a dark one; an OLAT stack has no room.
+    room = {"bright": ROOM_BEFORE_BRIGHT, "dark": ROOM_BEFORE_DARK}
     return {
         "size": [width, height],
         "small": [basis.ratios.shape[2], basis.ratios.shape[1]],
@@ -89,7 +91,7 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         "photo": _jpeg(_encoded(plate.before), _PHOTO_QUALITY),
         "plate": _webp(_encoded(background)),
         "background": plate.background is not None,
-        "room": _room(basis),
+        "room": room if len(basis.ratios) > len(basis.directions) else None,
         "matte": _webp(np.round(plate.matte * 255).astype(np.uint8)),
         "exposure": _exposure(basis.samples),
         **packed_lights(plate.background is not None, plate.even),
@@ -135,12 +137,6 @@ def packed_lights(of_photo: bool, even: float = 1.0) -> dict[str, Any]:
             for preset, image in images.items()
         },
     }
-
-
-def _room(basis: Basis) -> dict[str, float] | None:
-    """Shares of a room's light, before a bright background and before a dark one; None for an OLAT stack."""
-    has_one = len(basis.ratios) > len(basis.directions)
-    return {"bright": ROOM_BEFORE_BRIGHT, "dark": ROOM_BEFORE_DARK} if has_one else None
 
 
 def _exposure(samples: LightSamples) -> dict[str, Any]:

@@ -65,7 +65,9 @@ def find_landmarks(mean: np.ndarray, triangles: np.ndarray, known: dict[int, np.
     mesh = trimesh.Trimesh(mean, _outward(mean, triangles), process=False)
     rotation, translation = _start(mean[np.unique(triangles)], known)
     alpha = np.zeros(_sparse_face().basis.shape[-1])
-    inner = _inner(mesh)
+    # Faces away from the border: points beyond the border would all pair with it.
+    border = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    inner = np.logical_not(np.isin(mesh.faces, border).any(1))
     for share in np.linspace(0, 1, _ROUNDS):
         rotation, translation, alpha = _round(mesh, inner, known, rotation, translation, alpha, share)
     found = (_sparse_face().points(alpha) @ rotation.T + translation)[_sparse_face().rows :]
@@ -118,12 +120,6 @@ def _start(points: np.ndarray, known: dict[int, np.ndarray]) -> tuple[np.ndarray
     return np.eye(3), tip - LANDMARKS_M[_NOSE_TIP]
 
 
-def _inner(mesh: trimesh.Trimesh) -> np.ndarray:
-    """A mask [F] of the faces away from the border; points beyond the border would all pair with it."""
-    border = mesh.edges_sorted[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
-    return np.logical_not(np.isin(mesh.faces, border).any(1))
-
-
 def _round(
     mesh: trimesh.Trimesh,
     inner: np.ndarray,
@@ -155,15 +151,9 @@ def _round(
         indices = count + np.array(list(known))
         rows = np.concatenate([rows, jacobian[indices] / _KNOWN_NOISE_M])
         right = np.concatenate([right, (np.stack(list(known.values())) - points[indices]) / _KNOWN_NOISE_M])
-    return _solved(rows.reshape(-1, rows.shape[-1]), right.ravel(), rotation, translation, alpha)
-
-
-def _solved(
-    rows: np.ndarray, right: np.ndarray, rotation: np.ndarray, translation: np.ndarray, alpha: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Solve the round's equations with the prior, and apply the step to pose and coefficients."""
+    rows = rows.reshape(-1, rows.shape[-1])
     prior = np.concatenate([np.zeros(6), np.ones(len(alpha))])
-    gradient = rows.T @ right - prior * np.concatenate([np.zeros(6), alpha])
+    gradient = rows.T @ right.ravel() - prior * np.concatenate([np.zeros(6), alpha])
     step = np.linalg.solve(rows.T @ rows + np.diag(prior + 1e-9), gradient)
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     return turn @ rotation, translation + step[3:6], alpha + step[6:]
