@@ -30,15 +30,29 @@ RESULTS_VERSION = 22  # raised where the same recipe gives other pixels
 SHIPPED = Path(__file__).parents[1] / "assets"
 # Entries of recipes that are not called as the option that sets them is.
 _OPTIONS = {
+    "colour": "the colour of --background",
     "colourspace": "--input-colourspace",
     "config": "--ocio",
+    "data": "the data",
     "dataset_format": "facerf's version of datasets",
+    "kind": "--background",
+    "leaders": "the first photo of --exposure-group",
+    "matte_model": "the model of --matte-from",
+    "names": "the layers of --light",
     "non_negative": "--signed",
+    "ocio_config": "--ocio",
+    "path": "the image of --background",
+    "pattern": "the pattern of the capture",
     "photo_of_stack": "--photo",
     "results": "facerf's version of results",
     "rig": "--lights",
     "sampling": "--envmap-sampling",
+    "size_px": "--size",
+    "stage_cameras": "the cameras of the capture",
+    "stage_lights": "the lights of the capture",
+    "stage_values": "the intensities, colours or --colour-chart of the capture",
     "texture_side": "--texture-size",
+    "width_px": "--width",
 }
 
 Row = dict[str, Any]

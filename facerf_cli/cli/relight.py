@@ -148,7 +148,7 @@ def relight(
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
     balls = [path for setup in plan.maps if options.ball for path in _balls_of(setup, plan, output)]
-    refuse_read([film.path] if film else balls, files_read((items, plan, sources), items))
+    refuse_read([film.path] if film else images + balls, files_read((items, plan, sources), items))
     key = film.key_of_new(items, taken, images, plan.recipes_of, batch) if film else ""
     if film is not None and not key:
         return

@@ -213,7 +213,7 @@ def _conjugate_gradients(system: csr_array, right: np.ndarray, start: np.ndarray
     found, rest = start.copy(), right - system @ start
     inverse, along, before = 1 / system.diagonal(), np.zeros_like(right), np.inf
     for _ in range(_MOST_STEPS):
-        if np.linalg.norm(rest) < _TOLERANCE * np.linalg.norm(right):
+        if np.linalg.norm(rest) <= _TOLERANCE * np.linalg.norm(right):  # of nothing, too
             break
         scaled = inverse * rest
         now = rest @ scaled
