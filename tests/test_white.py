@@ -126,7 +126,7 @@ def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
     photo = astronaut.photo() * ORANGE.numpy()
     skin, shirt = {}, {}
     for white in ("photo", "scene"):
-        found = reflectance_of(astronaut.models(), in_orange(), "portrait", photo=photo, white=white)  # type: ignore[arg-type]
+        found = reflectance_of(astronaut.models(), in_orange(), "portrait", photo=photo, white=white)
         assert isinstance(found, PortraitField)
         maps, classes = found.views[0].maps, found.views[0].person.classes
         skin[white], shirt[white] = (
@@ -136,9 +136,9 @@ def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
         taken = (part["photo"] / part["scene"]).log()
         light = [float(taken[k] - taken[1]) for k in (0, 2)]
         assert light[0] > 0.3 and light[1] < -0.3
-    light = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
+    toward = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
     shown = [
-        next(predict_olat(astronaut.models(), astronaut.head(), light, white=white, network_alone=alone))
+        next(predict_olat(astronaut.models(), astronaut.head(), toward, white=white, network_alone=alone))
         for white in ("photo", None)
         for alone in (False, True)
     ]
