@@ -294,7 +294,7 @@ def test_a_model_of_rembg_gives_the_matte_and_its_licence_is_said(
     assert row["matte_from"] == expected
     rembg.write_bytes(b"other weights")
     assert facerf("segment", *line, "--dry-run") == 0
-    assert "made again: made from other options: --matte-model" in capsys.readouterr().err
+    assert "made from other options: the model of --matte-from" in capsys.readouterr().err
 
 
 def test_models_that_are_not_there_are_refused_with_the_command_that_fetches_them(
