@@ -17,14 +17,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from facerf_cli.light.picture import COLUMNS, ROWS, PictureLightNetwork
-from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
+from facerf_cli.light.sphere import LUMINANCE, latlong_directions, latlong_solid_angles
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 
 SEED = 53001
 MAPS, TURNS, STEPS, BATCH, RATE = 3600, 4, 700, 64, 2e-3  # more steps fit drawn maps better, real ones worse
 _MAP_PX, _TRUTH_ROWS = 256, 16  # width of a drawn map; rows of the map that is compared
 _ASPECTS = (3 / 2, 3 / 2, 4 / 3, 16 / 9, 1.0, 3 / 4, 2 / 3)
-_LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
 _SAMPLES = 2  # rays a pixel of a view, along each side
 
 
@@ -79,10 +78,10 @@ def photographed(views: Tensor, generator: torch.Generator) -> tuple[Tensor, Ten
     """Views [B, 3, h, w] of radiance as cameras give them, decoded from sRGB; and the gain [B, 3] to them."""
     count = len(views)
     mean = views.mean((2, 3)).clamp_min(1e-4)
-    level = mean @ _LUMINANCE
+    level = mean @ torch.tensor(LUMINANCE)
     gain = 0.2 * torch.exp(0.5 * torch.randn(count, generator=generator)) / level
     balance = torch.exp(0.12 * torch.randn(count, 3, generator=generator))
-    balance /= (balance @ _LUMINANCE)[:, None]
+    balance /= (balance @ torch.tensor(LUMINANCE))[:, None]
     tint = torch.exp(0.25 * torch.randn(count, 3, generator=generator))
     cast = (mean * tint / level[:, None]).clamp(0.2, 5)
     balance = balance * cast ** -(0.8 * torch.rand(count, 1, generator=generator))

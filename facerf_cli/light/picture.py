@@ -18,13 +18,12 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from facerf_cli.light.sh import sh_basis
-from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
+from facerf_cli.light.sphere import LUMINANCE, latlong_directions, latlong_solid_angles
 
 ASSET = Path(__file__).parents[1] / "assets" / "picture_light.safetensors"
 FOV_DEG = 60.0  # of a picture that does not state its own
 ROWS, COLUMNS = 32, 48  # of what the network sees of a picture, of any aspect
 _MAP_ROWS = 128
-_LUMINANCE = (0.2126, 0.7152, 0.0722)
 _ORDER, _COLOUR_ORDER, _CHANNELS, _CODE = 4, 1, 24, 96
 _DARK, _CLIPPED = 0.02, 0.985  # added to radiance over the mean; display value of a clipped pixel
 _KEPT_COLOUR = 0.7  # power of the light's mean colour
@@ -71,7 +70,7 @@ def _less_coloured(envmap: Tensor) -> Tensor:
     """A map whose mean colour is nearer grey: part of a picture's colour is that of the things in it."""
     solid_angles = latlong_solid_angles(*envmap.shape[:2])[..., None]
     mean = (envmap * solid_angles).sum((0, 1))
-    cast = mean / (mean @ mean.new_tensor(_LUMINANCE))
+    cast = mean / (mean @ mean.new_tensor(LUMINANCE))
     return envmap * cast ** (_KEPT_COLOUR - 1)
 
 
@@ -110,7 +109,7 @@ class PictureLightNetwork(nn.Module):
         `linear` [B, 3, 32, 48] is the picture, scene-linear with 1 where it clips; `tangents` [B, 2] are
         those of half its angles of view, across and down.
         """
-        weights = linear.new_tensor(_LUMINANCE)
+        weights = linear.new_tensor(LUMINANCE)
         mean = linear.mean((2, 3)).clamp_min(1e-4)
         level = (mean * weights).sum(1)
         logs = torch.log(linear / level[:, None, None, None] + _DARK)
