@@ -25,7 +25,7 @@ from facerf_cli.files.light_files import read_map_file
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.light.envmap import look_up, resampled
 from facerf_cli.light.picture import light_of_picture
-from facerf_cli.light.sphere import latlong_directions, latlong_solid_angles
+from facerf_cli.light.sphere import LUMINANCE, latlong_directions, latlong_solid_angles
 from tools.picture_network import ball_error, ball_normals, colour_error
 
 ROWS, COLUMNS, FOV_DEG, TURNS = 160, 240, 60.0, 4
@@ -34,7 +34,7 @@ TRUTH_ROWS = 128
 DIRECTIONS = latlong_directions(TRUTH_ROWS, 2 * TRUTH_ROWS)
 SOLID_ANGLES = latlong_solid_angles(TRUTH_ROWS, 2 * TRUTH_ROWS)
 NORMALS = ball_normals()
-LUMINANCE = torch.tensor([0.2126, 0.7152, 0.0722])
+WEIGHTS = torch.tensor(LUMINANCE)
 
 
 def main() -> None:
@@ -70,7 +70,7 @@ def cases_of(envmap: Tensor) -> list[tuple[Tensor, Tensor]]:
     for turn in range(TURNS):
         turned = torch.roll(envmap, turn * envmap.shape[1] // TURNS, 1)
         view = look_up(turned, directions).reshape(ROWS, COLUMNS, 3)
-        gain = MEAN / (view @ LUMINANCE).mean()
+        gain = MEAN / (view @ WEIGHTS).mean()
         stored = np.round(linear_to_srgb((view * gain).clamp(0, 1).numpy()) * 255) / 255
         picture = torch.from_numpy(srgb_to_linear(stored.astype(np.float32)))
         cases.append((picture, resampled(turned, TRUTH_ROWS) * gain))
@@ -80,7 +80,7 @@ def cases_of(envmap: Tensor) -> list[tuple[Tensor, Tensor]]:
 def figures(guess: Tensor, truth: Tensor) -> Tensor:
     """Error, colour and level [3] of a guessed map, against the truth, both [128, 256, 3]."""
     lit, truly = (on_ball(envmap)[None] for envmap in (guess, truth))
-    level = torch.log2((lit @ LUMINANCE).mean() / (truly @ LUMINANCE).mean()).abs()
+    level = torch.log2((lit @ WEIGHTS).mean() / (truly @ WEIGHTS).mean()).abs()
     return torch.stack([ball_error(lit, truly)[0], colour_error(lit, truly)[0], level])
 
 

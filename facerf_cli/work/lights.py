@@ -19,6 +19,7 @@ from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.outputs import Exposure, OutputImage, write_output
+from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import face_model
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map
@@ -52,7 +53,7 @@ def _is_readable(envmap: MapSource) -> bool:
 def read_map(envmap: MapSource) -> Tensor:
     """A lat-long map [H, W, 3], scene-linear; raises InputError that names what is wrong with it."""
     if isinstance(envmap, PhotoLight):
-        return _map_of_photo(envmap)
+        return _map_of_photo(envmap.path, envmap.options)
     if isinstance(envmap, DrawnMap):
         from facerf_cli.synth.sky.skies import draw_sky
 
@@ -64,11 +65,11 @@ def read_map(envmap: MapSource) -> Tensor:
 
 
 @cache
-def _map_of_photo(photo: PhotoLight) -> Tensor:
+def _map_of_photo(path: Path, options: LightOptions) -> Tensor:
     """Estimated once a process, in the half floats of the file that `facerf estimate-light` writes."""
     from facerf_cli.work.light_of_photo import map_of_photo
 
-    return map_of_photo(photo.path, photo.options, _LIGHT_WIDTH_PX // 2).half().float()
+    return map_of_photo(path, options, _LIGHT_WIDTH_PX // 2).half().float()
 
 
 @step("light")
