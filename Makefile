@@ -1,10 +1,10 @@
-# make demo | test | test-slow | lint | bench | man | completions | dist. The first call makes the virtual environment.
+# make demo | test | test-slow | lint | docs | bench | man | completions | dist. The first call makes the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 STAMP := $(VENV)/.installed
 FACERF := $(VENV)/bin/facerf
 
-.PHONY: demo test test-slow lint bench man completions dist setup clean
+.PHONY: demo test test-slow lint docs bench man completions dist setup clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml constraints.txt
@@ -34,6 +34,10 @@ test-slow: $(STAMP)
 bench: $(STAMP)
 	set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(VENV)/bin/python $$script; done
 
+# The site, into site/; a dead link or a warning fails.
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
+
 man: $(STAMP)
 	$(VENV)/bin/python -m facerf_cli.cli.manual man man
 
@@ -45,4 +49,4 @@ dist: $(STAMP)
 	$(VENV)/bin/python -m build --no-isolation
 
 clean:
-	rm -rf out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf out build dist site *.egg-info .mypy_cache .ruff_cache .pytest_cache

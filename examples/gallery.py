@@ -1,6 +1,6 @@
 """Draw the images of docs/gallery.md: two people, cut out, and under lights that facerf does well and badly.
 
-    python examples/gallery.py [GRACE_HOPPER.jpg [DOCS]]
+    python examples/gallery.py [GRACE_HOPPER.jpg [FOLDER]]
 
 The second photo is matplotlib's sample data (U.S. Navy, public domain); without an argument it is that of
 an installed matplotlib. Each row: the photo, then its lights in the order of `ROWS`.
@@ -74,7 +74,7 @@ def beside(images: list[np.ndarray]) -> np.ndarray:
 if __name__ == "__main__":
     given = [Path(argument) for argument in sys.argv[1:]]
     second = given[0] if given else hopper()
-    target = given[1] if given[1:] else HERE.parent / "docs"
+    target = given[1] if given[1:] else HERE.parent / "docs/pictures"
     for name, lights in (("well", WELL), ("badly", BADLY)):
         for photo in (HERE / "astronaut.jpg", second):
             write_display(target / f"gallery_{photo.stem}_{name}.jpg", row(photo, lights), 0.0)

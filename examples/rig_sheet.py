@@ -52,6 +52,6 @@ def labelled(image: np.ndarray, text: str) -> np.ndarray:
 
 if __name__ == "__main__":
     given = [Path(argument) for argument in sys.argv[1:]]
-    defaults = [HERE / "astronaut.jpg", HERE / "rigs.jpg"]
+    defaults = [HERE / "astronaut.jpg", HERE.parent / "docs/pictures/rigs.jpg"]
     photo, target = given + defaults[len(given) :]
     write_display(target, sheet(photo))

@@ -59,7 +59,7 @@ def test_the_wheel_has_all_of_the_package_and_its_documents(wheel: zipfile.ZipFi
     shared = {name.removeprefix(f"{DATA}/share/") for name in wheel.namelist() if name.startswith(DATA)}
     assert shared == (
         {f"man/man1/{Path(name).name}" for name in tracked("man/*.1")}
-        | {f"doc/facerf/{name}" for name in tracked("docs/*") | tracked("examples/**/*")}
+        | {f"doc/facerf/{name}" for name in tracked("docs/**/*") | tracked("examples/**/*")}
         | {f"doc/facerf/{name}" for name in ("README.md", "MODEL_CARD.md", "CHANGELOG.md")}
         | {"bash-completion/completions/facerf.bash", "zsh/site-functions/_facerf"}
         | {"fish/vendor_completions.d/facerf.fish"}

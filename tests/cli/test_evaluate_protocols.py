@@ -83,7 +83,7 @@ def test_a_checkpoint_of_another_layout_is_said_once(tmp_path: Path, capsys: Sai
     layout = {"layout_version": 99, "networks": {"reflectance": {"form": "default"}}}
     save_checkpoint(tmp_path / "other.safetensors", {}, layout)
     words = ["-o", tmp_path / "x", "--against", tmp_path / "other.safetensors"]
-    assert run("reconstruction", PHOTO, PHOTO.with_name("rigs.jpg"), *words) == 1
+    assert run("reconstruction", PHOTO, PHOTO.parents[1] / "docs/pictures/rigs.jpg", *words) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "other.safetensors: trained for another UV layout" in line
 

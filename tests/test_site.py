@@ -1,0 +1,45 @@
+"""The site of the documents: pages made of other files, and links; `make docs` builds all of it, strictly."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+pytest.importorskip("mkdocs")
+from mkdocs.structure.files import Files
+
+from tools import pages
+
+
+def linked(uri: str, markdown: str) -> str:
+    config: Any = SimpleNamespace(repo_url="https://host/facerf", site_dir="site", use_directory_urls=False)
+    config.plugins = SimpleNamespace(_current_plugin=None)
+    files = pages.on_files(Files([]), config)
+    page: Any = SimpleNamespace(file=SimpleNamespace(src_uri=uri))
+    return pages.on_page_markdown(markdown, page, config, files)
+
+
+@pytest.mark.parametrize(
+    ("uri", "link", "becomes"),
+    [
+        ("paper.md", "(../examples/README.md#a)", "(https://host/facerf/blob/main/examples/README.md#a)"),
+        ("index.md", "(benchmarks)", "(https://host/facerf/tree/main/benchmarks)"),
+        ("lights.md", "(../README.md#use)", "(index.md#use)"),
+        ("index.md", "(docs/gone.md)", "(gone.md)"),  # which mkdocs refuses
+        ("paper.md", "(https://host/x.md)", "(https://host/x.md)"),
+    ],
+)
+def test_links_lead_to_pages_or_to_the_repository(uri: str, link: str, becomes: str) -> None:
+    assert linked(uri, f"[a]{link}") == f"[a]{becomes}"
+
+
+def test_a_verb_has_a_page_of_its_manual_and_of_its_own_verbs() -> None:
+    page = "\n".join(pages._manual("face-model"))
+    assert page.startswith("# facerf face-model\n") and "\n## facerf face-model fetch\n" in page
+    assert "`KIND <ict-facekit>`\n:   ict" in page and "\\-" not in page
+    assert "```sh\nfacerf face-model list\n" in page
+    assert "relight-dataset" not in "\n".join(pages._manual("relight"))
+
+
+def test_text_of_the_manual_is_shown_literally() -> None:
+    assert pages._text(r"a_b `c_d` \-\-x <y> \fBz\fR") == r"a\_b `c_d` --x &lt;y> z"

@@ -1,0 +1,100 @@
+"""Hooks of mkdocs (mkdocs.yml): pages made of other files, and links that leave the folder of pages.
+
+The README is the home page; each verb's page is made of its man pages. A link to a file that is no page
+becomes its address in the repository.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from posixpath import join, normpath, relpath
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+from facerf_cli.main import VERBS
+
+ROOT = Path(__file__).parents[1]
+MADE = {"README.md": "index.md", "MODEL_CARD.md": "model_card.md"}  # files of the root to pages of the site
+_LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#]+)")
+_CODE_OR_SPECIAL = re.compile(r"`[^`]*`|[*_<]")
+_API = "# Python API\n\n[Python](python.md) shows how it is used.\n\n::: facerf_cli.api\n"
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are not in docs/."""
+    made = {page: (ROOT / source).read_text() for source, page in MADE.items()} | {"api.md": _API}
+    made |= {f"verbs/{verb}.md": "\n".join(_manual(verb)) for verb in ("facerf", *VERBS)}
+    for page, text in made.items():
+        files.append(File.generated(config, page, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn each link to a file into one to its page, or to the repository; mkdocs refuses what is neither."""
+    uri = page.file.src_uri
+    folder = "" if uri in MADE.values() else "docs"
+
+    def address(link: re.Match[str]) -> str:
+        path = normpath(join(folder, link[1]))
+        target = MADE.get(path, path.removeprefix("docs/"))
+        if files.get_file_from_path(target) or not (ROOT / path).exists():
+            return relpath(target, Path(uri).parent)
+        return f"{config.repo_url}/{'tree' if (ROOT / path).is_dir() else 'blob'}/main/{path}"
+
+    return markdown if uri.startswith("verbs/") else _LINK.sub(address, markdown)
+
+
+def _manual(verb: str) -> Iterator[str]:
+    """The lines of a verb's page: its man page, and those of the verbs within it."""
+    name = "facerf" if verb == "facerf" else f"facerf-{verb}"
+    yield from _markdown(ROOT / f"man/{name}.1")
+    for page in sorted((ROOT / "man").glob(f"{name}-*.1")):
+        if verb != "facerf" and page.stem.removeprefix("facerf-") not in VERBS:
+            yield from _markdown(page, "##")
+
+
+def _markdown(page: Path, heading: str = "#") -> Iterator[str]:
+    """The lines of a man page as `facerf_cli.cli.manual` writes it, as Markdown."""
+    lines = iter(page.read_text().splitlines())
+    section, in_code = "NAME", False
+    for line in lines:
+        macro, _, rest = line.partition(" ")
+        if macro == ".SH":
+            section = rest
+        if (
+            section in ("NAME", "SEE ALSO")
+            or line == ".SH SYNOPSIS"
+            or (section == "EXIT STATUS" and page.stem != "facerf")
+        ):
+            continue
+        match macro:
+            case ".SH" | ".SS":
+                yield f"\n{heading}{'#' * (1 + (macro == '.SS'))} {_text(rest).capitalize()}\n"
+            case ".TP":
+                term, meaning = next(lines), next(lines)
+                yield f"\n`{_plain(term)}`\n:   {_text(meaning)}"
+            case ".nf" | ".fi":
+                in_code = not in_code
+                yield "```sh" if in_code else "```"
+            case ".B":
+                yield f"{heading} {_plain(rest)}\n\n`{_plain(rest)} {_plain(next(lines))}`"
+            case ".PP":
+                yield ""
+            case _:
+                yield _plain(line) if in_code else _text(line)
+
+
+def _plain(text: str) -> str:
+    """The text of a line of troff."""
+    text = re.sub(r"\\f[BR]|\\&", "", text)
+    return text.replace(r"\-", "-").replace(r"\e", "\\")
+
+
+def _text(text: str) -> str:
+    """A line of troff as Markdown that shows it literally, but for code between backquotes."""
+    return _CODE_OR_SPECIAL.sub(
+        lambda found: {"<": "&lt;"}.get(found[0], found[0] if found[0][0] == "`" else f"\\{found[0]}"),
+        _plain(text),
+    )
