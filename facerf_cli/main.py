@@ -24,28 +24,30 @@ import typer
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.settings import Settings, device_name
+from facerf_cli.cli.brief import Verb, Verbs
 from facerf_cli.cli.examples import epilog_of, examples_of
-from facerf_cli.cli.options import EPILOG, HELP_NAMES, unwrapped, was_given, with_groups
+from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals
 from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 
-# The verbs in the order of a user's day, and their panels of the help.
+# The verbs in the order of a user's day, and their panels of the help, which say what one wants to do.
 VERBS = {
     verb: panel
     for panel, verbs in {
-        "Photos": ("relight", "view", "estimate-light", "predict-olat", "segment", "fit-geometry"),
-        "Light": ("convert-light", "envmap"),
-        "Data, training, evaluation": (
+        "Relight photos": ("relight", "view"),
+        "Take photos apart": ("estimate-light", "predict-olat", "segment", "fit-geometry"),
+        "Make and convert light": ("convert-light", "envmap"),
+        "Train and evaluate": (
             "synth-stage",
             "prepare-dataset",
             "relight-dataset",
             "train",
             "evaluate",
         ),
-        "Installation": ("check", "doctor", "config", "face-model"),
+        "Look after facerf": ("check", "doctor", "config", "face-model"),
     }.items()
     for verb in verbs
 }
@@ -105,18 +107,18 @@ def _command(name: str) -> Any:
     verbs = getattr(file, "app", None)
     if verbs is None:
         verbs = typer.Typer(add_completion=False)
-        verbs.command(name, context_settings=HELP_NAMES)(with_groups(getattr(file, name.replace("-", "_"))))
+        verbs.command(name)(with_groups(getattr(file, name.replace("-", "_"))))
     for one in verbs.registered_commands:
         assert one.callback is not None
         own = one.name or one.callback.__name__.replace("_", "-")
-        one.help = unwrapped(one.callback.__doc__ or "")
+        one.cls, one.help = Verb, unwrapped(one.callback.__doc__ or "")
         one.epilog = epilog_of(own if own == name else f"{name} {own}", EPILOG)
     found = typer.main.get_command(verbs)
     found.name, found.rich_help_panel = name, VERBS[name]  # type: ignore[attr-defined]
     return found
 
 
-class _Verbs(typer.core.TyperGroup):
+class _Verbs(Verbs):
     """The group of all verbs."""
 
     def __init__(self, **settings: Any) -> None:
@@ -129,7 +131,6 @@ app = typer.Typer(
     name="facerf",
     help="One photo of a face in; the face under any light, from any direction, out.",
     pretty_exceptions_enable=False,
-    context_settings=HELP_NAMES,
 )
 
 
@@ -217,6 +218,9 @@ def _global_options(
         memory_bytes=limit_bytes,
     )
     memory.set_limit(context.obj.job_bytes(1))
+
+
+_global_options.everyday = {"version"}  # type: ignore[attr-defined]  # so that verbs fill the screen
 
 
 def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, ...]:

@@ -28,6 +28,7 @@ class Option:
     metavar: str | None = None
     flags: tuple[str, ...] = ()  # --field-name where there are none
     panel: str | None = None  # of the help
+    everyday: bool = False  # in --help, as is what the verb's examples use; others are in --help-all
     shown_default: bool | str = True  # shown in the help: the default, a text in its place, or nothing
     least: float | None = None
     most: float | None = None

@@ -216,10 +216,10 @@ class BatchOptions:
         typed=Path,
         parse=folder_not_file,
     )
-    overwrite: Overwrite = option("changed", in_recipe=False, panel=BATCH)
+    overwrite: Overwrite = option("changed", in_recipe=False, panel=BATCH, everyday=True)
     dry_run: bool = option(False, in_recipe=False, panel=BATCH)
     jobs: int | None = option(
-        None, in_recipe=False, flags=("--jobs", "-j"), shown_default="1", least=1, panel=BATCH
+        None, in_recipe=False, flags=("--jobs", "-j"), shown_default="1", least=1, panel=BATCH, everyday=True
     )
     shard: Shard = option(
         Shard(), metavar="K/N", in_recipe=False, shown_default="all items", parse=Shard.parse, panel=BATCH

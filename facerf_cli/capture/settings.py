@@ -19,7 +19,7 @@ class ReadSettings:
         align: Shift frames in which the head has moved back to its place.
     """
 
-    layout: str = option("stage", metavar="NAME", panel=CAPTURE)
+    layout: str = option("stage", metavar="NAME", panel=CAPTURE, everyday=True)
     subtract_ambient: bool = option(False, panel=CORRECTION)
     align: bool = option(False, panel=CORRECTION)
 
@@ -35,7 +35,7 @@ class ChartSettings:
             images in the order of the cameras, separated by ;.
     """
 
-    colour_chart: str = option("", metavar="IMAGE", shown_default=False, panel=CORRECTION)
+    colour_chart: str = option("", metavar="IMAGE", shown_default=False, panel=CORRECTION, everyday=True)
     chart_corners: str = option("", metavar="'X,Y X,Y X,Y X,Y'", shown_default=False, panel=CORRECTION)
 
 

@@ -7,13 +7,15 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.cli.options import HELP_NAMES, is_default, refuse_given, settings_of, with_groups
+from facerf_cli.cli.brief import Verbs
+from facerf_cli.cli.options import is_default, refuse_given, settings_of, with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.options import EvaluateOptions, has_own_field_alone
 from facerf_cli.option import Only, Without
 from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptions
 
 app = typer.Typer(
+    cls=Verbs,
     add_completion=False,
     help="Measure the paper's tables on prepared data and photos, and other methods' images.",
 )
@@ -185,7 +187,7 @@ def pairs(
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
-    app.command(context_settings=HELP_NAMES)(with_groups(_protocol))
+    app.command()(with_groups(_protocol))
 
 
 def _evaluate(

@@ -7,12 +7,13 @@ from typing import Annotated, Literal
 import typer
 
 from facerf_cli.batch.inputs import refuse_read
+from facerf_cli.cli.brief import Verbs
 from facerf_cli.errors import UsageError
 from facerf_cli.run.logs import LOGGER_NAME, json_line
 
 _IMAGES = (".png", ".jpg", ".jpeg")
 log = logging.getLogger(LOGGER_NAME)
-app = typer.Typer(add_completion=False, help="Import, fetch, list and show morphable face models.")
+app = typer.Typer(cls=Verbs, add_completion=False, help="Import, fetch, list and show morphable face models.")
 
 Kind = Literal["ict-facekit", "flame", "basel-2009", "basel-2017", "basel-2019"]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]

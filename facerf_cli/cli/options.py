@@ -16,10 +16,10 @@ from facerf_cli.errors import UsageError
 from facerf_cli.option import PANELS, Only, Option, Without, attributes_of, flag
 
 EPILOG = (
-    "Global options (--checkpoint, --device, --memory, --seed, -v, -q; see 'facerf --help') may stand before "
-    "or after the verb."
+    "Global options (--checkpoint, --device, --memory, --seed, -v, -q; see 'facerf --help-all') may stand "
+    "before or after the verb."
 )
-HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+_MANY = 14  # parameters of a verb whose --help leaves some out
 
 
 def settings_of(context: typer.Context) -> Settings:
@@ -110,6 +110,8 @@ def with_groups(verb: Callable[..., Any]) -> Callable[..., Any]:
     as_typer_reads_it.__signature__ = inspect.Signature(parameters)
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     run.__name__, run.__doc__ = verb.__name__, verb.__doc__
+    if len(parameters) > _MANY:
+        as_typer_reads_it.everyday = {one.name for one in parameters if getattr(_note(one), "everyday", True)}
     return run
 
 
@@ -177,6 +179,7 @@ def _parameter(name: str, field: "dataclasses.Field[Any]", kind: Any, help: str)
         min=about.least,
         max=about.most,
     )
+    declared.everyday = about.everyday or about.required or field.default is dataclasses.MISSING
     default = field.default
     if about.parse is not None or about.typed is not None:
         kind, default = about.typed or str | None, about.default_text
@@ -186,8 +189,12 @@ def _parameter(name: str, field: "dataclasses.Field[Any]", kind: Any, help: str)
     return inspect.Parameter(name, keyword, default=default, annotation=Annotated[kind, declared])
 
 
+def _note(parameter: inspect.Parameter) -> Any:
+    """The declaration of a parameter that typer reads; None of the context."""
+    return next(iter(getattr(parameter.annotation, "__metadata__", ())), None)
+
+
 def _place(parameter: inspect.Parameter) -> int:
     """The place of a parameter's panel; those that a verb has for itself come first."""
-    notes = getattr(parameter.annotation, "__metadata__", ())
-    panel = next((getattr(note, "rich_help_panel", None) for note in notes), None)
+    panel = getattr(_note(parameter), "rich_help_panel", None)
     return PANELS.index(panel) if panel in PANELS else -1

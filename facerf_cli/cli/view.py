@@ -27,7 +27,7 @@ class MakePage(PhotoWork):
     """
 
     photo: Annotated[PhotoOptions, Without("texture_side")]
-    size_px: int = option(1024, metavar="PX", least=256, most=4096, panel=IMAGE)
+    size_px: int = option(1024, metavar="PX", least=256, most=4096, panel=IMAGE, everyday=True)
     white: White = white_option()
     verb, endings, networks = "view", (_PAGE,), networks_of(["portrait"])
     alone_as = (_PAGE,)

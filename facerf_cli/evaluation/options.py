@@ -118,7 +118,7 @@ class EvaluateOptions(BatchOptions):
         preset: Measure as many images as the paper did.
     """
 
-    split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA)
+    split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA, everyday=True)
     every: int = option(1, metavar="N", least=1, panel=DATA)
     pairs: Path | None = option(None, metavar="FILE", shown_default="those of the split", panel=DATA)
     joint_fit: bool = option(False, panel=DATA)
@@ -162,12 +162,18 @@ class EvaluateOptions(BatchOptions):
     )
     held_to_photo: bool = option(False, flags=("--held-to-photo",), panel=METHODS)
     compare: tuple[Path, ...] = option(
-        (), metavar="DIR", shown_default="none", typed=list[Path] | None, parse=tuple, panel=METHODS
+        (),
+        metavar="DIR",
+        shown_default="none",
+        typed=list[Path] | None,
+        parse=tuple,
+        panel=METHODS,
+        everyday=True,
     )
     pictures: bool = option(False, panel=MEASURES)
     keep_eyes: bool = option(False, panel=MEASURES)
     measures: Measures = Measures()
-    preset: Literal["paper"] | None = option(None, shown_default="none", panel=MEASURES)
+    preset: Literal["paper"] | None = option(None, shown_default="none", panel=MEASURES, everyday=True)
     # What the command line fills in.
     network_alone: bool = True  # the photo does not correct the field
     non_negative: bool = True  # the light's least squares

@@ -24,10 +24,12 @@ class StageSettings:
         frame: Show the head down to the collar, or a bust down to the chest.
     """
 
-    size_px: int = option(256, metavar="PX", panel=_IMAGE, flags=("--size",), least=64, most=1024)
+    size_px: int = option(
+        256, metavar="PX", panel=_IMAGE, flags=("--size",), least=64, most=1024, everyday=True
+    )
     face_model: str = option("builtin", metavar="NAME|PATH", panel=_STAGE)
     renderer: Renderer = option("bake", panel=_IMAGE)
     lights: int = option(150, metavar="N", panel=_STAGE, least=4, most=1000)
-    cameras: int = option(8, metavar="N", panel=_STAGE, least=1, most=8)
+    cameras: int = option(8, metavar="N", panel=_STAGE, least=1, most=8, everyday=True)
     seed: int = 0
     frame: Frame = option("head", panel=_IMAGE)

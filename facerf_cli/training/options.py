@@ -86,10 +86,11 @@ class TrainOptions:
         shown_default="joint with --preset paper, else reflectance",
         typed=Stage | None,
         panel=RUN,
+        everyday=True,
     )
     resume: bool = option(False, panel=RUN)
-    dry_run: bool = option(False, panel=RUN)
-    start_from: Path | None = option(None, metavar="FILE", shown_default="none", panel=RUN)
+    dry_run: bool = option(False, panel=RUN, everyday=True)
+    start_from: Path | None = option(None, metavar="FILE", shown_default="none", panel=RUN, everyday=True)
     dataset: Path | None = option(None, metavar="DIR", shown_default="synthetic heads", panel=DATA)
     texture_size: int | None = option(
         None,

@@ -62,7 +62,9 @@ class LightSources:
 
     envmap: list[str] | None = option(None, metavar="MAP|DIR", shown_default=False, panel=LIGHT)
     light: list[str] | None = option(None, metavar="LIGHT", shown_default=False, panel=LIGHT)
-    light_from: list[str] | None = option(None, metavar="PHOTO|DIR", shown_default=False, panel=LIGHT)
+    light_from: list[str] | None = option(
+        None, metavar="PHOTO|DIR", shown_default=False, panel=LIGHT, everyday=True
+    )
     fov_deg: float | None = fov_option()
     room: str | None = option(
         None, metavar="SHARE|MAP|none", shown_default="0.06; 0.03 before black", panel=LIGHT

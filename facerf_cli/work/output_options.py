@@ -84,6 +84,7 @@ class OutputOptions:
         shown_default="exr,png; with -o - png",
         parse=parse_formats,
         panel=IMAGE,
+        everyday=True,
     )
     output_colourspace: str | None = option(None, metavar="NAME", shown_default="linear Rec.709", panel=IMAGE)
     compression: Compression = option("zip", metavar="NAME", panel=IMAGE)

@@ -85,7 +85,7 @@ class PhotoOptions:
     )
     layer: str | None = option(None, metavar="NAME", shown_default="the image", panel=IMAGE)
     face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
-    face: str = option("largest", metavar="largest|all|INDEX", panel=FACE)
+    face: str = option("largest", metavar="largest|all|INDEX", panel=FACE, everyday=True)
     landmarks: Path | None = option(None, metavar=COMPANION, shown_default="detect them", panel=FACE)
     geometry: Geometry | None = option(None, shown_default="as the checkpoint was trained", panel=FACE)
     texture_side: int | None = option(

@@ -143,7 +143,9 @@ class RelightOptions:
 
     photo: PhotoOptions
     rig: str = option("150", metavar="N|FILE", flags=("--lights",), panel=LIGHT)
-    pose: str | None = option(None, metavar="YAW,PITCH,ROLL", shown_default="the photo's", panel=IMAGE)
+    pose: str | None = option(
+        None, metavar="YAW,PITCH,ROLL", shown_default="the photo's", panel=IMAGE, everyday=True
+    )
     reflectance: RelightKind = option("portrait", metavar="KIND", panel=METHOD)
     exposure: Exposure | None = option(
         None,
@@ -151,6 +153,7 @@ class RelightOptions:
         shown_default="auto; 0 with own",
         parse=parse_exposure,
         panel=IMAGE,
+        everyday=True,
     )
     exposure_group: ExposureGroup = option("photo", metavar="KIND", panel=IMAGE)
     output: OutputOptions = field(default_factory=OutputOptions)
@@ -161,6 +164,7 @@ class RelightOptions:
         default_text="photo",
         parse=parse_background,
         panel=IMAGE,
+        everyday=True,
     )
     background_blur: float = option(
         0.01,

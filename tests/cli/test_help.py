@@ -33,13 +33,14 @@ CONTEXT = typer.Context(ROOT)
 MAN = Path(__file__).parents[2] / "man"
 
 
-def test_the_order_is_that_of_a_day(capsys: Said) -> None:
+def test_the_order_is_that_of_a_day(capsys: Said, monkeypatch: Patch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
     assert main(["--help"]) == 0
     lines = [line.strip("│╭─╮ ") for line in capsys.readouterr().out.splitlines()]
     first = [line.split()[0] for line in lines if line]
-    order = ["Photos", "relight", "estimate-light", "predict-olat", "segment", "fit-geometry"]
-    order += ["Light", "convert-light", "envmap", "Data,", "synth-stage", "prepare-dataset"]
-    order += ["relight-dataset", "train", "evaluate", "Installation", "doctor", "face-model"]
+    order = ["Relight", "relight", "Take", "estimate-light", "predict-olat", "segment", "fit-geometry"]
+    order += ["Make", "convert-light", "envmap", "Train", "synth-stage", "prepare-dataset"]
+    order += ["relight-dataset", "train", "evaluate", "Look", "doctor", "face-model"]
     assert [word for word in first if word in order] == order
 
 
@@ -65,7 +66,7 @@ def test_help_and_man_pages_have_panels_paragraphs_and_brackets(capsys: Said, tm
     panels = [line.removeprefix(".SS ") for line in page.splitlines() if line.startswith(".SS ")]
     assert panels == ["Light", "Image", "Face", "Method", "Batch"]
     top = manual.pages()["facerf.1"]
-    assert top.index("fBrelight\\fR") < top.index(".SS Light") < top.index("fBenvmap\\fR")
+    assert top.index("fBrelight\\fR") < top.index(".SS Make") < top.index("fBenvmap\\fR")
     assert manual._text(".a-b\\c") == "\\&.a\\-b\\ec"
     assert main(["config", "--help"]) == 0
     assert "([relight]," in capsys.readouterr().out
@@ -75,10 +76,62 @@ def test_help_and_man_pages_have_panels_paragraphs_and_brackets(capsys: Said, tm
     assert {path.name for path in tmp_path.iterdir()} == set(manual.pages())
 
 
-def test_the_longest_help_is_under_190_lines(capsys: Said, monkeypatch: Patch) -> None:
+def _shown(capsys: Said, *line: str) -> list[str]:
+    """The lines of a help."""
+    assert main(list(line)) == 0
+    return capsys.readouterr().out.splitlines()
+
+
+def _named(lines: list[str]) -> set[str]:
+    """The options that a help lists; a name in angles or a metavar may follow."""
+    return {word for line in lines if line.startswith("│") for word in line.split()[:3] if word[:2] == "--"}
+
+
+def test_help_has_the_dozen_options_of_everyday_use_and_says_how_to_see_all(
+    capsys: Said, monkeypatch: Patch
+) -> None:
     monkeypatch.setenv("COLUMNS", "100")
-    assert main(["relight", "--help"]) == 0
-    assert 60 < len(capsys.readouterr().out.splitlines()) < 190
+    brief, full = _shown(capsys, "relight", "--help"), _shown(capsys, "relight", "--help-all")
+    assert len(brief) < 90 and 150 < len(full) < 200
+    assert {"--output", "--light", "--background", "--face", "--jobs"} < _named(brief)
+    assert len(_named(brief)) <= 16 and "--shard" not in _named(brief)
+    left = len(_named(full)) - len(_named(brief))
+    assert f" {left} more options: facerf relight --help-all, or man facerf-relight." in map(
+        str.rstrip, brief
+    )
+    assert not any("more options" in line for line in full)
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "--device" not in _named(_shown(capsys)) and "--device" in _named(_shown(capsys, "--help-all"))
+
+
+@pytest.mark.parametrize("path", [path for path, _ in manual._walk(CONTEXT, ROOT, ()) if path])
+def test_help_all_and_the_man_page_have_every_option(
+    path: tuple[str, ...], capsys: Said, monkeypatch: Patch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    full = " ".join(_shown(capsys, *path, "--help-all"))
+    page = manual.pages()[f"{'-'.join(('facerf', *path))}.1"]
+    command: Any = ROOT
+    for name in path:
+        command = command.commands[name]
+    for option in command.params:
+        if option.param_type_name == "option":
+            assert option.opts[0] in full and manual._text(option.opts[0]) in page
+
+
+@pytest.mark.parametrize(
+    ("line", "near"),
+    {
+        "relight me.jpg --backround none": "--background",
+        "relight me.jpg --ligth 40,20": "--light",
+        "--devise cpu doctor": "--device",
+        "rlight": "'relight'",
+        "evaluate olta": "'olat'",
+    }.items(),
+)
+def test_what_is_mistyped_gets_the_near_name(line: str, near: str, capsys: Said) -> None:
+    assert main(line.split()) == 2
+    assert near in capsys.readouterr().err.partition("see '")[0]
 
 
 @pytest.mark.usefixtures("fresh_command_line")

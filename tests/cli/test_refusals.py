@@ -371,7 +371,7 @@ def test_a_configuration(text: str, words: str, tmp_path: Path, capsys: Said) ->
 
 @pytest.mark.parametrize("name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "pairs"])
 def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said) -> None:
-    assert main(["evaluate", name, "--help"]) == 0
+    assert main(["evaluate", name, "--help-all"]) == 0
     out = capsys.readouterr().out
     assert "--output" in out and "--space" in out and "{options}" not in out
     assert ("--reflectance" in out) == (name != "pairs") and ("--keep-eyes" in out) == (name[0] not in "yp")

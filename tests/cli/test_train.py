@@ -293,7 +293,7 @@ def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: P
 
 
 def test_help_has_its_options_in_groups(capsys: Said) -> None:
-    assert main(["train", "--help"]) == 0
+    assert main(["train", "--help-all"]) == 0
     text = capsys.readouterr().out
     places = [text.index(group) for group in ("The run", "Data", "Length", "Losses and ablations", "Speed")]
     assert places == sorted(places)
