@@ -11,9 +11,11 @@ from facerf_cli._version import __version__ as __version__
 
 if TYPE_CHECKING:
     from facerf_cli.api import (
+        Group,
         Light,
         Person,
         PhotoCamera,
+        find_faces,
         fit,
         load_models,
         read_image,
@@ -22,9 +24,11 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "Group",
     "Light",
     "Person",
     "PhotoCamera",
+    "find_faces",
     "fit",
     "load_models",
     "read_image",

@@ -16,11 +16,22 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files import read, write
 from facerf_cli.light.light import Array, Light, rig
 from facerf_cli.network.files import checkpoint_file
-from facerf_cli.person import Person, PhotoCamera, fit
+from facerf_cli.person import Group, Person, PhotoCamera, find_faces, fit
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.models import load_models as load
 
-__all__ = ["Light", "Person", "PhotoCamera", "fit", "load_models", "read_image", "rig", "write_image"]
+__all__ = [
+    "Group",
+    "Light",
+    "Person",
+    "PhotoCamera",
+    "find_faces",
+    "fit",
+    "load_models",
+    "read_image",
+    "rig",
+    "write_image",
+]
 
 
 def read_image(path: str | Path, colourspace: str | None = None) -> np.ndarray:

@@ -25,7 +25,17 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import require_regular
 from facerf_cli.image.strips import covering, in_strips
 from facerf_cli.light.envmap import Backdrop, check_envmap
-from facerf_cli.light.light import Array, Light, as_light, as_tensor, directions_of, linear_pixels, sums_of
+from facerf_cli.light.light import (
+    Array,
+    Light,
+    as_light,
+    as_tensor,
+    check_finite,
+    check_kind,
+    directions_of,
+    linear_pixels,
+    sums_of,
+)
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
@@ -35,7 +45,7 @@ from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
 from facerf_cli.relighting import White
 from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
 from facerf_cli.relighting.face_in_photo import FaceInPhoto
-from facerf_cli.relighting.field import MEMORY_BYTES, Field
+from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
 from facerf_cli.relighting.people_in_photo import Background as Behind
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
@@ -53,10 +63,33 @@ Background = Literal["photo", "none"] | Array | tuple[float, float, float]
 _LIGHTS_AT_ONCE = 8
 
 
+def find_faces(
+    models: Models,
+    photo: Array,
+    which: str = "all",
+    geometry: Geometry | None = None,
+    name: str = "photo",
+) -> Sequence[FaceBox]:
+    """Find the faces of a photo, from left to right, for `fit`.
+
+    Args:
+        models: The networks and the face model.
+        photo: Scene-linear [H, W, 3].
+        which: "all", "largest", or a number from the left.
+        geometry: By which they will be fitted; see `fit`.
+        name: The photo's name, for messages.
+
+    Raises InputError where no face is found.
+    """
+    chosen = geometry or models.default_geometry
+    return pipeline.find_for(models.networks.people, chosen, _pixels_of(name, photo), name, which)
+
+
 @overload
 def fit(models: Models, photo: Array, *choices: Any, **more: Any) -> "Person": ...
 @overload
 def fit(models: Models, photo: Sequence[Array], *choices: Any, **more: Any) -> "list[Person]": ...
+@torch.no_grad()
 def fit(
     models: Models,
     photo: Array | Sequence[Array],
@@ -68,12 +101,14 @@ def fit(
     texture_side: int | None = None,
     white: White | None = "photo",
     face: FaceBox | None = None,
+    head: Head | None = None,
+    steady: SteadyFrame | None = None,
 ) -> "Person | list[Person]":
     """Fit a person of a photo, by default that with the largest face, once for all lights.
 
     Args:
         models: The networks and the face model, from `load_models`.
-        photo: Scene-linear [H, W, 3]; a list of photos gives a list of people.
+        photo: Scene-linear [H, W, 3], which is not copied; a list of photos gives a list of people.
         landmarks_px: The face's 68 landmarks [68, 2] in the photo's pixels, in place of the detector's.
         geometry: "landmarks", or "network": the Geometry Network regresses the head, without landmarks; by
             default as the networks were trained.
@@ -84,7 +119,9 @@ def fit(
         texture_side: Side of the face's texture in texels; by default that of the networks' training.
         white: Under even white light skin has the colours of the photo; or, of a photo in coloured light, the
             "scene", those without that light; None: those of the networks.
-        face: The face, found in the photo before, in place of the largest one.
+        face: The face, from `find_faces`, in place of the largest one.
+        head: The head, where it was fitted before.
+        steady: What the frames around it steady, of a frame of a shot (`relighting/sequence.py`).
 
     Of a list of photos landmarks and mattes are lists, too. Raises InputError where no face is found or the
     fit fails.
@@ -100,58 +137,29 @@ def fit(
         raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     if landmarks_px is not None and geometry == "network":
         raise UsageError("geometry: 'network' uses no landmarks; leave one out")
-
-    def fitted(name: str, photo: Array, landmarks_px: Any, matte: Any) -> "Person":
-        pixels = linear_pixels(name, photo).detach().clone().numpy()
-        found = face
+    if isinstance(photo, Sequence):
+        marks, mattes = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte))
+        people = []
+        for number, (one, points, share) in enumerate(zip(photo, marks, mattes, strict=True)):
+            if points is None:
+                (face,) = find_faces(models, one, "largest", geometry, f"photo {number}")
+            choices = geometry, reflectance, network_alone, share, texture_side, white
+            people.append(fit(models, one, points, *choices, face))
+        return people
+    pixels = _pixels_of("photo", photo)
+    if matte is not None:
+        matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
+        if matte.shape != pixels.shape[:2]:
+            raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
+    if head is None:
         if landmarks_px is not None:
-            found = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
-        elif found is None:
-            chosen = geometry or models.default_geometry
-            found = pipeline.find_for(models.networks.people, chosen, pixels, name)[0]
-        if matte is not None:
-            matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
-            if matte.shape != pixels.shape[:2]:
-                raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
-        head = pipeline.head_of(models, pixels, found, models.sides(texture_side), matte)
-        person = person_of(models, pixels, head, reflectance, network_alone, matte, white)
-        return replace(person, tensors=isinstance(photo, Tensor))
-
-    if not isinstance(photo, Sequence):
-        return fitted("photo", photo, landmarks_px, matte)
-    more = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte))
-    return [fitted(f"photo {number}", *one) for number, one in enumerate(zip(photo, *more, strict=True))]
-
-
-@torch.no_grad()
-def person_of(
-    models: Models,
-    photo: np.ndarray | None,
-    head: Head,
-    kind: RelightKind = "portrait",
-    network_alone: bool = False,
-    matte: np.ndarray | None = None,
-    white: White | None = None,
-    steady: SteadyFrame | None = None,
-    memory_bytes: int = MEMORY_BYTES,
-) -> "Person":
-    """Read the reflectance of a fitted head.
-
-    Args:
-        models: The networks and the face model.
-        photo: Scene-linear [H, W, 3].
-        head: The head in it.
-        kind: The reflectance to read.
-        network_alone: Leave out the correction by the photo.
-        matte: The person's share [H, W] of the photo, if it is given.
-        white: Whose colours skin has under even white light; None: those of the networks.
-        steady: What is steadied by the frames around it, of a frame of a shot.
-        memory_bytes: Memory that a prediction may take.
-    """
-    found = pipeline.reflectance_of(
-        models, head, kind, network_alone, memory_bytes, photo, steady, matte, white
-    )
-    return Person(models, photo, head, found, matte, kind, network_alone, white=white)
+            face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
+        elif face is None:
+            (face,) = find_faces(models, pixels, "largest", geometry)
+        head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)
+    found = pipeline.reflectance_of(models, head, reflectance, network_alone, pixels, steady, matte, white)
+    tensors = isinstance(photo, Tensor)
+    return Person(models, pixels, head, found, matte, reflectance, network_alone, tensors, white)
 
 
 class PhotoCamera(NamedTuple):
@@ -185,8 +193,36 @@ class Target:
 AS_IN_PHOTO = Target()
 
 
+class PersonOrGroup:
+    """A person, or a group: gives arrays of numpy, or of torch where it was given such."""
+
+    models: Any
+    tensors: Any
+
+    def _answer(
+        self,
+        light: Any,
+        lights: Sequence[Light],
+        pose: Pose | None,
+        shown: Iterator[Any],
+        layers: Sequence[str],
+    ) -> Any:
+        """The images that a caller asked for, or dicts with layers; one for a light, a list for a list."""
+        given = [pose, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
+        with _gradients(*given):
+            images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
+        found = images if layers else [one["image"] for one in images]
+        return found if isinstance(light, Sequence) else found[0]
+
+    def _out(self, values: Array, *given: Any) -> Any:
+        """Values as arrays, or as tensors on the models' device where the photo or what was given is one."""
+        if self.tensors or any(isinstance(one, Tensor) for one in given):
+            return torch.as_tensor(values).to(self.models.device)
+        return values.detach().numpy() if isinstance(values, Tensor) else values
+
+
 @dataclass(frozen=True, eq=False)
-class Person:
+class Person(PersonOrGroup):
     """One person of a photo, as `fit` gives it; each light then costs what a light costs.
 
     Attributes:
@@ -239,32 +275,20 @@ class Person:
 
         A light or pose of tensors gives tensors, through which gradients flow (docs/gradients.md).
         """
-        lights = [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
-        given = [pose, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
-        with self._gradients(*given):
-            in_photo = not (alone or pose is not None)
-            known = [*FACE_LAYERS, *(PERSON_LAYERS if in_photo and self.kind == "portrait" else ())]
-            if isinstance(layers, str) or not set(layers) <= set(known):
-                raise ValueError(
-                    f"layers is {layers!r}, not a list of some of {', '.join(dict.fromkeys(known))}"
-                )
-            is_whole = in_photo and self.kind in ("portrait", "field")
-            if not is_whole and any(one.own_rgb is not None for one in lights):
-                raise UsageError("Light.own(): is of the whole photo; leave out pose, alone and baselines")
-            if in_photo:
-                shown = self._photos(lights, background, layers)
-            else:
-                shown = self._faces(lights, pose, layers)
-            images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
-        found = images if layers else [one["image"] for one in images]
-        return found if isinstance(light, Sequence) else found[0]
+        if not alone and pose is None:
+            return self._group.relight(light, background, layers, room)
+        lights = _lights_of(light, room)
+        if any(one.own_rgb is not None for one in lights):
+            raise UsageError("Light.own(): is of the whole photo; leave out pose and alone")
+        _check_layers(layers, FACE_LAYERS)
+        return self._answer(light, lights, pose, self._faces(lights, pose, layers), layers)
 
     def olat(self, lights: int | Array = 150) -> Array:
         """The person over black under each light alone [L, H, W, 3]; the images add up by a light's weights.
 
         `lights` are unit directions [L, 3], or the size of a uniform rig, `facerf.rig(lights)`.
         """
-        people = self._people
+        people = self._group.composed_once
         found = [
             people.light_layer(relit) for relit in _one_by_one(people, Lights.each(directions_of(lights)))
         ]
@@ -275,7 +299,7 @@ class Person:
         directions = directions_of(lights)
         turn = None if pose is None else self.head.fit.turn_to(_rotation(pose))
         field = self.reflectance.field if isinstance(self.reflectance, PortraitField) else self.reflectance
-        with self._gradients(lights, pose):
+        with _gradients(lights, pose):
             if isinstance(field, Field):
                 textures = torch.cat(list(field.olats(directions, turn)))
             else:
@@ -326,7 +350,7 @@ class Person:
         if self.photo is None or target.composite == "face":
             photo_px = None if self.photo is None else (self.photo.shape[0], self.photo.shape[1])
             return FaceAlone(self.models.face, self.head, self.reflectance, target.fit, photo_px)
-        return PeopleInPhoto([self.in_photo(target)], target.background)
+        return self._group.composed(target)
 
     def in_photo(self, target: Target = AS_IN_PHOTO) -> PersonInPhoto | FaceInPhoto:
         """Prepare the person in its photo; the target's matte says which part of it changes."""
@@ -462,13 +486,13 @@ class Person:
         require_regular(Path(path), "give one that Person.save wrote")
         try:
             arrays = read_npz(Path(path))
-            fit, side = fit_from_arrays(arrays), min(arrays["visible"].shape[-1], LARGEST_TEXTURE)
+            fitted, side = fit_from_arrays(arrays), min(arrays["visible"].shape[-1], LARGEST_TEXTURE)
             maps = {"texture": (3, side, side), "visible": (side, side), "normals": (3, side, side)}
             face = FaceTexture(**{name: floats(arrays, name, shape) for name, shape in maps.items()})
             photo = linear_pixels("photo", arrays["photo"]).numpy()
-            cropped = floats(arrays, "cropped", (fit.crop.size_px, fit.crop.size_px, 3)).numpy()
+            cropped = floats(arrays, "cropped", (fitted.crop.size_px, fitted.crop.size_px, 3)).numpy()
             matte = floats(arrays, "matte", photo.shape[:2]).numpy() if "matte" in arrays else None
-            fit.vertices_camera(models.face)
+            fitted.vertices_camera(models.face)
             one_of(RelightKind, "kind", kind := str(arrays["kind"]))
             alone = bool(arrays["network_alone"])
             white = str(arrays.get("white", "photo")) or None
@@ -477,14 +501,95 @@ class Person:
         except (ValueError, TypeError, LookupError, OverflowError) as error:
             said = f"{path}: not a person that facerf wrote ({error}); fit the photo again"
             raise InputError(said) from None
-        head = Head(cropped, fit, face)
-        return person_of(models, photo, head, kind, alone, matte, white)  # type: ignore[arg-type]
+        head = Head(cropped, fitted, face)
+        return fit(models, photo, matte=matte, reflectance=kind, network_alone=alone, white=white, head=head)
+
+    def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
+        """The face alone under each light; gradients reach all that it is made of."""
+        fit = self.head.fit
+        posed = None if pose is None else replace(fit, rotation=_rotation(pose))
+        face = self.composed(Target(posed, "face"))
+        assert isinstance(face, FaceAlone)
+        view = face.view
+        for part in batches(len(lights), face.nbytes):
+            for one in face.relit(sums_of(lights[part])):
+                image = torch.zeros(*face.size_px, 4)
+                image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
+                arrays = face.rendered(RenderRequest(one, layers=layers))
+                del arrays["rgb"]
+                yield {"image": image, **arrays}
+
+    @cached_property
+    def _group(self) -> "Group":
+        return Group([self])
+
+    def _layer(self, name: str) -> Any:
+        if name == "albedo" and self.kind != "portrait":
+            raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
+        relit = next(_one_by_one(self._group.composed_once, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
+        return self._out(self._group.composed_once.rendered(RenderRequest(relit, layers=[name]))[name])
+
+    @property
+    def _photo_camera(self) -> Camera:
+        assert self.photo is not None
+        return photo_camera(self.head.fit.crop, self.photo.shape[0], self.photo.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Group(PersonOrGroup):
+    """People of one photo, relit together; those whose faces are larger stand in front.
+
+    Attributes:
+        people: As `fit` gives them, all of the same photo.
+    """
+
+    people: Sequence[Person]
+
+    def relight(
+        self,
+        light: Light | Array | Sequence[Light | Array],
+        background: Background = "photo",
+        layers: Sequence[str] = (),
+        room: float = 0.0,
+    ) -> Any:
+        """Relight all people by the same light, in one image of the photo's frame; see `Person.relight`."""
+        lights, kinds = _lights_of(light, room), {person.kind for person in self.people}
+        if not kinds <= {"portrait", "field"} and any(one.own_rgb is not None for one in lights):
+            raise UsageError("Light.own(): is of the whole photo; leave out baselines")
+        _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
+        return self._answer(light, lights, None, self._photos(lights, background, layers), layers)
+
+    @property
+    def matte(self) -> Array:
+        """The people's share [H, W] of the photo."""
+        return self._out(self.composed_once.matte)
+
+    @property
+    def models(self) -> Models:
+        """The networks and the face model."""
+        return self.people[0].models
+
+    @property
+    def tensors(self) -> bool:
+        """True of a photo that was given as a tensor."""
+        return self.people[0].tensors
+
+    def composed(self, target: Target = AS_IN_PHOTO) -> PeopleInPhoto:
+        """Prepare images of the people before a background that differ by their light alone."""
+        nearest_first = sorted(self.people, key=lambda person: -person.head.fit.crop.side_px)
+        return PeopleInPhoto([person.in_photo(target) for person in nearest_first], target.background)
+
+    @cached_property
+    def composed_once(self) -> PeopleInPhoto:
+        """The people in their photo, with all that does not depend on the light."""
+        with torch.no_grad():
+            return self.composed()
 
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
     ) -> Iterator[Any]:
         """The photo under each light, as dicts of arrays; gradients reach the weights alone."""
-        people, behind = self._people, None
+        people, behind = self.composed_once, None
         if not isinstance(background, str):
             pixels = np.array(background)[None, None] if isinstance(background, tuple) else background
             behind = covering(linear_pixels("background", pixels).detach().numpy(), *people.size_px)
@@ -505,56 +610,12 @@ class Person:
                 if weights.requires_grad:
                     image = _OfWeights.apply(weights, each, people, image)  # type: ignore[no-untyped-call]
                 if own is not None and own.requires_grad:
-                    layer = people.people[0].own[:] if straight else people.own_layer()
+                    layer = people.own_image() if straight else people.own_layer()
                     image = image + (own - own.detach()) * torch.from_numpy(layer)
                 if straight:
                     image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
                 found = {"person.A": people.matte, **arrays} if layers else arrays
                 yield {"image": image, **found}
-
-    def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
-        """The face alone under each light; gradients reach all that it is made of."""
-        fit = self.head.fit
-        posed = None if pose is None else replace(fit, rotation=_rotation(pose))
-        face = self.composed(Target(posed, "face"))
-        assert isinstance(face, FaceAlone)
-        view = face.view
-        for part in batches(len(lights), face.nbytes):
-            for one in face.relit(sums_of(lights[part])):
-                image = torch.zeros(*face.size_px, 4)
-                image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
-                arrays = face.rendered(RenderRequest(one, layers=layers))
-                del arrays["rgb"]
-                yield {"image": image, **arrays}
-
-    @cached_property
-    def _people(self) -> PeopleInPhoto:
-        """The person in the photo, with all that does not depend on the light."""
-        with torch.no_grad():
-            return PeopleInPhoto([self.in_photo()])
-
-    def _layer(self, name: str) -> Any:
-        if name == "albedo" and self.kind != "portrait":
-            raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
-        relit = next(_one_by_one(self._people, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
-        return self._out(self._people.rendered(RenderRequest(relit, layers=[name]))[name])
-
-    @property
-    def _photo_camera(self) -> Camera:
-        assert self.photo is not None
-        return photo_camera(self.head.fit.crop, self.photo.shape[0], self.photo.shape[1])
-
-    def _gradients(self, *given: Any) -> torch.set_grad_enabled:
-        """Gradients where tensors are given."""
-        return torch.set_grad_enabled(
-            torch.is_grad_enabled() and any(isinstance(one, Tensor) for one in given)
-        )
-
-    def _out(self, values: Array, *given: Any) -> Any:
-        """Values as arrays, or as tensors on the models' device where the photo or what was given is one."""
-        if self.tensors or any(isinstance(one, Tensor) for one in given):
-            return torch.as_tensor(values).to(self.models.device)
-        return values.detach().numpy() if isinstance(values, Tensor) else values
 
 
 def _one_by_one(people: PeopleInPhoto, each: Lights) -> Iterator[Any]:
@@ -584,10 +645,33 @@ class _OfWeights(torch.autograd.Function):
         return torch.stack(sums), None, None, None
 
 
+def _lights_of(light: Any, room: float) -> list[Light]:
+    return [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
+
+
+def _check_layers(layers: Sequence[str], known: Sequence[str]) -> None:
+    """Raise ValueError for what is no list of known layers."""
+    if isinstance(layers, str) or not set(layers) <= set(known):
+        raise ValueError(f"layers is {layers!r}, not a list of some of {', '.join(dict.fromkeys(known))}")
+
+
+def _gradients(*given: Any) -> torch.set_grad_enabled:
+    """Gradients where tensors are given."""
+    return torch.set_grad_enabled(torch.is_grad_enabled() and any(isinstance(one, Tensor) for one in given))
+
+
 def one_of(choices: Any, name: str, value: str) -> None:
     """Raise ValueError for a word that is not one of a Literal's."""
     if value not in get_args(choices):
         raise ValueError(f"{name} is {value!r}, not one of {', '.join(get_args(choices))}")
+
+
+def _pixels_of(name: str, photo: Array) -> np.ndarray:
+    """A photo's pixels [H, W, 3], which are not copied; raises ValueError for others."""
+    check_kind(name, photo)
+    pixels = np.asarray(photo.detach().cpu() if isinstance(photo, Tensor) else photo, np.float32)
+    check_finite(name, pixels)
+    return pixels
 
 
 def _rotation(pose: Pose) -> Tensor:

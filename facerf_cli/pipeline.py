@@ -35,7 +35,6 @@ from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import (
-    MEMORY_BYTES,
     Field,
     balance_of,
     photo_evidence,
@@ -145,7 +144,6 @@ def reflectance_of(
     head: Head,
     kind: RelightKind = "field",
     network_alone: bool = False,
-    memory_bytes: int = MEMORY_BYTES,
     photo: np.ndarray | None = None,
     steady: SteadyFrame | None = None,
     matte: np.ndarray | None = None,
@@ -168,7 +166,7 @@ def reflectance_of(
     def of_face() -> tuple[SourceLight | None, Field]:
         found = None if network_alone else source_light(models, head.face, steady.light if steady else None)
         quotient = found.quotient if found else None
-        field = Field(models, head.face, quotient, memory_bytes, even_shade=found is not None)
+        field = Field(models, head.face, quotient, even_shade=found is not None)
         if steady or white is None:
             return found, replace(field, balance=steady.balance if steady else None)
         even = found.even if found else field.small_under_even_light()
@@ -234,7 +232,6 @@ def predict_olat(
     lights: Tensor,
     rotation: Tensor | None = None,
     network_alone: bool = False,
-    memory_bytes: int = MEMORY_BYTES,
     bf16: bool = False,
     white: White | None = None,
 ) -> Iterator[Tensor]:
@@ -243,7 +240,7 @@ def predict_olat(
     `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's. For the rest see
     `reflectance_of`.
     """
-    field = reflectance_of(models, head, "field", network_alone, memory_bytes, white=white)
+    field = reflectance_of(models, head, "field", network_alone, white=white)
     assert isinstance(field, Field)
     turn = None if rotation is None else head.fit.turn_to(rotation)
     return replace(field, bf16=bf16).olats(lights, turn)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from facerf_cli.run.memory import batches
 from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import PhotoFace
-from facerf_cli.work.plan import beside_people
+from facerf_cli.work.plan import beside_people, require_people
 
 SIZE = (4, 6)
 
@@ -112,15 +111,14 @@ def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by
     faces = [PhotoFace(f"_face{k}", "a.png", FaceBox((k, 0, k + 1, 1), 1.0)) for k in range(3)]
     fitted: list[str] = []
     monkeypatch.setattr(photos, "find_people", lambda *_: list(faces))
-    monkeypatch.setattr(photos, "load_models_once", lambda _: SimpleNamespace(default_geometry="landmarks"))
     monkeypatch.setattr(photos, "_fitted", lambda face, *_: fitted.append(face.tag) or face)
     item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
     options = PhotoOptions(Settings(), face="all")
     each = photos.fit_each(item, image, options)
     assert next(each).tag == "_face2" and fitted == ["_face2"]
     memory.set_limit(100 << 20)
-    with pytest.raises(InputError, match=r"a\.png: 3 people in one image: needs .* --composite face"):
-        photos.fit_each(item, image, options, together=True)
+    with pytest.raises(InputError, match=r"3 people in one image: needs .* --composite face"):
+        require_people(3, (4, 6))
 
 
 def test_people_leave_less_memory_for_lights_at_once() -> None:

@@ -16,6 +16,7 @@ import torch
 import facerf_cli as facerf
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.crop import from_landmarks
+from facerf_cli.files.read import read_image
 from facerf_cli.main import main
 from facerf_cli.portrait.confidence import SCALES
 from tests import astronaut
@@ -52,7 +53,16 @@ def person() -> facerf.Person:
 
 def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
     photo, size = page["photo"], page["photo"].shape[:2]
-    for name in ("image", "both", "key_alone", "in_the_sun", "before_map", "before_grey", "weighed"):
+    for name in (
+        "image",
+        "together",
+        "both",
+        "key_alone",
+        "in_the_sun",
+        "before_map",
+        "before_grey",
+        "weighed",
+    ):
         assert page[name].shape == photo.shape and np.isfinite(page[name]).all(), name
     assert page["images"].shape == (12, *photo.shape) and page["textures"].shape == (12, 256, 256, 3)
     assert page["cut_out"].shape == page["turned"].shape == page["face"].shape == (*size, 4)
@@ -78,6 +88,30 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert set(row["factors"]) == set(SCALES)  # of the face, its fit and the matte
     assert row["certainty"] == "sure" and set(row["touches_frame"]) == {"bottom"}
+
+
+def test_a_group_is_relit_as_on_the_command_line(tmp_path: Path) -> None:
+    """Two people: the same calls give the same image, its alpha and its layers."""
+    one = astronaut.photo()
+    both = np.hstack([one, np.full_like(one[:, :100], 0.2), one[:, ::-1]])
+    facerf.write_image(tmp_path / "both.exr", both)
+    line = ["relight", str(tmp_path / "both.exr"), "--face", "all", "--light", "60,30", "--room", "none"]
+    line += ["--background", "none", "--aov", "depth", "--exposure", "0", "-o", str(tmp_path / "out")]
+    assert main([*line, "--reflectance", "field"]) == 0
+    (written,) = (tmp_path / "out").glob("*.exr")
+    image = read_image(written)
+    photo = facerf.read_image(tmp_path / "both.exr")
+    faces = facerf.find_faces(astronaut.models(), photo)
+    assert [round(face.box_px[0] / photo.shape[1]) for face in faces] == [0, 1]
+    people = [facerf.fit(astronaut.models(), photo, face=face, reflectance="field") for face in faces]
+    group = facerf.Group(people)
+    found = group.relight(KEY, background="none", layers=["depth"])
+    assert image.alpha is not None
+    np.testing.assert_allclose(found["image"][..., 3], image.alpha, atol=1e-3)  # half floats
+    np.testing.assert_allclose(group.matte, found["image"][..., 3])
+    shown = found["image"][..., :3] * found["image"][..., 3:]
+    np.testing.assert_allclose(shown, image.pixels * image.alpha[..., None], atol=2e-3)
+    assert set(found) == {"image", "person.A", "depth"} and found["depth"].any()
 
 
 def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: Path) -> None:

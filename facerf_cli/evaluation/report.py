@@ -19,7 +19,7 @@ from pydantic import BeforeValidator
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import METRICS, Comparison, Row
-from facerf_cli.evaluation.summary import ALL, Cell, Group, Summary, cell_words, published_for
+from facerf_cli.evaluation.summary import ALL, CaseGroup, Cell, Summary, cell_words, published_for
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document
 from facerf_cli.files.sheets import filled_page
@@ -200,7 +200,7 @@ def page(
     )
 
 
-def _axis(groups: Sequence[Group], metric: str) -> tuple[float, float]:
+def _axis(groups: Sequence[CaseGroup], metric: str) -> tuple[float, float]:
     """The lowest and highest value of the plots; an error's axis begins at 0 if no value is negative."""
     cells = [cell for group in groups for cell in group.cells.get(metric, {}).values()]
     ends = [end for cell in cells for end in (*np.quantile(cell.values, _QUANTILES), cell.interval.mean)]

@@ -91,7 +91,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Group:
+class CaseGroup:
     """The images whose `fact` is `value`; all images if the fact is ''."""
 
     fact: str
@@ -106,7 +106,7 @@ class Summary:
     layout: Layout
     methods: tuple[str, ...]
     metrics: tuple[str, ...]  # the layout's first, then all others that were measured
-    groups: tuple[Group, ...]  # the first is of all images
+    groups: tuple[CaseGroup, ...]  # the first is of all images
     images: int
     persons: int
 
@@ -153,7 +153,7 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     narrow = tuple(name for name in layout.metrics if name in measured)
     metrics = tuple(dict.fromkeys([*narrow, *measured]))
     methods = tuple(dict.fromkeys(row.method for row in rows))
-    groups = [Group("", "", _cells(rows, methods, metrics))]
+    groups = [CaseGroup("", "", _cells(rows, methods, metrics))]
     text = dict.fromkeys(name for row in rows for name, value in row.facts.items() if isinstance(value, str))
     for fact in layout.by or text:
         by_value: dict[str, list[Row]] = {}
@@ -161,7 +161,7 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
             if fact in row.facts:
                 by_value.setdefault(str(row.facts[fact]), []).append(row)
         for value in sorted(by_value, key=natural):
-            groups.append(Group(fact, value, _cells(by_value[value], methods, narrow)))
+            groups.append(CaseGroup(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
     if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
         note = (
@@ -172,7 +172,7 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
 
 
-def published_for(summary: Summary, group: Group, metric: str) -> list[PublishedFigure]:
+def published_for(summary: Summary, group: CaseGroup, metric: str) -> list[PublishedFigure]:
     """The published figures of a group and a metric."""
     key = metric, group.fact, group.value
     return [one for one in summary.layout.published if (one.metric, one.fact, one.value) == key]
@@ -245,7 +245,7 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
         console.print(Text(f"Networks, with the first digits of SHA-256: {'; '.join(named)}."))
 
 
-def _table(summary: Summary, metric: str, groups: Sequence[Group], plain: bool) -> Table:
+def _table(summary: Summary, metric: str, groups: Sequence[CaseGroup], plain: bool) -> Table:
     """The groups' rows: one for each method, then the published figures."""
     how = METRICS[metric]
     better = "less" if how.lower_is_better else "more"

@@ -66,6 +66,8 @@ class FaceView:
 
     def surface(self, rows: slice) -> Tensor:
         """Unit normals and positions [n, w, 6] in rows of the window, camera space, m."""
+        if rows.start == rows.stop:
+            return torch.zeros(0, self.camera.width_px, 6)
         triangles = grid_triangles()
         attributes = torch.cat([vertex_normals(self.vertices_camera, triangles), self.vertices_camera], 1)
         fragments = rasterize(self.vertices_camera, triangles, rows_of_camera(self.camera, rows))

@@ -191,16 +191,26 @@ def unit_directions(values: Any) -> Tensor:
 
 def linear_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> Tensor:
     """Scene-linear pixels [H, W, 3] or [H, W] on the CPU; raises ValueError for others, with their name."""
+    check_kind(name, pixels, shape)
+    linear = as_tensor(pixels)
+    check_finite(name, linear.detach().numpy())
+    return linear
+
+
+def check_kind(name: str, pixels: Any, shape: str = "[H, W, 3]") -> None:
+    """Raise an error, with their name, for what is no array [H, W, 3] or [H, W] of floats."""
     if not isinstance(pixels, np.ndarray | Tensor):
         raise TypeError(f"{name} is {type(pixels).__name__}, not an array {shape}; read a file by read_image")
     if pixels.ndim != shape.count(",") + 1 or (shape.endswith("3]") and pixels.shape[2] != 3):
         raise ValueError(f"{name} has shape {list(pixels.shape)}, not {shape}")
     if not (pixels.is_floating_point() if isinstance(pixels, Tensor) else pixels.dtype.kind == "f"):
         raise ValueError(f"{name} holds {pixels.dtype}; give scene-linear floats, as read_image does")
-    linear = as_tensor(pixels)
-    if not linear.isfinite().all():
+
+
+def check_finite(name: str, values: np.ndarray) -> None:
+    """Raise ValueError for pixels that are no numbers."""
+    if not np.isfinite(values).all():
         raise ValueError(f"{name} holds values that are not finite")
-    return linear
 
 
 def as_tensor(values: Any) -> Tensor:

@@ -24,9 +24,9 @@ from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.shade import without_colour_of_shade
 from facerf_cli.relighting.white import Balance
+from facerf_cli.run.memory import limit_bytes
 from facerf_cli.run.threads import count, in_threads
 
-MEMORY_BYTES = 2 << 30  # for the prediction, by default
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
 _LIGHT_SIDE = 128  # texels on which light is estimated
 _AROUND = 32  # lights that shine as even light does
@@ -44,7 +44,6 @@ class Field:
     models: Models
     face: FaceTexture
     quotient: Quotient | None = None
-    memory_bytes: int = MEMORY_BYTES
     bf16: bool = False
     even_shade: bool = False
     balance: Balance | None = None
@@ -112,7 +111,7 @@ class Field:
         most = _LIGHTS_ON_CPU if self.models.device.type == "cpu" else lights
         texels = self.face.texture.shape[-1] ** 2
         bytes_per_light = self._network.bytes_per_light(texels) * count()
-        return max(1, min(most, self.memory_bytes // bytes_per_light))
+        return max(1, min(most, limit_bytes() // bytes_per_light))
 
 
 def shining(weights: Tensor) -> Tensor:

@@ -96,7 +96,16 @@ class PeopleInPhoto(Relightable):
 
     def own_layer(self) -> np.ndarray:
         """The people [H, W, 3] as photographed, over black."""
-        return in_strips(self._as_photographed, *self.size_px)["own"]
+        return in_strips(lambda rows: {"": self._own(self._present(rows), rows)}, *self.size_px)[""]
+
+    def own_image(self) -> np.ndarray:
+        """The people [H, W, 3] as photographed, not multiplied by alpha."""
+
+        def of_rows(rows: slice) -> dict[str, np.ndarray]:
+            present = self._present(rows)
+            return {"": _straight(present, [one.person.own[rows] for one in present])}
+
+        return in_strips(of_rows, *self.size_px)[""]
 
     def _present(self, rows: slice) -> list[_Present]:
         """The people in some rows: the first, and of a crowd few others."""
@@ -109,9 +118,6 @@ class PeopleInPhoto(Relightable):
 
     def _shares(self, rows: slice) -> dict[str, np.ndarray]:
         return {"alpha": _alpha(self._present(rows))[..., 0]}
-
-    def _as_photographed(self, rows: slice) -> dict[str, np.ndarray]:
-        return {"own": self._own(self._present(rows), rows)}
 
     def _own(self, present: Sequence[_Present], rows: slice) -> np.ndarray:
         return _over(_BLACK, present, [one.person.own[rows] for one in present])
@@ -126,9 +132,7 @@ class PeopleInPhoto(Relightable):
             plate = (self.people[0].photo[rows] - self._own(present, rows)) * np.float32(2.0**-request.ev)
             found = plate + _over(_BLACK, present, pixels)
             return found.clip(min=0) if len(self.people) > 1 else found
-        if len(present) == 1:
-            return pixels[0]
-        return _over(_BLACK, present, pixels) / np.maximum(_alpha(present), _TINY)
+        return _straight(present, pixels)
 
 
 def _over(below: Any, present: Sequence[_Present], pixels: Sequence[np.ndarray]) -> np.ndarray:
@@ -136,6 +140,13 @@ def _over(below: Any, present: Sequence[_Present], pixels: Sequence[np.ndarray])
     for one, own in zip(present, pixels, strict=True):
         below = below + one.share * (own - below)
     return np.asarray(below)
+
+
+def _straight(present: Sequence[_Present], pixels: Sequence[np.ndarray]) -> np.ndarray:
+    """People over nothing, not multiplied by alpha."""
+    if len(present) == 1:
+        return pixels[0]
+    return _over(_BLACK, present, pixels) / np.maximum(_alpha(present), _TINY)
 
 
 def _alpha(present: Sequence[_Present]) -> np.ndarray:

@@ -16,7 +16,7 @@ from facerf_cli.batch.inputs import Item, companions
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import check_in_photo
-from facerf_cli.face.fit import FaceFit, Geometry
+from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
@@ -24,7 +24,8 @@ from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
 from facerf_cli.network.files import serving_files
-from facerf_cli.pipeline import find_for, head_of
+from facerf_cli.person import find_faces
+from facerf_cli.pipeline import head_of
 from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_of, face_facts, touched_sides
 from facerf_cli.portrait.find import Face, FaceBox, face_at
 from facerf_cli.portrait.segment import Segmentation
@@ -35,7 +36,7 @@ from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.matte_models import matte_by_rembg, require_rembg
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
-from facerf_cli.work.plan import KEPT_PX, beside, require_people
+from facerf_cli.work.plan import KEPT_PX, beside
 
 
 def companion(item: Item, given: Path, option: str) -> Path:
@@ -171,20 +172,12 @@ def naming(name: object) -> Iterator[None]:
         raise InputError(f"{name}: {error}") from None
 
 
-def fit_each(
-    item: Item, image: LinearImage, options: PhotoOptions, together: bool = False
-) -> Iterator[FittedFace]:
+def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FittedFace]:
     """Find the faces of a photo that the options choose; fit one after the other, from right to left.
 
-    So the first one's files are written last, and mark the photo as finished. Raises InputError where so many
-    people do not fit in one image `together`.
+    So the first one's files are written last, and mark the photo as finished.
     """
-    models = load_models_once(options)
-    matte = person_matte(item, image.pixels, options)
-    found = find_people(item, image, options, options.geometry or models.default_geometry)
-    if together:
-        with naming(item.input_path):
-            require_people(len(found), image.pixels.shape[:2])
+    matte, found = person_matte(item, image.pixels, options), find_people(item, image, options, True)
     return (_fitted(found.pop(), image, options, matte) for _ in range(len(found)))
 
 
@@ -207,15 +200,16 @@ def facts_of_found(faces: Sequence[PhotoFace], options: PhotoOptions) -> dict[st
 
 
 def find_people(
-    item: Item, image: LinearImage, options: PhotoOptions, geometry: Geometry = "landmarks"
+    item: Item, image: LinearImage, options: PhotoOptions, to_fit: bool = False
 ) -> list[PhotoFace]:
-    """Find the faces that the options choose, from left to right, with what a geometry needs."""
+    """Find the faces that the options choose, from left to right, with landmarks or what a fit needs."""
     faces: Sequence[FaceBox]
     if options.landmarks is not None:
         faces = [_given(item, image, options.landmarks)]
     else:
-        networks, path = load_models_once(options).networks.people, str(item.input_path)
-        faces = find_for(networks, geometry, image.pixels, path, options.face)
+        geometry = options.geometry if to_fit else "landmarks"
+        path = str(item.input_path)
+        faces = find_faces(load_models_once(options), image.pixels, options.face, geometry, path)
     found = []
     for number, face in enumerate(faces):
         name, (left, top, right, bottom) = str(item.input_path), face.box_px
@@ -270,6 +264,11 @@ def _fitted(
     with naming(face.name):
         models = load_models_once(options)
         head = head_of(models, image.pixels, face.found, models.sides(options.texture_side), matte)
+    return fitted_face(face, head, matte)
+
+
+def fitted_face(face: PhotoFace, head: Head, matte: np.ndarray | None) -> FittedFace:
+    """A face with its head, and its person's matte [H, W] if given; warns of a fit that is poor."""
     if head.fit.quality == "poor":
         log.warning(
             "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "

@@ -16,29 +16,33 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
+from facerf_cli.files.read import LinearImage
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.strips import Empty, rows_of
-from facerf_cli.person import Person, Target, person_of
-from facerf_cli.relighting.people_in_photo import PeopleInPhoto
-from facerf_cli.relighting.relightable import Relightable, RenderRequest
+from facerf_cli.person import Group, Person, Target, fit
+from facerf_cli.relighting.people_in_photo import Background
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line, step
-from facerf_cli.run.memory import batches, limit_bytes
+from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
+    PhotoFace,
     facts_of,
-    fit_each,
+    find_people,
+    fitted_face,
     load_models_once,
     naming,
+    person_matte,
     provenance,
     read_matte,
     read_photo,
     rotation_of,
 )
-from facerf_cli.work.plan import beside_people, canvas, require_face
+from facerf_cli.work.plan import beside_people, canvas, require_face, require_people
 from facerf_cli.work.relight_options import RelightPlan
 from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces
 
@@ -74,72 +78,91 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
 
             yield scene_of_stack(item, plan)
             return
-    options, models = plan.options, load_models_once(plan.photo)
+    options, rotation = plan.options, rotation_of(plan.options.pose)
     lights_of = partial(lights_over_rig, rig=options.rig, sampling=plan.sampling)
     lights_of(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
-    in_photo, kind, alone = options.composite == "photo", options.reflectance, options.network_alone
+    in_photo = options.composite == "photo"
+    faces: Sequence[PhotoFace]
     if place := _in_shot(item, plan):
         shot, frame = place
-        image, face = shot.fitted(frame, kind == "portrait")
-        faces = iter([face])
+        image, face = shot.fitted(frame, options.reflectance == "portrait")
+        faces, matte = [face], face.matte
     else:
         image = read_photo(item, plan.photo)
-        faces = fit_each(item, image, plan.photo, together=in_photo)
-    photo, rotation = image.pixels, rotation_of(options.pose)
-    for number, people in enumerate([list(faces)[::-1]] if together else ([face] for face in faces)):
-        if not number:
-            check_faces(item, people[-1].number, plan)
-        nearest_first = sorted(people, key=lambda face: -face.fit.crop.side_px)
-        persons, targets = [], []
-        for face in nearest_first:
-            target = Target(None if rotation is None else replace(face.fit, rotation=rotation), "face")
-            if in_photo:
-                background, matte = options.background.kind, None
-                if options.matte is not None:
-                    matte = read_matte(item, options.matte, photo.shape[:2], face.steady is not None)
-                behind = background if background in ("photo", "none") else "given"
-                target = Target(None, "photo", matte, None if behind == "photo" else image.alpha, behind)
-            with naming(item.input_path):
-                require_face(models.face, target.fit or face.fit, photo.shape[:2])
-                person = person_of(
-                    models, photo, face.head, kind, alone, face.matte, options.white, face.steady,
-                    limit_bytes(),
-                )  # fmt: skip
-                far = person.balance is not None and person.balance.is_far and face.steady is None
-                if far and options.white == "photo":
-                    log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
-                if in_photo and face.matte is None:
-                    face.see(person.segmentation)
-            persons.append(person)
-            targets.append(target)
+        matte, faces = (
+            person_matte(item, image.pixels, plan.photo),
+            find_people(item, image, plan.photo, True),
+        )
+    photo, background = image.pixels, options.background.kind
+    check_faces(item, faces[-1].number, plan)
+    target = Target(composite="face")
+    if in_photo:
+        behind: Background = "photo" if background == "photo" else "none" if background == "none" else "given"
+        matted = (
+            None if options.matte is None else read_matte(item, options.matte, photo.shape[:2], bool(place))
+        )
+        target = Target(matte=matted, alpha=None if background == "photo" else image.alpha, background=behind)
+        with naming(item.input_path):
+            require_people(len(faces), photo.shape[:2])
+    for some in [faces] if together else ([face] for face in reversed(faces)):
+        fitted = [_fitted(face, image, matte, plan) for face in some]
+        people = [face for face, _ in fitted]
+        fitted.sort(key=lambda one: -one[0].fit.crop.side_px)  # the nearest first
+        persons = [person for _, person in fitted]
+        subject = persons[0] if len(persons) == 1 else Group(persons)
+        if rotation is not None:
+            target = replace(target, fit=replace(people[0].fit, rotation=rotation))
+        with naming(item.input_path):
+            for face, person in fitted:
+                require_face(person.models.face, target.fit or face.fit, photo.shape[:2])
         scene = LitScene(
             setups=plan.setups,
             lights_of=lights_of,
             metadata=_metadata(item, plan),
             people=people,
-            faces=tuple(face.number for face in nearest_first),
+            faces=tuple(face.number for face, _ in fitted),
             evens=tuple(person.even_brightness for person in persons),
             plate=plate_metadata(image.metadata),
-            subject=_subject(persons, targets),
+            subject=subject.composed(target),
         )
         if not in_photo:
             yield replace(scene, tag=people[0].tag)
             continue
-        camera = photo_camera(nearest_first[0].fit.crop, *photo.shape[:2])
+        nearest = fitted[0][0]
+        camera = photo_camera(nearest.fit.crop, *photo.shape[:2])
         yield replace(
             scene,
-            alpha=image.alpha if options.background.kind == "photo" else None,
+            alpha=image.alpha if background == "photo" else None,
             behind=backdrop(options.background, options.background_blur, camera),
-            identity=_identity_of(photo, nearest_first[0]) if options.identity else None,
+            identity=_identity_of(photo, nearest) if options.identity else None,
         )
 
 
-def _subject(people: Sequence[Person], targets: Sequence[Target]) -> Relightable:
-    """People in their photo, or the face of the first alone."""
-    if targets[0].composite == "face":
-        return people[0].composed(targets[0])
-    each = [person.in_photo(target) for person, target in zip(people, targets, strict=True)]
-    return PeopleInPhoto(each, targets[0].background)
+def _fitted(
+    face: PhotoFace, image: LinearImage, matte: np.ndarray | None, plan: RelightPlan
+) -> tuple[FittedFace, Person]:
+    """Fit the person of a face, whose matte [H, W] may be given; of a frame of a shot the head is known."""
+    options, known = plan.options, face if isinstance(face, FittedFace) else None
+    with naming(face.name):
+        person = fit(
+            load_models_once(plan.photo),
+            image.pixels,
+            reflectance=options.reflectance,
+            network_alone=options.network_alone,
+            matte=matte,
+            texture_side=plan.photo.texture_side,
+            white=options.white,
+            face=face.found,
+            head=known and known.head,
+            steady=known and known.steady,
+        )
+    if known is None:
+        known = fitted_face(face, person.head, matte)
+        if person.balance is not None and person.balance.is_far and options.white == "photo":
+            log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
+    if options.composite == "photo" and matte is None:
+        known.see(person.segmentation)
+    return known, person
 
 
 def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:

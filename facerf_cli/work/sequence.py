@@ -290,7 +290,9 @@ class OpenShot:
             steady = take.window(number, portrait)
         head, matte = steady.head, steady.segmentation.matte
         found = face_at(head.fit.crop.to_photo(head.landmarks_px))
-        face = FittedFace("", f"frame {number}", found, head=head, steady=steady, matte=matte)
+        face = FittedFace(
+            "", str(self.shot.frames[number].input_path), found, head=head, steady=steady, matte=matte
+        )
         return self.frames.image(number), face
 
     @contextmanager

@@ -25,7 +25,7 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
 from facerf_cli.image.strips import resized
 from facerf_cli.light.studio_points import Lights, rig_by_text
-from facerf_cli.person import Target, person_of
+from facerf_cli.person import Target, fit
 from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.relightable import RenderRequest
@@ -121,9 +121,8 @@ def _of_person(
         None if one is None else resized(one, *photo.shape[:2]) for one in (image.alpha, face.matte)
     )
     with naming(item.input_path):
-        limit_bytes = memory.limit_bytes()
-        person = person_of(
-            models, photo, head, "portrait", work.network_alone, matte, work.white, memory_bytes=limit_bytes
+        person = fit(
+            models, photo, matte=matte, network_alone=work.network_alone, white=work.white, head=head
         )
     subject = person.composed(Target(alpha=alpha, background="none"))
 
@@ -169,9 +168,7 @@ def _of_face(
 
     def olats() -> Iterator[Tensor]:
         alone, bf16 = work.network_alone, work.precision == "bf16"
-        for textures in predict_olat(
-            models, face.head, directions, rotation, alone, memory.limit_bytes(), bf16, work.white
-        ):
+        for textures in predict_olat(models, face.head, directions, rotation, alone, bf16, work.white):
             tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
             yield render_face(textures, *large) if work.frame == "face" else textures
 

@@ -18,7 +18,7 @@ from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, stream_
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.person import person_of
+from facerf_cli.person import fit
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
@@ -86,7 +86,7 @@ def of_photo(
     white: White | None = None,
 ) -> tuple[Basis, Plate]:
     """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
-    person = person_of(models, photo, head, matte=matte, white=white)
+    person = fit(models, photo, matte=matte, white=white, head=head)
     people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
     return basis, Plate(photo, people.matte, photo - people.own_layer(), person.even_brightness)
