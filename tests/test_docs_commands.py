@@ -1,4 +1,4 @@
-"""Every command line of docs/clusters.md and docs/training.md runs, at toy size and in the pages' order.
+"""Every command line of some pages runs, at toy size and in the pages' order.
 
 A page's lines work in one folder, each on what those before it made. `toy` replaces sizes, addresses and
 downloads; torchrun starts two processes that meet by Gloo on this machine.
@@ -65,6 +65,7 @@ def toy(command: str) -> list[str]:
 def place(tmp_path: Path) -> Iterator[Path]:
     """A folder with all that the pages take for given; a Ray that they start is left at the end."""
     save_face_model(tmp_path / "ict.npz", load_face_model())
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     write_joint_dataset(tmp_path / "dataset")
     write_small_dataset(tmp_path / "data", counts=(2, 1, 1), lights=12, crop_px=48)
     for name in ("photos", "ffhq"):
@@ -80,7 +81,7 @@ def place(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("page", "count"), [("training.md", 6), ("clusters.md", 13)])
+@pytest.mark.parametrize(("page", "count"), [("training.md", 6), ("clusters.md", 13), ("tutorial.md", 9)])
 def test_every_line_of_the_page_runs(page: str, count: int, place: Path, monkeypatch: Patch) -> None:
     monkeypatch.chdir(place)
     environment = {"SLURM_ARRAY_TASK_ID": "1", "SLURM_ARRAY_TASK_COUNT": "1"}

@@ -16,7 +16,12 @@ from mkdocs.structure.pages import Page
 from facerf_cli.main import VERBS
 
 ROOT = Path(__file__).parents[1]
-MADE = {"README.md": "index.md", "MODEL_CARD.md": "model_card.md"}  # files of the root to pages of the site
+MADE = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "MODEL_CARD.md": "model_card.md",
+    "CHANGELOG.md": "changelog.md",
+}  # files of the root to pages of the site
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#]+)")
 _CODE_OR_SPECIAL = re.compile(r"`[^`]*`|[*_<]")
 _API = "# Python API\n\n[Python](python.md) shows how it is used.\n\n::: facerf_cli.api\n"
