@@ -3,7 +3,7 @@
     python examples/gallery.py [GRACE_HOPPER.jpg [FOLDER]]
 
 The second photo is matplotlib's sample data (U.S. Navy, public domain); without an argument it is that of
-an installed matplotlib. Each row: the photo, then its lights in the order of `ROWS`.
+an installed matplotlib. Each row: the photo, then its lights in the order of `ROWS`; the wall is skimage's.
 """
 
 import importlib.util
@@ -15,6 +15,7 @@ import numpy as np
 
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
+from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import resized
 from facerf_cli.main import main
 
@@ -56,6 +57,18 @@ def cut_out(photo: Path) -> np.ndarray:
     )
 
 
+def before_wall(photo: Path) -> np.ndarray:
+    """The person before a brick wall, in its light and with a key light beside."""
+    from skimage.data import brick
+
+    with tempfile.TemporaryDirectory() as folder:
+        wall = Path(folder, "wall.png")
+        write_display(wall, srgb_to_linear(brick()[..., None].repeat(3, -1) / np.float32(255)))
+        words = ["relight", str(photo), "--background", str(wall), "--light-wrap", "0.3"]
+        words += ["--light-from", "background", "--light-from", "room=background", "--light", "key=60,25"]
+        return beside(made(words, [f"{photo.stem}_wall_light.png", f"{photo.stem}_light_room+key.png"]))
+
+
 def made(words: list[str], files: list[str]) -> list[np.ndarray]:
     """Images [H, W, 3], linear, that a command writes."""
     with tempfile.TemporaryDirectory() as folder:
@@ -80,3 +93,4 @@ if __name__ == "__main__":
             write_display(target / f"gallery_{photo.stem}_{name}.jpg", row(photo, lights), 0.0)
     both = [cut_out(photo) for photo in (HERE / "astronaut.jpg", second)]
     write_display(target / "gallery_cut_out.jpg", np.concatenate(both, 1), 0.0)
+    write_display(target / "gallery_before_wall.jpg", before_wall(HERE / "astronaut.jpg"), 0.0)

@@ -3,7 +3,7 @@
 _LINES = """
 facerf relight me.jpg --light 40,20 -o relit.png
 facerf relight photos/ --envmap skies/ --rotate 0:360:24 -o relit/
-facerf relight plate.exr --light own --light rim=160,10 --exr single -o relit/
+facerf relight me.jpg --background beach.jpg --light-from background --light-wrap 0.3 -o relit/
 facerf view me.jpg -o me.html
 facerf view photos/ -o pages/
 facerf view stacks/me_olat.exr -o me.html

@@ -58,6 +58,7 @@ class RenderRequest:
         layers: Names of further layers, under the image's light.
         ev: Exposure in EV at which the photo's background keeps its look.
         background: Image [H, W, 3] behind the subject; None: the photo, or nothing.
+        wrap: Light [H, W, 3] of the background that is added to the image, and is its layer "wrap".
     """
 
     image: Any = None
@@ -65,6 +66,7 @@ class RenderRequest:
     layers: Sequence[str] = ()
     ev: float = 0.0
     background: Rows | None = None
+    wrap: Rows | None = None
 
     def ready(self, subject: "Relightable") -> "RenderRequest":
         """The same with all that does not depend on rows computed."""
@@ -128,7 +130,15 @@ class Relightable(ABC):
 
         Raises UsageError for layers that this subject lacks.
         """
-        return in_strips(partial(self.render, request.ready(self)), *self.size_px, empty)
+        return in_strips(partial(self._wrapped, request.ready(self)), *self.size_px, empty)
+
+    def _wrapped(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
+        """Some rows of all that is asked, with the background's light over the edge."""
+        found = self.render(request, rows)
+        if request.wrap is not None and request.image is not None:
+            found["wrap"] = request.wrap[rows]
+            found["rgb"] = found["rgb"] + found["wrap"]
+        return found
 
     def image(self, relit: Any, ev: float = 0.0, background: Rows | None = None) -> RelitImage:
         """The image under one sum of lights."""

@@ -12,6 +12,7 @@ import numpy as np
 from facerf_cli.errors import UsageError
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
+from facerf_cli.image.haze import Haze
 from facerf_cli.image.strips import Rows
 from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.work.output_options import Format, OutputOptions
@@ -26,7 +27,7 @@ class OutputImage:
 
     `share` [H, W] is how far a soft view applies to each pixel, or `added` [H, W, 3], by rows, what was
     not photographed (`colour.encode_display`); without both it applies to all. `header` is further metadata
-    of the EXR alone.
+    of the EXR alone; `haze`, of PNG and JPEG, is that of the picture behind the share.
     """
 
     pixels: np.ndarray
@@ -35,6 +36,7 @@ class OutputImage:
     share: np.ndarray | None = None
     added: Rows | None = None
     header: Mapping[str, Any] = field(default_factory=dict)
+    haze: Haze | None = None
 
 
 def check_output(options: OutputOptions) -> None:
@@ -69,7 +71,16 @@ def write_output(
             shown = {"facerf:view": view.name, **(metadata or {})}
             kept = image.share, image.added
             write_display(
-                target, image.pixels, exposure, image.alpha, shown, view, *kept, bits, options.quality
+                target,
+                image.pixels,
+                exposure,
+                image.alpha,
+                shown,
+                view,
+                *kept,
+                bits,
+                options.quality,
+                image.haze,
             )
 
     at_once = len(options.formats) if not isinstance(image.pixels, np.memmap) else 1

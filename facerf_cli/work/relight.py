@@ -19,7 +19,9 @@ from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
-from facerf_cli.image.strips import Empty, rows_of
+from facerf_cli.image.haze import haze_of
+from facerf_cli.image.light_wrap import LightWrap
+from facerf_cli.image.strips import Empty, Scaled, rows_of
 from facerf_cli.person import Group, Person, Target, fit
 from facerf_cli.relighting.people_in_photo import Background
 from facerf_cli.relighting.relightable import RenderRequest
@@ -279,13 +281,15 @@ def _rendered(
     bends what other lights add.
     """
     subject, lit = scene.subject, with_room(setup)
-    behind = scene.behind(setup, ev) if scene.behind else None
+    behind, wrap = scene.behind(setup, ev) if scene.behind else None, None
+    if behind is not None and plan.options.light_wrap:
+        wrap = LightWrap(behind, subject.matte, plan.options.light_wrap)
     parts = batches(len(lit.names), subject.nbytes)
     arrays: dict[str, np.ndarray] = {}
     for part in parts or [slice(0)]:
         each = scene.relit_by_each(setup, part) if lit.names else ()
         lights = dict(zip(lit.names[part], each, strict=True))
-        request = RenderRequest(None if arrays else relit, lights, plan.options.aov, ev, behind)
+        request = RenderRequest(None if arrays else relit, lights, plan.options.aov, ev, behind, wrap)
         arrays |= subject.rendered(request, empty)
         del lights, request  # before others are relit
     pixels, alpha = arrays.pop("rgb"), subject.alpha(behind)
@@ -295,9 +299,12 @@ def _rendered(
     added = None
     if setup.has_own:
         others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
+        others += [layers["wrap"]] if wrap is not None else []
         added = SumOf(others, subject.size_px[1], alpha)
-    share = matte if keeps else None
-    return OutputImage(pixels, scene.alpha if alpha is None else alpha, layers, share, added)
+    share, haze = matte if keeps else None, None
+    if behind is not None and plan.options.match_tones:
+        haze = haze_of(Scaled(behind, np.float32(2.0**ev)), subject.size_px)
+    return OutputImage(pixels, scene.alpha if alpha is None else alpha, layers, share, added, haze=haze)
 
 
 @dataclass(frozen=True, eq=False)

@@ -129,6 +129,8 @@ class RelightOptions:
         background: Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which
             keep their look; the envmap; or none (alpha).
         background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
+        light_wrap: Let so much of the background's light run over the matte's edge; the EXR's layer wrap.
+        match_tones: Keep a person in PNG and JPEG within the haze of the picture behind it.
         aov: Add layers to the EXR besides its matte: albedo, normal, position, depth, shadow, specular,
             classes, face, uv.
         matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
@@ -176,6 +178,8 @@ class RelightOptions:
         parse=lambda percent: percent / 100,
         panel=IMAGE,
     )
+    light_wrap: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=IMAGE)
+    match_tones: bool = option(False, panel=IMAGE)
     aov: tuple[str, ...] = option(
         (), metavar="NAME,...", shown_default="none", default_text="", parse=parse_aov, panel=IMAGE
     )
@@ -306,6 +310,11 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     photo.check()
     if options.background.kind != "photo" and alone:
         raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
+    behind = options.background.kind
+    if options.light_wrap and behind in ("photo", "none"):
+        raise UsageError("--light-wrap: is of another background; add --background FILE, COLOUR or envmap")
+    if options.match_tones and behind != "file":
+        raise UsageError("--match-tones: is of a picture behind the person; add --background FILE")
     if options.identity and alone:
         raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
     check_companion(options.matte, "--matte")
@@ -313,6 +322,8 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
     how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
     setups = collect_setups(sources, output, photo.settings.seed, how, options.background.path)
+    if options.light_wrap and any("wrap" in setup.names for setup in setups):
+        raise UsageError("--light-wrap: a light has the name wrap, too; give it another")
     if alone and any(setup.has_own for setup in setups):
         raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
     by_photo = [light for setup in setups for light in setup.by_photo]

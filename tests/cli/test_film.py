@@ -17,6 +17,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
+from facerf_cli.work import light_of_picture
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.shots import ShotOptions, collect_frames
@@ -95,6 +96,28 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     capsys.readouterr()
     assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
     assert capsys.readouterr().out == "" and names(out) == sorted([*images, "me_track.jsonl", "report.jsonl"])
+
+
+def test_all_frames_have_the_one_light_of_the_picture_behind_them(
+    given: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
+) -> None:
+    """It is guessed once; a film in its place is refused."""
+    guessed = []
+    monkeypatch.setattr(light_of_picture, "stated_fov_deg", lambda image: guessed.append(image))
+    ramp = np.linspace(20, 220, 60).astype(np.uint8)[None, :, None]
+    Image.fromarray(np.broadcast_to(ramp, (40, 60, 3))).save(tmp_path / "beach.png")
+    line = ("--background", tmp_path / "beach.png", "--light-from", "background", "--light-wrap", "0.3")
+    out = tmp_path / "out"
+    assert facerf(given, "relight", given / "me.mp4", *line, "--format", "exr", "-o", out, *CHEAP) == 0
+    assert len(guessed) == 1
+    lights = {read_image(path).metadata["facerf:lights"] for path in out.glob("*.exr")}
+    assert len(lights) == 1 and len(list(out.glob("*.exr"))) == FRAMES
+    rows = [json.loads(row) for row in (out / "report.jsonl").read_text().splitlines()]
+    assert all(list(row["exposure_ev"].values()) == [0] for row in rows)
+    capsys.readouterr()
+    film = ("--background", given / "me.mp4", "--light-from", "background")
+    assert facerf(given, "relight", given / "small.png", *film, "-o", tmp_path / "no", *CHEAP) == 1
+    assert "me.mp4" in capsys.readouterr().err
 
 
 def test_an_interrupted_film_goes_on_where_it_was(given: Path, tmp_path: Path, monkeypatch: Patch) -> None:
