@@ -90,7 +90,7 @@ if __name__ == "__main__":
     target = given[1] if given[1:] else HERE.parent / "docs/pictures"
     for name, lights in (("well", WELL), ("badly", BADLY)):
         for photo in (HERE / "astronaut.jpg", second):
-            write_display(target / f"gallery_{photo.stem}_{name}.jpg", row(photo, lights), 0.0)
+            write_display(target / f"gallery_{photo.stem}_{name}.jpg", row(photo, lights), quality=85)
     both = [cut_out(photo) for photo in (HERE / "astronaut.jpg", second)]
-    write_display(target / "gallery_cut_out.jpg", np.concatenate(both, 1), 0.0)
-    write_display(target / "gallery_before_wall.jpg", before_wall(HERE / "astronaut.jpg"), 0.0)
+    write_display(target / "gallery_cut_out.jpg", np.concatenate(both, 1), quality=85)
+    write_display(target / "gallery_before_wall.jpg", before_wall(HERE / "astronaut.jpg"), quality=85)

@@ -54,4 +54,4 @@ if __name__ == "__main__":
     given = [Path(argument) for argument in sys.argv[1:]]
     defaults = [HERE / "astronaut.jpg", HERE.parent / "docs/pictures/rigs.jpg"]
     photo, target = given + defaults[len(given) :]
-    write_display(target, sheet(photo))
+    write_display(target, sheet(photo), quality=85)

@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 import facerf_cli as facerf
-from facerf_cli.files.sheets import contact_sheet, labels
+from facerf_cli.files.sheets import contact_sheet
 from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
 
@@ -20,7 +20,7 @@ STEPS = ("photo", "crop, landmarks", "texture (UV)", "one light at a time", "wei
 
 
 def way(photo: np.ndarray, envmap: np.ndarray) -> np.ndarray:
-    """The steps side by side [h, w, 3], linear, each with its name above."""
+    """The steps, three in a row [h, w, 3], linear, each with its name above."""
     person = facerf.fit(facerf.load_models(), photo)
     crop, points = person.head.fit.crop, person.landmarks
     corner = np.array([crop.x0_px, crop.y0_px])
@@ -32,12 +32,22 @@ def way(photo: np.ndarray, envmap: np.ndarray) -> np.ndarray:
     total = (textures * light.weights[:, None, None]).sum(0)
     in_front = np.argsort(-light.directions[:, 2])[:72:8]  # nine of the lights before the face
     single = contact_sheet(np.asarray(textures[in_front]), 3)
-    relit = person.relight(light)
     level = person.texture.mean()
+    relit = person.relight(float(level / total.mean()) * light)
     as_bright = [values * level / values[values > 0].mean() for values in (single, total)]
-    steps = [around, face, person.texture, *as_bright, relit * level / total.mean()]
-    tiles = contact_sheet(np.stack([resized(square(step), TILE_PX, TILE_PX) for step in steps]), len(steps))
-    return np.concatenate([resized(labels(STEPS, TILE_PX // 2, 16), 32, tiles.shape[1]), tiles])
+    steps = [around, face, person.texture, *as_bright, relit]
+    tiles = [
+        np.concatenate([title(name), resized(square(step), TILE_PX, TILE_PX)])
+        for name, step in zip(STEPS, steps, strict=True)
+    ]
+    return contact_sheet(np.stack(tiles), 3)
+
+
+def title(name: str) -> np.ndarray:
+    """A strip [h, TILE_PX, 3] with the name of a step."""
+    strip = Image.new("RGB", (TILE_PX, 32))
+    ImageDraw.Draw(strip).text((8, 4), name, "white", ImageFont.load_default(18))
+    return np.asarray(strip, np.float32) / 255
 
 
 def marked(image: np.ndarray, boxes: list[tuple[float, ...]], width: int) -> np.ndarray:
