@@ -4,9 +4,9 @@ Before the photo's own background the image is the photo, without its people as 
 people over it. So edges come back exactly, and layers of lights add up.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -91,21 +91,16 @@ class PeopleInPhoto(Relightable):
             for name in request.layers:
                 found |= _layer(name, request.image, present, seen)
         for name, light in request.lights.items():
-            found[name] = _over(_BLACK, present, _pixels(present, light, seen, rows))
+            found[name] = _over(present, _pixels(present, light, seen, rows))
         return found
 
     def own_layer(self) -> np.ndarray:
         """The people [H, W, 3] as photographed, over black."""
-        return in_strips(lambda rows: {"": self._own(self._present(rows), rows)}, *self.size_px)[""]
+        return in_strips(partial(self._as_photographed, over=_over), *self.size_px)["own"]
 
     def own_image(self) -> np.ndarray:
         """The people [H, W, 3] as photographed, not multiplied by alpha."""
-
-        def of_rows(rows: slice) -> dict[str, np.ndarray]:
-            present = self._present(rows)
-            return {"": _straight(present, [one.person.own[rows] for one in present])}
-
-        return in_strips(of_rows, *self.size_px)[""]
+        return in_strips(partial(self._as_photographed, over=_straight), *self.size_px)["own"]
 
     def _present(self, rows: slice) -> list[_Present]:
         """The people in some rows: the first, and of a crowd few others."""
@@ -119,24 +114,26 @@ class PeopleInPhoto(Relightable):
     def _shares(self, rows: slice) -> dict[str, np.ndarray]:
         return {"alpha": _alpha(self._present(rows))[..., 0]}
 
-    def _own(self, present: Sequence[_Present], rows: slice) -> np.ndarray:
-        return _over(_BLACK, present, [one.person.own[rows] for one in present])
+    def _as_photographed(self, rows: slice, over: Callable[..., np.ndarray]) -> dict[str, np.ndarray]:
+        present = self._present(rows)
+        return {"own": over(present, _own(present, rows))}
 
     def _image(
         self, request: RenderRequest, present: Sequence[_Present], seen: Sequence[Any], rows: slice
     ) -> np.ndarray:
         pixels = _pixels(present, request.image, seen, rows)
         if request.background is not None:
-            return _over(request.background[rows], present, pixels)
+            return _over(present, pixels, request.background[rows])
         if self.keeps_photo:
-            plate = (self.people[0].photo[rows] - self._own(present, rows)) * np.float32(2.0**-request.ev)
-            found = plate + _over(_BLACK, present, pixels)
+            own = _over(present, _own(present, rows))
+            plate = (self.people[0].photo[rows] - own) * np.float32(2.0**-request.ev)
+            found = plate + _over(present, pixels)
             return found.clip(min=0) if len(self.people) > 1 else found
         return _straight(present, pixels)
 
 
-def _over(below: Any, present: Sequence[_Present], pixels: Sequence[np.ndarray]) -> np.ndarray:
-    """People, the nearest first, with pixels [h, W, 3] of each, laid over what is below."""
+def _over(present: Sequence[_Present], pixels: Sequence[np.ndarray], below: Any = _BLACK) -> np.ndarray:
+    """People, the nearest first, with pixels [h, W, 3] of each, laid over what is below, by default black."""
     for one, own in zip(present, pixels, strict=True):
         below = below + one.share * (own - below)
     return np.asarray(below)
@@ -146,7 +143,7 @@ def _straight(present: Sequence[_Present], pixels: Sequence[np.ndarray]) -> np.n
     """People over nothing, not multiplied by alpha."""
     if len(present) == 1:
         return pixels[0]
-    return _over(_BLACK, present, pixels) / np.maximum(_alpha(present), _TINY)
+    return _over(present, pixels) / np.maximum(_alpha(present), _TINY)
 
 
 def _alpha(present: Sequence[_Present]) -> np.ndarray:
@@ -155,6 +152,11 @@ def _alpha(present: Sequence[_Present]) -> np.ndarray:
     for one in present:
         found = found + one.share * (1 - found)
     return np.asarray(found)
+
+
+def _own(present: Sequence[_Present], rows: slice) -> list[np.ndarray]:
+    """Pixels [h, W, 3] of each of the people, as photographed."""
+    return [one.person.own[rows] for one in present]
 
 
 def _pixels(

@@ -16,7 +16,6 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
-from facerf_cli.files.read import LinearImage
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.haze import haze_of
@@ -45,7 +44,7 @@ from facerf_cli.work.photos import (
     rotation_of,
 )
 from facerf_cli.work.plan import beside_people, canvas, require_face, require_people
-from facerf_cli.work.relight_options import RelightPlan
+from facerf_cli.work.relight_options import RelightOptions, RelightPlan
 from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces
 
 log = logging.getLogger(LOGGER_NAME)
@@ -91,23 +90,37 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
         faces, matte = [face], face.matte
     else:
         image = read_photo(item, plan.photo)
-        matte, faces = (
-            person_matte(item, image.pixels, plan.photo),
-            find_people(item, image, plan.photo, True),
-        )
+        matte = person_matte(item, image.pixels, plan.photo)
+        faces = find_people(item, image, plan.photo, to_fit=True)
     photo, background = image.pixels, options.background.kind
     check_faces(item, faces[-1].number, plan)
     target = Target(composite="face")
     if in_photo:
-        behind: Background = "photo" if background == "photo" else "none" if background == "none" else "given"
-        matted = (
-            None if options.matte is None else read_matte(item, options.matte, photo.shape[:2], bool(place))
-        )
-        target = Target(matte=matted, alpha=None if background == "photo" else image.alpha, background=behind)
+        shown = None
+        if options.matte is not None:
+            shown = read_matte(item, options.matte, photo.shape[:2], in_shot=place is not None)
+        behind: Background = background if background in ("photo", "none") else "given"
+        target = Target(matte=shown, alpha=None if behind == "photo" else image.alpha, background=behind)
         with naming(item.input_path):
             require_people(len(faces), photo.shape[:2])
     for some in [faces] if together else ([face] for face in reversed(faces)):
-        fitted = [_fitted(face, image, matte, plan) for face in some]
+        fitted: list[tuple[FittedFace, Person]] = []
+        for face in some:
+            known = face if isinstance(face, FittedFace) else None  # of a frame of a shot
+            with naming(face.name):
+                person = fit(
+                    load_models_once(plan.photo),
+                    photo,
+                    reflectance=options.reflectance,
+                    network_alone=options.network_alone,
+                    matte=matte,
+                    texture_side=plan.photo.texture_side,
+                    white=options.white,
+                    face=face.found,
+                    head=known and known.head,
+                    steady=known and known.steady,
+                )
+            fitted.append((_described(face, person, matte, options), person))
         people = [face for face, _ in fitted]
         fitted.sort(key=lambda one: -one[0].fit.crop.side_px)  # the nearest first
         persons = [person for _, person in fitted]
@@ -140,31 +153,18 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
         )
 
 
-def _fitted(
-    face: PhotoFace, image: LinearImage, matte: np.ndarray | None, plan: RelightPlan
-) -> tuple[FittedFace, Person]:
-    """Fit the person of a face, whose matte [H, W] may be given; of a frame of a shot the head is known."""
-    options, known = plan.options, face if isinstance(face, FittedFace) else None
-    with naming(face.name):
-        person = fit(
-            load_models_once(plan.photo),
-            image.pixels,
-            reflectance=options.reflectance,
-            network_alone=options.network_alone,
-            matte=matte,
-            texture_side=plan.photo.texture_side,
-            white=options.white,
-            face=face.found,
-            head=known and known.head,
-            steady=known and known.steady,
-        )
-    if known is None:
-        known = fitted_face(face, person.head, matte)
-        if person.balance is not None and person.balance.is_far and options.white == "photo":
-            log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
+def _described(
+    face: PhotoFace, person: Person, matte: np.ndarray | None, options: RelightOptions
+) -> FittedFace:
+    """The face of a person, with what is known of its fit and its matte, if that was not given."""
+    if isinstance(face, FittedFace):
+        return face
+    found = fitted_face(face, person.head, matte)
+    if person.balance is not None and person.balance.is_far and options.white == "photo":
+        log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
     if options.composite == "photo" and matte is None:
-        known.see(person.segmentation)
-    return known, person
+        found.see(person.segmentation)
+    return found
 
 
 def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
