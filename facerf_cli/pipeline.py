@@ -149,14 +149,21 @@ def reflectance_of(
     matte: np.ndarray | None = None,
     white: White | None = None,
 ) -> Reflectance:
-    """Read the reflectance of a head from its photo; the portrait field needs the photo [H, W, 3] itself.
+    """Read the reflectance of a head from its photo.
 
-    A frame of a shot comes with what is steadied by the frames around it, and has the face's field alone
-    where it shows nobody; a photo may come with the person's `matte` [H, W].
-
-    The fields are corrected by the photo's quotient image, so that the photo comes back under its own light;
-    with `network_alone` they are not. By `white` skin under even white light has the photo's colours, or
-    those of skin (`white.py`); None leaves the network's. The paper's baselines have neither.
+    Args:
+        models: The networks and the face model.
+        head: The head in the photo.
+        kind: The portrait field, the face's, or a baseline of the paper, which has neither quotient nor
+            white.
+        network_alone: Leave out the correction by the photo's quotient image, by which the photo comes back
+            under its own light.
+        photo: Scene-linear [H, W, 3], which the portrait field needs itself.
+        steady: What the frames around it steady, of a frame of a shot, which has the face's field alone where
+            it shows nobody.
+        matte: The person's share [H, W] of the photo, if it is given.
+        white: Under even white light skin has the photo's colours, or those of skin (`white.py`); None leaves
+            the network's.
     """
     if kind != "field" and kind != "portrait":
         return explain(models, head, kind).reflectance
@@ -235,10 +242,16 @@ def predict_olat(
     bf16: bool = False,
     white: White | None = None,
 ) -> Iterator[Tensor]:
-    """Yield OLAT textures for unit directions [L, 3], in batches [l, 3, T, T] that fit the memory.
+    """Yield OLAT textures of a head, in batches [l, 3, T, T] that fit the memory.
 
-    `rotation` [3, 3], head_to_camera, is the target's head pose; None keeps the photo's. For the rest see
-    `reflectance_of`.
+    Args:
+        models: The networks and the face model.
+        head: The head in its photo.
+        lights: Unit directions [L, 3], camera space.
+        rotation: The target's head pose, head_to_camera [3, 3]; None keeps the photo's.
+        network_alone: As in `reflectance_of`.
+        bf16: Compute in half precision.
+        white: As in `reflectance_of`.
     """
     field = reflectance_of(models, head, "field", network_alone, white=white)
     assert isinstance(field, Field)
@@ -272,13 +285,19 @@ def estimate_light(
     more: Sequence[Head] = (),
     white: White | None = None,
 ) -> LightEstimate:
-    """Estimate the light of a head's photo over a rig [L, 3] (paper, 'Light Estimation', Eq. leastsq).
+    """Estimate the light of a head's photo over a rig (paper, 'Light Estimation', Eq. leastsq).
 
-    Of a shot the heads of `more` frames take part in the field's least squares.
+    Args:
+        models: The networks and the face model.
+        head: The head in its photo.
+        kind: The field, or a baseline of the paper, which estimates its own light.
+        rig: Unit directions [L, 3], camera space; by default 150.
+        estimator: How the least squares are solved and refined.
+        keep_eyes: Eyes take part, which the paper leaves out.
+        more: Heads of other frames of a shot, which take part.
+        white: The light is that over the photo's or over skin's own colours (`white.py`).
 
     Where one lamp and light from around explain the photo as well, they are its light (`source_light.py`).
-    By `white` the light is that over the photo's or over skin's own colours (`white.py`). The models other
-    than the field estimate their own light. Eyes are left out, as in the paper, unless `keep_eyes`.
     Raises InputError where too little of the face is visible.
     """
     evidence = photo_evidence(head.face, keep_eyes)
