@@ -30,7 +30,8 @@ from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding
-from facerf_cli.capture.stage_json import STAGE_FILE, read_capture
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.stage_json import STAGE_FILE
 from facerf_cli.files.read import read_image
 
 _IN_FRONT = 0.7  # cosine to the first camera's axis of the lights whose frames get faults

@@ -23,8 +23,8 @@ from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding, frames_left_out
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, read_shifts
 
 _SET_ON = ("yaleB05", "yaleB15", "yaleB22")  # subjects on which the thresholds were set

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from _common import arguments, print_header, print_row, required
 
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.person import fit
 from facerf_cli.pipeline import find_for

@@ -20,7 +20,7 @@ from _common import arguments, print_header, print_row, required
 
 import facerf_cli as facerf
 from facerf_cli.api import Person
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.errors import FacerfError
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.sphere import azel_to_direction

@@ -6,7 +6,7 @@ of a lens, by OpenCV's coefficients, is undone where a frame is read.
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in a light's plac
 _AMBIENT_WORDS = ("ambient", "dark", "black", "room", "background")  # there, too: a frame without lights
 _RESERVED = r"{}\:*?"  # wildcards of patterns, and characters that file names cannot have everywhere
 _LONGEST = 500
+BlackLevel = float | tuple[float, float, float]
 Coefficients = tuple[float, ...]  # k1, k2, p1, p2 and, where there are five, k3
 _STEPS = 64  # of the radius along which a lens is examined
 
@@ -69,7 +70,7 @@ class Capture:
     folder: Path
     pattern: str  # path of a frame, with {light}, and mostly {subject} and {camera}
     colour_space: str
-    black_level: float
+    black_level: BlackLevel
     light_ids: tuple[str, ...]
     directions_world: np.ndarray  # [L, 3] unit, toward the lights
     intensities: np.ndarray  # [L, 3] positive
@@ -86,6 +87,11 @@ class Capture:
     )  # of the cameras whose lenses distort
     align: bool = False  # whether to undo head motion: `shifts` are then found for each subject
     charts: tuple[ChartCorrection, ...] = ()  # corrections of the cameras by photographed colour charts
+    colour_matrix: np.ndarray | None = None  # [3, 3], on linear values without the black level
+    positions_m: np.ndarray | None = None  # [L, 3] of near lights, in the world; NaN of far ones
+    centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3], to which near light is measured
+    stops: Mapping[str, float] = field(default_factory=dict)  # by which a subject's frames are brighter
+    ignored: frozenset[str] = frozenset()  # names in a light's place that are of no single light
     # Pixels down and right that undo the head motion of a frame, by subject, camera and light.
     shifts: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
 
@@ -110,13 +116,34 @@ class Capture:
                 f"{posed.width_px} x {posed.height_px}; give frames of one size, or correct the camera"
             )
         ambient = self.ambient(subject, camera) if self.subtract_ambient else None
-        dark = np.float32(self.black_level) if ambient is None else ambient
         shift_px = self.shifts.get((subject, camera, self.light_ids[light]), (0.0, 0.0))
-        lit = (pixels - dark) / self.intensities[light].astype(np.float32)
+        exposed = np.float32(2.0 ** self.stops.get(subject, 0.0)) * self.intensities[light].astype(np.float32)
+        lit = self.without_dark(pixels, ambient) / exposed
         lit = correct_colours(self.charts, camera, lit)
         if camera in self.distortion:
             lit = undistorted(lit, posed, self.distortion[camera])
         return shift_image(lit, *shift_px)
+
+    def without_dark(self, pixels: np.ndarray, ambient: np.ndarray | None = None) -> np.ndarray:
+        """Values [..., 3] without the black level, or an ambient image, in the colours of the matrix."""
+        linear = pixels - (np.asarray(self.black_level, np.float32) if ambient is None else ambient)
+        return linear if self.colour_matrix is None else linear @ self.colour_matrix.T.astype(np.float32)
+
+    def about(self, head_m: np.ndarray) -> "Capture":
+        """The capture with its near lights as a head at [3] in the world receives them.
+
+        A near light is weaker by the square of its distance, and shines along the line to the head.
+        """
+        if self.positions_m is None:
+            return self
+        near = np.isfinite(self.positions_m).all(1)
+        offsets = self.positions_m[near] - head_m
+        distances = np.linalg.norm(offsets, axis=1, keepdims=True)
+        directions, intensities = self.directions_world.copy(), self.intensities.copy()
+        directions[near] = offsets / distances
+        measured = np.linalg.norm(self.positions_m[near] - self.centre_m, axis=1, keepdims=True)
+        intensities[near] *= (measured / distances) ** 2
+        return replace(self, directions_world=directions, intensities=intensities, centre_m=head_m)
 
     def ambient(self, subject: str, camera: str) -> np.ndarray | None:
         """Read a subject's image without any light [H, W, 3], black level included.
@@ -240,7 +267,7 @@ def undistorted(image: np.ndarray, camera: PosedCamera, coefficients: Coefficien
     return np.ascontiguousarray(flat[0].permute(1, 2, 0).numpy())
 
 
-@lru_cache(maxsize=16)  # all frames of a camera share it
+@lru_cache(maxsize=2)  # all frames of a camera share it
 def _grid(
     focal_px: tuple[float, float],
     centre_px: tuple[float, float],

@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from skimage.draw import polygon
@@ -198,7 +199,7 @@ def read_charts(capture: Capture, image: str, corners_px: Sequence[np.ndarray]) 
 def _normalise(capture: Capture, decoded: np.ndarray) -> np.ndarray:
     """Subtract the black level from values [..., 3], and divide by the lights' mean rgb at luminance 1."""
     mean = capture.intensities.mean(0)
-    return (decoded - capture.black_level) / (mean / luminance(mean)).astype(decoded.dtype)
+    return capture.without_dark(decoded) / (mean / luminance(mean)).astype(decoded.dtype)
 
 
 def _read_chart(
@@ -240,7 +241,7 @@ def _refuse(image: Path, faults: Iterator[str]) -> None:
         raise InputError(f"{image}: {fault}")
 
 
-def _faults_of_light(image: Path, patches: Patches, black_level: float) -> Iterator[str]:
+def _faults_of_light(image: Path, patches: Patches, black_level: Any) -> Iterator[str]:
     """Faults of patches that are too small, dark, noisy, clipped or grey to measure."""
     if patches.counts.min() < _LEAST_PX:
         yield (
@@ -248,7 +249,7 @@ def _faults_of_light(image: Path, patches: Patches, black_level: float) -> Itera
             f"photograph it larger, {_LEAST_PX} are needed"
         )
     greys = patches.colours[GREYS]
-    brightest = (greys - black_level).max(0)
+    brightest = (greys - np.asarray(black_level)).max(0)
     if brightest.min() <= 0 or patches.noise[GREYS].max() > _LARGEST_NOISE * brightest[1]:
         yield "the chart is too dark, or too noisy; expose it longer"
     clipped = int((patches.at_white > _CLIPPED_SHARE).sum())

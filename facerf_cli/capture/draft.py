@@ -2,15 +2,12 @@
 
 The entry "draft" lists what was found, what a person must fill in, and what to check.
 
-Directions come from a list of lights next to the images, with lines `name x y z` or `x y z`, x to the image's
-right, y up, z toward the camera: an LP file of reflectance transformation imaging, whose first line is the
-number of lines that follow, or a plain text file. Vectors are normalised, because lists may also hold the
-positions of lights relative to the object.
+Directions or positions come from a list of lights next to the images (`light_lists.py`), cameras from the XML
+of Metashape.
 """
 
 import json
 import logging
-import math
 import os
 import re
 from collections import Counter
@@ -19,16 +16,15 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-import numpy as np
-
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
+from facerf_cli.capture.light_lists import DraftLights, draft_lights, match_lights, read_light_list
+from facerf_cli.capture.metashape import read_metashape
 from facerf_cli.capture.stage_json import FACING, STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
-from facerf_cli.files.texts import read_text
 from facerf_cli.image.colour import LINEAR, find_space
 from facerf_cli.run.logs import LOGGER_NAME, counted
 
@@ -50,13 +46,8 @@ _WANTED = {
 }
 # Files.
 _DEEPEST = 8  # folders below the capture that are searched
-# Lists of lights.
-_LIST_SUFFIX, _LIST_NAMES = ".lp", ("lights.txt", "light_directions.txt")
-_LIST_LIMIT_BYTES = 4 << 20
-_DIGITS = 6
+_LIST_NAME = re.compile(r".*\.lp|light.*\.(txt|json)|.*\.xml", re.IGNORECASE)
 
-Direction = list[float]  # unit vector toward the light
-ListedLight = tuple[str, Direction]  # name of an image, empty in a list without names; direction of its light
 Headers = dict[str, Header | None]  # by the paths of images
 Key = tuple[str, str, str]  # subject, camera and light; empty where the pattern does not name them
 
@@ -110,6 +101,7 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
     if not folder.is_dir():
         raise UsageError(f"{folder}: no such folder; give the folder of a capture")
     images, lists = scan_folder(folder, suffixes)
+    calibrations = [path for path in lists if path.lower().endswith(".xml")]
     if not images:
         raise UsageError(f"{folder}: no images found (looked for {' '.join(sorted(suffixes))})")
     try:
@@ -119,8 +111,8 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
             example = f"'{likely}' for {_list([images[examples.index(likely)]])}"
             raise UsageError(f"--pattern is needed; say what the parts of a path are, such as {example}")
         frames = frames_by_pattern(images, pattern)
-        if len(lights := frames.ids("light")) < _LEAST_LIGHTS:
-            names = f"{counted(len(lights), 'light')} ({', '.join(lights)})"
+        if len(found := frames.ids("light")) < _LEAST_LIGHTS:
+            names = f"{counted(len(found), 'light')} ({', '.join(found)})"
             raise UsageError(
                 f"{names}, but a capture has {_LEAST_LIGHTS} or more; give its folder, or correct --pattern"
             )
@@ -129,16 +121,17 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
             raise UsageError("the images cannot be read; check the files")
     except UsageError as error:
         raise UsageError(f"{folder}: {error}") from None
-    directions, about_list = _read_directions(folder, lists, frames)
-    content = _content(folder, pattern, frames, headers, directions)
+    lights, about_lights = _read_lights(folder, [one for one in lists if one not in calibrations], frames)
+    cameras, about_cameras = _read_cameras(folder, calibrations, frames)
+    content = _content(folder, pattern, frames, headers, lights, cameras)
     words = ", ".join(counted(len(frames.ids(field)), field) for field in FIELDS)
     missing, expected = frames.expected - len(frames.paths), frames.expected
     exist = f"{missing} of {expected} frames are missing" if missing else f"all {expected} frames exist"
     notes = [
         f"{pattern}: {words}; {exist}",
         *(f"fill in: {note}" for note in _gaps(content)),
-        *([about_list] if about_list else []),
-        *(f"check: {note}" for note in _assumptions(headers, content)),
+        *filter(None, (about_lights, about_cameras)),
+        *(f"check: {note}" for note in _assumptions(headers, content, cameras)),
     ]
     if strays := frames.strays:
         wrong = "do not match the pattern, or have ids not of letters, digits, - and _ alone"
@@ -182,23 +175,37 @@ def _space_name(path: str, header: Header) -> str | None:
     return header.space.name if find_space(header.space.name) == header.space else None
 
 
-def _read_directions(
-    folder: Path, lists: Sequence[str], frames: Frames
-) -> tuple[dict[str, list[float]], str]:
-    """Directions by light from the first list of lights, and a note about the list."""
+def _read_lights(folder: Path, lists: Sequence[str], frames: Frames) -> tuple[DraftLights, str]:
+    """Lights from the first list of lights, and a note about it."""
     if not lists:
-        return {}, ""
-    lights, name = frames.ids("light"), lists[0]
+        return DraftLights(), ""
+    names, name = frames.ids("light"), lists[0]
     stems = {PurePosixPath(path).stem: light for (_, _, light), path in frames.paths.items()}
     try:
         listed = read_light_list(folder / name)
     except InputError as error:
-        return {}, f"left out: a list of lights: {error}"
-    if found := match_lights(listed, lights, stems):
-        axes = "x right, y up, z toward the camera, as world space"
-        return found, f"check: lights: directions from {_list([name])}, {axes}"
-    problem = f"its {len(listed)} lines name none of the {len(lights)} lights"
-    return {}, f"left out: a list of lights: {folder / name}: {problem}"
+        return DraftLights(), f"left out: a list of lights: {error}"
+    if found := match_lights(listed, names, stems):
+        lights = draft_lights(found, [vector for _, vector in listed])
+        return lights, f"check: lights: {lights.kind} from {_list([name])}, {lights.assumed}"
+    problem = f"its {len(listed)} lines name none of the {len(names)} lights"
+    return DraftLights(), f"left out: a list of lights: {folder / name}: {problem}"
+
+
+def _read_cameras(
+    folder: Path, calibrations: Sequence[str], frames: Frames
+) -> tuple[dict[str, dict[str, Any]], str]:
+    """Cameras of the images from Metashape's XML, and a note about it."""
+    if not calibrations:
+        return {}, ""
+    try:
+        known = read_metashape(folder / calibrations[0])
+    except InputError as error:
+        return {}, f"left out: a calibration: {error}"
+    found = {name: known[name] for name in frames.ids("camera") if name in known}
+    if not found:
+        return {}, f"left out: a calibration: {folder / calibrations[0]}: has no camera of the images' names"
+    return found, f"check: cameras: from {_list(calibrations[:1])}, whose unit is taken as a metre"
 
 
 def _content(
@@ -206,8 +213,10 @@ def _content(
     pattern: str,
     frames: Frames,
     headers: Mapping[str, Headers],
-    directions: Mapping[str, list[float]],
+    lights: DraftLights,
+    cameras: Mapping[str, dict[str, Any]],
 ) -> dict[str, Any]:
+    """The entries of stage.json."""
     read = ((path, header) for of_camera in headers.values() for path, header in of_camera.items() if header)
     spaces = {_space_name(path, header) for path, header in read}
     ambient = frames.ambient.most_common(1)
@@ -220,10 +229,13 @@ def _content(
         "pattern": pattern,
         **({"ambient": pattern.replace("{light}", ambient[0][0])} if ambient else {}),
         "lights": [
-            {"id": light, "direction": directions.get(light), "intensity": [1.0, 1.0, 1.0]}
+            {"id": light, **lights.entries.get(light, {"direction": None}), "intensity": [1.0, 1.0, 1.0]}
             for light in frames.ids("light")
         ],
-        "cameras": [_camera(name, _sizes(of), len(headers) == 1) for name, of in headers.items()],
+        **({} if lights.centre_m is None else {"centre": lights.centre_m}),
+        "cameras": [
+            cameras.get(name) or _camera(name, _sizes(of), len(headers) == 1) for name, of in headers.items()
+        ],
         **({} if "{subject}" in pattern else {"subjects": {subject: {}}}),
     }
 
@@ -243,8 +255,8 @@ def _gaps(content: Mapping[str, Any]) -> Iterator[str]:
     """Describe the null entries, counted by light and camera."""
     for key, value in content.items():
         entries = value if isinstance(value, list) else ()
-        for name in entries[0] if entries else ():
-            if empty := [entry["id"] for entry in entries if entry[name] is None]:
+        for name in dict.fromkeys(name for entry in entries if isinstance(entry, dict) for name in entry):
+            if empty := [entry["id"] for entry in entries if entry.get(name, 0) is None]:
                 yield f"{name} of {len(empty)} of {counted(len(entries), key[:-1])} ({_WANTED[name]})"
     if content["colour_space"] is None:
         yield (
@@ -253,7 +265,9 @@ def _gaps(content: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _assumptions(headers: Mapping[str, Headers], content: Mapping[str, Any]) -> Iterator[str]:
+def _assumptions(
+    headers: Mapping[str, Headers], content: Mapping[str, Any], calibrated: Collection[str]
+) -> Iterator[str]:
     yield "lights: the intensity 1 1 1 is assumed of each"
     for camera, of_camera in headers.items():
         if len(sizes := _sizes(of_camera)) > 1:
@@ -262,8 +276,9 @@ def _assumptions(headers: Mapping[str, Headers], content: Mapping[str, Any]) -> 
     sampled = [header for of_camera in headers.values() for header in of_camera.values()]
     if unread := sampled.count(None):
         yield f"cameras: {unread} of {counted(len(sampled), 'image')} sampled cannot be read"
-    yield "cameras: K is a guess, with a focal length of 4 times the longer side; calibrate them"
-    if len(headers) == 1:
+    if len(calibrated) < len(headers):
+        yield "cameras: K is a guess, with a focal length of 4 times the longer side; calibrate them"
+    if len(headers) == 1 and not calibrated:
         yield "cameras: the space of the one camera is the world: x right, y up, z toward the camera"
     if space := content["colour_space"]:
         yield f"colour_space: {space}, from the headers of some images"
@@ -279,7 +294,7 @@ def _list(names: Sequence[str]) -> str:
 
 
 def scan_folder(folder: Path, suffixes: Collection[str]) -> tuple[list[str], list[str]]:
-    """Find images with these suffixes, and lists of lights, the uppermost first.
+    """Find images with these suffixes, and lists of lights and calibrations, the uppermost first.
 
     Paths are relative to the folder, with / between names. Hidden files and folders are skipped. Links to
     folders are followed, but each folder is entered once.
@@ -298,7 +313,7 @@ def scan_folder(folder: Path, suffixes: Collection[str]) -> tuple[list[str], lis
             suffix, path = os.path.splitext(name)[1].lower(), (below / name).as_posix()
             if suffix in suffixes:
                 images.append(path)
-            elif (suffix == _LIST_SUFFIX or name.lower() in _LIST_NAMES) and (folder / path).is_file():
+            elif _LIST_NAME.fullmatch(name) and (folder / path).is_file():
                 lists.append(path)
     return images, sorted(lists, key=lambda path: (path.count("/"), path))
 
@@ -340,44 +355,3 @@ def example_pattern(path: str) -> str:
     fields = ["{subject}", "{camera}"][: len(folders)]
     above = folders[: len(folders) - len(fields)]
     return "/".join([*above, *fields, "{light}" + PurePosixPath(path).suffix])
-
-
-def read_light_list(path: Path) -> list[ListedLight]:
-    """Read a list of lights; InputError names the first wrong line."""
-    text = read_text(path, _LIST_LIMIT_BYTES, "give lines `name x y z`")
-    lights: list[ListedLight] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").rsplit(maxsplit=3)
-        if not fields or (not lights and len(fields) == 1 and fields[0].isdecimal()):
-            continue  # empty, or the number of lines
-        try:
-            *name, x, y, z = fields
-            vector = np.array([float(x), float(y), float(z)])
-        except ValueError:
-            raise InputError(f"{path}: line {number} is wrong; give `name x y z`") from None
-        length = float(np.linalg.norm(vector))
-        if not 0 < length < math.inf:
-            raise InputError(f"{path}: line {number} has no direction; give a finite vector other than 0")
-        direction = (vector / length).round(_DIGITS) + 0.0  # turns -0.0 into 0.0
-        lights.append(("".join(name).strip(), direction.tolist()))
-    return lights
-
-
-def match_lights(
-    listed: Sequence[ListedLight], light_ids: Sequence[str], light_of_stem: Mapping[str, str]
-) -> dict[str, Direction]:
-    """Assign listed directions to lights by name; a list without names goes by the order of the lights.
-
-    `light_of_stem` maps the stem of an image's file name to its light.
-    """
-    if not any(name for name, _ in listed):
-        pairs = zip(light_ids, listed, strict=True) if len(listed) == len(light_ids) else ()
-        return {light: direction for light, (_, direction) in pairs}
-    known = {**light_of_stem, **{light: light for light in light_ids}}
-    found = {}
-    for path, direction in listed:
-        name = path.replace("\\", "/").split("/")[-1]
-        light = known.get(name) or known.get(name.rpartition(".")[0])
-        if light is not None:
-            found[light] = direction
-    return found

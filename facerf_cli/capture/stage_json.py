@@ -1,9 +1,9 @@
-"""Reader of captures, and of `stage.json`, the description of a capture that stands next to its images.
+"""Reader of `stage.json`, the description of a capture that stands next to its images.
 
     {"format": "facerf-stage-1", "axes": "opencv", "unit": "m",
      "colour_space": "lin_rec709", "black_level": 0.0,
      "pattern": "{subject}/{camera}/{light}.exr",
-     "lights": [{"id": "L000", "direction": [x, y, z], "intensity": [r, g, b]}],
+     "lights": [{"id": "L000", "direction": [x, y, z] or "position": [x, y, z], "intensity": [r, g, b]}],
      "cameras": [{"id": "C0", "width": 256, "height": 256, "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
                   "world_to_camera": 3 x 4 or 4 x 4}],
      "subjects": {"0000": {traits}}, "provenance": {...}}
@@ -16,14 +16,18 @@ it radiance 1. The black level is linear too.
 A camera may have "distortion": OpenCV's k1, k2, p1, p2 and k3, which is undone in every frame. A single
 camera without a pose is the world: x right, y up, z toward the camera.
 
+A light with a position, in metres in the world, is near: its direction follows from the head that is fitted,
+and it is weighed by the square of its distance; its intensity is that at "centre" (by default the world's
+origin). "colour_matrix" [3, 3] acts on linear values without the black level, which may be of each channel.
+"exposure_stops" {subject: stops} says whose frames are brighter; "ignore" lists names in a light's place that
+are of no single light, as those of tracking frames.
+
 Without `subjects`, every name that the pattern finds on disk is a subject. "ambient", for example
 "{subject}/{camera}/ambient.exr", is optional: images without any light, which --subtract-ambient subtracts in
 place of the black level. A pattern may lack {camera} if there is one camera, and {subject} if `subjects`
 lists one.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -31,10 +35,16 @@ import numpy as np
 import torch
 from pydantic import AfterValidator, Field, PlainValidator, model_validator
 
-from facerf_cli.capture.capture import FIELDS, Capture, Coefficients, find_subjects, folds, require_pattern
-from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.capture.yale_b import read_yale_capture
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.capture.capture import (
+    FIELDS,
+    BlackLevel,
+    Capture,
+    Coefficients,
+    find_subjects,
+    folds,
+    require_pattern,
+)
+from facerf_cli.errors import UsageError
 from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three, distinct, read_document
 from facerf_cli.image.colour import named_space
@@ -46,6 +56,8 @@ MOST_LIGHTS, MOST_CAMERAS, MOST_SUBJECTS = 4096, 256, 100_000
 _LONGEST_SIDE_PX = 65_536
 _ORTHONORMAL_OFF = 1e-3  # of a singular value from 1, in rotations written with few digits
 _LEAST_INTENSITY = 1e-12  # frames are divided by it, in float32
+_NEAREST_M, _MOST_STOPS = 0.05, 20.0  # of a near light from the centre; of a subject's exposure
+_MOST_BLACK = 1e12
 _ASPECT_OFF = 0.01  # of fx / fy from 1: a face crop has square pixels
 # A world that equals the camera's space (y up, z toward the camera), in OpenCV's axes (y down, z forward).
 FACING = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]]
@@ -64,6 +76,24 @@ def _intensity(rgb: np.ndarray) -> np.ndarray:
     if not (rgb > _LEAST_INTENSITY).all():
         raise ValueError("a positive value in every channel is needed (frames are divided by it)")
     return rgb
+
+
+def _black_level(value: Any) -> BlackLevel:
+    levels = value if isinstance(value, list) else [value]
+    numbers = [level for level in levels if isinstance(level, int | float) and abs(level) <= _MOST_BLACK]
+    if len(levels) not in (1, 3) or len(numbers) != len(levels) or isinstance(value, bool):
+        raise ValueError("a number, or one for each of three channels, is needed")
+    return (float(levels[0]), float(levels[1]), float(levels[2])) if len(levels) == 3 else float(levels[0])
+
+
+def _nowhere() -> np.ndarray:
+    return np.full(3, np.nan)
+
+
+def _invertible(matrix: np.ndarray) -> np.ndarray:
+    if np.linalg.matrix_rank(matrix) < 3:
+        raise ValueError("a matrix that keeps three colours apart is needed")
+    return matrix
 
 
 def _intrinsics(k: np.ndarray) -> np.ndarray:
@@ -105,11 +135,18 @@ Side = Annotated[int, Field(ge=1, le=_LONGEST_SIDE_PX)]
 
 
 class LightEntry(Document):
-    """A light of the stage."""
+    """A light of the stage: a far one has a direction, a near one a position."""
 
     id: Name
-    direction: Direction
+    direction: Direction = Field(default_factory=_nowhere)
+    position: Three = Field(default_factory=_nowhere)
     intensity: Annotated[Three, AfterValidator(_intensity)]
+
+    @model_validator(mode="after")
+    def _is_somewhere(self) -> "LightEntry":
+        if np.isnan(self.direction[0]) == np.isnan(self.position[0]):
+            raise ValueError("either 'direction' or 'position' is needed")
+        return self
 
 
 class CameraEntry(Document):
@@ -148,7 +185,13 @@ class StageDocument(Document):
     axes: Literal["opencv"]
     unit: Literal["m"]
     colour_space: Annotated[str, AfterValidator(_colour_space)]
-    black_level: Annotated[float, Field(ge=-1e12, le=1e12)]
+    black_level: Annotated[BlackLevel, PlainValidator(_black_level)]
+    colour_matrix: Annotated[Matrix3, AfterValidator(_invertible)] | None = None
+    centre: Three = Field(default_factory=lambda: np.zeros(3))
+    exposure_stops: dict[Name, Annotated[float, Field(ge=-_MOST_STOPS, le=_MOST_STOPS)]] = Field(
+        default_factory=dict
+    )
+    ignore: Annotated[list[str], Field(max_length=MOST_LIGHTS)] = Field(default_factory=list)
     pattern: str
     lights: Annotated[list[LightEntry], Field(min_length=1, max_length=MOST_LIGHTS)]
     cameras: Annotated[list[CameraEntry], Field(min_length=1, max_length=MOST_CAMERAS)]
@@ -160,6 +203,11 @@ class StageDocument(Document):
     def _has_distinct_ids(self) -> "StageDocument":
         distinct([light.id for light in self.lights], "the light")
         distinct([camera.id for camera in self.cameras], "the camera")
+        for light in self.lights:
+            if np.linalg.norm(light.position - self.centre) < _NEAREST_M:
+                raise ValueError(f"light {light.id} is at the centre; a position in metres is needed")
+        if unknown := sorted(self.exposure_stops.keys() - (self.subjects or self.exposure_stops).keys()):
+            raise ValueError(f"exposure_stops: there is no subject {unknown[0]}")
         posed = [camera.id for camera in self.cameras if "world_to_camera" in camera.model_fields_set]
         if len(self.cameras) > 1 and (without := sorted({one.id for one in self.cameras} - set(posed))):
             raise ValueError(f"camera {without[0]} has no 'world_to_camera'; only a single camera needs none")
@@ -174,7 +222,8 @@ def read_stage(folder: Path) -> Capture:
     needed = {field for field in FIELDS if not single.get(field)}  # in a pattern
     pattern = require_pattern(stage.pattern, f"{path}: pattern", needed)
     light_ids, camera_ids = ([entry.id for entry in entries] for entries in (stage.lights, stage.cameras))
-    return Capture(
+    positions = np.stack([light.position for light in stage.lights])
+    capture = Capture(
         folder=folder,
         pattern=pattern,
         colour_space=stage.colour_space,
@@ -193,27 +242,10 @@ def read_stage(folder: Path) -> Capture:
         ambient_pattern=(
             require_pattern(stage.ambient, f"{path}: ambient", needed, FIELDS[:2]) if stage.ambient else ""
         ),
+        colour_matrix=stage.colour_matrix,
+        positions_m=None if np.isnan(positions).all() else positions,
+        centre_m=stage.centre,
+        stops=stage.exposure_stops,
+        ignored=frozenset(stage.ignore),
     )
-
-
-_AS_STORED = ReadSettings()
-LAYOUTS: dict[str, Callable[[Path], Capture]] = {"stage": read_stage, "extended-yale-b": read_yale_capture}
-
-
-def read_capture(folder: Path, settings: ReadSettings = _AS_STORED) -> Capture:
-    """Read a capture's description in one of `LAYOUTS`; no images yet.
-
-    UsageError for an unknown layout, or `subtract_ambient` without ambient images; InputError for a wrong
-    description.
-    """
-    if settings.layout not in LAYOUTS:
-        known = ", ".join(sorted(LAYOUTS))
-        raise UsageError(f"--layout {settings.layout}: unknown layout; there is {known}")
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder; give the folder of a capture")
-    capture = LAYOUTS[settings.layout](folder)
-    if settings.subtract_ambient and not capture.ambient_pattern:
-        raise UsageError(
-            f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' images; add them, or omit it"
-        )
-    return replace(capture, subtract_ambient=settings.subtract_ambient, align=settings.align)
+    return capture.about(stage.centre)

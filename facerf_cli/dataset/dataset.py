@@ -15,7 +15,7 @@ those it has (`lights`, in the order of its stacks' parts) and why the others ar
 import hashlib
 import json
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -262,16 +262,22 @@ class Split:
         train, validation, test = counts.tolist()
         return train, validation, test
 
-    def of(self, subjects: Iterable[str], seed: int) -> dict[str, tuple[str, ...]]:
-        """Assign subjects to splits, each sorted.
+    def of(self, subjects: Mapping[str, Mapping[str, Any]], seed: int) -> dict[str, tuple[str, ...]]:
+        """Assign subjects, with their traits, to splits, each sorted; those of one "person" stay together.
 
         The order that is cut into splits depends on each subject's name and the seed alone, so that adding or
         removing a subject moves few of the others.
         """
-        order = sorted(subjects, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest())
+        people: dict[str, list[str]] = {}
+        for name, traits in subjects.items():
+            people.setdefault(str(traits.get("person", name)), []).append(name)
+        order = sorted(people, key=lambda name: hashlib.sha256(f"{seed}/{name}".encode()).digest())
         ends = np.cumsum([0, *self.counts(len(order))]).tolist()
         parts = (order[first:last] for first, last in pairwise(ends))
-        return {split: tuple(sorted(part)) for split, part in zip(SPLITS, parts, strict=True)}
+        return {
+            split: tuple(sorted(name for person in part for name in people[person]))
+            for split, part in zip(SPLITS, parts, strict=True)
+        }
 
 
 def preparation(capture: Capture, face_model_sha256: str, crop_px: int | None, network_sha256: str) -> Recipe:
@@ -335,10 +341,16 @@ def _calibration(capture: Capture) -> dict[str, Any]:
 
     `preparation` compares all of it: another word here prepares every dataset again.
     """
-    lights = zip(capture.light_ids, capture.directions_world.tolist(), strict=True)
+    lights = [
+        {"id": name, "direction_world": direction}
+        for name, direction in zip(capture.light_ids, capture.directions_world.tolist(), strict=True)
+    ]
+    for light, place in zip(lights, [] if capture.positions_m is None else capture.positions_m, strict=False):
+        if np.isfinite(place).all():
+            light["position_m"] = place.tolist()
     gains = zip(capture.light_ids, (1 / capture.intensities).tolist(), strict=True)
     return {
-        "rig": {"lights": [{"id": name, "direction_world": direction} for name, direction in lights]},
+        "rig": {"lights": lights},
         "cameras": [
             {
                 "id": name,
@@ -355,6 +367,8 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             "from": capture.colour_space,
             "to": _COLOUR_SPACE,
             "black_level": capture.black_level,
+            **({} if capture.colour_matrix is None else {"colour_matrix": capture.colour_matrix.tolist()}),
+            **({"exposure_stops": dict(capture.stops)} if capture.stops else {}),
             **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
             **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),

@@ -80,6 +80,8 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
         joint = fit_views(how.model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
     except InputError as error:
         raise InputError(f"{subject}: {error}") from None
+    head_m = joint.vertices_world(how.model).mean(0).numpy()
+    person = replace(person, capture=capture.about(head_m))
     cameras, rows, dropped = {}, [], dict(chosen.dropped)
     for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
         seen_px = None if error_iod is None else landmarks_px  # missing or rejected without an error

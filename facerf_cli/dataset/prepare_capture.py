@@ -30,8 +30,8 @@ from facerf_cli.capture.findings import (
     stopping,
     write_findings,
 )
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.settings import ChartSettings, CheckSettings, ReadSettings
-from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.dataset.dataset import (
     DATASET_FILE,
     LARGEST_CROP_PX,

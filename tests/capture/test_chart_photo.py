@@ -17,7 +17,7 @@ from facerf_cli.capture.chart import (
     squares_px,
     write_chart_overlays,
 )
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr

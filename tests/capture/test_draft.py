@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.capture.draft import as_text, draft_stage, frames_by_pattern, match_lights, read_light_list
+from facerf_cli.capture.draft import as_text, draft_stage, frames_by_pattern
+from facerf_cli.capture.layouts import read_capture
+from facerf_cli.capture.light_lists import match_lights, read_light_list
 from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import ACESCG
+from tests.capture.stages import LENS
 
 FOLDERS = "{subject}/{camera}/{light}.exr"
 SUFFIXES = frozenset({".exr", ".png", ".pgm"})
@@ -278,11 +280,47 @@ def test_lists_are_read_by_the_images_names_or_by_order(tmp_path: Path) -> None:
     path = listed(tmp_path, "3\r\nC:\\rti\\a 1.jpg 0 0 2\r\nrti/L2.jpg 0.6 0 .8\r\nL9.jpg 1 0 0\r\n")
     lights = read_light_list(path)
     assert [name for name, _ in lights] == ["C:\\rti\\a 1.jpg", "rti/L2.jpg", "L9.jpg"]
-    assert match_lights(lights, ["L1", "L2"], {"a 1": "L1"}) == {"L1": [0, 0, 1], "L2": [0.6, 0, 0.8]}
+    assert match_lights(lights, ["L1", "L2"], {"a 1": "L1"}) == {"L1": [0, 0, 2], "L2": [0.6, 0, 0.8]}
     lights = read_light_list(listed(tmp_path, "# x y z\n\n0 0 1\n0, 1, 0\n-1e0 0 0\n"))
     expected = {"2": [0, 0, 1], "10": [0, 1, 0], "11": [-1, 0, 0]}
     assert match_lights(lights, ["2", "10", "11"], {}) == expected
     assert match_lights(lights, ["2", "10"], {}) == {}
+
+
+def test_positions_and_cameras_of_a_stage_are_drafted_in_its_axes(given_stage: Path) -> None:
+    """Lights in millimetres about a place, and Metashape's cameras."""
+    pattern = "{camera}/{subject}/{light}.exr"
+    stage = draft_stage(given_stage, SUFFIXES, pattern)
+    assert noted(stage, "positions from lights.json, taken as millimetres")
+    assert noted(stage, "cameras: from calibration.xml, whose unit is taken as a metre")
+    assert stage["centre"] == pytest.approx([0.64, 1.7, 0.5], abs=1e-3)
+    assert stage["lights"][3]["position"] == pytest.approx([0.64, 1.7 + 1.6 * 0.6, 0.5 + 1.6 * 0.8], abs=1e-6)
+    (camera,) = stage["cameras"]
+    assert camera["distortion"] == [-0.1, 0.02, -0.005, 0.004, 0.003] and camera["K"][0][0] == 180.5
+    (given_stage / "stage.json").write_text(as_text(stage))
+    capture = read_capture(given_stage)
+    assert capture.directions_world[3] == pytest.approx([0, 0.6, 0.8], abs=1e-6)
+    (given_stage / "lights.json").write_text('{"L03": [0, 3, 4], "L07": [0, 0, 1]}')
+    lights = {light["id"]: light for light in draft_stage(given_stage, SUFFIXES, pattern)["lights"]}
+    assert lights["L03"]["direction"] == [0, 0.6, 0.8] and lights["L00"]["direction"] is None
+    (given_stage / "lights.json").write_text("7")
+    assert noted(draft_stage(given_stage, SUFFIXES, pattern), "is no list of lights")
+    (given_stage / "calibration.xml").write_text(LENS.replace('label="A"', 'label="B"'))
+    assert noted(draft_stage(given_stage, SUFFIXES, pattern), "has no camera of the images' names")
+
+
+@pytest.fixture
+def given_stage(tmp_path: Path) -> Path:
+    """A stage of one camera A with ten lights about its middle."""
+    around = np.random.default_rng(2).normal(size=(10, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    around[3] = [0, 0.6, 0.8]
+    places = np.array([640, 1700, 500]) + 1600 * around
+    for light in range(10):
+        image(tmp_path / f"A/someone/L{light:02d}.exr", 100, 200)
+    (tmp_path / "lights.json").write_text(json.dumps({"light_positions": places.tolist()}))
+    (tmp_path / "calibration.xml").write_text(LENS)
+    return tmp_path
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from facerf_cli.capture.capture import distorted
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.write import write_exr
 from facerf_cli.image.colour import matrix_to_rec709, named_space
@@ -69,6 +69,23 @@ def test_black_level_intensity_and_colour_space_are_those_of_the_description(tmp
     assert capture.frame("0000", "C0", 1)[0, 0] == pytest.approx(expected, rel=1e-3)
 
 
+def test_a_matrix_acts_on_what_is_above_the_black_of_each_channel(tmp_path: Path) -> None:
+    matrix = [[1, 0.5, 0], [0, 1, 0], [0, 0, 2]]
+    given = {"black_level": [0.25, 1.25, 2.0], "colour_matrix": matrix, "exposure_stops": {"0000": 1}}
+    capture = read_capture(capture_at(tmp_path, **given))
+    assert capture.frame("0000", "C0", 1)[5, 5] == pytest.approx([1.25, 0.5, 0.25])
+
+
+def test_a_light_with_a_position_shines_on_a_head_from_there(tmp_path: Path) -> None:
+    lights = [{"id": "L0", "position": [0, 3, 4], "intensity": [1, 2, 4]}, GOOD["lights"][1]]
+    capture = read_capture(capture_at(tmp_path, lights=lights, centre=[0, 0, 4]))
+    assert capture.directions_world == pytest.approx(np.array([[0, 1, 0], [0.6, 0, 0.8]]))
+    nearer = capture.about(np.array([0, 1.5, 4]))
+    assert nearer.intensities == pytest.approx(np.array([[4, 8, 16], [1, 1, 1]]))
+    assert nearer.about(np.array([0, 0, 4])).intensities == pytest.approx(capture.intensities)
+    assert nearer.frame("0000", "C0", 0)[0, 0] == pytest.approx([2 / 4, 2 / 8, 2 / 16])
+
+
 def test_nan_is_zero_and_noise_below_black_stays(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     import OpenImageIO as oiio
 
@@ -124,6 +141,13 @@ def camera(**changes: Any) -> list[dict[str, Any]]:
         ({"subjects": ["0000"]}, "an object"),
         ({"subjects": {"0000.json": {}}}, "a name"),  # fits/0000.json is the record of 0000
         ({"subjects": {"0000": 3}}, "an object"),
+        ({"black_level": [0, 1]}, "a number, or one for each of three channels"),
+        ({"black_level": True}, "a number, or one"),
+        ({"colour_matrix": [[1, 0, 0], [1, 0, 0], [0, 0, 1]]}, "keeps three colours apart"),
+        ({"lights": light(position=[0, 0, 1])}, "either 'direction' or 'position'"),
+        ({"lights": [{"id": "L0", "position": [0, 0, 0], "intensity": [1, 1, 1]}]}, "L0 is at the centre"),
+        ({"exposure_stops": {"0000": 40}}, "exposure_stops"),
+        ({"exposure_stops": {"1": 1}, "subjects": {"0000": {}}}, "there is no subject 1"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_line(tmp_path: Path, change: dict[str, Any], said: str) -> None:
@@ -145,7 +169,7 @@ def test_no_capture_and_no_such_layout(tmp_path: Path) -> None:
         read_capture(tmp_path)
     with pytest.raises(InputError, match="no such folder"):
         read_capture(tmp_path / "nowhere")
-    with pytest.raises(UsageError, match="there is extended-yale-b, stage"):
+    with pytest.raises(UsageError, match="there is extended-yale-b, faceolat, faceolat-linear, stage"):
         read_capture(tmp_path, ReadSettings("multipie"))
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.capture.stage_json import read_capture
 from facerf_cli.capture.yale_b import UNMARKED_DAMAGE, Flash, YaleB, guess_camera, read_shifts, read_yale_b
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError, UsageError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.dataset.dataset import Dataset, DatasetFolder, read_dataset
 from facerf_cli.dataset.prepare import Preparation, _Subject
 from facerf_cli.face.fit import load_fit

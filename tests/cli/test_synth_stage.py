@@ -12,7 +12,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.files.read import read_image
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.main import main

@@ -136,10 +136,14 @@ def test_a_split_that_is_none(text: str) -> None:
 def test_splits_are_stable_disjoint_and_no_larger_than_the_dataset() -> None:
     with pytest.raises(UsageError, match="has 40"):
         Split.parse("300/10/40").counts(40)
-    names = [f"{index:04d}" for index in range(200)]
+    names: dict[str, dict[str, str]] = {f"{index:04d}": {} for index in range(200)}
     split = Split.parse("0.8/0.1/0.1")
-    before, after, other = split.of(names, 0), split.of(names[:-1], 0), split.of(names, 1)
-    assert sorted(name for part in before.values() for name in part) == names
-    assert before == split.of(reversed(names), 0) and before != other
+    fewer = dict(list(names.items())[:-1])
+    before, after, other = split.of(names, 0), split.of(fewer, 0), split.of(names, 1)
+    assert sorted(name for part in before.values() for name in part) == [*names]
+    assert before == split.of(dict(reversed(names.items())), 0) and before != other
     moved = sum(len(set(before[part]) ^ set(after[part])) for part in SPLITS)
     assert moved <= 5  # of a subject more: itself, and one over each border
+    takes = {name: {"person": name[:3]} for name in names}  # ten of each person
+    for part in split.of(takes, 0).values():
+        assert len(part) == 10 * len({name[:3] for name in part})

@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from facerf_cli.capture.capture import shift_image
 from facerf_cli.capture.checks.motion import align_shifts, head_path, peak, with_alignment
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from tests.capture.checks.egg_stage import CAMERA, IDS, SUBJECT, directions, images, write_stage
 
 PLANTED = {2: (3.0, -4.0), 5: (0.0, 1.5), 7: (-2.25, 0.5)}  # frames and how far they moved, down and right

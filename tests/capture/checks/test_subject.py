@@ -1,5 +1,6 @@
 """Each fault planted in a small stage and found, and nothing found where there is none."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from facerf_cli.capture.checks.shading import RigFit, check_rigs
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding, frames_left_out, stopping
-from facerf_cli.capture.stage_json import read_capture
+from facerf_cli.capture.layouts import read_capture
 from tests.capture.checks.egg_stage import (
     CAMERA,
     HEIGHT,
@@ -82,6 +83,9 @@ def test_files_of_no_lamp_are_counted_but_not_the_ambient_one(tmp_path: Path, so
         write_frame(frame(folder, 0).with_stem(name), sound[0] * 0.9)
     found = only(findings(folder))
     assert found.check == "extra" and found.figures["files"] == 1 and "L900" in found.words
+    stage = json.loads((folder / "stage.json").read_text())
+    (folder / "stage.json").write_text(json.dumps(stage | {"ignore": ["L900"]}))
+    assert not findings(folder)
 
 
 def test_a_frame_of_another_size_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:

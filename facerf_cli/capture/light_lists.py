@@ -1,0 +1,129 @@
+"""Lists of a stage's lights beside its images, for drafts of `stage.json`.
+
+A text has lines `name x y z` or `x y z`, as LP files of reflectance transformation imaging, whose first line
+is the number of lines that follow. A JSON file holds a list of [x, y, z], or {name: [x, y, z]}, either of
+them maybe under "light_positions". Vectors are directions, or positions relative to the object. Where they
+lie on a sphere about another place, they are positions in the axes of the stage: in metres or, if that would
+be too large a stage, in millimetres.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from facerf_cli.errors import InputError
+from facerf_cli.files.texts import parse_json, read_text
+
+_LIMIT_BYTES = 4 << 20
+_DIGITS = 6
+_LARGEST_STAGE = 20.0  # radius in metres: larger ones are in millimetres
+_ASIDE, _OFF = 0.05, 0.1  # of the radius: a middle farther away is a place; lights are so near to the sphere
+_FEWEST = 8  # lights that determine a sphere
+
+Vector = list[float]
+ListedLight = tuple[str, Vector]  # name of an image, empty in a list without names
+
+
+@dataclass(frozen=True)
+class DraftLights:
+    """Entries of lights as `stage.json` has them, by their ids; `centre_m` is where intensities hold."""
+
+    entries: dict[str, dict[str, Vector]] = field(default_factory=dict)
+    centre_m: Vector | None = None
+    kind: str = "directions"
+    assumed: str = "x right, y up, z toward the camera, as world space"
+
+
+def draft_lights(found: Mapping[str, Vector], everything: Sequence[Vector]) -> DraftLights:
+    """Describe lights by their vectors, which are some of all of a list's."""
+    vectors = np.array(everything)
+    middle = sphere_middle(vectors) if len(vectors) >= _FEWEST else np.zeros(3)
+    distances = np.linalg.norm(vectors - middle, axis=1)
+    radius = float(distances.mean())
+    if np.linalg.norm(middle) < _ASIDE * radius or np.abs(distances / radius - 1).max() > _OFF:
+        return DraftLights({light: {"direction": _rounded(_unit(vector))} for light, vector in found.items()})
+    unit_m, unit = (1e-3, "millimetres") if radius > _LARGEST_STAGE else (1.0, "metres")
+    entries = {light: {"position": _rounded(unit_m * np.array(vector))} for light, vector in found.items()}
+    words = f"taken as {unit} in the axes of the cameras; 'centre' is the middle of their sphere"
+    return DraftLights(entries, _rounded(unit_m * middle), "positions", words)
+
+
+def sphere_middle(points: np.ndarray) -> np.ndarray:
+    """The middle [3] of the sphere nearest to points [N, 3], by linear least squares."""
+    terms = np.column_stack([2 * points, np.ones(len(points))])
+    return np.asarray(np.linalg.lstsq(terms, (points**2).sum(1), rcond=None)[0][:3])
+
+
+def read_light_list(path: Path) -> list[ListedLight]:
+    """Read a list of lights; InputError names the first wrong line or entry."""
+    text = read_text(path, _LIMIT_BYTES, "give lines `name x y z`")
+    try:
+        rows = _rows_of_json(text) if path.suffix.lower() == ".json" else _rows_of_text(text)
+    except ValueError as error:
+        raise InputError(f"{path}: is no list of lights ({error}); give [[x, y, z], ...]") from None
+    lights: list[ListedLight] = []
+    for place, name, values in rows:
+        try:
+            x, y, z = values
+            vector = [float(x), float(y), float(z)]
+        except (ValueError, TypeError):
+            raise InputError(f"{path}: {place} is wrong; give `name x y z`") from None
+        if not 0 < math.hypot(*vector) < math.inf:
+            raise InputError(f"{path}: {place} has no direction; give a finite vector other than 0")
+        lights.append((name, vector))
+    return lights
+
+
+def _rows_of_text(text: str) -> list[tuple[str, str, Any]]:
+    """The place of each light, its name and its values."""
+    rows: list[tuple[str, str, Any]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = line.split("#")[0].replace(",", " ").rsplit(maxsplit=3)
+        if not fields or (not rows and len(fields) == 1 and fields[0].isdecimal()):
+            continue  # empty, or the number of lines
+        rows.append((f"line {number}", "".join(fields[:-3]).strip(), fields[-3:]))
+    return rows
+
+
+def _rows_of_json(text: str) -> list[tuple[str, str, Any]]:
+    content = parse_json(text)
+    if isinstance(content, dict):
+        content = content.get("light_positions", content)
+    if isinstance(content, dict):
+        return [(name, name, values) for name, values in content.items()]
+    if not isinstance(content, list):
+        raise ValueError("neither a list nor an object")
+    return [(f"light {number}", "", values) for number, values in enumerate(content)]
+
+
+def match_lights(
+    listed: Sequence[ListedLight], light_ids: Sequence[str], light_of_stem: Mapping[str, str]
+) -> dict[str, Vector]:
+    """Assign listed vectors to lights by name; a list without names goes by the order of the lights.
+
+    `light_of_stem` maps the stem of an image's file name to its light.
+    """
+    if not any(name for name, _ in listed):
+        pairs = zip(light_ids, listed, strict=True) if len(listed) == len(light_ids) else ()
+        return {light: vector for light, (_, vector) in pairs}
+    known = {**light_of_stem, **{light: light for light in light_ids}}
+    found = {}
+    for path, vector in listed:
+        name = path.replace("\\", "/").split("/")[-1]
+        light = known.get(name) or known.get(name.rpartition(".")[0])
+        if light is not None:
+            found[light] = vector
+    return found
+
+
+def _unit(vector: Vector) -> np.ndarray:
+    return np.array(vector) / np.linalg.norm(vector)
+
+
+def _rounded(values: np.ndarray) -> Vector:
+    rounded: Vector = (values.round(_DIGITS) + 0.0).tolist()  # turns -0.0 into 0.0
+    return rounded
