@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "facerf_cli"
 LEVELS = (
     ("__main__", "main", "cli"),
-    ("work", "api"),
-    ("evaluation", "training", "viewer", "capture", "dataset", "synth"),
+    ("work", "api", "evaluation"),
+    ("training", "viewer", "capture", "dataset", "synth"),
     ("person", "pipeline", "relighting", "portrait", "baselines", "network", "face"),
     ("batch", "light", "raster", "image", "files", "run", "errors", "option", "_version"),
 )

@@ -74,7 +74,7 @@ def _light_list(path: Path) -> None:
 
 def _table(path: Path) -> None:
     from facerf_cli.capture.yale_b import read_shifts
-    from facerf_cli.evaluation.pairs import read_facts
+    from facerf_cli.evaluation.folders import read_facts
 
     (read_shifts if path.name == "shifts.csv" else read_facts)(path)
 
@@ -100,7 +100,7 @@ def _fit(path: Path) -> None:
 
 
 def _array(path: Path) -> None:
-    from facerf_cli.evaluation.pairs import read_array
+    from facerf_cli.evaluation.folders import read_array
 
     read_array(path)
 

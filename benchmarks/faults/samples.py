@@ -515,12 +515,11 @@ def figures() -> Samples:
     row = {"case": "a", "person": "p", "method": "field", "facts": {"tone": "light"}, "values": {"l1": 0.1}}
     strip = {
         "case": "a",
-        "file": "strips/a.jpg",
         "methods": ["field"],
         "scales": [1.0],
         "size_px": [10, 12],
-        "ev": 0.0,
         "has_source": True,
+        "jpeg": "",
     }
     content = {"format": FORMAT, "rows": [row], "strips": [strip], "pictures": ["x.exr"]}
     return {"a.json": json.dumps(content).encode()}

@@ -54,7 +54,7 @@ joint without-normals --without-normals
 joint mean-face --mean-face
 $train -o "$run/diffuse-sh" --stage diffuse-sh --dataset "$run/dataset" "${diffuse[@]}" --resume "${length[@]}"
 
-# The tables. Each run leaves the list of its pairs, pairs.json, for --pairs of anybody else's run.
+# The tables. Rows of other methods: facerf evaluate cases, then compare (docs/evaluation.md).
 measure=(facerf --checkpoint "$run/paper.safetensors" evaluate)
 "${measure[@]}" olat "$run/dataset" --preset paper --network-alone -o "$run/tables/1" # rows 'same' and 'different pose'
 rivals=(--reflectance field --reflectance diffuse-sh --reflectance specular-sh --reflectance prt)
@@ -62,7 +62,7 @@ solve=(--signed --refine features)
 two=(facerf --checkpoint "$run/paper.safetensors" --checkpoint "$run/diffuse-sh" --checkpoint "$run/light" evaluate)
 "${two[@]}" reconstruction "$test_photos" --preset paper "${rivals[@]}" "${solve[@]}" -o "$run/tables/2-reconstruction"
 "${two[@]}" transfer "$run/dataset" --preset paper "${rivals[@]}" "${solve[@]}" -o "$run/tables/2-transfer"
-"${measure[@]}" olat "$run/dataset" --pairs "$run/tables/1/pairs.json" --network-alone \
+"${measure[@]}" olat "$run/dataset" --preset paper --network-alone \
     --against "$run/without-normals.safetensors" -o "$run/tables/3"
 "${measure[@]}" geometry "$test_photos" --preset paper --mean-checkpoint "$run/mean-face.safetensors" -o "$run/tables/4"
 

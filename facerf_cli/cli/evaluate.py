@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from facerf_cli.cli.brief import Verbs
-from facerf_cli.cli.options import is_default, refuse_given, settings_of, with_groups
+from facerf_cli.cli.options import is_default, refuse_given, with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.evaluation.options import EvaluateOptions, has_own_field_alone
 from facerf_cli.option import Only, Without
@@ -17,14 +17,14 @@ from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptio
 app = typer.Typer(
     cls=Verbs,
     add_completion=False,
-    help="Measure the paper's tables on prepared data and photos, and other methods' images.",
+    help="Measure the paper's tables on prepared data and photos, and any methods on frozen cases.",
 )
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
 _BATCH = ("output", "measures", "overwrite", "dry_run", "jobs", "shard", "ray")
 _MADE_BY_FIELD = ("network_alone", "held_to_photo", "mean_checkpoint")
-_PAIRS = ("split", "every", "pairs", "joint_fit")
-_METHODS = ("reflectance", "against", "compare", "pictures", "keep_eyes", "preset")
+_PAIRS = ("split", "every", "joint_fit")
+_METHODS = ("reflectance", "against", "pictures", "keep_eyes", "preset")
 
 DatasetArgument = Annotated[
     Path,
@@ -48,7 +48,7 @@ def olat(
     context: typer.Context,
     dataset: DatasetArgument,
     *,
-    photo: Annotated[PhotoOptions, Only("face_model", "geometry")],
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
     field: FieldOptions,
     options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS)],
 ) -> None:
@@ -60,8 +60,7 @@ def olat(
     the paper. In the same pose a row 'composite' is that of `facerf relight`, with the photo's detail. Tables
     are by pose, by the angle of the light, and by skin tone if the capture holds it. The row 'lambert' is the
     source's own texture under the cosine of the light: the least that a method must beat. A second
-    checkpoint, --against without_normals.safetensors, gives the paper's Table 3. DIR/pairs.json lists the
-    pairs, for --pairs.
+    checkpoint, --against without_normals.safetensors, gives the paper's Table 3.
     """
     options = replace(options, dataset=dataset, network_alone=field.network_alone)
     _evaluate(context, "olat", options, photo)
@@ -120,7 +119,7 @@ def geometry(
     inputs: PhotosOrDatasetArgument,
     *,
     photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS[:3], *_METHODS, "facts", "mean_checkpoint")],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS[:2], *_METHODS, "facts", "mean_checkpoint")],
 ) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
@@ -144,9 +143,9 @@ def yale_b(
         ),
     ],
     *,
-    photo: Annotated[PhotoOptions, Only("face_model", "geometry")],
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
     field: FieldOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_METHODS[:4], "shifts", "subjects", "room")],
+    options: Annotated[EvaluateOptions, Only(*_BATCH, *_METHODS[:3], "shifts", "subjects", "room")],
 ) -> None:
     """Relight real people to real point lights and compare with their photos under these.
 
@@ -154,9 +153,8 @@ def yale_b(
     are single flashes and four environments. Lights are given, not estimated. Images are read as linear, as
     measured, relit as by `facerf relight`, and compared inside one ellipse, open eyes included. Cases are
     SUBJECT/SOURCE/LIGHT. An own Reflectance Network is measured alone; with --reflectance portrait its row
-    names both networks. The rows of other methods were published for the same images. A method for --compare
-    runs on the sources that --pictures keeps; its PNGs are read as given, too, and its colours are averaged.
-    The database is for research and never trained on.
+    names both networks. The rows of other methods were published for the same images. The database is for
+    research and never trained on.
     """
     if is_default(context, "reflectance") and not has_own_field_alone(photo.settings.checkpoints):
         options = replace(options, reflectance=("portrait",))
@@ -164,29 +162,56 @@ def yale_b(
     _evaluate(context, "yale-b", options, photo, [str(folder)])
 
 
-def pairs(
+def cases(
     context: typer.Context,
-    predictions: Annotated[
-        list[Path],
+    dataset: DatasetArgument,
+    *,
+    photo: Annotated[PhotoOptions, Only("face_model")],
+    options: Annotated[
+        EvaluateOptions,
+        Only("output", *_BATCH[2:], "split", "every", "pairs", "same_pose", "preset", "keep_eyes"),
+    ],
+) -> None:
+    """Freeze pairs of a dataset as cases that any method can render, for `evaluate compare`.
+
+    A case has a source image, the pose and the light to render, the truth and the mask of the comparison, in
+    the frame of the dataset's crops: no checkpoint has a part in them. DIR/cases.csv lists them, with poses
+    and lights in numbers; DIR/light has each light as a lat-long map. Sources in which no face is found are
+    named and left out. docs/evaluation.md says what a method has to render.
+    """
+    _evaluate(context, "cases", replace(options, dataset=dataset, reflectance=(), joint_fit=True), photo)
+
+
+def compare(
+    context: typer.Context,
+    truth: Annotated[
+        Path,
         typer.Argument(
-            metavar="PREDICTIONS...",
-            help="Folders of images with the names of the truths; each folder is a method. Others are "
-            "compared with the first.",
+            metavar="CASES",
+            help="Folder of `evaluate cases`, of images that --pictures kept, or of any true images.",
             show_default=False,
         ),
     ],
-    options: Annotated[EvaluateOptions, Only(*_BATCH, "truth", "masks", "facts")],
+    *,
+    photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
+    field: FieldOptions,
+    options: Annotated[EvaluateOptions, Only(*_BATCH, "reflectance", "against", "methods", "masks", "facts")],
 ) -> None:
-    """Measure folders of predictions against a folder of truths, image by image.
+    """Compare any number of methods on frozen cases: folders of images, and facerf's own.
 
-    Trees are mirrored; names must match, suffixes may differ. A missing, an additional or a differently sized
-    prediction is an error: no table is made of what is left.
+    Each --method is a folder of images with the names of the truths; trees are mirrored, suffixes may differ.
+    --reflectance and --against render the cases of `evaluate cases` by facerf, as any other method has to: in
+    the source's pose as `facerf relight`, in another the face alone. The others are compared with the first
+    method. A missing, an additional or a differently sized image is an error: no table is made of what is
+    left.
     """
-    options = replace(options, reflectance=(), predictions=tuple(predictions))
-    _evaluate(context, "pairs", options, PhotoOptions(settings_of(context)))
+    if is_default(context, "reflectance"):
+        options = replace(options, reflectance=())
+    options = replace(options, truth=truth, network_alone=field.network_alone)
+    _evaluate(context, "compare", options, photo)
 
 
-for _protocol in (olat, reconstruction, transfer, geometry, yale_b, pairs):
+for _protocol in (olat, reconstruction, transfer, geometry, yale_b, cases, compare):
     app.command()(with_groups(_protocol))
 
 
@@ -208,9 +233,9 @@ def _evaluate(
     if not options.has_field:
         why = "is for the field; give --reflectance field too, or leave it out"
         refuse_given(context, _MADE_BY_FIELD, why)
-    from facerf_cli.work.evaluate import evaluate
+    from facerf_cli.evaluation.run import Evaluation
 
-    raise typer.Exit(evaluate(protocol, options, photo, inputs))
+    raise typer.Exit(Evaluation.of(protocol, options, photo, inputs).run())
 
 
 def _only_dataset(inputs: Sequence[str]) -> Path | None:

@@ -45,7 +45,7 @@ facerf doctor --json
 facerf doctor --checkpoint run/
 facerf config
 facerf config relight
-facerf config evaluate.pairs --config facerf.toml
+facerf config evaluate.compare --config facerf.toml
 facerf evaluate olat dataset/ -o report/
 facerf evaluate olat dataset/ --checkpoint run/ -o report/
 facerf evaluate olat dataset/ --against other.safetensors -o report/
@@ -61,9 +61,12 @@ facerf evaluate geometry dataset/ -o report/
 facerf evaluate yale-b CroppedYale/ -o report/
 facerf evaluate yale-b CroppedYale/ --jobs 2 -o report/
 facerf evaluate yale-b CroppedYale/ --checkpoint run/ -o report/
-facerf evaluate pairs mine/ --truth truth/ -o report/
-facerf evaluate pairs mine/ theirs/ --truth truth/ -o report/
-facerf evaluate pairs mine/ --truth truth/ --masks masks/ -o report/
+facerf evaluate cases dataset/ -o cases/
+facerf evaluate cases dataset/ --same-pose -o cases/
+facerf evaluate cases dataset/ --split all --every 10 -o cases/
+facerf evaluate compare cases/ --reflectance field --method theirs=renders/ -o report/
+facerf evaluate compare cases/ --against mine.safetensors --form my_lab.networks:Net -o report/
+facerf evaluate compare truth/ --method mine/ --method theirs/ --masks masks/ -o report/
 facerf face-model fetch ict-facekit
 facerf face-model fetch ict-facekit -v
 facerf face-model fetch ict-facekit -q

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.evaluation.measure import Comparison
-from facerf_cli.evaluation.people import HeadView, Method, Portrait, common_mask
+from facerf_cli.evaluation.people import Bench, HeadView, Portrait, common_mask
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.metrics import light_error_deg, tone_drift_deg
@@ -34,6 +34,7 @@ from facerf_cli.relighting.relightable import Relit
 LAMBERT = "lambert"  # the source's texture under the cosine of the light: the least a method must beat
 COMPOSITE = "composite"  # the first method's face back in its photo, with its detail
 FULL, MEAN = "all components", "mean face"  # the forms of Table 4
+SAME, DIFFERENT = "same pose", "different pose"
 LIGHTS_DEG = (0, 30, 60, 90, 180)  # between a light and the camera's axis
 TURNS_DEG = (0, 30, 60, 180)  # of the head, from the source's pose to the target's
 _NO_TURN_DEG = 0.5
@@ -41,15 +42,11 @@ _NEAR_AXIS_DEG = 25.0  # lights that show the skin's colour rather than its shap
 
 
 @torch.no_grad()
-def compare_olats(faces: Sequence[Portrait], methods: Sequence[Method]) -> Iterator[Comparison]:
+def compare_olats(faces: Sequence[Portrait], bench: Bench) -> Iterator[Comparison]:
     """A source: each method's image under the target's light next to the stack's own, unclipped."""
     (face,) = faces
-    assert face.origin is not None
-    person, pair = face.origin
-    light = torch.from_numpy(person.header(pair.target_camera).directions[pair.target_light]).float()
-    lights = Lights.each(light[None])
-    same = pair.source_camera == pair.target_camera
-    target = face if same else person.lit(pair.target_camera)
+    methods, (target, light, truth) = bench.methods, target_of(face)
+    lights, same = Lights.each(light[None]), target is face
     predictions, views = {}, []
     for method in methods:
         view = target.pose_of(face.by(method.models), method.models)
@@ -60,19 +57,28 @@ def compare_olats(faces: Sequence[Portrait], methods: Sequence[Method]) -> Itera
     if same:  # the image of `facerf relight`, cropped as the truth is
         whole = next(methods[0].images(face.photo.pixels, first.head, lights, Target()))
         predictions[COMPOSITE] = first.fit.crop.apply(whole)
-    stack = person.dataset.stack_path(pair.subject, pair.target_camera)
-    truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
-    pose = "same pose" if same else "different pose"
     comparison = Comparison(
-        replace(face.case, facts={"pose": pose, **_angles(light, first), **face.case.facts}),
-        first.fit.crop.apply(truth.permute(1, 2, 0).numpy()),
+        replace(face.case, facts={**olat_facts(light, first, same), **face.case.facts}),
+        first.fit.crop.apply(truth),
         common_mask(views),
         predictions,
         source=first.head.cropped,
         landmarks_px=target.by(methods[0].models).head.landmarks_px,
         source_face=face.by(methods[0].models).face,
     )
-    yield _with_drift(comparison, person.albedo, first.region("skin"))
+    assert face.origin is not None
+    yield _with_drift(comparison, face.origin[0].albedo, first.region("skin"))
+
+
+def target_of(face: Portrait) -> tuple[Portrait, Tensor, np.ndarray]:
+    """The target of a source: the person in its camera, the light [3], and the image [S, S, 3] under it."""
+    assert face.origin is not None
+    person, pair = face.origin
+    light = torch.from_numpy(person.header(pair.target_camera).directions[pair.target_light]).float()
+    target = face if pair.source_camera == pair.target_camera else person.lit(pair.target_camera)
+    stack = person.dataset.stack_path(pair.subject, pair.target_camera)
+    truth = read_olats(stack, slice(pair.target_light, pair.target_light + 1))[0].float()
+    return target, light, truth.permute(1, 2, 0).numpy()
 
 
 def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:
@@ -84,12 +90,13 @@ def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:
     return face.image(Relit(head.face.texture * cosine)).pixels
 
 
-def _angles(light: Tensor, view: HeadView) -> dict[str, str | float]:
+def olat_facts(light: Tensor, view: HeadView, same: bool) -> dict[str, str | float]:
     """Facts on the direction of the light and the turn of the head from the source's pose."""
     turn_deg = angle_of(view.head.fit.turn_to(view.fit.rotation))
     angle_deg = float(torch.rad2deg(light[2].clamp(-1, 1).acos()))
     azimuth_deg, elevation_deg = direction_to_azel(light)
     return {
+        "pose": SAME if same else DIFFERENT,
         "angle": angle_class(angle_deg),
         "turn": turn_class(turn_deg),
         "turn_deg": turn_deg,
@@ -113,22 +120,19 @@ def _with_drift(comparison: Comparison, albedo: np.ndarray | None, skin: np.ndar
 
 
 @torch.no_grad()
-def reconstruct(
-    faces: Sequence[Portrait], methods: Sequence[Method], with_light: bool = True
-) -> Iterator[Comparison]:
+def reconstruct(faces: Sequence[Portrait], bench: Bench, with_light: bool = True) -> Iterator[Comparison]:
     """A portrait's crop next to each method's reconstruction, where all of them show the face.
 
-    Where the true light is known, each has the error of its brightest direction, `with_light`. The methods
-    of Table 4 are fitted to the same landmarks, or regressed from the same crop.
+    Where the true light is known, each has the error of its brightest direction, `with_light`.
     """
     (face,) = faces
     truth = face.origin[0].light(face.origin[1]) if face.origin and with_light else None
     predictions, views, extra = {}, [], {}
-    for method in methods:
+    for method in bench.methods:
         view = face.by(method.models)
         explained = method.explained(view.head)
-        light, target = explained.light, Target(composite="face")
-        predictions[method.name] = method.image(view.head, explained.reflectance, light, target)
+        light = explained.light
+        predictions[method.name] = method.image(view.head, explained.reflectance, light, view.fit)
         views.append(view)
         if truth is not None:
             estimated = brightest(light.directions.numpy(), light.weights.numpy())
@@ -144,21 +148,31 @@ def brightest(directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.asarray(directions[luminance(weights).argmax()])
 
 
-def fitted_and_mean(fitted: Sequence[Method], mean: Sequence[Method]) -> tuple[Method, ...]:
-    """The methods of Table 4; a row has the name of the form, and its method's if there are many."""
-    return tuple(
-        replace(method, name=form if len(methods) == 1 else f"{form}, {method.name}")
-        for form, methods in ((FULL, fitted), (MEAN, mean))
-        for method in methods
-    )
+def reconstruct_with_mean(faces: Sequence[Portrait], bench: Bench) -> Iterator[Comparison]:
+    """Table 4: each method over the fitted face, then over the mean face; the light has no part in it.
+
+    Both are fitted to the same landmarks, or regressed from the same crop. A row has the name of the form,
+    and its method's if there are many.
+    """
+    forms = [(FULL, method, method.models) for method in bench.methods]
+    for method in bench.methods:
+        own = bench.mean if bench.mean and method.kind == "field" else method.models
+        forms.append((MEAN, method, replace(own, face=own.face.pose_only())))
+    several = len(bench.methods) > 1
+    methods = [
+        replace(method, name=f"{form}, {method.name}" if several else form, models=models)
+        for form, method, models in forms
+    ]
+    return reconstruct(faces, replace(bench, methods=methods), with_light=False)
 
 
 @torch.no_grad()
-def transfer(faces: Sequence[Portrait], methods: Sequence[Method]) -> Iterator[Comparison]:
+def transfer(faces: Sequence[Portrait], bench: Bench) -> Iterator[Comparison]:
     """Both images, each rendered from its own light and the other's reflectance.
 
     The same method estimates that light with the image's own reflectance.
     """
+    methods = bench.methods
     views = [[face.by(method.models) for method in methods] for face in faces]
     explained = [
         [method.explained(view.head) for method, view in zip(methods, of_face, strict=True)]
@@ -168,8 +182,8 @@ def transfer(faces: Sequence[Portrait], methods: Sequence[Method]) -> Iterator[C
         predictions = {}
         for number, method in enumerate(methods):
             head, reflectance = views[other][number].head, explained[other][number].reflectance
-            light, target = explained[own][number].light, Target(views[own][number].fit, "face")
-            predictions[method.name] = method.image(head, reflectance, light, target)
+            light, fit = explained[own][number].light, views[own][number].fit
+            predictions[method.name] = method.image(head, reflectance, light, fit)
         first, source = views[own][0].head, views[other][0].head
         turn_deg = angle_of(source.fit.turn_to(first.fit.rotation))
         case = faces[own].case

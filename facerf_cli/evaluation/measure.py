@@ -43,7 +43,7 @@ class Comparison:
     its own frame. landmarks_px [68, 2] are those of the truth, for the face-recognition distance; without
     them it is not measured. `source_face`, for that of the source, is the face's mask [h, w] in the source
     and its landmarks [68, 2] there. `extra` holds each method's figures that only the protocol can compute
-    ('light_error_deg'). `grey_as_given` is that of `pairs.read_predictions`.
+    ('light_error_deg'). `light` is a lat-long map of the light to render, for methods that read maps.
     """
 
     case: Case
@@ -54,7 +54,7 @@ class Comparison:
     landmarks_px: np.ndarray | None = None
     source_face: tuple[np.ndarray, np.ndarray] | None = None
     extra: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by method
-    grey_as_given: bool = False
+    light: np.ndarray | None = None
 
 
 NEAR_BLACK = 0.02  # root mean square: the Si-MSE of a darker truth is below .0004 for any image
@@ -116,6 +116,11 @@ class Metric:
     title: str
     lower_is_better: bool = True
     digits: int = 5
+
+    @property
+    def better(self) -> str:
+        """Which values are better, in a word."""
+        return "less" if self.lower_is_better else "more"
 
 
 METRICS: Mapping[str, Metric] = {  # by name, in the order of tables; a row has those that apply to it

@@ -18,15 +18,15 @@ Space = Literal["linear", "display"]
 _KINDS = get_args(RelightKind)
 
 
-def folder_name(folder: Path) -> str:
-    """The name of a folder of predictions, and of its method; '.' is resolved, a link is not."""
-    return Path(os.path.abspath(folder)).name
+def name_of(path: Path) -> str:
+    """The name of a method: a folder's, a checkpoint's, or for the best and the last of a run its folder's.
 
-
-def checkpoint_name(path: Path) -> str:
-    """The name of a checkpoint's method: the file's, or for the best and the last of a run its folder's."""
-    of_run = path.is_dir() or path.stem in ("best", "last")
-    return folder_name(path if path.is_dir() else path.parent) if of_run else path.stem
+    '.' is resolved, a link is not.
+    """
+    path = Path(os.path.abspath(path))
+    if path.is_dir():
+        return path.name
+    return path.parent.name if path.stem in ("best", "last") else path.stem
 
 
 def portrait_name(checkpoints: Sequence[Path]) -> str:
@@ -37,7 +37,7 @@ def portrait_name(checkpoints: Sequence[Path]) -> str:
     """
     files = serving_files(checkpoints)
     own = [files[name] != SHIPPED[name] for name in ("reflectance", "portrait")]
-    both = checkpoint_name(files["reflectance"]), checkpoint_name(files["portrait"])
+    both = name_of(files["reflectance"]), name_of(files["portrait"])
     return "portrait" if own[0] == own[1] else "+".join(both)
 
 
@@ -73,18 +73,30 @@ def _parse_kinds(names: Sequence[str]) -> tuple[RelightKind, ...]:
 
 
 @dataclass(frozen=True)
-class NamedCheckpoint:
-    """A checkpoint, or a run's folder, under the name of its method."""
+class NamedPath:
+    """A checkpoint, a run's folder or a folder of images, under the name of its method."""
 
     name: str
     path: Path
 
     @staticmethod
-    def parse(text: str) -> "NamedCheckpoint":
-        """Parse FILE or NAME=FILE."""
-        name, equals, file = text.rpartition("=")
-        path = Path(file)
-        return NamedCheckpoint(name if equals else checkpoint_name(path), path)
+    def parse(text: str) -> "NamedPath":
+        """Parse PATH or NAME=PATH."""
+        name, equals, path = text.rpartition("=")
+        return NamedPath(name if equals else name_of(Path(path)), Path(path))
+
+
+def _named(flag: str, kind: str) -> Any:
+    """Make the field of an option that names methods."""
+    return option(
+        (),
+        metavar=f"{kind}|NAME={kind}",
+        flags=(flag,),
+        shown_default="none",
+        typed=list[str] | None,
+        parse=lambda given: tuple(map(NamedPath.parse, given)),
+        panel=METHODS,
+    )
 
 
 @dataclass(frozen=True)
@@ -94,7 +106,8 @@ class EvaluateOptions(BatchOptions):
     Attributes:
         split: Measure this split of DATASET; all if no network was trained on it.
         every: Measure every Nth pair of DATASET's split only.
-        pairs: Measure the pairs of a list, the pairs.json of another run.
+        pairs: Freeze the pairs of a list, the pairs.json that an earlier version wrote.
+        same_pose: Take the pairs alone whose target camera is that of the source.
         joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
             instead of each image alone.
         photos: Read photos, two of each person or in folders.
@@ -102,18 +115,17 @@ class EvaluateOptions(BatchOptions):
             subject's frontal one.
         subjects: Measure these subjects only, such as yaleB05,yaleB15. Repeatable.
         room: Light from all around that comes with each flash, as a room sends it back: a share of it.
-        truth: Compare with the truths in this folder: .exr .hdr .npy (linear), .png .jpg .tif ...
         masks: Compare inside masks: images with the truths' names, white inside.
-        facts: Read a row for each image: name, person, and columns for the list of images; of `pairs` those
+        facts: Read a row for each image: name, person, and columns for the list of images; in `compare` those
             that are text break the tables down.
         reflectance: Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait;
             repeatable, and the others are compared with the first.
         against: Measure another checkpoint of the field, under its name or that of its run. Repeatable.
         mean_checkpoint: Use a checkpoint of `facerf train --mean-face` for the mean face.
         held_to_photo: Correct the field by the quotient of its photo, as `relight` does.
-        compare: Measure predictions of another method, DIR/CASE.exr, .png or .npy, under the folder's name.
-            Repeatable.
-        pictures: Keep every source, truth, mask and prediction as EXR in DIR/pictures, for other methods.
+        methods: Measure a folder of images (.exr .hdr .npy, linear; .png .jpg .tif ...) with the truths'
+            names. Repeatable.
+        pictures: Keep every source, truth, mask and prediction as EXR in DIR/pictures, for `compare`.
         keep_eyes: Compare open eyes, too (default: not, as in the paper).
         preset: Measure as many images as the paper did.
     """
@@ -121,6 +133,7 @@ class EvaluateOptions(BatchOptions):
     split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA, everyday=True)
     every: int = option(1, metavar="N", least=1, panel=DATA)
     pairs: Path | None = option(None, metavar="FILE", shown_default="those of the split", panel=DATA)
+    same_pose: bool = option(False, flags=("--same-pose",), panel=DATA)
     joint_fit: bool = option(False, panel=DATA)
     photos: bool = option(False, in_recipe=False, flags=("--photos",), panel=DATA)
     shifts: Path | None = option(None, metavar="CSV", shown_default="no alignment", panel=DATA)
@@ -134,9 +147,8 @@ class EvaluateOptions(BatchOptions):
         panel=DATA,
     )
     room: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
-    truth: Path | None = option(None, metavar="DIR", in_recipe=False, shown_default=False, required=True)
     masks: Path | None = option(
-        None, metavar="DIR", shown_default="the truths' alpha, else everything", panel=DATA
+        None, metavar="DIR", shown_default="those of CASES, the truths' alpha, else everything", panel=DATA
     )
     facts: Path | None = option(
         None, metavar="CSV", shown_default="a person is an image's topmost folder", panel=DATA
@@ -144,32 +156,17 @@ class EvaluateOptions(BatchOptions):
     reflectance: tuple[RelightKind, ...] = option(
         ("field",),
         metavar="KIND",
-        shown_default="field; of yale-b portrait, or field for an own field's --checkpoint",
+        shown_default="field; of compare none; of yale-b portrait, or field for an own field's --checkpoint",
         typed=list[str] | None,
         parse=_parse_kinds,
         panel=METHODS,
     )
-    against: tuple[NamedCheckpoint, ...] = option(
-        (),
-        metavar="FILE|NAME=FILE",
-        shown_default="none",
-        typed=list[str] | None,
-        parse=lambda given: tuple(map(NamedCheckpoint.parse, given)),
-        panel=METHODS,
-    )
+    against: tuple[NamedPath, ...] = _named("--against", "FILE")
+    methods: tuple[NamedPath, ...] = _named("--method", "DIR")
     mean_checkpoint: Path | None = option(
         None, metavar="FILE", shown_default="that of the fitted face", panel=METHODS
     )
     held_to_photo: bool = option(False, flags=("--held-to-photo",), panel=METHODS)
-    compare: tuple[Path, ...] = option(
-        (),
-        metavar="DIR",
-        shown_default="none",
-        typed=list[Path] | None,
-        parse=tuple,
-        panel=METHODS,
-        everyday=True,
-    )
     pictures: bool = option(False, panel=MEASURES)
     keep_eyes: bool = option(False, panel=MEASURES)
     measures: Measures = Measures()
@@ -178,14 +175,18 @@ class EvaluateOptions(BatchOptions):
     network_alone: bool = True  # the photo does not correct the field
     non_negative: bool = True  # the light's least squares
     refine: str = "none"
-    predictions: tuple[Path, ...] = ()  # folders of `pairs`
+    truth: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # the folder of `compare`
     dataset: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: photos
 
     @property
-    def methods(self) -> tuple[str, ...]:
-        """The names of all methods: reflectance models, checkpoints, and folders of predictions."""
-        folders = map(folder_name, (*self.predictions, *self.compare))
-        return (*self.reflectance, *(one.name for one in self.against), *folders)
+    def names(self) -> tuple[str, ...]:
+        """The names of all methods: reflectance models, checkpoints, and folders of images."""
+        return (*self.reflectance, *(one.name for one in (*self.against, *self.methods)))
+
+    @property
+    def ours(self) -> bool:
+        """True if facerf renders images of a method."""
+        return bool(self.reflectance or self.against)
 
     @property
     def has_field(self) -> bool:
@@ -198,16 +199,14 @@ class EvaluateOptions(BatchOptions):
 
     def check(self) -> None:
         """Raise UsageError for options that would fail every item, or that exclude each other."""
-        twice = sorted({name for name in self.methods if self.methods.count(name) > 1})
-        if twice:
-            raise UsageError(f"two methods have the name {twice[0]!r}; rename one, or give NAME=FILE")
+        if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
+            raise UsageError(f"two methods have the name {twice[0]!r}; rename one, or give NAME=PATH")
         for one in self.against:
             if not one.path.exists():
                 raise UsageError(f"--against {one.path}: no such file; give one that exists")
-        for folder in self.compare:
-            if not folder.is_dir():
-                raise UsageError(f"--compare {folder}: no such folder; give one that exists")
-        for read in (*self.compare, *self.predictions, self.truth, self.masks):
+        for read in (*(one.path for one in self.methods), self.truth, self.masks):
+            if read and not read.is_dir():
+                raise UsageError(f"{read}: no such folder; give one that exists")
             if read and Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(read)):
                 raise UsageError(f"-o {self.output}: lies in {read}, which is read; give another folder")
         if self.measures.lpips is not None and self.measures.vgg_weights is None:

@@ -57,9 +57,9 @@ class Method:
             raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
         return explain(self.models, head, self.kind, self.network_alone, self.estimator)
 
-    def image(self, head: Head, reflectance: Reflectance, light: RigLight, target: Target) -> np.ndarray:
-        """The face alone [S, S, 3] in the crop of the target's fit, under one light."""
-        return Person(self.models, None, head, reflectance).image(light, target).pixels
+    def image(self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit) -> np.ndarray:
+        """The face alone [S, S, 3] under one light, in the pose and the crop of a fit."""
+        return Person(self.models, None, head, reflectance).image(light, Target(fit, "face")).pixels
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
@@ -178,14 +178,34 @@ def common_mask(views: Iterable[HeadView]) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class DatasetPerson:
-    """A subject of a prepared dataset."""
+    """A subject of a prepared dataset, and groups of its pairs, whose sources are compared group by group."""
 
     dataset: Dataset
     name: str
-    reading: Reading
-    strangers: frozenset[Pair] = frozenset()  # of a frozen list, which the dataset's own pairs lack
+    reading: Reading | None = None  # until it is compared
+    groups: Sequence[Sequence[Pair]] = ()
+    listed: bool = False  # by an old list, whose sources are rendered from their recipes
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
+
+    def compared(self, compare: "Compare", bench: "Bench") -> Iterator[Comparison]:
+        """Compare each group; one in one of whose images no face is found is named and left out.
+
+        Raises UsageError where the joint fits are of another face model.
+        """
+        if bench.reading.geometry is None and bench.models.face.name != self.dataset.face_model:
+            raise UsageError(
+                f"{self.dataset.folder}: its joint fits are of {self.dataset.face_model}; give it as "
+                "--face-model"
+            )
+        person = replace(self, reading=bench.reading)
+        for pairs in self.groups:
+            try:
+                found = list(compare([person.portrait(pair) for pair in pairs], bench))
+            except NoFaceError as error:
+                log.warning("%s: left out (%s)", " and ".join(map(_name, pairs)), error)
+            else:
+                yield from found
 
     def portrait(self, pair: Pair) -> Portrait:
         """The face in the source of a pair; NoFaceError where none is found in it."""
@@ -208,6 +228,7 @@ class DatasetPerson:
 
     def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
         header = self.header(camera)
+        assert self.reading is not None
         face: FaceBox | FaceFit
         if self.reading.geometry is None:
             fit = fit_from_arrays(header.fit)
@@ -223,7 +244,7 @@ class DatasetPerson:
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
         path = image_path(self.dataset, *pair.key)
-        if path.is_file() and pair not in self.strangers:
+        if path.is_file() and not self.listed:
             return read_image(path).pixels
         return render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
 
@@ -231,7 +252,7 @@ class DatasetPerson:
         """The true light of a pair's source: camera-space directions [L, 3], rgb weights [L, 3]."""
         directions = self.header(pair.source_camera).directions
         # Nothing is written into a dataset that is measured on.
-        if pair in self.strangers or not weights_path(self.dataset).is_file():
+        if not weights_path(self.dataset).is_file():
             return directions, pair_weights(self.dataset, pair).numpy()
         pairs, weights = load_pairs(self.dataset)[self.name]
         return directions, np.array(weights[pairs.index(pair)])
@@ -262,77 +283,39 @@ class DatasetPerson:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The means of a run: its methods, these over the mean face, and the reading of faces and of photos."""
+    """The means of a run: its methods, the networks trained with the mean face, the reading of faces."""
 
-    methods: tuple[Method, ...]
-    mean: tuple[Method, ...]
+    models: Models
     reading: Reading
-    faces_of: Callable[[Item], Iterator[Portrait]]
+    methods: Sequence[Method] = ()
+    mean: Models | None = None
+    faces_of: Callable[[Item], Iterable[Portrait]] = lambda _: ()
+
+    def heads(self, photo: np.ndarray, face: FaceBox) -> Iterator[tuple[Method, Head]]:
+        """Yield each method with its head of a face; methods over the same networks share the fit."""
+        heads: dict[int, Head] = {}
+        for method in self.methods:
+            key = id(method.models)
+            if key not in heads:
+                heads[key] = head_of(method.models, photo, face)
+            yield method, heads[key]
 
 
-Compare = Callable[[Sequence[Portrait], Sequence[Method]], Iterable[Comparison]]
-
-
-def compare_people(
-    person: DatasetPerson, groups: Iterable[Sequence[Pair]], compare: Compare, methods: Sequence[Method]
-) -> Iterator[Comparison]:
-    """Compare the sources of each group of a person's pairs.
-
-    A group in one of whose images no face is found is named and left out; any other error is raised.
-    """
-    for pairs in groups:
-        try:
-            found = list(compare([person.portrait(pair) for pair in pairs], methods))
-        except NoFaceError as error:
-            log.warning("%s: left out (%s)", " and ".join(map(_name, pairs)), error)
-        else:
-            yield from found
+Compare = Callable[[Sequence[Portrait], Bench], Iterable[Comparison]]
 
 
 @dataclass(frozen=True)
-class PersonPairs:
-    """Pairs of a person of a dataset, whose sources are compared group by group."""
+class PhotoFaces:
+    """A photo whose faces are compared one by one, or two of a person whose faces are compared together."""
 
-    dataset: Dataset
-    name: str
-    groups: Sequence[Sequence[Pair]]
-    strangers: frozenset[Pair] = frozenset()
+    items: tuple[Item, ...]
+    person: str = ""
 
     def compared(self, compare: Compare, bench: Bench) -> Iterator[Comparison]:
-        """Compare each group; raises UsageError where the joint fits are of another face model."""
-        face_model = self.dataset.face_model
-        if bench.reading.geometry is None and bench.methods[0].models.face.name != face_model:
-            raise UsageError(
-                f"--joint-fit: {self.dataset.folder} has fits of {face_model}; give it as --face-model"
-            )
-        person = DatasetPerson(self.dataset, self.name, bench.reading, self.strangers)
-        return compare_people(person, self.groups, compare, bench.methods)
-
-
-@dataclass(frozen=True)
-class Photo:
-    """A photo whose faces are compared one by one."""
-
-    item: Item
-
-    def compared(self, compare: Compare, bench: Bench) -> Iterator[Comparison]:
-        """Compare each face."""
-        for face in bench.faces_of(self.item):
-            yield from compare([face], bench.methods)
-
-
-@dataclass(frozen=True)
-class Couple:
-    """Two photos of a person, whose first faces are compared together."""
-
-    person: str
-    photos: tuple[Item, Item]
-
-    def compared(self, compare: Compare, bench: Bench) -> Iterable[Comparison]:
-        """Compare the faces of both."""
-        faces = [next(bench.faces_of(photo)) for photo in self.photos]
-        of_person = [replace(face, case=replace(face.case, person=self.person)) for face in faces]
-        return compare(of_person, bench.methods)
+        """Compare each face, or the faces of both."""
+        for faces in zip(*map(bench.faces_of, self.items), strict=False):
+            cases = [replace(face.case, person=self.person or face.case.person) for face in faces]
+            yield from compare([replace(f, case=c) for f, c in zip(faces, cases, strict=True)], bench)
 
 
 def _name(pair: Pair) -> str:

@@ -5,23 +5,24 @@ one is one more value; `run.py` measures, keeps and sums up.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 from facerf_cli.capture.yale_b import YaleB
+from facerf_cli.evaluation.cases import compare_images, freeze
 from facerf_cli.evaluation.comparisons import (
     COMPOSITE,
     LAMBERT,
     compare_olats,
-    fitted_and_mean,
     reconstruct,
+    reconstruct_with_mean,
     transfer,
 )
+from facerf_cli.evaluation.folders import choose_cases
 from facerf_cli.evaluation.measure import Comparison
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions
-from facerf_cli.evaluation.pairs import ImagePair, choose_images, compare_pair
-from facerf_cli.evaluation.people import Bench, Compare, Couple, PersonPairs, Photo
+from facerf_cli.evaluation.people import Bench, Compare, DatasetPerson, PhotoFaces
 from facerf_cli.evaluation.selection import choose_couples, choose_people, choose_sources, olat_pairs
 from facerf_cli.evaluation.summary import Layout
 from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS, choose_subjects, compare_subject
@@ -38,40 +39,25 @@ class Protocol:
         name: The verb.
         choose: Choose what is measured, by the options and the inputs of the command line.
         compare: Yield the comparisons of what one item holds.
-        layout: The tables.
+        layout: The tables; None: images alone are written, for `compare`.
         notes: Yield the notes below them.
     """
 
     name: str
     choose: Callable[[EvaluateOptions, Sequence[str]], Chosen]
     compare: Callable[[EvaluateOptions, MakeBench, Any], Iterable[Comparison]]
-    layout: Layout
+    layout: Layout | None
     notes: Callable[[EvaluateOptions, Chosen], Iterable[str]] = lambda options, chosen: ()
 
 
-Faces = PersonPairs | Photo | Couple
-
-
 def _faces(
-    compare: Compare, options: EvaluateOptions, bench: MakeBench, faces: Faces
+    compare: Compare, options: EvaluateOptions, bench: MakeBench, faces: DatasetPerson | PhotoFaces
 ) -> Iterable[Comparison]:
     return faces.compared(compare, bench())
 
 
-def _with_mean(options: EvaluateOptions, bench: MakeBench, faces: Faces) -> Iterable[Comparison]:
-    made = bench()
-    both = replace(made, methods=fitted_and_mean(made.methods, made.mean))
-    return faces.compared(partial(reconstruct, with_light=False), both)
-
-
 def _subject(options: EvaluateOptions, bench: MakeBench, subject: tuple[YaleB, str]) -> Iterable[Comparison]:
-    made = bench()
-    return compare_subject(*subject, made.methods, made.reading, options.room)
-
-
-def _images(options: EvaluateOptions, bench: MakeBench, pairs: Sequence[ImagePair]) -> Iterator[Comparison]:
-    finder = bench().reading.people if options.measures.face_distance else None
-    return (compare_pair(pair, finder) for pair in pairs)
+    return compare_subject(*subject, bench(), options.room)
 
 
 def _olat_notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
@@ -149,9 +135,15 @@ def _yale_b_notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
         yield f"Settings were chosen on {', '.join(settings)}."
 
 
+def _compare_notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
+    if options.ours:
+        yield _field_is(options, "its source image")
+        yield "In the source's pose images of facerf are those of `facerf relight`, in others the face alone."
+
+
 OLAT = Protocol(
     "olat",
-    partial(choose_people, olat_pairs, 1),
+    partial(choose_people, olat_pairs),
     partial(_faces, compare_olats),
     Layout(
         "Single lights of held-out people",
@@ -185,7 +177,7 @@ TRANSFER = Protocol(
 GEOMETRY = Protocol(
     "geometry",
     choose_sources,
-    _with_mean,
+    partial(_faces, reconstruct_with_mean),
     Layout(
         "The fitted face and the mean face in its pose", ("si_mse", "face_distance", "ssim"), by=("tone",)
     ),
@@ -202,10 +194,12 @@ YALE_B = Protocol(
     ),
     _yale_b_notes,
 )
-PAIRS = Protocol(
-    "pairs",
-    choose_images,
-    _images,
+CASES = Protocol("cases", partial(choose_people, olat_pairs), partial(_faces, freeze), None)
+COMPARE = Protocol(
+    "compare",
+    choose_cases,
+    compare_images,
     Layout("Predictions against {truth}", ("si_mse", "mse", "psnr", "ssim", "lpips", "face_distance")),
+    _compare_notes,
 )
-PROTOCOLS = {one.name: one for one in (OLAT, RECONSTRUCTION, TRANSFER, GEOMETRY, YALE_B, PAIRS)}
+PROTOCOLS = {one.name: one for one in (OLAT, RECONSTRUCTION, TRANSFER, GEOMETRY, YALE_B, CASES, COMPARE)}

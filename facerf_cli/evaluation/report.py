@@ -9,7 +9,6 @@ import io
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from itertools import cycle
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,46 +18,43 @@ from pydantic import BeforeValidator
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import METRICS, Comparison, Row
-from facerf_cli.evaluation.summary import ALL, CaseGroup, Cell, Summary, cell_words, published_for
+from facerf_cli.evaluation.summary import Summary
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document
+from facerf_cli.files.image_metadata import Attributes, xmp_packet
 from facerf_cli.files.sheets import filled_page
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.metrics import best_scale
 from facerf_cli.run.logs import json_line
 
-Format = Literal["facerf-evaluation-3"]
-FORMAT: Format = "facerf-evaluation-3"
+Format = Literal["facerf-evaluation-4"]
+FORMAT: Format = "facerf-evaluation-4"
 
-WORST, FEW = 40, 4  # cases on the page; `few` are typical ones, and as many the best
-# Okabe and Ito's colours (2008), which colour-blind readers can tell apart; for methods in their order.
-METHOD_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b8860b", "#3a9fd8", "#8a8a8a")
-_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)  # of the plots: line, box, bar, box, line
+SHOWN = 48  # cases on the page
 ERROR_HIGHEST = 0.2  # of display values 0..1: the end of the false colours
 # Dark to bright by violet and orange; the lightness only rises, so that the error also reads in grey.
 ERROR_COLOURS = ((8, 6, 20), (87, 22, 110), (187, 55, 84), (249, 142, 9), (252, 250, 176))
 _TILE_PX = 192  # the longer side
 _GAP_PX = 4  # between tiles
 _GAP = (128,) * 3  # grey of the gap, that glares neither on a light page nor on a dark one
+_QUALITY = 88  # of JPEG
 _OUTSIDE = 0.16  # display value of what is not compared
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Facts on a case's strip: source over truth, then the methods' images over their errors.
+    """The images of a case side by side: source over truth, then the methods' images over their errors.
 
-    Images are at the truth's exposure `ev`, the methods' multiplied by `scales`, which are 1 if no scale was
-    sought. A source has its own exposure; without a source, the mask is there. `file` is the path of the JPEG
-    below the evaluation's folder, once it is written.
+    Images are at the truth's exposure, the methods' multiplied by `scales`, which are 1 if no scale was
+    sought. A source has its own exposure; without a source, the mask is there. `jpeg` is in base64.
     """
 
     case: str
-    file: str
     methods: tuple[str, ...]
-    ev: float
     scales: tuple[float, ...]
     has_source: bool
     size_px: tuple[int, int]  # width, height
+    jpeg: str
 
 
 def _with_nan(row: Any) -> Any:
@@ -70,20 +66,15 @@ def _with_nan(row: Any) -> Any:
 
 @dataclass(frozen=True)
 class ItemFigures:
-    """The document of a finished item: its rows and its strips.
+    """The document of a finished item: its rows, its strips, and the paths of `pictures` that were kept.
 
-    `pictures` are images kept for other methods. Paths are relative to the evaluation's folder.
+    Paths are relative to the evaluation's folder.
     """
 
     format: Format
     rows: tuple[Annotated[Row, BeforeValidator(_with_nan)], ...]
     strips: tuple[Strip, ...]
     pictures: tuple[str, ...]
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """All other files that the item wrote."""
-        return (*(strip.file for strip in self.strips), *self.pictures)
 
 
 def write_figures(path: Path, figures: ItemFigures) -> None:
@@ -115,107 +106,47 @@ def images_csv(rows: Sequence[Row]) -> str:
     return stream.getvalue()
 
 
-@dataclass(frozen=True)
-class ChosenCases:
-    """Names of cases to look at, each once; where there are few, all are in `worst`."""
-
-    worst: list[str]
-    typical: list[str]
-    best: list[str]
-
-    def all(self) -> list[str]:
-        """All of them."""
-        return self.worst + self.typical + self.best
-
-
-def choose_cases(
-    rows: Sequence[Row], metric: str, among: Collection[str], worst: int = WORST, few: int = FEW
-) -> ChosenCases:
+def cases_to_show(rows: Sequence[Row], metric: str, among: Collection[str], most: int = SHOWN) -> list[str]:
     """Choose cases by a metric of the first method, the worst first; none without a finite figure.
 
-    Args:
-        rows: Of all methods and cases.
-        metric: The name of the metric.
-        among: Names of the cases to choose from.
-        worst: Number of cases, of those beyond the median.
-        few: Number near the median of all rows, and of the best.
+    Of more than `most` half are the worst, and half are spread over the others, down to the best.
     """
     sign = 1 if METRICS[metric].lower_is_better else -1
     figures = {
         row.case: sign * row.values.get(metric, math.nan) for row in rows if row.method == rows[0].method
     }
-    badness = {case: figure for case, figure in figures.items() if math.isfinite(figure)}
-    ranked = sorted(badness.keys() & set(among), key=lambda case: (-badness[case], case))
-    if len(ranked) == len(badness) <= worst:
-        return ChosenCases(ranked, [], [])
-    median = float(np.median(list(badness.values())))
-    rest, best = ranked[:-few], ranked[-few:][::-1]
-    typical = sorted(rest, key=lambda case: abs(badness[case] - median))[:few]
-    bad = [case for case in rest if case not in typical and badness[case] > median]
-    return ChosenCases(bad[:worst], typical, best)
+    bad = {case: figure for case, figure in figures.items() if case in among and math.isfinite(figure)}
+    ranked = sorted(bad, key=lambda case: (-bad[case], case))
+    if len(ranked) <= most:
+        return ranked
+    worst = most // 2
+    places = np.linspace(worst, len(ranked) - 1, most - worst).round().astype(int)
+    return ranked[:worst] + [ranked[place] for place in places]
 
 
-def page(
-    summary: Summary, run: Mapping[str, Any], rows: Sequence[Row], strips: Sequence[Strip], folder: Path
-) -> str:
-    """Write the report. Equal figures give equal bytes.
+def page(summary: Summary, run: Mapping[str, Any], rows: Sequence[Row], strips: Sequence[Strip]) -> str:
+    """Write the report: the tables, and the strips that were kept. Equal figures give equal bytes.
 
-    Args:
-        summary: The tables.
-        run: `facerf`, the version; `command`; `networks`, file and SHA-256 of each by title; and other facts.
-        rows: The figures of every image and method.
-        strips: Those that were kept, whose files lie below the folder.
-        folder: The evaluation's folder.
+    `run` has `facerf`, the version; `command`; `networks`, file and SHA-256 of each by title; other facts.
     """
-    chosen = choose_cases(rows, summary.metrics[0], [strip.case for strip in strips])
     strip_of = {strip.case: strip for strip in strips}
-    rows_of: dict[str, list[Row]] = {case: [] for case in chosen.all()}
+    shown = cases_to_show(rows, summary.metrics[0], strip_of)
+    rows_of: dict[str, list[Row]] = {case: [] for case in shown}
     for row in rows:
         if row.case in rows_of:
             rows_of[row.case].append(row)
-    worst = "All cases, the worst first" if len(chosen.worst) == summary.images else "Worst cases"
-    sections = {"Typical cases": chosen.typical, "Best cases": chosen.best}
     return filled_page(
         Path(__file__).with_name("report.html"),
         summary=summary,
         run=run,
-        sections={worst: chosen.worst} | {title: cases for title, cases in sections.items() if cases},
+        shown=shown,
         strip_of=strip_of,
         rows_of=rows_of,
-        jpegs={
-            case: base64.b64encode((folder / strip_of[case].file).read_bytes()).decode() for case in rows_of
-        },
-        facts=list(dict.fromkeys(group.fact for group in summary.groups if group.fact)),
-        metrics=[name for name in summary.layout.metrics if name in summary.metrics],
-        colours=dict(zip(summary.methods, cycle(METHOD_COLOURS))),
         gradient=", ".join(f"rgb({r} {g} {b})" for r, g, b in ERROR_COLOURS),
         highest=ERROR_HIGHEST,
-        everywhere=ALL,
         figure=_figure,
         metric_named=METRICS.__getitem__,
-        axis_of=_axis,
-        cell_words=cell_words,
-        spread_of=_spread,
-        published_for=published_for,
     )
-
-
-def _axis(groups: Sequence[CaseGroup], metric: str) -> tuple[float, float]:
-    """The lowest and highest value of the plots; an error's axis begins at 0 if no value is negative."""
-    cells = [cell for group in groups for cell in group.cells.get(metric, {}).values()]
-    ends = [end for cell in cells for end in (*np.quantile(cell.values, _QUANTILES), cell.interval.mean)]
-    low, high = float(min(ends, default=0)), float(max(ends, default=1))
-    low = 0.0 if low >= 0 and METRICS[metric].lower_is_better else low
-    return (low, high) if high > low else (low, low + 1)
-
-
-def _spread(cell: Cell, axis: tuple[float, float]) -> dict[str, str]:
-    """Places of a method's values on the axis, in percent: a line, a box and its width, a bar and a dot."""
-    low, high = axis
-    at = 100 * (np.array([*np.quantile(cell.values, _QUANTILES), cell.interval.mean]) - low) / (high - low)
-    names = ("least", "lower", "middle", "upper", "most", "mean")
-    width = max(at[3] - at[1], 0.4)
-    return {name: f"{place:.2f}%" for name, place in zip(names, at, strict=True)} | {"box": f"{width:.2f}%"}
 
 
 def _figure(values: Mapping[str, float], metric: str) -> str:
@@ -225,8 +156,11 @@ def _figure(values: Mapping[str, float], metric: str) -> str:
     return f"{values[metric]:.{METRICS[metric].digits}f}" if math.isfinite(values[metric]) else "none"
 
 
-def draw_strip(comparison: Comparison, scaled: bool) -> tuple[Strip, Image.Image]:
-    """Draw a case's strip; `scaled` multiplies predictions by the scale that Si-MSE finds."""
+def draw_strip(comparison: Comparison, scaled: bool, marks: Attributes) -> Strip:
+    """Draw a case's strip; `scaled` multiplies predictions by the scale that Si-MSE finds.
+
+    `marks` are the metadata that say that it is synthetic.
+    """
     truth, mask, source = comparison.truth, comparison.mask, comparison.source
     ev = auto_exposure_ev(truth, mask)
     true = _display(truth, ev)
@@ -246,16 +180,16 @@ def draw_strip(comparison: Comparison, scaled: bool) -> tuple[Strip, Image.Image
         for row, tile in enumerate(tiles):
             place = column * (width + _GAP_PX), row * (height + _GAP_PX)
             image.paste(_fitted(tile, (width, height)), place)
-    strip = Strip(
+    jpeg = io.BytesIO()
+    image.save(jpeg, "JPEG", quality=_QUALITY, subsampling=0, xmp=xmp_packet(marks))
+    return Strip(
         comparison.case.name,
-        "",
         tuple(comparison.predictions),
-        ev,
         tuple(scales),
         source is not None,
         size_px,
+        base64.b64encode(jpeg.getvalue()).decode(),
     )
-    return strip, image
 
 
 def _display(linear: np.ndarray, ev: float) -> np.ndarray:

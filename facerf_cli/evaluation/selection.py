@@ -1,26 +1,24 @@
 """The images that are measured: pairs of a dataset, photos, and couples of both.
 
-All, every Nth, as many as the paper measured, or a frozen list, which each run leaves as DIR/pairs.json.
+All, every Nth, or as many as the paper measured.
 """
 
 import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
-
-from pydantic import Field
+from typing import Any, Literal, TypeVar
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, check_pair, pairs_path, read_pairs
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.folders import read_facts
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions
-from facerf_cli.evaluation.pairs import read_facts
-from facerf_cli.evaluation.people import Couple, PersonPairs, Photo
-from facerf_cli.files.documents import Document, checked, read_document, write_document
+from facerf_cli.evaluation.people import DatasetPerson, PhotoFaces
+from facerf_cli.files.documents import Document, checked, read_document
 from facerf_cli.run.logs import LOGGER_NAME
 
 PairsByPerson = Mapping[str, Sequence[Pair]]
@@ -31,34 +29,22 @@ log = logging.getLogger(LOGGER_NAME)
 # The paper's numbers of images ('Quantitative Evaluations', Tables 1, 2 and 4).
 _PAPER_PHOTOS, _PAPER_COUPLES, _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT = 130, 43, 160, 3900, 8100
 
-ListFormat = Literal["facerf-pairs-1"]
-LIST_FORMAT: ListFormat = "facerf-pairs-1"
-PAIRS_LIST = "pairs.json"
-
 
 def choose_people(
     choose: Callable[[PairsByPerson, EvaluateOptions], Groups],
-    size: int,
     options: EvaluateOptions,
     inputs: Sequence[str],
 ) -> Chosen:
-    """Choose groups of `size` pairs of the people of a dataset; those of a list, if one is given."""
+    """Choose groups of pairs of the people of a dataset; the pairs of an old list, if one is given."""
     assert options.dataset is not None
     dataset = read_dataset(options.dataset)
-    strangers: frozenset[Pair] = frozenset()
     if options.pairs:
-        groups = read_list(options.pairs, dataset, size)
-        listed = {pair for members in groups.values() for group in members for pair in group}
-        strangers = frozenset(listed.difference(read_pairs(dataset)))
+        groups: Groups = read_list(options.pairs, dataset)
     else:
-        groups = choose(pairs_of_split(dataset, options.split), options)
-    if not options.dry_run:
-        # Freezes the pairs of a run, with the recipes of their sources, for `--pairs` of any other run.
-        rows = [[asdict(pair) for pair in group] for members in groups.values() for group in members]
-        write_document(options.output / PAIRS_LIST, {"format": LIST_FORMAT, "groups": rows})
+        groups = choose(pairs_of_split(dataset, options), options)
     items = {
-        options.item(options.dataset / "olat" / name, name): PersonPairs(
-            dataset, name, groups[name], strangers
+        options.item(options.dataset / "olat" / name, name): DatasetPerson(
+            dataset, name, groups=groups[name], listed=options.pairs is not None
         )
         for name in sorted(groups)
     }
@@ -69,7 +55,7 @@ def choose_people(
 def choose_sources(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
     """Choose sources of a dataset, or photos: all, or up to the paper's number."""
     if options.dataset:
-        return choose_people(source_pairs, 1, options, inputs)
+        return choose_people(source_pairs, options, inputs)
     photos = collect_items(inputs, options.output, PHOTO_SUFFIXES)
     names = {photo.name for photo in photos}
     described = {} if options.facts is None else read_facts(options.facts)
@@ -78,13 +64,13 @@ def choose_sources(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
             f"{options.facts}: {unknown[0]} is no photo of this run; give names such as {min(names)}"
         )
     most = _up_to(_PAPER_PHOTOS, len(photos), "photos") if options.preset else len(photos)
-    return Chosen({photo: Photo(photo) for photo in photos[:most]})
+    return Chosen({photo: PhotoFaces((photo,)) for photo in photos[:most]})
 
 
 def choose_couples(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
     """Choose couples of sources of a dataset, or of photos: all, or up to the paper's number."""
     if options.dataset:
-        return choose_people(couple_pairs, 2, options, inputs)
+        return choose_people(couple_pairs, options, inputs)
     by_person: dict[str, list[tuple[Item, Item]]] = {}
     for person, couple in couples_of_photos(inputs, options.output):
         by_person.setdefault(person, []).append(couple)
@@ -94,20 +80,21 @@ def choose_couples(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
     for person, couples in by_person.items():
         for first, second in couples:
             item = options.item(first.input_path, f"{first.name}--{Path(second.name).name}")
-            items[item] = Couple(person, (first, second))
-    return Chosen(items, tuple(couple.photos[1].input_path for couple in items.values()))
+            items[item] = PhotoFaces((first, second), person)
+    return Chosen(items, tuple(couple.items[1].input_path for couple in items.values()))
 
 
-def pairs_of_split(dataset: Dataset, split: str) -> dict[str, list[Pair]]:
+def pairs_of_split(dataset: Dataset, options: EvaluateOptions) -> dict[str, list[Pair]]:
     """The pairs of a split, or of all, by person; raises UsageError if there are none."""
     pairs: dict[str, list[Pair]] = {}
     for pair in read_pairs(dataset):
-        if split in ("all", pair.split):
+        in_pose = not options.same_pose or pair.source_camera == pair.target_camera
+        if options.split in ("all", pair.split) and in_pose:
             pairs.setdefault(pair.subject, []).append(pair)
     if not pairs:
         raise UsageError(
-            f"{dataset.folder}: no pairs in the split {split}; run facerf relight-dataset, or give another "
-            "--split"
+            f"{dataset.folder}: no pairs in the split {options.split}; run facerf relight-dataset, or "
+            "give another --split"
         )
     return pairs
 
@@ -188,43 +175,31 @@ def _up_to(paper: int, found: int, what: str) -> int:
 
 
 class _PairList(Document):
-    format: ListFormat
-    groups: Annotated[
-        list[Annotated[list[dict[str, Any]], Field(min_length=1, max_length=2)]], Field(min_length=1)
-    ]
+    format: Literal["facerf-pairs-1"]
+    groups: list[list[dict[str, Any]]]
 
 
-def read_list(path: Path, dataset: Dataset, size: int) -> Groups:
-    """Read a frozen list of groups of `size` pairs of a dataset; a map that has moved may lie next to it.
+def read_list(path: Path, dataset: Dataset) -> dict[str, list[tuple[Pair, ...]]]:
+    """Read the pairs of a list of an earlier version; a map that has moved may lie next to it.
 
     Raises InputError where a pair's person, camera or light is not the dataset's, or in another split.
     """
-    content = read_document(path, _PairList, "give the pairs.json of another run of facerf evaluate")
-    listed = [
-        tuple(checked(Pair, row, f"{path}: groups[{number}]") for row in group)
-        for number, group in enumerate(content.groups)
-    ]
-    keys = [pair.key for group in listed for pair in group]
-    if len(set(keys)) < len(keys):
-        raise InputError(f"{path}: lists a pair twice; remove one")
+    log.warning("%s: lists of pairs are read for this version only; publish the folder of cases", path)
+    content = read_document(path, _PairList, "give the pairs.json of an earlier version of facerf evaluate")
     groups: dict[str, list[tuple[Pair, ...]]] = {}
-    for number, group in enumerate(listed):
+    for row in (row for group in content.groups for row in group):
+        pair = checked(Pair, row, f"{path}: groups")
         try:
-            for pair in group:
-                check_pair(dataset, pair)
-            if len(group) != size or len({pair.subject for pair in group}) > 1:
-                raise ValueError(f"{size} of one person are needed")
+            check_pair(dataset, pair)
         except (KeyError, ValueError) as error:
             raise InputError(
-                f"{path}: groups[{number}] does not fit {dataset.folder} ({error}); prepare the dataset with "
-                "the people, splits, cameras and lights of the list"
+                f"{path}: {pair.subject}/{pair.index:05d} does not fit {dataset.folder} ({error}); prepare "
+                "it with the people, splits, cameras and lights of the list"
             ) from None
-        moved = []  # the maps of a list may lie beside it
-        for pair in group:
-            near = path.parent / Path(pair.envmap).name
-            is_near = near.is_file() and not Path(pair.envmap).is_file()
-            moved.append(replace(pair, envmap=str(near)) if is_near else pair)
-        groups.setdefault(group[0].subject, []).append(tuple(moved))
+        near = path.parent / Path(pair.envmap).name
+        if near.is_file() and not Path(pair.envmap).is_file():
+            pair = replace(pair, envmap=str(near))
+        groups.setdefault(pair.subject, []).append((pair,))
     return groups
 
 

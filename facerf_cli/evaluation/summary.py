@@ -20,36 +20,20 @@ from facerf_cli.run.logs import counted
 
 ALL = "all images"
 _DIGITS = 12  # of a digest
+_MOST_VALUES = 12  # of a fact that breaks tables down, where the protocol names none
 _PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 
 
-@dataclass(frozen=True)
-class PublishedFigure:
-    """A published figure: mean and standard deviation over images of one metric of one method, as published.
-
-    `fact` and `value` name the group of our figures that it is shown with ('pose', 'same pose'); all images
-    if they are ''. `source` and `data` name where it was published and what it was measured on.
-    """
-
-    method: str
-    metric: str
-    mean: str
-    sd: str  # '' if not published
-    fact: str
-    value: str
-    source: str
-    data: str
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figure for JSON."""
-        return vars(self) | {"mean": float(self.mean), "sd": float(self.sd) if self.sd else None}
+PublishedFigure = Mapping[str, str]  # a row of published.csv, for orientation; '' where it says nothing
 
 
 def published(*protocols: str) -> tuple[PublishedFigure, ...]:
-    """Read the figures that are shown with those of protocols, from published.csv."""
+    """Read the figures that are shown with those of protocols, from published.csv.
+
+    `mean` and `sd` are over images, as published; `fact` and `value` name the group that they are shown with.
+    """
     with Path(__file__).with_name("published.csv").open(encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row.pop("protocol") in protocols]
-    return tuple(PublishedFigure(**row) for row in rows)
+        return tuple(row for row in csv.DictReader(stream) if row.pop("protocol") in protocols)
 
 
 @dataclass(frozen=True)
@@ -57,7 +41,8 @@ class Layout:
     """The contents of a protocol's tables.
 
     `title` is the heading. The first of `metrics` decides which images are the best and the worst. `by` names
-    the facts, as text, that break the tables down; where it is empty, all do. `notes` are printed below.
+    the facts, as text, that break the tables down; empty: all of few values. `notes` are
+    printed below.
     """
 
     title: str
@@ -71,23 +56,15 @@ class Layout:
 class Cell:
     """One metric of one method over a group of images, and against the first method.
 
-    `values` are sorted; those that are not finite are counted in `left_out`. `difference` is this method's
-    value less the first one's, on the images that both have, and `won` the share of these on which this
-    method is better; a tie counts half. The first method has none, nor one without such images.
+    Values that are not finite are counted in `left_out`. `difference` is this method's value less the first
+    one's, on the images that both have, and `won` the share of these on which this method is better; a tie
+    counts half. The first method has none, nor one without such images.
     """
 
-    values: tuple[float, ...]
     interval: Interval
     left_out: int
     difference: Interval | None = None
     won: float = math.nan
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON."""
-        entry: dict[str, Any] = self.interval.as_dict() | {"left_out": self.left_out}
-        if self.difference is not None:
-            entry["less_the_first"] = self.difference.as_dict() | {"won": self.won}
-        return entry
 
 
 @dataclass(frozen=True)
@@ -101,7 +78,7 @@ class CaseGroup:
 
 @dataclass(frozen=True)
 class Summary:
-    """All tables of a run."""
+    """All tables of a run: of each metric the rows of every group of images."""
 
     layout: Layout
     methods: tuple[str, ...]
@@ -116,19 +93,44 @@ class Summary:
         images = counted(self.images, "image")
         return f"{images} of {counted(self.persons, 'person')}" if self.persons else images
 
+    @property
+    def shown(self) -> list[str]:
+        """The metrics that have a table."""
+        return [metric for metric in self.layout.metrics if metric in self.metrics]
+
+    @property
+    def columns(self) -> list[str]:
+        """The headings of the tables; those of differences only where there are several methods."""
+        names = ["images", "method", "n", "mean", "sd", "median", "95 % interval", "vs first", "won"]
+        return names if len(self.methods) > 1 else names[:7]
+
+    def table(self, metric: str) -> list[list[str]]:
+        """The rows of a metric: of each group the methods, then published figures, which have no n.
+
+        The first metric is broken down by facts.
+        """
+        rows = []
+        for group in self.groups if metric == self.shown[0] else self.groups[:1]:
+            title = f"{group.fact}: {group.value}" if group.fact else ALL
+            for method, cell in group.cells.get(metric, {}).items():
+                words = cell_words(cell, METRICS[metric].digits)
+                rows.append([title, method, str(cell.interval.images), *words][: len(self.columns)])
+                title = ""
+            key = metric, group.fact, group.value
+            for one in self.layout.published:
+                if (one["metric"], one["fact"], one["value"]) == key:
+                    rows.append([f"published, {one['source']}", one["method"], "", one["mean"], one["sd"]])
+        return rows
+
+    @property
+    def notes(self) -> list[str]:
+        """The lines below the tables."""
+        measured_on = dict.fromkeys(f"{one['source']}: {one['data']}" for one in self.layout.published)
+        published = [f"Published figures. {'. '.join(measured_on)}."] if measured_on else []
+        return [*published, *self.layout.notes]
+
     def as_dict(self) -> dict[str, Any]:
         """Return all tables for JSON."""
-        groups = [
-            {
-                "fact": group.fact or None,
-                "value": group.value or None,
-                "metrics": {
-                    metric: {method: cell.as_dict() for method, cell in by_method.items()}
-                    for metric, by_method in group.cells.items()
-                },
-            }
-            for group in self.groups
-        ]
         return {
             "title": self.layout.title,
             "notes": self.layout.notes,
@@ -136,9 +138,30 @@ class Summary:
             "persons": self.persons,
             "methods": self.methods,
             "metrics": self.metrics,
-            "groups": groups,
-            "published": [figure.as_dict() for figure in self.layout.published],
+            "groups": [
+                {
+                    "fact": group.fact or None,
+                    "value": group.value or None,
+                    "metrics": {
+                        metric: {method: _entry(cell) for method, cell in by_method.items()}
+                        for metric, by_method in group.cells.items()
+                    },
+                }
+                for group in self.groups
+            ],
+            "published": [
+                {**one, "mean": float(one["mean"]), "sd": float(one["sd"]) if one["sd"] else None}
+                for one in self.layout.published
+            ],
         }
+
+
+def _entry(cell: Cell) -> dict[str, Any]:
+    """The figures of a cell for JSON."""
+    entry = cell.interval.as_dict() | {"left_out": cell.left_out}
+    if cell.difference is None:
+        return entry
+    return entry | {"less_the_first": cell.difference.as_dict() | {"won": cell.won}}
 
 
 def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
@@ -160,6 +183,8 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for row in rows:
             if fact in row.facts:
                 by_value.setdefault(str(row.facts[fact]), []).append(row)
+        if not layout.by and len(by_value) > _MOST_VALUES:  # such as the files of maps
+            continue
         for value in sorted(by_value, key=natural):
             groups.append(CaseGroup(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
@@ -170,12 +195,6 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         )
         layout = replace(layout, notes=(*layout.notes, note))
     return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
-
-
-def published_for(summary: Summary, group: CaseGroup, metric: str) -> list[PublishedFigure]:
-    """The published figures of a group and a metric."""
-    key = metric, group.fact, group.value
-    return [one for one in summary.layout.published if (one.metric, one.fact, one.value) == key]
 
 
 def natural(text: str) -> list[tuple[int, float, str]]:
@@ -196,8 +215,7 @@ def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) 
             interval = _interval([(row.person, row.values[metric]) for row in ours])
             if interval is None:
                 continue
-            values = tuple(sorted(row.values[metric] for row in ours))
-            cell = Cell(values, interval, sum(row.method == method for row in measured) - len(ours))
+            cell = Cell(interval, sum(row.method == method for row in measured) - len(ours))
             if method != methods[0]:
                 both = [
                     (row.person, row.values[metric] - firsts[row.case]) for row in ours if row.case in firsts
@@ -229,50 +247,28 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
     plain = not terminal or console.width <= _PIPED_WIDTH  # rules take columns that a narrow terminal lacks
-    layout = summary.layout
-    console.print(Text(f"{layout.title}: {summary.size}", style="bold"))
-    shown = [metric for metric in layout.metrics if metric in summary.metrics]
-    for metric in shown:
-        groups = summary.groups if metric == shown[0] else summary.groups[:1]
-        console.print(_table(summary, metric, groups, plain))
-    measured_on = dict.fromkeys(f"{figure.source}: {figure.data}" for figure in layout.published)
-    if measured_on:
-        console.print(Text("Published figures. " + ". ".join(measured_on) + "."))
-    for note in layout.notes:
+    console.print(Text(f"{summary.layout.title}: {summary.size}", style="bold"))
+    for metric in summary.shown:
+        table = Table(
+            title=Text(f"\n{METRICS[metric].title} ({METRICS[metric].better} is better)"),
+            title_justify="left",
+            box=None if plain else box.SIMPLE_HEAD,
+            pad_edge=False,
+            padding=(0, 1, 0, 0),
+            expand=False,
+        )
+        table.add_column("images", overflow="fold", min_width=10, max_width=26)
+        table.add_column("method", overflow="fold", max_width=20)
+        for name in summary.columns[2:]:
+            table.add_column(name, justify="right", no_wrap=name not in ("95 % interval", "vs first"))
+        for row in summary.table(metric):
+            table.add_row(*map(Text, row))
+        console.print(table)
+    for note in summary.notes:
         console.print(Text(note))
     if networks:
         named = [f"{title} {one['file']} {one['sha256'][:_DIGITS]}" for title, one in networks.items()]
         console.print(Text(f"Networks, with the first digits of SHA-256: {'; '.join(named)}."))
-
-
-def _table(summary: Summary, metric: str, groups: Sequence[CaseGroup], plain: bool) -> Table:
-    """The groups' rows: one for each method, then the published figures."""
-    how = METRICS[metric]
-    better = "less" if how.lower_is_better else "more"
-    table = Table(
-        title=Text(f"\n{how.title} ({better} is better)"),
-        title_justify="left",
-        box=None if plain else box.SIMPLE_HEAD,
-        pad_edge=False,
-        padding=(0, 1, 0, 0),
-        expand=False,
-    )
-    table.add_column("images", overflow="fold", min_width=10, max_width=26)
-    table.add_column("method", overflow="fold", max_width=20)
-    columns = ["n", "mean", "sd", "median", "95 % interval", "vs first", "won"]
-    for name in columns[: None if len(summary.methods) > 1 else 5]:
-        table.add_column(name, justify="right", no_wrap=name not in ("95 % interval", "vs first"))
-    rows: list[list[str]] = []
-    for group in groups:
-        title = f"{group.fact}: {group.value}" if group.fact else ALL
-        for method, cell in group.cells.get(metric, {}).items():
-            rows.append([title, method, str(cell.interval.images), *cell_words(cell, how.digits)])
-            title = ""
-        for figure in published_for(summary, group, metric):
-            rows.append([f"published, {figure.source}", figure.method, "", figure.mean, figure.sd])
-    for row in rows:
-        table.add_row(*map(Text, row[: len(table.columns)]))
-    return table
 
 
 def cell_words(cell: Cell, digits: int) -> list[str]:

@@ -19,14 +19,12 @@ from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB, read_sh
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions
-from facerf_cli.evaluation.people import Method, Reading
-from facerf_cli.face.head import Head
+from facerf_cli.evaluation.people import Bench
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.person import Target
-from facerf_cli.pipeline import head_of
-from facerf_cli.portrait.find import Face, FaceBox
+from facerf_cli.portrait.find import Face
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
 ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera
@@ -179,29 +177,27 @@ def choose_subjects(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
     return Chosen({options.item(database.folder / name, name): (database, name) for name in chosen})
 
 
-def compare_subject(
-    database: YaleB, name: str, methods: Sequence[Method], reading: Reading, room: float = 0.0
-) -> Iterator[Comparison]:
+def compare_subject(database: YaleB, name: str, bench: Bench, room: float = 0.0) -> Iterator[Comparison]:
     """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
 
-    A subject's sources share the landmarks, or the box, of its frontal image. Raises InputError where no face
-    is found in that, or an image cannot be read.
-
-    Args:
-        database: The images.
-        name: The subject's.
-        methods: What is compared, at least one.
-        reading: How the face is found.
-        room: What the room sends back from all around, as a share of what a flash sends.
+    A subject's sources share the landmarks, or the box, of its frontal image. `room` is what comes back from
+    all around, as a share of what a flash sends. Raises InputError where no face is found, or an image cannot
+    be read.
     """
     subject = YaleSubject(database, name)
     relightings = list(subject.relightings())
-    face = reading.find(_rgb(subject.image("frontal")), str(database.folder / name))
+    face = bench.reading.find(_rgb(subject.image("frontal")), str(database.folder / name))
     places_px = face.landmarks_px if isinstance(face, Face) else None
     for source in dict.fromkeys(one.source for one in relightings):
         of_source = [one for one in relightings if one.source == source]
         photo = _rgb(subject.image(source))
-        relit = _relit_by_all(subject, photo, face, of_source, methods, room)
+        lights = _lights(subject, of_source, room)
+        relit = {
+            method.name: [
+                image.mean(-1).clip(min=0) for image in method.images(photo, head, lights, Target())
+            ]
+            for method, head in bench.heads(photo, face)
+        }
         for row, one in enumerate(of_source):
             yield Comparison(
                 case=one.case(name),
@@ -211,33 +207,11 @@ def compare_subject(
                 source=photo,
                 landmarks_px=places_px,
                 source_face=None if places_px is None else (face_mask(), places_px),
-                grey_as_given=True,
             )
 
 
 def _rgb(grey: np.ndarray) -> np.ndarray:
     return np.repeat(grey[..., None], 3, -1).astype(np.float32)
-
-
-def _relit_by_all(
-    subject: YaleSubject,
-    photo: np.ndarray,
-    face: FaceBox,
-    relightings: Sequence[Relighting],
-    methods: Sequence[Method],
-    room: float,
-) -> Mapping[str, list[np.ndarray]]:
-    """The images [H, W] of one source under every target light, by method."""
-    lights = _lights(subject, relightings, room)
-    heads: dict[int, Head] = {}
-    relit = {}
-    for method in methods:
-        key = id(method.models)  # methods over the same networks share the fit
-        if key not in heads:
-            heads[key] = head_of(method.models, photo, face)
-        images = method.images(photo, heads[key], lights, Target())
-        relit[method.name] = [image.mean(-1).clip(min=0) for image in images]
-    return relit
 
 
 def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float) -> Lights:

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,23 +18,28 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
-from facerf_cli.evaluation import people
+from facerf_cli.evaluation import bench, cases, people
+from facerf_cli.evaluation.bench import bench_of, methods_of
+from facerf_cli.evaluation.folders import read_facts
 from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
-from facerf_cli.network.checkpoint import save_checkpoint
+from facerf_cli.network import checkpoint
+from facerf_cli.network.checkpoint import new_network, save_checkpoint, save_networks, use_form
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.relighting.models import Models
-from facerf_cli.work import evaluate
-from facerf_cli.work.evaluate import bench_of, methods_of
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import load_models_once
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double
 from tests.kinds import Folders, Patch, Said
+from tests.network.test_own_forms import NAME as OWN_NETWORK
+from tests.network.test_own_forms import write_own_package
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 
@@ -54,7 +59,7 @@ def doubles(monkeypatch: Patch) -> None:
     def load(options: EvaluateOptions, photo: PhotoOptions) -> tuple[Double, ...]:
         return (Double("field", models=load_models_once(photo)),)
 
-    monkeypatch.setattr(evaluate, "methods_of", load)
+    monkeypatch.setattr(bench, "methods_of", load)
 
 
 def run(protocol: str, *words: str | Path) -> int:
@@ -103,8 +108,8 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(tmp_path: Path, capsys: 
     path = tmp_path / "half.png"
     Image.fromarray(np.dstack([photo, shown])).save(path)
     photo_options = PhotoOptions(Settings(device="cpu"))
-    bench, models = bench_of(EvaluateOptions(tmp_path), photo_options), load_models_once(photo_options)
-    whole, half = (next(bench.faces_of(Item(x, x, x.stem))) for x in (PHOTO, path))
+    made, models = bench_of(EvaluateOptions(tmp_path), photo_options), load_models_once(photo_options)
+    whole, half = (next(iter(made.faces_of(Item(x, x, x.stem)))) for x in (PHOTO, path))
     seen, part = whole.by(models), half.by(models)
     crop = part.fit.crop
     column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
@@ -160,27 +165,61 @@ def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.usefixtures("doubles")
-def test_a_frozen_list_gives_the_same_figures_on_a_dataset_of_other_pairs(
-    folder: Path, tmp_path: Path, capsys: Said
+def test_one_table_of_facerf_an_own_network_and_a_folder(
+    folder: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
-    first, again, bare = (tmp_path / name for name in ("first", "again", "bare"))
-    assert run("reconstruction", folder, "-o", first, "--preset", "paper", "--joint-fit") == 0
+    """On cases that are frozen without any checkpoint; the own network is a form of an installed package."""
+    write_own_package(tmp_path / "site", monkeypatch)
+    face = load_fit(read_dataset(folder).fit_path("0001", "C0")).landmarks_px.double().numpy()
+    monkeypatch.setattr(people, "find_for", lambda *given: [face_at(face)])
+    monkeypatch.setattr(cases, "find_faces", lambda *given: [face_at(face)])
+    frozen, theirs, out = (tmp_path / name for name in ("cases", "theirs", "out"))
+    assert run("cases", folder, "-o", frozen, "--every", "4") == 0
+    listed = read_facts(frozen / "cases.csv")
+    held_out = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][::4]
+    assert set(listed) == {f"{pair.subject}/{pair.index:05d}" for pair in held_out}
+    for name in listed:
+        assert read_image(frozen / f"light/{name}.exr").pixels.shape == (64, 128, 3)
+        source = read_image(frozen / f"source/{name}.exr").pixels
+        write_exr(theirs / f"{name}.exr", np.broadcast_to(source.mean((0, 1)), source.shape))
+    use_form(OWN_NETWORK)
+    network = new_network("reflectance", OWN_NETWORK, {})
+    own = tmp_path / "own.safetensors"
+    save_networks(own, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
+    del checkpoint._CLASSES["reflectance", OWN_NETWORK]
+    line = ["--reflectance", "field", "--against", own, "--method", f"mean={theirs}", "-o", out]
+    assert run("compare", frozen, *line) == 1 and "give --form" in capsys.readouterr().err
+    assert run("compare", frozen, *line, "--form", OWN_NETWORK) == 0
+    found = json.loads((out / "summary.json").read_text())
+    assert found["methods"] == ["field", "own", "mean"] and found["pictures"] == len(listed)
+    assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
+    assert "Reflectance Network of own" in (out / "report.html").read_text()
+    assert run("olat", folder, "-o", out, "--form", "no_such:Class") == 2
+    assert "--form no_such:Class" in capsys.readouterr().err
+
+
+def test_an_old_list_of_pairs_is_frozen_on_a_dataset_of_other_pairs(
+    folder: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
+) -> None:
+    monkeypatch.setattr(cases, "find_faces", lambda *given: [])
+    pairs = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][:2]
+    old = {"format": "facerf-pairs-1", "groups": [[asdict(pair)] for pair in pairs]}
+    listed, bare = tmp_path / "pairs.json", tmp_path / "bare"
+    listed.write_text(json.dumps(old))
     shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("relit"))
     own = ["--envmaps", "procedural:3", "--per-subject", "6", "--seed", "9"]  # other pairs, same numbers
     assert main(["relight-dataset", str(bare), *own]) == 0
-    assert run("reconstruction", bare, "-o", again, "--pairs", first / "pairs.json", "--joint-fit") == 0
-    assert images(first) == images(again) and len(images(first)) == 12
-    assert (first / "pairs.json").read_text() == (again / "pairs.json").read_text()
-    content = json.loads((first / "pairs.json").read_text())
+    assert run("cases", bare, "-o", tmp_path / "cases", "--pairs", listed) == 0
+    assert "are read for this version only" in capsys.readouterr().err
+    for pair in pairs:
+        places = folder / "relit", tmp_path / "cases/source"
+        before, after = (read_image(p / f"{pair.subject}/{pair.index:05d}.exr").pixels for p in places)
+        np.testing.assert_array_equal(before, after)
     for key, value in (("target_camera", "C9"), ("split", "train"), ("subject", "../x")):
-        wrong = tmp_path / "wrong.json"
-        group = [content["groups"][0][0] | {key: value}]
-        wrong.write_text(json.dumps(content | {"groups": [group]}))
-        assert run("reconstruction", bare, "-o", tmp_path / "w", "--pairs", wrong) == 1
-        assert "groups[0] does not fit" in capsys.readouterr().err
-    assert run("transfer", bare, "-o", tmp_path / "w", "--pairs", first / "pairs.json") == 1
-    assert "2 of one person" in capsys.readouterr().err
+        wrong = {"groups": [[asdict(pairs[0]) | {key: value}]]}
+        listed.write_text(json.dumps(old | wrong))
+        assert run("cases", bare, "-o", tmp_path / "w", "--pairs", listed) == 1
+        assert "does not fit" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("doubles")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.yale_b import Flash
-from facerf_cli.evaluation import people, yale_b
+from facerf_cli.evaluation import bench as making
+from facerf_cli.evaluation import people, run, yale_b
 from facerf_cli.evaluation.measure import SOURCE
 from facerf_cli.evaluation.people import Bench, Reading
 from facerf_cli.face.morphable import load_face_model
@@ -17,7 +18,6 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.network.files import BEST, SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
-from facerf_cli.work import evaluate
 from tests.capture.yale_fixture import write_pgm, write_yale_b
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
@@ -27,7 +27,8 @@ FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
 
 
 def bench(*methods: Any) -> Bench:
-    return Bench(methods, (), Reading(SHIPPED_NETWORKS.people, Sides(256, 512), "landmarks"), iter)
+    reading = Reading(SHIPPED_NETWORKS.people, Sides(256, 512), "landmarks")
+    return Bench(methods[0].models, reading, methods)
 
 
 @pytest.fixture
@@ -39,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    monkeypatch.setattr(evaluate, "bench_of", lambda *_: bench(Lambert("field", models)))
+    monkeypatch.setattr(run, "bench_of", lambda *_: bench(Lambert("field", models=models)))
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("overhead",))
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
@@ -78,33 +79,33 @@ def test_an_own_field_is_measured_alone_or_its_row_names_both(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And the tables name every network that took part, with its digest."""
-    run, out, asked = tmp_path / "mine", tmp_path / "out", []
-    run.mkdir()
-    save_toy_checkpoint(run / "best.safetensors")
+    mine, out, asked = tmp_path / "mine", tmp_path / "out", []
+    mine.mkdir()
+    save_toy_checkpoint(mine / "best.safetensors")
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    named = evaluate.methods_of
+    named = making.methods_of
 
     def toys(*options: Any) -> Bench:
         asked.append([method.name for method in named(*options)])
-        return bench(*(Lambert(name, models) for name in asked[-1]))
+        return bench(*(Lambert(name, models=models) for name in asked[-1]))
 
-    monkeypatch.setattr(evaluate, "bench_of", toys)
+    monkeypatch.setattr(run, "bench_of", toys)
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ())
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ())
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     line = ["evaluate", "yale-b", str(folder), "-o", str(out), "--subjects", "yaleB07"]
     lines: list[tuple[list[str], list[str], dict[str, Path]]] = [
         ([], ["portrait"], {"Reflectance Network": SHIPPED["reflectance"]}),
-        (["--checkpoint", str(run)], ["field"], {"Reflectance Network": run / BEST}),
+        (["--checkpoint", str(mine)], ["field"], {"Reflectance Network": mine / BEST}),
         (
-            ["--checkpoint", str(run), "--reflectance", "portrait"],
+            ["--checkpoint", str(mine), "--reflectance", "portrait"],
             ["mine+portrait"],
-            {"Reflectance Network": run / BEST, "Portrait Network": SHIPPED["portrait"]},
+            {"Reflectance Network": mine / BEST, "Portrait Network": SHIPPED["portrait"]},
         ),
         (
-            ["--against", str(run)],
+            ["--against", str(mine)],
             ["portrait", "mine"],
-            {"Reflectance Network": SHIPPED["reflectance"], "Reflectance Network of mine": run / BEST},
+            {"Reflectance Network": SHIPPED["reflectance"], "Reflectance Network of mine": mine / BEST},
         ),
     ]
     for options, names, files in lines:

@@ -23,7 +23,7 @@ from tests.cli.toy_batch import outputs_of, run
 FOLDER_VERBS = {
     "relight", "estimate-light", "convert-light", "predict-olat", "fit-geometry", "synth-stage",
     "prepare-dataset", "relight-dataset", "evaluate olat", "evaluate reconstruction", "evaluate transfer",
-    "evaluate geometry", "evaluate yale-b", "evaluate pairs", "segment", "view",
+    "evaluate geometry", "evaluate yale-b", "evaluate cases", "evaluate compare", "segment", "view",
 }  # fmt: skip
 Call = Callable[..., BatchOptions]
 

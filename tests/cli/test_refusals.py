@@ -248,14 +248,12 @@ WRONG: dict[str, dict[str, str]] = {
     },
     "evaluate": {
         "olat data --preset paper --every 2": "exclude each other",
-        "olat data --pairs x.json --every 2": "--pairs: is a list of its own",
+        "cases data --pairs x.json --every 2": "--pairs: is a list of its own",
         "olat data --split validation": "no pairs in the split validation",
         "olat data --reflectance phong": "give portrait, field, diffuse-sh",
         "olat data --reflectance prt --network-alone": "is for the field",
         "olat data --against none.safetensors": "no such file",
         "olat data --against field.safetensors": "two methods have the name 'field'",
-        "olat data --compare good -o good/out": "lies in good, which is read",
-        "olat data --compare nowhere": "no such folder",
         "geometry data a.jpg": "one dataset among several inputs",
         "geometry a.jpg --against a.jpg": "--mean-checkpoint",
         "geometry a.jpg --reflectance prt --mean-checkpoint x": "is for the field",
@@ -275,14 +273,15 @@ WRONG: dict[str, dict[str, str]] = {
         "transfer --photos a.jpg link.jpg": "given twice",
         "transfer --photos a.jpg one/../a.jpg": "given twice",
         "transfer --photos a.jpg b.jpg b.jpg a.jpg": "given twice",
-        "pairs good": "--truth",
-        "pairs none --truth truth": "no such folder",
-        "pairs good --truth truth -o truth": "give another folder",
-        "pairs good --truth truth -o truth/here": "lies in truth, which is read",
-        "pairs good --truth truth -o good/here": "lies in good, which is read",
-        "pairs good --truth truth --lpips y": "--vgg-weights",
-        "pairs good --truth truth --preset paper": "--preset",
-        "pairs good good --truth truth": "two methods have the name 'good'",
+        "compare truth": "no method; give --method",
+        "compare truth --method none": "no such folder",
+        "compare truth --method good -o truth": "lies in truth, which is read",
+        "compare truth --method good -o good/here": "lies in good, which is read",
+        "compare truth --method good --lpips y": "--vgg-weights",
+        "compare truth --method good --preset paper": "--preset",
+        "compare truth --method good --method=good": "two methods have the name 'good'",
+        "compare truth --method good --method=same=good": "given twice",
+        "compare truth --method good --network-alone": "is for the field",
         "yale-b yale --subjects yaleB07,yaleB99": "--subjects yaleB99: not in",
         "yale-b yale --keep-eyes": "--keep-eyes",
     },
@@ -376,9 +375,12 @@ def test_a_configuration(text: str, words: str, tmp_path: Path, capsys: Said) ->
     assert words in line and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "pairs"])
+@pytest.mark.parametrize(
+    "name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "cases", "compare"]
+)
 def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said) -> None:
     assert main(["evaluate", name, "--help-all"]) == 0
     out = capsys.readouterr().out
-    assert "--output" in out and "--space" in out and "{options}" not in out
-    assert ("--reflectance" in out) == (name != "pairs") and ("--keep-eyes" in out) == (name[0] not in "yp")
+    assert "--output" in out and ("--space" in out) == (name != "cases") and "{options}" not in out
+    assert ("--form" in out) == ("--reflectance" in out) == (name != "cases")
+    assert ("--keep-eyes" in out) == (name not in ("yale-b", "compare"))

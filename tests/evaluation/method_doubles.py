@@ -75,10 +75,12 @@ class Double(Method):
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
     ) -> Iterator[np.ndarray]:
-        reflectance = Unlit(head.face, self.gain)
         for row in lights.weights:
             light = RigLight(lights.directions, row)
-            yield Person(self.models, photo, head, reflectance).image(light, target).pixels
+            yield Person(self.models, photo, head, self.reflectance(head)).image(light, target).pixels
+
+    def reflectance(self, head: Head) -> Any:
+        return Unlit(head.face, self.gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,18 +107,12 @@ class PersonOfAlbedo(DatasetPerson):
         return front, header.normals @ header.directions[front]
 
 
-@dataclass(frozen=True, eq=False)
-class Lambert:
+class Lambert(Double):
     """A method whose face is white and flat: the cosine of the light to the camera's axis."""
 
-    name: str
-    models: Any
-
-    def images(self, photo: np.ndarray, head: Head, lights: Lights, target: Target) -> Iterator[np.ndarray]:
+    def reflectance(self, head: Head) -> Any:
         assert head.face.texture.shape == (3, 256, 256)
-        for row in lights.weights:
-            light = RigLight(lights.directions, row)
-            yield Person(self.models, photo, head, self).image(light, target).pixels
+        return self
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         cosines = torch.einsum("mlc,l->mc", weights, directions[:, 2].clamp_min(0))

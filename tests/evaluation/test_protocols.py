@@ -15,7 +15,8 @@ import torch
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, image_path, read_pairs, weights_path
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation import people
+from facerf_cli.evaluation import cases, people
+from facerf_cli.evaluation.cases import freeze, rendered
 from facerf_cli.evaluation.comparisons import (
     COMPOSITE,
     FULL,
@@ -25,19 +26,22 @@ from facerf_cli.evaluation.comparisons import (
     angle_of,
     brightest,
     compare_olats,
-    fitted_and_mean,
     reconstruct,
+    reconstruct_with_mean,
     transfer,
     turn_class,
 )
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import EvaluateOptions
-from facerf_cli.evaluation.people import Bench, DatasetPerson, PersonPairs, Reading, compare_people
+from facerf_cli.evaluation.people import Bench, DatasetPerson, Reading
 from facerf_cli.evaluation.selection import couples_of, evenly, olat_pairs
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import si_mse
+from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.portrait.find import Face, face_at
@@ -80,7 +84,14 @@ def unlit(gain: float = 1.0, models: FaceModelOnly = FACE_ONLY) -> Double:
 
 
 def olats(person: DatasetPerson, pairs: list[Pair], methods: list[Double]) -> Iterator[Comparison]:
-    return compare_people(person, [(pair,) for pair in pairs], compare_olats, methods)
+    return replace(person, groups=[(pair,) for pair in pairs]).compared(
+        compare_olats, bench(person, *methods)
+    )
+
+
+def bench(person: DatasetPerson, *methods: Double) -> Bench:
+    assert person.reading is not None
+    return Bench(FACE_ONLY, person.reading, methods)  # type: ignore[arg-type]
 
 
 def side_light(person: DatasetPerson, camera: str) -> int:
@@ -129,7 +140,7 @@ def test_a_photo_put_together_from_its_own_texture_is_the_photo(person: DatasetP
     face = person.portrait(asked)
     assert face.origin is not None
     lit: Any = SimpleNamespace(light=lambda _: truth)
-    (found,) = reconstruct([replace(face, origin=(lit, asked))], [unlit(0.5)])
+    (found,) = reconstruct([replace(face, origin=(lit, asked))], bench(person, unlit(0.5)))
     error = si_mse(found.predictions["unlit"], image, found.mask)
     assert error < 0.01 * np.square(image[found.mask > 0.5]).mean()
     np.testing.assert_allclose(found.extra["unlit"]["light_error_deg"], 90)
@@ -143,7 +154,7 @@ def test_reflectances_change_places_and_lights_stay(person: DatasetPerson) -> No
     for camera in ("C0", "C1"):
         asked = pair(0, camera, camera, 0)
         sides.append(replace(person.portrait(asked), case=Case(f"by {camera}", "0000")))
-    first, second = transfer(sides, [method])
+    first, second = transfer(sides, bench(person, method))
     assert first.case.name == "by C0_by_by C1"
     a, b = method.made
     ((_, light_of_a, turn),) = b.reflectance.asked  # type: ignore[attr-defined]
@@ -167,13 +178,11 @@ def test_the_mean_face_is_compared_where_both_see_the_face(dataset: Dataset, mon
     face = person.portrait(pair(0, "C1", "C1", 0))
     views = [face.by(models) for models in (FACE_ONLY, mean)]
     assert views[0].fit.alpha.any() and not views[1].fit.alpha.any()
-    forms = [unlit()], [unlit(models=mean)]
-    (found,) = reconstruct([face], fitted_and_mean(*forms), with_light=False)
+    (found,) = reconstruct_with_mean([face], bench(person, unlit()))
     assert list(found.predictions) == [FULL, MEAN]
     assert np.array_equal(found.mask, np.minimum(views[0].mask, views[1].mask))
-    two = [[replace(methods[0], name=method) for method in "xy"] for methods in forms]
-    names = [method.name for method in fitted_and_mean(*two)]
-    assert names == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
+    (found,) = reconstruct_with_mean([face], bench(person, *(replace(unlit(), name=name) for name in "xy")))
+    assert list(found.predictions) == [f"{FULL}, x", f"{FULL}, y", f"{MEAN}, x", f"{MEAN}, y"]
 
 
 def found_by_truth(dataset: Dataset, monkeypatch: Patch, blind: str = "") -> PersonOfAlbedo:
@@ -266,10 +275,40 @@ def test_images_without_a_face_are_left_out_and_named(
     assert sum("left out" in record.message for record in caplog.records) == 2
 
 
-def test_joint_fits_of_another_face_model_are_refused(dataset: Dataset) -> None:
-    bench = Bench((unlit(),), (), reading(), iter)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="has fits of other; give it as --face-model"):
-        PersonPairs(replace(dataset, face_model="other"), "0000", []).compared(compare_olats, bench)
+@pytest.mark.parametrize("camera", ["C0", "C1"])
+def test_a_case_is_the_stacks_image_and_facerf_renders_it_in_its_frame(
+    dataset: Dataset, monkeypatch: Patch, camera: str
+) -> None:
+    """By a reflectance that changes nothing: the photo in its pose, in another the albedo at the face."""
+    monkeypatch.setattr(cases, "find_faces", lambda *given: [])
+    person = person_of(dataset)
+    asked = pair(0, "C0", camera, side_light(person, camera))
+    (case,) = replace(person, groups=[(asked,)]).compared(freeze, bench(person))
+    facts, light = case.case.facts, person.header(camera).directions[asked.target_light]
+    truth = read_olats(dataset.stack_path("0000", camera), [asked.target_light])[0].float()
+    np.testing.assert_array_equal(case.truth, truth.permute(1, 2, 0))
+    direction = azel_to_direction(float(facts["azimuth_deg"]), float(facts["elevation_deg"]))
+    np.testing.assert_allclose(direction, light, atol=1e-5)
+    assert case.light is not None and case.source is not None and not case.predictions
+    weights = envmap_weights(torch.from_numpy(case.light), direction[None])
+    np.testing.assert_allclose(weights, 1, rtol=0.01)
+    assert facts["yaw_deg"] == pytest.approx({"C0": -15, "C1": 20}[camera], abs=1e-3)
+    ours = bench(found_by_truth(dataset, monkeypatch), unlit())
+    image = rendered(case.case, case.source, ours)["unlit"]
+    inside = case.mask > 0.5
+    if camera == "C0":
+        np.testing.assert_allclose(image[inside], case.source[inside], atol=2e-3)
+    else:
+        albedo = person.source(pair(0, "C1", "C1", 0))
+        assert si_mse(image, albedo, case.mask) < 0.02 * np.square(albedo[inside]).mean()
+    with pytest.raises(InputError, match="0000/00000: has no source, pose and light"):
+        rendered(case.case, None, ours)
+
+
+def test_joint_fits_of_another_face_model_are_refused(person: DatasetPerson, dataset: Dataset) -> None:
+    other = DatasetPerson(replace(dataset, face_model="other"), "0000")
+    with pytest.raises(UsageError, match="joint fits are of other; give it as --face-model"):
+        list(other.compared(compare_olats, bench(person)))
 
 
 def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
@@ -291,7 +330,7 @@ def test_a_photo_of_which_nothing_is_seen_or_that_is_damaged_is_an_error(person:
         raise InputError("damaged")
 
     with pytest.raises(InputError, match="damaged"):
-        list(compare_people(person, [(pair(0, "C0", "C0", 0),)], compare, []))
+        list(replace(person, groups=[(pair(0, "C0", "C0", 0),)]).compared(compare, bench(person)))
 
 
 def test_couples_and_presets_are_spread_evenly() -> None:

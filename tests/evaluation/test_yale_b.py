@@ -5,21 +5,19 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people, yale_b
 from facerf_cli.evaluation.measure import measure
 from facerf_cli.evaluation.options import Measures
-from facerf_cli.evaluation.pairs import read_predictions
-from facerf_cli.evaluation.people import Method, Reading
+from facerf_cli.evaluation.people import Bench, Method, Reading
 from facerf_cli.evaluation.summary import published
 from facerf_cli.evaluation.yale_b import (
     Relighting,
@@ -30,6 +28,7 @@ from facerf_cli.evaluation.yale_b import (
 )
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
+from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Person
 from facerf_cli.pipeline import fit_photo, head_of, reflectance_of
 from facerf_cli.portrait.find import Face
@@ -100,9 +99,9 @@ def test_images_are_the_benchmarks(databases: tuple[YaleB, Any], subject: str) -
 def test_scores_are_the_benchmarks(
     databases: tuple[YaleB, Any], reference: tuple[ModuleType, ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(yale_b, "_relit_by_all", too_bright_sources)
+    bright: Any = SimpleNamespace(reading=READING, heads=lambda photo, face: [(TooBright(), face)])
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
-    comparisons = list(compare_subject(databases[0], "yaleB05", [], READING))
+    comparisons = list(compare_subject(databases[0], "yaleB05", bright))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
         subject, _, light = comparison.case.name.split("/")
@@ -113,12 +112,14 @@ def test_scores_are_the_benchmarks(
             assert row.values[ours] == pytest.approx(theirs[name], abs=1e-6), (comparison.case.name, ours)
 
 
-def too_bright_sources(
-    subject: YaleSubject, photo: np.ndarray, face: Face, asked: list[Any], *_: Any
-) -> dict[str, np.ndarray]:
-    """In the place of methods: the source itself, twice as bright, so that scale and clipping count."""
-    assert face.landmarks_px.shape == (68, 2)
-    return {"copy": np.stack([2 * photo[..., 0]] * len(asked))}
+class TooBright:
+    """The source itself, twice as bright, so that scale and clipping count."""
+
+    name = "copy"
+
+    def images(self, photo: np.ndarray, face: Face, lights: Lights, target: Any) -> list[np.ndarray]:
+        assert face.landmarks_px.shape == (68, 2)
+        return [2 * photo] * len(lights.weights)
 
 
 def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]) -> None:
@@ -128,11 +129,11 @@ def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]
         [float(number) for cell in row for number in cell.replace("·", "/").split("/")] for row in table
     ]
     ours = published("yale-b")
-    for method in dict.fromkeys(row.method for row in ours):
-        assert [float(row.mean) for row in ours if row.method == method] in figures, method
-    quotient = [row for row in ours if row.method == "quotient image"]
+    for method in dict.fromkeys(row["method"] for row in ours):
+        assert [float(row["mean"]) for row in ours if row["method"] == method] in figures, method
+    quotient = [row for row in ours if row["method"] == "quotient image"]
     assert len(ours) == 11 * 4 and len(quotient) == 11
-    assert all(row.data == "same images, 21 people, given more data" for row in quotient)
+    assert all(row["data"] == "same images, 21 people, given more data" for row in quotient)
 
 
 @pytest.fixture
@@ -148,19 +149,18 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "_CORE", (Flash(0, 0), Flash(-70, 0)))
     monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
     monkeypatch.setattr(Person, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32)))
-    monkeypatch.setattr(yale_b, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
+    monkeypatch.setattr(people, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
-    models = FaceModelOnly(load_face_model("builtin"))
-    methods: Any = [Lambert("a", models), Lambert("b", models)]
-    comparisons = list(compare_subject(small, "yaleB07", methods, READING))
+    models: Any = FaceModelOnly(load_face_model("builtin"))
+    methods: Any = [Lambert("a", models=models), Lambert("b", models=models)]
+    comparisons = list(compare_subject(small, "yaleB07", Bench(models, READING, methods)))
     columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
     assert columns == {"frontal": 6, "soft": 2, "environment": 1} and fits["fitted"] == 2  # one a source
     for comparison in comparisons:
         assert set(comparison.predictions) == {"a", "b"}
         assert comparison.truth.shape == comparison.predictions["a"].shape == (192, 168, 3)
         assert comparison.mask.shape == (192, 168) and comparison.case.person == "yaleB07"
-        assert comparison.grey_as_given
     by_name = {comparison.case.name: comparison for comparison in comparisons}
     side = by_name["yaleB07/frontal/A-070E+00"]
     assert side.case.facts["angle"] == "60-80 deg" and side.case.facts["subjects"] == "test"
@@ -169,7 +169,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
     one = Relighting("frontal", "frontal", "A-070E+00")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (in_room,) = compare_subject(small, "yaleB07", methods[:1], READING, room=0.5)
+    (in_room,) = compare_subject(small, "yaleB07", Bench(models, READING, methods[:1]), room=0.5)
     lighter = in_room.predictions["a"][110, 84]
     np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
@@ -178,7 +178,7 @@ def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
     with pytest.raises(InputError, match=r"yaleB07: no undamaged image under A\+000E\+00"):
-        list(compare_subject(read_yale_b(folder), "yaleB07", [], READING))
+        list(compare_subject(read_yale_b(folder), "yaleB07", Bench(load_models(), READING)))
 
 
 def test_environments_come_from_their_side(small: YaleB) -> None:
@@ -201,26 +201,8 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
     directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()
     one = Relighting("environment", "win_left", "env_two_side")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (comparison,) = compare_subject(
-        small, "yaleB07", [Method("a", "diffuse-sh", models, network_alone=False)], READING
-    )
+    method = Method("a", "diffuse-sh", models, network_alone=False)
+    (comparison,) = compare_subject(small, "yaleB07", Bench(models, READING, [method]))
     weights = torch.from_numpy(subject.weights(one.light)).float()[:, None].expand(-1, 3)
     expected = person.image(RigLight(directions, weights)).pixels.mean(-1).clip(0)
     np.testing.assert_allclose(comparison.predictions["a"][..., 1], expected, rtol=1e-4, atol=1e-5)
-
-
-def test_predictions_in_files_are_read_as_the_benchmark_reads_them(
-    reference: tuple[ModuleType, ModuleType], tmp_path: Path
-) -> None:
-    values = np.random.default_rng(0).integers(0, 256, (192, 168, 3), np.uint8)
-    case = "yaleB05/frontal/A+035E-20"
-    grey, colours, array = (tmp_path / name for name in ("grey", "colours", "array"))
-    for folder in (grey, colours, array):
-        (folder / case).parent.mkdir(parents=True)
-    Image.fromarray(values[..., 0]).save(grey / f"{case}.png")
-    Image.fromarray(values).save(colours / f"{case}.png")
-    np.save(array / f"{case}.npy", values[..., 1] / np.float32(255))
-    found = read_predictions((grey, colours, array), case, (192, 168, 3), grey_as_given=True)
-    for folder in (grey, colours, array):
-        theirs = reference[1].load(str(next(folder.rglob("A+035*"))))
-        np.testing.assert_allclose(found[folder.name], np.repeat(theirs[..., None], 3, -1), atol=1e-6)

@@ -1,19 +1,20 @@
 """A protocol of a few made-up images, to drive the evaluation without networks or faces."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings
+from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions
 from facerf_cli.evaluation.protocols import Protocol
 from facerf_cli.evaluation.run import Evaluation
 from facerf_cli.evaluation.summary import Layout, published
+from facerf_cli.work.photo_options import PhotoOptions
 
 PEOPLE = ("anna", "bea", "carl")
 LAYOUT = Layout(
@@ -31,7 +32,7 @@ class Toy:
     """
 
     cases: int = 4
-    notes: Path | None = field(default=None, metadata=NOT_IN_RECIPE)
+    notes: Path | None = None
 
 
 def compare(options: EvaluateOptions, bench: object, content: tuple[Toy, Item]) -> Iterator[Comparison]:
@@ -94,4 +95,4 @@ def evaluation(
     given = EvaluateOptions(output, **{"reflectance": (), **options})  # type: ignore[arg-type]
     toy = toy or Toy()
     chosen = Chosen({item: (toy, item) for item in (items(output) if inputs is None else inputs)})
-    return Evaluation(PROTOCOL, chosen, given, Settings(), dict, toy)  # type: ignore[arg-type]
+    return Evaluation(PROTOCOL, chosen, given, PhotoOptions(Settings()))

@@ -1,14 +1,21 @@
-"""Folders of predictions against a folder of truths, matched by name; any images can be measured.
+"""Folders of images that are measured: the truths of cases, and a folder of images for each method.
 
-Trees are mirrored; a name is the path without its suffix, so a truth .exr may have a .png prediction. Every
-image of every folder must have its counterparts: without failed ones a mean improves.
+A folder of cases, as `evaluate cases` and `--pictures` write it, has
+
+    cases.csv         a row a case: name, person, and facts (docs/evaluation.md)
+    source/NAME.exr   the image that methods are given
+    truth/NAME.exr, mask/NAME.exr
+
+Any other folder holds the truths themselves. Trees are mirrored; a name is the path without its suffix, so a
+truth .exr may have a .png prediction. Every image must have its counterparts: without failed ones a mean
+improves.
 """
 
 import csv
 import io
 import math
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tokenize import TokenError
@@ -17,59 +24,60 @@ import numpy as np
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.options import Chosen, EvaluateOptions, folder_name
+from facerf_cli.evaluation.measure import Case
+from facerf_cli.evaluation.options import Chosen, EvaluateOptions
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.read import PHOTO_LIMIT_PX, LinearImage, read_image
 from facerf_cli.files.texts import read_text, require_regular
-from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.find import find_faces
 
+CASES, SOURCE, TRUTH, MASK, LIGHT = "cases.csv", "source", "truth", "mask", "light"
 SUFFIXES = PHOTO_SUFFIXES | {".npy"}
 _PARTS = 64  # most items
 _NAMED_AT_MOST = 3  # names of files in an error
 _LARGEST_BYTES = 64 * 2**20  # of a CSV file
 _CSV_ADVICE = "begin with a header such as name,person,..."
-PREDICTION_SUFFIXES = (".exr", ".png", ".npy")  # of `--compare`
 _LARGEST_NUMBER_BYTES, _HEADER_BYTES = 8, 1 << 16  # limits of a .npy file
 
 
 @dataclass(frozen=True)
-class ImagePair:
-    """The files of a case's truth, of its predictions by method, and of its mask."""
+class CaseFiles:
+    """The files of a case: its truth, the predictions by method, the mask, and what methods are given."""
 
     case: Case
     truth: Path
     predictions: Mapping[str, Path]
     mask: Path | None
+    source: Path | None
 
 
-def choose_images(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
-    """Choose all images of folders of predictions, with their truths, in parts."""
+def choose_cases(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+    """Choose all cases of a folder with the images of each method, in parts."""
+    cases = match_cases(options)
+    size = math.ceil(len(cases) / _PARTS)
+    parts = [cases[start : start + size] for start in range(0, len(cases), size)]
     assert options.truth is not None
-    pairs = collect_pairs(options.predictions, options.truth, options.masks, options.facts)
-    size = math.ceil(len(pairs) / _PARTS)
-    parts = [pairs[start : start + size] for start in range(0, len(pairs), size)]
     return Chosen({options.item(options.truth, f"part-{n:02d}"): part for n, part in enumerate(parts)})
 
 
-def collect_pairs(
-    predictions: Sequence[Path], truths: Path, masks: Path | None = None, facts: Path | None = None
-) -> list[ImagePair]:
-    """Match the images of folders, sorted by name; a folder of predictions is a method with its name.
+def match_cases(options: EvaluateOptions) -> list[CaseFiles]:
+    """Match the images of folders with their truths, sorted by name.
 
-    `masks` mirrors the truths; `facts` is a CSV file (`read_facts`). Raises UsageError for folders that
-    cannot be used, InputError for names that do not match: it names the first few and counts all.
+    Raises UsageError for folders that cannot be used, InputError for names that do not match: it names the
+    first few and counts all.
     """
-    folders = [truths, *predictions, *([] if masks is None else [masks])]
-    if not predictions:
-        raise UsageError("pairs: no folder of predictions; give at least one")
-    for folder in folders:
-        if not folder.is_dir():
-            raise UsageError(f"{folder}: no such folder; check the path")
-    resolved = [folder.resolve() for folder in folders]
-    if again := [folder for folder in folders if resolved.count(folder.resolve()) > 1]:
-        raise UsageError(f"{again[0]}: given twice; give separate folders of predictions, truths and masks")
-    images = {folder: _images_in(folder, resolved) for folder in folders}
+    root = options.truth
+    assert root is not None
+    frozen = (root / CASES).is_file()
+    truths, facts = (root / TRUTH, options.facts or root / CASES) if frozen else (root, options.facts)
+    mask = root / MASK if frozen and options.masks is None else options.masks
+    methods = {one.name: one.path for one in options.methods}
+    if not options.names:
+        raise UsageError("compare: no method; give --method NAME=FOLDER, or --reflectance field")
+    given = [truths, *([mask] if mask else []), *methods.values()]
+    resolved = [folder.resolve() for folder in given]
+    if again := [folder for folder in given if resolved.count(folder.resolve()) > 1]:
+        raise UsageError(f"{again[0]}: given twice; give separate folders of methods, truths and masks")
+    images = {folder: _images_in(folder, resolved) for folder in given}
     described = {} if facts is None else read_facts(facts)
     found = images.pop(truths)
     others: dict[Path, Mapping[str, object]] = {**images, **({} if facts is None else {facts: described})}
@@ -78,11 +86,12 @@ def collect_pairs(
             f"{'; '.join(wrong)}; give the names of {truths}, with its subfolders; suffixes may differ"
         )
     return [
-        ImagePair(
+        CaseFiles(
             case_of(name, described),
             found[name],
-            {folder_name(folder): images[folder][name] for folder in predictions},
-            images[masks][name] if masks else None,
+            {method: images[folder][name] for method, folder in methods.items()},
+            images[mask][name] if mask else None,
+            root / SOURCE / f"{name}.exr" if frozen else None,
         )
         for name in sorted(found)
     ]
@@ -95,22 +104,20 @@ def case_of(name: str, described: Mapping[str, Case]) -> Case:
     return replace(known, person=known.person or (folder if slash else ""))
 
 
-def compare_pair(pair: ImagePair, finder: PeopleNetworks | None = None) -> Comparison:
-    """Read a pair. EXR, HDR and .npy are scene-linear, other images are decoded by their colour space.
-
-    The mask is the mask's image (its values as they are, the mean of its channels), else the truth's alpha,
-    else everything. `finder` detects the truth's face, for Face dis, and raises InputError where
-    there is none.
-    """
-    truth = _read(pair.truth)
-    mask = truth.alpha
-    if pair.mask is not None:
-        mask = _read(pair.mask, "linear").pixels.mean(-1).clip(0, 1)
-    if mask is None:
-        mask = np.ones(truth.pixels.shape[:2], np.float32)
-    landmarks_px = find_faces(finder, truth.pixels, str(pair.truth))[0].landmarks_px if finder else None
-    predictions = {method: _read(path).pixels for method, path in pair.predictions.items()}
-    return Comparison(pair.case, truth.pixels, mask, predictions, landmarks_px=landmarks_px)
+def write_cases(path: Path, cases: Iterable[Case]) -> None:
+    """Write the list of a folder of cases, as `read_facts` reads it."""
+    rows = {
+        case.name: {"name": case.name, "person": case.person}
+        | {fact: value if isinstance(value, str) else f"{value:.7g}" for fact, value in case.facts.items()}
+        for case in cases
+    }
+    stream = io.StringIO()
+    columns = dict.fromkeys(column for row in rows.values() for column in row)
+    writer = csv.DictWriter(stream, list(columns), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows.values())
+    with atomic_path(path) as temporary:
+        temporary.write_text(stream.getvalue(), encoding="utf-8", errors="backslashreplace")
 
 
 def _images_in(folder: Path, elsewhere: Collection[Path]) -> dict[str, Path]:
@@ -131,7 +138,7 @@ def _images_in(folder: Path, elsewhere: Collection[Path]) -> dict[str, Path]:
     return found
 
 
-def _mismatch(truths: Mapping[str, Path], others: Mapping[str, object], where: Path) -> str:
+def _mismatch(truths: Mapping[str, object], others: Mapping[str, object], where: Path) -> str:
     """Describe names that do not match the truths'; empty if all do."""
     missing, strangers = sorted(truths.keys() - others.keys()), sorted(others.keys() - truths.keys())
     parts = [f"{len(missing)} of {len(truths)} missing ({_few(missing)})"] if missing else []
@@ -143,7 +150,8 @@ def _few(names: Sequence[str]) -> str:
     return ", ".join(names[:_NAMED_AT_MOST]) + (", ..." if len(names) > _NAMED_AT_MOST else "")
 
 
-def _read(path: Path, colourspace: str | None = None) -> LinearImage:
+def read_pixels(path: Path, colourspace: str | None = None) -> LinearImage:
+    """Read an image. EXR, HDR and .npy are scene-linear, others are decoded by their own or a given space."""
     if path.suffix.lower() == ".npy":
         return LinearImage(read_array(path))
     return read_image(path, colourspace)
@@ -187,44 +195,6 @@ def _is_number(cell: str) -> bool:
         return math.isfinite(float(cell))
     except ValueError:
         return False
-
-
-def read_predictions(
-    folders: Sequence[Path], case: str, shape: tuple[int, ...], grey_as_given: bool = False
-) -> dict[str, np.ndarray]:
-    """Read a case's predictions FOLDER/CASE.exr, .png or .npy by method, which is the folder's name.
-
-    They are linear Rec.709 [H, W, 3] of the truth's `shape`. With `grey_as_given` PNGs are read as linear
-    values, too, and the mean of the channels is compared. Raises InputError that lists all that are missing
-    or unfit: without its failures a method's mean improves.
-    """
-    found, wrong = {}, []
-    for folder in folders:
-        try:
-            found[folder_name(folder)] = _prediction(folder, case, shape, grey_as_given)
-        except InputError as error:
-            wrong.append(str(error))
-    if wrong:
-        raise InputError("; ".join(wrong))
-    return found
-
-
-def _prediction(folder: Path, case: str, shape: tuple[int, ...], grey_as_given: bool) -> np.ndarray:
-    there = [path for suffix in PREDICTION_SUFFIXES if (path := folder / f"{case}{suffix}").is_file()]
-    if not there:
-        raise InputError(
-            f"{folder}: no prediction for case {case}; add it as {', '.join(PREDICTION_SUFFIXES)}"
-        )
-    if len(there) > 1:
-        names = " and ".join(path.name for path in there)
-        raise InputError(f"{folder}: case {case} has the files {names}; remove all but one")
-    pixels = _read(there[0], "linear" if grey_as_given else None).pixels
-    if grey_as_given:
-        pixels = np.repeat(pixels.mean(-1, keepdims=True), 3, -1)
-    if pixels.shape[:2] != tuple(shape[:2]):
-        have, wanted = (f"{size[1]} x {size[0]}" for size in (pixels.shape, shape))
-        raise InputError(f"{there[0]}: {have} pixels, the truth has {wanted}; give an image in its frame")
-    return pixels
 
 
 def read_array(path: Path) -> np.ndarray:

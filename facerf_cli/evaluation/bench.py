@@ -1,42 +1,22 @@
-"""A protocol of `facerf evaluate` run by the options of photos: its methods, faces and networks."""
+"""The means of a run by its options: methods, how faces are read, and the networks that take part."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item
+from facerf_cli.evaluation.folders import case_of, read_facts
 from facerf_cli.evaluation.measure import Case
 from facerf_cli.evaluation.options import EvaluateOptions, portrait_name
-from facerf_cli.evaluation.pairs import case_of, read_facts
 from facerf_cli.evaluation.people import Bench, Method, Portrait, Reading
-from facerf_cli.evaluation.protocols import PROTOCOLS
-from facerf_cli.evaluation.run import Evaluation
 from facerf_cli.network.files import checkpoint_file, serving_files, title_of
 from facerf_cli.network.stored_graph import ASSET
 from facerf_cli.pipeline import Estimator
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
-from facerf_cli.work.photos import face_model, fit_faces, load_models_once, prepare_photos, read_photo
-
-
-def evaluate(name: str, options: EvaluateOptions, photo: PhotoOptions, inputs: Sequence[str]) -> int:
-    """Measure what a protocol, by its name, chooses of the inputs; the exit code."""
-    protocol = PROTOCOLS[name]
-    chosen = protocol.choose(options, inputs)
-    bench, networks = partial(bench_of, options, photo), tuple(_networks_named(options, photo).items())
-    if not options.reflectance:  # no method of ours takes part
-        return Evaluation(protocol, chosen, options, photo.settings, bench, None, networks).run()
-    model, prepare = partial(face_model, photo), partial(_prepare, options, photo)
-    return Evaluation(protocol, chosen, options, photo.settings, bench, photo, networks, model, prepare).run()
-
-
-def _prepare(options: EvaluateOptions, photo: PhotoOptions) -> None:
-    """Load what all items need; raises UsageError or InputError for what would fail each."""
-    prepare_photos(photo, _networks_used(options), with_networks=not options.dry_run)
-    if not options.dry_run:
-        bench_of(options, photo)
+from facerf_cli.work.photos import fit_faces, load_models_once, read_photo
 
 
 @cache
@@ -47,17 +27,12 @@ def bench_of(options: EvaluateOptions, photo: PhotoOptions) -> Bench:
     """
     models, methods = load_models_once(photo), methods_of(options, photo)
     geometry = None if options.joint_fit else photo.geometry or models.default_geometry
-    sides, people = models.sides(photo.texture_side), models.networks.people
-    reading = Reading(people, sides, geometry, options.keep_eyes)
+    reading = Reading(models.networks.people, models.sides(photo.texture_side), geometry, options.keep_eyes)
     mean = _load(options.mean_checkpoint, photo) if options.mean_checkpoint else None
-    over_mean = []
-    for method in methods:
-        own = mean if mean and method.kind == "field" else method.models
-        over_mean.append(replace(method, models=replace(own, face=own.face.pose_only())))
-    return Bench(methods, tuple(over_mean), reading, partial(faces_of, options, photo, reading))
+    return Bench(models, reading, methods, mean, partial(_faces_of, options, photo, reading))
 
 
-def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> tuple[Method, ...]:
+def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
     """The methods, in the order of their names."""
     models, features = load_models_once(photo), None
     if options.refine == "features":
@@ -71,7 +46,7 @@ def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> tuple[Method, .
         other = _load(one.path, photo)
         other.networks.load(("reflectance",))  # fails before anything is measured
         methods.append(make(one.name, "field", other))
-    return tuple(methods)
+    return methods
 
 
 def _load(path: Path, photo: PhotoOptions) -> Models:
@@ -79,17 +54,15 @@ def _load(path: Path, photo: PhotoOptions) -> Models:
     return load_models((checkpoint_file(path),), photo.face_model, load_models_once(photo).device, photo.form)
 
 
-def faces_of(
+def _faces_of(
     options: EvaluateOptions, photo: PhotoOptions, reading: Reading, item: Item
 ) -> Iterator[Portrait]:
     """Yield the chosen faces of a photo."""
-    image, models = read_photo(item, photo), load_models_once(photo)
+    image = read_photo(item, photo)
     for face in fit_faces(item, image, photo):
         case = case_of(f"{item.name}{face.tag}", _described(options.facts))
         case = replace(case, facts={"quality": face.fit.quality, **case.facts})
-        portrait = Portrait(str(item.input_path), case, image, face.found, reading)
-        portrait.by(models)
-        yield portrait
+        yield Portrait(str(item.input_path), case, image, face.found, reading)
 
 
 @cache
@@ -98,17 +71,17 @@ def _described(facts: Path | None) -> Mapping[str, Case]:
     return {} if facts is None else read_facts(facts)
 
 
-def _networks_used(options: EvaluateOptions) -> Collection[str]:
+def networks_used(options: EvaluateOptions) -> Collection[str]:
     """Names of the networks that the options of the field's methods use; those of faces always."""
-    if not options.reflectance:
-        return {"parsing"} if options.measures.face_distance else ()
+    if not options.ours:
+        return {"parsing"} if options.measures.face_distance or options.dataset else ()
     refined = options.refine == "features" and options.measures.vgg_weights is None
     return networks_of(options.reflectance) | ({"light_features"} if refined else set())
 
 
-def _networks_named(options: EvaluateOptions, photo: PhotoOptions) -> dict[str, Path]:
+def networks_named(options: EvaluateOptions, photo: PhotoOptions) -> dict[str, Path]:
     """The file of each network that takes part, by title; those that one method alone uses name it."""
-    uses = _networks_used(options)
+    uses = networks_used(options)
     if not uses:
         return {}
     files = serving_files(photo.settings.checkpoints)

@@ -8,12 +8,14 @@ import pytest
 from PIL import Image
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.measure import Case, measure
-from facerf_cli.evaluation.options import Measures
-from facerf_cli.evaluation.pairs import case_of, collect_pairs, compare_pair, read_predictions
-from facerf_cli.files.write import write_display, write_exr
+from facerf_cli.evaluation.cases import compare_images
+from facerf_cli.evaluation.folders import CaseFiles, case_of, match_cases, write_cases
+from facerf_cli.evaluation.measure import Case, Comparison, measure
+from facerf_cli.evaluation.options import EvaluateOptions, Measures, NamedPath
+from facerf_cli.files.write import write_exr
 from facerf_cli.image.colour import srgb_to_linear
 
+OUT = Path("out")
 NAMES = ("anna/one", "anna/two", "bert/one")
 SHAPE = (6, 9, 3)
 
@@ -21,6 +23,16 @@ SHAPE = (6, 9, 3)
 def image(name: str) -> np.ndarray:
     """An image of a name, exact in half floats and in 8 bits of linear light."""
     return np.random.default_rng(len(name) + ord(name[0])).integers(0, 256, SHAPE).astype(np.float32) / 256
+
+
+def match(methods: list[Path], truth: Path, **more: Path) -> list[CaseFiles]:
+    folders = tuple(NamedPath(folder.name, folder) for folder in methods)
+    return match_cases(EvaluateOptions(OUT, reflectance=(), methods=folders, truth=truth, **more))
+
+
+def compare(files: CaseFiles) -> Comparison:
+    (found,) = compare_images(EvaluateOptions(OUT, reflectance=()), pytest.fail, [files])
+    return found
 
 
 def save(path: Path, pixels: np.ndarray, alpha: np.ndarray | None = None) -> None:
@@ -55,33 +67,28 @@ def test_an_image_is_no_person_and_folders_that_are_none_are_refused(truths: Pat
     assert case_of("b", described).facts == {"age": 3.0}
     (truths.parent / "empty").mkdir()
     for predictions, words in (
-        ([truths.parent / "missing"], "no such folder"),
         ([ours, truths.parent / "empty"], "no images"),
         ([truths], "given twice"),
-        ([], "no folder of predictions"),
+        ([], "no method; give --method"),
     ):
         with pytest.raises(UsageError, match=words):
-            collect_pairs(predictions, truths)
+            match(predictions, truths)
 
 
 def test_images_of_all_formats_meet_their_truths(truths: Path, ours: Path) -> None:
-    pairs = collect_pairs([ours], truths)
+    pairs = match([ours], truths)
     assert [(pair.case.name, pair.case.person) for pair in pairs] == list(
         zip(NAMES, ("anna", "anna", "bert"), strict=True)
     )
-    errors = [measure(compare_pair(pair), Measures())[0].values["mse"] for pair in pairs]
+    errors = [measure(compare(pair), Measures())[0].values["mse"] for pair in pairs]
     assert errors[:2] == [0, 0] and errors[2] > 0.01  # a PNG is encoded
-    decoded = compare_pair(pairs[2]).predictions["ours"]
-    np.testing.assert_allclose(decoded, srgb_to_linear(image(NAMES[2]) * 256 / 255), atol=1e-5)
-
-
-def test_several_methods_stand_side_by_side(truths: Path, ours: Path) -> None:
-    theirs = truths.parent / "theirs"
     for name in NAMES:
-        save(theirs / f"{name}.npy", image(name)[..., 0])  # grey
-    comparison = compare_pair(collect_pairs([ours, theirs], truths)[0])
-    assert list(comparison.predictions) == ["ours", "theirs"]
-    assert comparison.predictions["theirs"].shape == SHAPE and comparison.mask.all()
+        save(truths.parent / f"theirs/{name}.npy", image(name)[..., 0])  # grey
+    both = compare(match([ours, truths.parent / "theirs"], truths)[2])
+    assert list(both.predictions) == ["ours", "theirs"] and both.mask.all()
+    assert both.predictions["theirs"].shape == SHAPE
+    decoded = both.predictions["ours"]
+    np.testing.assert_allclose(decoded, srgb_to_linear(image(NAMES[2]) * 256 / 255), atol=1e-5)
 
 
 def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: Path) -> None:
@@ -90,7 +97,7 @@ def test_all_that_is_missing_or_strange_is_said_in_one_line(truths: Path, ours: 
     for number in range(5):
         save(ours / f"carl/{number}.npy", image("c"))
     with pytest.raises(InputError) as caught:
-        collect_pairs([ours], truths)
+        match([ours], truths)
     line = str(caught.value)
     assert "2 of 3 missing (anna/one, anna/two)" in line and "\n" not in line
     assert "5 without a truth (carl/0, carl/1, carl/2, ...)" in line
@@ -101,35 +108,24 @@ def test_two_images_of_one_name_are_refused_and_folders_may_lie_in_the_truths(
 ) -> None:
     save(ours / "anna/one.exr", image("a"))
     with pytest.raises(InputError, match=r"anna/one has the files one\.exr and one\.npy"):
-        collect_pairs([ours], truths)
+        match([ours], truths)
     (ours / "anna/one.exr").unlink()
     ours.rename(truths / "ours")
-    assert [pair.case.name for pair in collect_pairs([truths / "ours"], truths)] == list(NAMES)
-
-
-def test_a_turned_photo_has_its_upright_size(tmp_path: Path) -> None:
-    upright = Image.fromarray((image("a") * 255).astype(np.uint8))  # 9 x 6
-    exif = Image.Exif()
-    exif[0x0112] = 6  # a quarter turn to be made when it is shown
-    (tmp_path / "ours").mkdir()
-    upright.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "ours/a.jpg", exif=exif, quality=100)
-    save(tmp_path / "truth/a.exr", image("a"))
-    comparison = compare_pair(collect_pairs([tmp_path / "ours"], tmp_path / "truth")[0])
-    assert comparison.predictions["ours"].shape == comparison.truth.shape == SHAPE
+    assert [pair.case.name for pair in match([truths / "ours"], truths)] == list(NAMES)
 
 
 def test_masks_are_the_images_values_then_alpha_then_all(truths: Path, ours: Path) -> None:
     alpha = np.full(SHAPE[:2], 0.25, np.float32)
     save(truths / "anna/two.exr", image(NAMES[1]), alpha)
-    assert np.allclose(compare_pair(collect_pairs([ours], truths)[1]).mask, 0.25)
+    assert np.allclose(compare(match([ours], truths)[1]).mask, 0.25)
     masks = truths.parent / "masks"
     for name in NAMES:
         save(masks / f"{name}.png", np.full(SHAPE[:2], 51))
-    with_masks = [compare_pair(pair).mask for pair in collect_pairs([ours], truths, masks)]
+    with_masks = [compare(pair).mask for pair in match([ours], truths, masks=masks)]
     assert all(np.allclose(mask, 0.2) for mask in with_masks)
     (masks / "anna/one.png").unlink()
     with pytest.raises(InputError, match="masks: 1 of 3 missing"):
-        collect_pairs([ours], truths, masks)
+        match([ours], truths, masks=masks)
 
 
 def test_facts_of_a_list(truths: Path, ours: Path) -> None:
@@ -137,7 +133,7 @@ def test_facts_of_a_list(truths: Path, ours: Path) -> None:
     path.write_text(
         "\ufeffname, person, pose, angle\nanna/one, A, same, 5\nanna/two, A, other,\nbert/one,, same, 7.5\n"
     )
-    pairs = collect_pairs([ours], truths, facts=path)
+    pairs = match([ours], truths, facts=path)
     assert [pair.case.person for pair in pairs] == ["A", "A", "bert"]
     assert [dict(pair.case.facts) for pair in pairs] == [
         {"pose": "same", "angle": 5.0},
@@ -162,7 +158,7 @@ def test_lists_that_cannot_be_used(truths: Path, ours: Path, text: str, words: s
     path = truths.parent / "facts.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=words):
-        collect_pairs([ours], truths, facts=path)
+        match([ours], truths, facts=path)
 
 
 @pytest.mark.parametrize(
@@ -176,35 +172,19 @@ def test_files_that_hold_no_image(truths: Path, ours: Path, content: Any) -> Non
     else:
         np.save(path, content)
     with pytest.raises(InputError, match=r"anna/one\.npy"):
-        compare_pair(collect_pairs([ours], truths)[0])
+        compare(match([ours], truths)[0])
     np.save(path, np.array([Path("x")], object), allow_pickle=True)
     with pytest.raises(InputError, match=r"anna/one\.npy: not an array"):
-        compare_pair(collect_pairs([ours], truths)[0])
+        compare(match([ours], truths)[0])
 
 
-@pytest.fixture
-def theirs(tmp_path: Path) -> Path:
-    folder = tmp_path / "theirs"
-    write_exr(folder / "a/00.exr", np.full(SHAPE, 0.25, np.float32))
-    write_display(folder / "a/01.png", np.full(SHAPE, 0.25, np.float32))
-    np.save(folder / "a/02.npy", np.full(SHAPE[:2], 0.25))
-    return folder
-
-
-def test_predictions_are_linear_light_in_every_kind_of_file(theirs: Path) -> None:
-    for case in ("a/00", "a/01", "a/02"):
-        (found,) = read_predictions((theirs,), case, SHAPE).items()
-        assert found[0] == "theirs" and found[1].shape == SHAPE
-        np.testing.assert_allclose(found[1], 0.25, atol=2e-3)
-
-
-def test_predictions_that_are_missing_or_unfit_are_named(theirs: Path, tmp_path: Path) -> None:
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError) as error:
-        read_predictions((theirs, tmp_path / "empty"), "a/03", SHAPE)
-    assert all(part in str(error.value) for part in (str(theirs), "empty", "case a/03", ".npy"))
-    with pytest.raises(InputError, match="9 x 6 pixels, the truth has 6 x 9"):
-        read_predictions((theirs,), "a/00", (9, 6, 3))
-    write_exr(theirs / "a/02.exr", np.zeros(SHAPE, np.float32))
-    with pytest.raises(InputError, match=r"02.exr and 02.npy; remove all but one"):
-        read_predictions((theirs,), "a/02", SHAPE)
+def test_a_folder_of_cases_has_its_truths_masks_sources_and_facts(truths: Path, ours: Path) -> None:
+    folder = truths.parent / "cases"
+    for kind in ("source", "mask"):
+        for name in NAMES:
+            save(folder / f"{kind}/{name}.exr", np.full(SHAPE, 0.5, np.float32))
+    truths.rename(folder / "truth")
+    write_cases(folder / "cases.csv", [Case(name, "A", {"pose": "p", "yaw_deg": -0.1}) for name in NAMES])
+    found = compare(match([ours], folder)[0])
+    assert found.case == Case("anna/one", "A", {"pose": "p", "yaw_deg": -0.1})
+    assert found.source is not None and (found.source == 0.5).all() and (found.mask == 0.5).all()
