@@ -43,3 +43,9 @@ def test_a_verb_has_a_page_of_its_manual_and_of_its_own_verbs() -> None:
 
 def test_text_of_the_manual_is_shown_literally() -> None:
     assert pages._text(r"a_b `c_d` \-\-x <y> \fBz\fR") == r"a\_b `c_d` --x &lt;y> z"
+
+
+def test_lists_are_written_as_python_markdown_reads_them() -> None:
+    page = "a:\n- b\n\n  ```sh\n  c\n  ```\n- d\n- e\n1. f\n   g\n\nh\n\n```\n- i\n  j\n```"
+    read = "a:\n\n- b\n\n    ```sh\n    c\n    ```\n\n- d\n- e\n1. f\n    g\n\nh\n\n```\n- i\n  j\n```"
+    assert linked("paper.md", page) == read

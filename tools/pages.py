@@ -23,6 +23,7 @@ MADE = {
     "CHANGELOG.md": "changelog.md",
 }  # files of the root to pages of the site
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#]+)")
+_MARKER = re.compile(r"(?:-|\d+\.) +")
 _CODE_OR_SPECIAL = re.compile(r"`[^`]*`|[*_<]")
 _API = "# Python API\n\n[Python](python.md) shows how it is used.\n\n::: facerf_cli.api\n"
 
@@ -48,7 +49,30 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
             return relpath(target, Path(uri).parent)
         return f"{config.repo_url}/{'tree' if (ROOT / path).is_dir() else 'blob'}/main/{path}"
 
-    return markdown if uri.startswith("verbs/") else _LINK.sub(address, markdown)
+    return markdown if uri.startswith("verbs/") else _LINK.sub(address, _lists(markdown))
+
+
+def _lists(markdown: str) -> str:
+    """Write lists as Python-Markdown reads them: after a blank line, what an item holds after four spaces."""
+    lines: list[str] = []
+    item, is_loose, is_code = (
+        0,
+        True,
+        False,
+    )  # item: the width of the marker of the item that a line belongs to
+    for line in markdown.split("\n"):
+        is_code ^= line.startswith("```")
+        if marker := not is_code and _MARKER.match(line):
+            if is_loose:
+                lines.append("")
+            item, is_loose = len(marker[0]), False
+        elif line and not line.startswith(item * " "):
+            item, is_loose = 0, True
+        elif line and item:
+            line = (4 - item) * " " + line
+        is_loose |= not line
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def _manual(verb: str) -> Iterator[str]:
