@@ -84,7 +84,8 @@ class Crop:
         for part in strips(region.shape):
             values = np.ascontiguousarray(region[part], np.float32)
             tall += rows[:, top + part.start : top + part.stop] @ values.reshape(len(values), -1)
-            low, high = np.minimum(low, values.min((0, 1))), np.maximum(high, values.max((0, 1)))
+            # rows first: many times as fast as all at once
+            low, high = np.minimum(low, values.min(0).min(0)), np.maximum(high, values.max(0).max(0))
         tall = tall.reshape(self.size_px, width, channels).transpose(1, 0, 2).reshape(width, -1)
         cut = (columns[:, left:right] @ tall).reshape(self.size_px, self.size_px, channels)
         bounded = np.clip(cut.transpose(1, 0, 2), low, high)
