@@ -52,14 +52,14 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
     """Decode sRGB (IEC 61966-2-1), float32 of any shape; negative values are mirrored."""
     size = np.abs(encoded)
     linear = np.where(size <= 0.04045, size / 12.92, ((size + 0.055) / 1.055) ** 2.4)
-    return np.copysign(linear, encoded).astype(np.float32)
+    return np.copysign(linear, encoded).astype(np.float32, copy=False)
 
 
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     """Encode sRGB (IEC 61966-2-1), float32 of any shape, also beyond 1; negative values are mirrored."""
     size = np.abs(linear)
     encoded = np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055)
-    return np.copysign(encoded, linear).astype(np.float32)
+    return np.copysign(encoded, linear).astype(np.float32, copy=False)
 
 
 @cache
