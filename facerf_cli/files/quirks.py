@@ -78,6 +78,17 @@ def require_whole_png(path: Path) -> None:
                 raise InputError(f"{path}: damaged: a checksum of the PNG file is wrong; copy it again")
 
 
+def kinds_of_chunks(path: Path) -> set[bytes]:
+    """The kinds of a PNG's chunks before its pixels; of a file of another kind none."""
+    kinds: set[bytes] = set()
+    with path.open("rb") as stream:
+        if stream.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE:
+            while len(head := stream.read(8)) == 8 and head[4:] != b"IDAT":
+                kinds.add(head[4:])
+                stream.seek(int.from_bytes(head[:4], "big") + 4, 1)  # with a checksum
+    return kinds
+
+
 def require_whole_cineon(path: Path, spec: oiio.ImageSpec) -> None:
     """Raise InputError where 10-bit pixels are missing, three in 32 bits, which OpenImageIO leaves black."""
     with path.open("rb") as stream:

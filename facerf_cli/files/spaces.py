@@ -20,7 +20,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.quirks import by_pillow, starts_with
+from facerf_cli.files.quirks import by_pillow, kinds_of_chunks, starts_with
 from facerf_cli.image.colour import (
     ACES,
     ACESCG,
@@ -154,9 +154,10 @@ def _space_of_exif(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
 
 def _space_of_png(path: Path) -> ColourSpace | None:
     """Return the space of a PNG's gAMA and cHRM; None without them, and where it says sRGB."""
-    is_png = starts_with(path, b"\x89PNG")
-    info = (by_pillow(path, lambda image: dict(image.info)) if is_png else None) or {}
-    if "srgb" in info or not {"gamma", "chromaticity"} & info.keys():
+    kinds = kinds_of_chunks(path)
+    is_told = b"sRGB" not in kinds and not kinds.isdisjoint((b"gAMA", b"cHRM"))
+    info = by_pillow(path, lambda image: dict(image.info)) if is_told else None
+    if not info:
         return None
     white_first = info.get("chromaticity")
     primaries = (*white_first[2:], *white_first[:2]) if white_first else REC709_CHROMATICITIES
