@@ -39,17 +39,19 @@ class EdgeFill(NamedTuple):
 
         They take of a person's `own`, by their trust [S, S].
         """
-        side, flat, trusted = own.shape[-1], colours.flatten(1), (trust * own).flatten()
+        side, flat = own.shape[-1], colours.flatten(1)
+        wide, trusted = (F.pad(part, (_REACH_PX,) * 4).flatten(-2) for part in (colours, trust * own))
         pixels = torch.nonzero(kept.flatten() < _FAR)[:, 0]
         steps = list(product(range(-_REACH_PX, _REACH_PX + 1), repeat=2))
+        corner = pixels + pixels // side * 2 * _REACH_PX  # of the pixels around, with the border
+        mine = flat[:, pixels]
         around = np.empty((len(pixels), len(steps)), np.int32)
         weights = np.empty(around.shape, np.float32)
         for number, (down, right) in enumerate(steps):
-            y, x = pixels // side + down, pixels % side + right
-            at = y.clamp(0, side - 1) * side + x.clamp(0, side - 1)
-            weight = _likeness(((flat[:, at] - flat[:, pixels]) ** 2).sum(0)) * trusted[at]
-            weight *= (x >= 0) & (x < side) & (y >= 0) & (y < side)
-            around[:, number] = at
+            at = corner + ((down + _REACH_PX) * (side + 2 * _REACH_PX) + right + _REACH_PX)
+            likeness = _likeness(wide.index_select(1, at).sub_(mine).square_().sum(0))
+            weight = likeness * trusted[at]  # 0 beyond the maps
+            around[:, number] = pixels + (down * side + right)
             weights[:, number] = weight * math.exp(-(down**2 + right**2) / (2 * _SPREAD_PX**2))
         for _ in range(2):  # of what is left
             weights /= weights.sum(1, keepdims=True).clip(min=1e-12)
