@@ -132,13 +132,14 @@ def load_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         memory.require(str(path), _COPIES * path.stat().st_size, "a smaller checkpoint")
         with safe_open(path, framework="pt") as file:
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-        if not all(tensor.isfinite().all() for tensor in tensors.values()):
+        tensors = {k: (t.float() if t.dtype == torch.float16 else t) for k, t in tensors.items()}
+        if not all(tensor.sum().isfinite() for tensor in tensors.values()):
             raise ValueError("it holds values that are not finite")
     except (SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise InputError(
             f"{path}: not a facerf checkpoint ({error}); give a file that `facerf train` wrote"
         ) from None
-    return {k: (t.float() if t.dtype == torch.float16 else t) for k, t in tensors.items()}, metadata
+    return tensors, metadata
 
 
 def _restore(name: str, described: dict[str, Any], tensors: dict[str, Tensor]) -> nn.Module:
