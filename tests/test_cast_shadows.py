@@ -101,6 +101,9 @@ def test_key_lights_are_singled_out() -> None:
     assert [key for key in keys if key.is_near] == [
         KeyLight(n, at, True, slice(0, 1)) for n, at in ((0, 4), (1, 7), (2, 8))
     ]
+    alone = torch.diag_embed(weights[1].T).permute(1, 2, 0)[3:4]  # a sum of its own
+    _, keys = replace(lights, weights=torch.cat([weights[1:2], alone])).with_keys_alone()
+    assert [key[:2] for key in keys] == [(0, 2), (0, 1), (1, 1)]
 
 
 @pytest.fixture(scope="module")

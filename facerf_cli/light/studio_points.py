@@ -192,9 +192,11 @@ class Lights:
             alone[kind][samples] = sums[number][kind][samples]
             if not alone[kind].any():
                 continue
-            others = not all(map(torch.equal, alone, sums[number]))
-            keys.append(KeyLight(number, len(sums) if others else number, kind == 1, samples))
-            sums += [alone] * others
+            same = (at for at, one in enumerate(sums[: len(self)]) if all(map(torch.equal, alone, one)))
+            at = next(same, len(sums))
+            keys.append(KeyLight(number, at, kind == 1, samples))
+            if at == len(sums):
+                sums.append(alone)
         far, near = (torch.stack(weights) for weights in zip(*sums, strict=True))
         return Lights(self.directions, far, self.near, near if self.near else None), keys
 

@@ -138,11 +138,15 @@ class PersonInPhoto:
             Relit(blended[at], None, tuple(view[at] for view in lit), mirrored[at], mouths[at])
             for at in range(len(blended))
         ]
+        shadows: dict[tuple[bool, int], CastShadow] = {}
         for number, own in enumerate(owns):
             cast = []
             for key in (one for one in keys if one.number == number):
-                light = near[key.samples.start][0] if key.is_near else directions[key.samples].detach()
-                cast.append((every[key.alone], cast_shadow(field.views[0], light)))
+                at = key.is_near, key.samples.start
+                if at not in shadows:
+                    light = near[at[1]][0] if key.is_near else directions[key.samples].detach()
+                    shadows[at] = cast_shadow(field.views[0], light)
+                cast.append((every[key.alone], shadows[at]))
             yield replace(every[number], own=own, keys=tuple(cast))
 
     @cached_property

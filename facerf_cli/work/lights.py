@@ -121,18 +121,18 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
 
 
 def _far(count: int, lights: Iterable[FarLight]) -> Lights:
-    """Far lights of so many setups; at least one, if dark."""
-    directions, weights = [torch.tensor([[0.0, 0.0, 1.0]])], [torch.zeros(count, 1, 3)]
+    """Far lights of so many setups, each once; at least one, if dark."""
+    found: dict[bytes, tuple[Tensor, Tensor]] = {}
     for row, towards, rgb in lights:
-        directions.append(towards)
-        weights.append(torch.zeros(count, len(towards), 3))
-        weights[-1][row] = rgb
-    some = slice(len(directions) > 1, None)
-    ends = [0, *accumulate(map(len, directions[some]))]
+        new = towards, torch.zeros(count, len(towards), 3)
+        found.setdefault(towards.numpy().tobytes(), new)[1][row] += rgb
+    dark = [(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(count, 1, 3))]
+    directions, weights = zip(*(found.values() or dark), strict=True)
+    ends = [0, *accumulate(map(len, directions))]
     keys = tuple(
-        slice(*at) for at, toward in zip(pairwise(ends), directions[some], strict=True) if is_narrow(toward)
+        slice(*at) for at, toward in zip(pairwise(ends), directions, strict=True) if is_narrow(toward)
     )
-    return Lights(torch.cat(directions[some]), torch.cat(weights[some], 1), keys=keys)
+    return Lights(torch.cat(directions), torch.cat(weights, 1), keys=keys)
 
 
 def own_weights(setups: Sequence[LightSetup]) -> Tensor | None:

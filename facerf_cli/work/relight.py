@@ -1,7 +1,7 @@
 """One item of `facerf relight`: read, its people fitted, relit by every setup, exposed, written."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -206,8 +206,7 @@ def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
         if isinstance(rule := plan.exposure_rule, float):
             return dict.fromkeys((setup.name for setup in plan.setups), rule)
         scene = next(scenes_of(leader, plan, together=True))
-        parts = batches(len(scene.setups), scene.subject.nbytes)
-        known |= _exposures_ev(scene, parts, scene.relit, plan)
+        known |= _exposures_ev(scene, scene.relit, plan)
     return known
 
 
@@ -231,20 +230,20 @@ def _write_setups(
     Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
     of each image, and facts of it for the report: the exposure of the PNG in its place, the identity.
     """
-    parts = batches(len(scene.setups), scene.subject.nbytes)
+    parts = scene.parts
     whole = scene.relit(parts[0]) if len(parts) == 1 else None
 
-    def relit_by(part: slice) -> list[Any]:
+    def relit_by(part: slice) -> list[list[Any]]:
         return scene.relit(part) if whole is None else whole
 
-    exposures_ev = shared_ev or _exposures_ev(scene, parts, relit_by, plan)
+    exposures_ev = shared_ev or _exposures_ev(scene, relit_by, plan)
     written: dict[Path, dict[str, float]] = {}
     for part in parts:
-        for setup, relit in zip(scene.setups[part], relit_by(part), strict=True):
+        for setup, (relit, *each) in zip(scene.setups[part], relit_by(part), strict=True):
             _require_finite(item, setup, relit)
             path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
             with canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
-                image = _rendered(scene, setup, relit, ev, plan, empty)
+                image = _rendered(scene, setup, relit, each, ev, plan, empty)
                 image = replace(image, header={**scene.plate, **_made_by(setup, plan)})
                 write_output(
                     path, image, ev, plan.options.output, {**scene.metadata, "facerf:exposure_ev": ev}
@@ -258,7 +257,7 @@ def _write_setups(
             said += [f"in a room that sends {setup.room:g} back"] if setup.room else []
             if said and not (shared_ev and plan.shots.all):
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
-            del relit  # of all of its part, beside the next
+            del relit, each  # of all of its part, beside the next
     return written
 
 
@@ -273,7 +272,13 @@ def _made_by(setup: LightSetup, plan: RelightPlan) -> dict[str, str]:
 
 @step("render")
 def _rendered(
-    scene: LitScene, setup: LightSetup, relit: Any, ev: float, plan: RelightPlan, empty: Empty
+    scene: LitScene,
+    setup: LightSetup,
+    relit: Any,
+    each: Sequence[Any],
+    ev: float,
+    plan: RelightPlan,
+    empty: Empty,
 ) -> OutputImage:
     """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
 
@@ -287,11 +292,9 @@ def _rendered(
     parts = batches(len(lit.names), subject.nbytes)
     arrays: dict[str, np.ndarray] = {}
     for part in parts or [slice(0)]:
-        each = scene.relit_by_each(setup, part) if lit.names else ()
-        lights = dict(zip(lit.names[part], each, strict=True))
+        lights = dict(zip(lit.names[part], each[part], strict=True))
         request = RenderRequest(None if arrays else relit, lights, plan.options.aov, ev, behind, wrap)
         arrays |= subject.rendered(request, empty)
-        del lights, request  # before others are relit
     pixels, alpha = arrays.pop("rgb"), subject.alpha(behind)
     matte = subject.person_matte
     layers = arrays if matte is None else {"person.A": matte, **arrays}
@@ -334,18 +337,19 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    scene: LitScene, parts: Iterable[slice], relit_by: Callable[[slice], list[Any]], plan: RelightPlan
+    scene: LitScene, relit_by: Callable[[slice], list[list[Any]]], plan: RelightPlan
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(rule := plan.exposure_rule, float):
         return dict.fromkeys((setup.name for setup in plan.setups), rule)
     found: dict[str, float] = {}
     strengths = scene.lights[0].strengths()
-    for part in parts:
-        for setup, light, relit in zip(scene.setups[part], strengths[part], relit_by(part), strict=True):
+    for part in scene.parts:
+        at = scene.ends[:-1][part]
+        for setup, first, (relit, *_) in zip(scene.setups[part], at, relit_by(part), strict=True):
             chosen_ev = setup.exposure_ev
             if chosen_ev is None:
-                most_ev = most_exposure_ev(rule, light)
+                most_ev = most_exposure_ev(rule, strengths[first])
                 chosen_ev = round(min(scene.subject.exposure_ev(relit, rule), most_ev), 2)
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
             del relit  # a view of one holds all of its part, beside the next

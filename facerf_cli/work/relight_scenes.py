@@ -1,8 +1,9 @@
 """The scenes of `facerf relight`: people of a photo, or an OLAT stack, and what is behind them."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import accumulate, islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.run.logs import step
+from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import as_in_photo, each_alone, on_face, read_map, with_room
 from facerf_cli.work.photos import FittedFace
@@ -62,30 +64,37 @@ class LitScene:
 
     @cached_property
     def lights(self) -> list[Lights]:
-        """The lights of all setups on each of the people."""
-        return [self.lights_of(one) for one in self._as_lit(self.setups)]
+        """The lights of all setups, as `as_lit` lists them, on each of the people."""
+        people = zip(self.faces, self.evens, strict=True)
+        return [self.lights_of(as_lit(self.setups, *one)) for one in people]
+
+    @cached_property
+    def ends(self) -> list[int]:
+        """Where each setup ends among the sums of `lights`, after a first 0."""
+        return list(accumulate((1 + len(with_room(setup).names) for setup in self.setups), initial=0))
+
+    @property
+    def parts(self) -> list[slice]:
+        """As many of the setups at a time as fit the memory."""
+        most = max(last - first for first, last in pairwise(self.ends))
+        return batches(len(self.setups), most * self.subject.nbytes)
 
     @step("render")
-    def relit(self, part: slice) -> list[Any]:
-        """The people under some of the setups."""
-        return list(self._relit([lights[part] for lights in self.lights]))
-
-    def relit_by_each(self, setup: LightSetup, part: slice) -> Iterator[Any]:
-        """The people under some of the lights of a setup, each alone."""
-        lit = self._as_lit((setup,))
-        return self._relit([self.lights_of(each_alone(one)[part]) for (one,) in lit])
-
-    def _as_lit(self, setups: tuple[LightSetup, ...]) -> list[tuple[LightSetup, ...]]:
-        """Setups as they shine on each of the people."""
-        return [as_lit(setups, *one) for one in zip(self.faces, self.evens, strict=True)]
-
-    def _relit(self, lights: Sequence[Lights]) -> Iterator[Any]:
-        return self.subject.relit(lights if isinstance(self.subject, PeopleInPhoto) else lights[0])
+    def relit(self, part: slice) -> list[list[Any]]:
+        """The people under some of the setups: under all of its lights, and under each that has a name."""
+        ends = self.ends[part.start : part.stop + 1]
+        lights = [of_one[ends[0] : ends[-1]] for of_one in self.lights]
+        found = self.subject.relit(lights if isinstance(self.subject, PeopleInPhoto) else lights[0])
+        return [list(islice(found, last - first)) for first, last in pairwise(ends)]
 
 
 def as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[LightSetup, ...]:
-    """Setups as they shine on one of the people, with the light of their rooms."""
-    return tuple(with_room(as_in_photo(on_face(setup, face), even)) for setup in setups)
+    """Setups as they shine on one of the people, with the light of their rooms.
+
+    After one whose lights have names comes each of these alone.
+    """
+    lit = [with_room(as_in_photo(on_face(setup, face), even)) for setup in setups]
+    return tuple(one for setup in lit for one in (setup, *(each_alone(setup) if setup.names else ())))
 
 
 def backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:

@@ -1,5 +1,6 @@
 """The light of a room that comes with lights by default, and maps that shine together with lights."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from facerf_cli.main import main
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, in_room
 from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.relight_options import parse_background
+from facerf_cli.work.relight_scenes import as_lit
 from tests.astronaut import PATH as PHOTO
 from tests.cli.test_relight import relight
 from tests.exr_layers import exr_layers
@@ -39,6 +41,13 @@ def setups_of(
 
 def lights_of(*setups: LightSetup) -> Lights:
     return lights_over_rig(tuple(with_room(setup) for setup in setups), "150", "cell")
+
+
+def test_a_named_light_is_one_of_the_sums_that_it_shines_in() -> None:
+    (setup,) = setups_of([KEY, RIM])
+    found = lights_over_rig(as_lit((replace(setup, room=0.1),), 0), "150", "cell")
+    assert len(found) == 4 and len(found.directions) == 2 + 24  # of the room
+    torch.testing.assert_close(found.weights[0], found.weights[1:].sum(0))
 
 
 @pytest.mark.parametrize(
