@@ -105,9 +105,10 @@ class Enlarged:
         return ViewRows(rows, columns, pixels, grid, albedo, strands)
 
     def ready(self, light: PortraitLight) -> ViewLight:
-        """Light [3, S, S] that can be read at any pixel."""
-        front = self._smooth(torch.cat([light.shading, light.highlights]))
-        return ViewLight(front, self._smooth(light.behind) if light.behind.any() else light.behind)
+        """Light [3, S, S] that can be read at any pixel, in the photo's units."""
+        unit = self._view.exposure.repeat(2, 1, 1)
+        front = unit * self._smooth(torch.cat([light.shading, light.highlights]))
+        return ViewLight(front, unit * self._smooth(light.behind) if light.behind.any() else light.behind)
 
     def radiance(self, light: ViewLight, seen: ViewRows, rims: Rims | None) -> np.ndarray:
         """Radiance [h, w, 3] under light but that from behind; with `rims` that follows [h, w, 6]."""
@@ -122,7 +123,7 @@ class Enlarged:
             offsets = offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
             # Strands that stand before such a light show one by one.
             parts.append(lit(light.rear, seen.grid + offsets) * (brightness * seen.strands))
-        return _by_pixel(torch.cat([part * self._view.exposure for part in parts]))
+        return _by_pixel(torch.cat(parts))
 
     def flat(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
         """Luminances [h, w, 2] of the photo without its light, by the guided gain and by the coarse one."""
