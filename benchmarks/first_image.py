@@ -6,7 +6,8 @@ Each line is a new process with one thread for each of torch's pools; the lines,
 in a worktree, take turns, and the least of the rounds counts. Bytecode is cached, as in an installation.
 Steps are those that `facerf -v --log-json` prints; `look`, a part of reflectance that runs beside the rest of
 it, stands alone as well. What is in no step is the command line and imports. `help`, `facerf --help`, is over
-`import typer, rich`.
+`import typer, rich`. The bound of 12 megapixels is what files alone take: a photo is read, multiplied once
+and written as EXR and PNG.
 """
 
 import json
@@ -31,7 +32,15 @@ _CASES = {
     "1024 px, a map": (1024, _MAP),
     "12 megapixels, a map": (0, _MAP),
 }
-_HELP = "help"
+_HELP, _BOUND = "help", "12 megapixels, the bound"
+_FILES_ALONE = """
+import sys, pathlib
+from facerf_cli.files import read, write
+pixels, path = read.read_image(pathlib.Path(sys.argv[1])).pixels, pathlib.Path(sys.argv[2])
+write.write_exr(path.with_suffix(".exr"), pixels * 0.5)
+write.write_display(path.with_suffix(".png"), pixels)
+"""
+_ALL = (*_CASES, _BOUND, _HELP)
 _STEPS = ("load", "read", "find", "fit", "look", "reflectance", "light", "render", "write")
 
 
@@ -46,7 +55,7 @@ class Cost(NamedTuple):
 def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--against", metavar="REV", help="a commit to compare with")
-    parser.add_argument("--cases", nargs="+", default=[*_CASES, _HELP], choices=[*_CASES, _HELP])
+    parser.add_argument("--cases", nargs="+", default=_ALL, choices=_ALL)
     parser.add_argument("--rounds", type=int, default=3)
     given = parser.parse_args()
     with TemporaryDirectory() as temporary, worktree(given.against, Path(temporary)) as other:
@@ -90,6 +99,8 @@ def line_of(name: str, folder: Path) -> list[str]:
     """The arguments of python for a case."""
     if name == _HELP:
         return ["-m", "facerf_cli", "--help"]
+    if name == _BOUND:
+        return ["-c", _FILES_ALONE, str(enlarged(folder, 12)), str(folder / "copy")]
     side, lights = _CASES[name]
     photo = folder / f"{side}.png"
     if side:

@@ -70,7 +70,7 @@ class LitScene:
 
     @cached_property
     def ends(self) -> list[int]:
-        """Where each setup ends among the sums of `lights`, after a first 0."""
+        """The end of each setup among the sums of `lights`, after a first 0."""
         return list(accumulate((1 + len(with_room(setup).names) for setup in self.setups), initial=0))
 
     @property
