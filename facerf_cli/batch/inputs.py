@@ -372,4 +372,4 @@ def _say_passed_over(folder: Path, passed: Counter[str], linked: Sequence[str]) 
     if kinds or folders:
         files = [f"{passed.total()} files ({', '.join(kinds)})"] if kinds else []
         said = printable_line(", ".join([*files, *folders]))
-        log.info("%s: passed over: %s; what is named itself is read", folder, said)
+        log.info("%s: not read: %s; name a file itself to read it", folder, said)

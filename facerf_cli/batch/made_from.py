@@ -3,7 +3,8 @@
 A key joins the digests of an output's recipe (all options and files that shape it) and of its input.
 `.facerf-index.jsonl` has a row for each output (its key and SHA-256), for each recipe, and for each file
 that was read (size, time, inode and SHA-256: an unchanged one is not read again). The last row of a name
-counts. With `--shard` each process writes an index of its own and reads all.
+counts. With `--shard` each process writes an index of its own and reads all. That of the one file that `-o`
+names is in the user's cache, so that nothing lies beside the file.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.batch.settings import Shard
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256, is_regular, parse_json, regular_size, require_regular
 from facerf_cli.option import flag
@@ -38,6 +39,8 @@ _OPTIONS = {
     "kind": "--background",
     "leaders": "the first photo of --exposure-group",
     "matte_model": "the model of --matte-from",
+    "lights": "the lights",
+    "name": "the lights",
     "names": "the layers of --light",
     "non_negative": "--signed",
     "ocio_config": "--ocio",
@@ -86,7 +89,7 @@ def other_options(old: Recipe, new: Recipe) -> str:
     return (
         "other options"
         + (": " if old and names else "")
-        + ", ".join(_OPTIONS.get(name, flag(name)) for name in names if old)
+        + ", ".join(dict.fromkeys(_OPTIONS.get(name, flag(name)) for name in names if old))
     )
 
 
@@ -224,14 +227,22 @@ def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
 class FolderIndex:
     """The index of an output folder: outputs, by their path in it, and their keys; files; recipes."""
 
-    def __init__(self, folder: Path, verb: str = "", shard: Shard = Shard()) -> None:  # noqa: B008 (frozen)
+    def __init__(
+        self,
+        folder: Path,
+        verb: str = "",
+        shard: Shard = Shard(),  # noqa: B008 (frozen)
+        file: Path | None = None,
+    ) -> None:
         self._folder, self._verb = folder, verb
         self._prefix = os.path.join(folder, "")
-        self.path = folder / f".facerf-index{shard.suffix}.jsonl"
+        self.path = _in_cache(file) if file else folder / f".facerf-index{shard.suffix}.jsonl"
+        # A cache that cannot be written to costs the next run the same work again, not this one.
+        self._lost: tuple[type[Exception], ...] = (FacerfError, OSError) if file else ()
         self.outputs: dict[str, Row] = {}
         self._files: dict[str, Row] = {}
         self._recipes: dict[str, Recipe] = {}
-        for path in sorted(folder.glob(_INDEXES)):
+        for path in [self.path] if file else sorted(folder.glob(_INDEXES)):
             for row in json_rows(path):
                 self._take(row)
         self._new: list[Row] = []  # files read since the rows were last written
@@ -271,7 +282,7 @@ class FolderIndex:
                 stale[path] = "" if row is None else "an output is missing"
                 continue
             if row is None or row.get("verb") != self._verb:
-                stale[path] = "there is no record of what they were made from"
+                stale[path] = "nothing says what they were made from"
                 continue
             key, recipe = _of_output(recipes, number)
             before, _, read_before = str(row.get("key")).partition(" ")
@@ -297,7 +308,7 @@ class FolderIndex:
         rows: list[Mapping[str, Any]] = list(self._files.values())
         rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
         rows += self.outputs.values()
-        with atomic_path(self.path) as temporary:
+        with suppress(*self._lost), atomic_path(self.path) as temporary:
             temporary.write_text(lines_of(rows), encoding="utf-8")
 
     def add(self, made: Made, outputs: Sequence[Path], recipes: Keyed) -> None:
@@ -310,7 +321,7 @@ class FolderIndex:
             name = self._name(Path(row["file"]))
             key = _key(keys.get(name, ""), made.read["sha256"])
             rows.append({"output": name, "verb": self._verb, "sha256": row["sha256"], "key": key})
-        with self.path.open("a", encoding="utf-8") as stream:
+        with suppress(*self._lost), self.path.open("a", encoding="utf-8") as stream:
             stream.write(lines_of([*rows, *self._new]))
         self._new.clear()
 
@@ -329,6 +340,14 @@ class FolderIndex:
         if text.startswith(self._prefix) and ".." not in text:  # as all of a verb's; ten times faster
             return text[len(self._prefix) :].replace(os.sep, "/")
         return Path(os.path.relpath(path, self._folder)).as_posix()
+
+
+def _in_cache(file: Path) -> Path:
+    """The index of the one file that `-o` names."""
+    from facerf_cli.files.downloads import cache_folder  # --help does without it
+
+    name = hashlib.sha256(os.fsencode(os.path.abspath(file))).hexdigest()[:16]
+    return cache_folder() / "written" / f"{name}.jsonl"
 
 
 def keyed(recipes: Sequence[Recipe]) -> Keyed:

@@ -233,6 +233,8 @@ class BatchOptions:
         parse=file_pattern,
         panel=BATCH,
     )
+    file: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # the one that -o names
+    reports: bool = field(default=True, metadata=NOT_IN_RECIPE)
     in_a_row: int = field(default=1, metadata=NOT_IN_RECIPE)  # neighbouring items that a process takes
     print_outputs: bool = field(default=True, metadata=NOT_IN_RECIPE)  # on stdout
 
@@ -257,7 +259,7 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
                 stack.enter_context(alone_in(options.output, lock_name))
             except OSError as error:
                 raise unusable(options.output, error) from error
-        index = FolderIndex(options.output, verb, options.shard)
+        index = FolderIndex(options.output, verb, options.shard, options.file)
         recipes = keyed(job.recipes_of(index.digest_of))
         stale = _stale(job, items, recipes, options, index)
         lacks = 0
@@ -273,7 +275,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             _log_made_again(again)
             return max(lacks, _list_what_would_be_done(todo, finished, job))
         report = options.output / f"report{options.shard.suffix}.jsonl"
-        open_report(report, verb, todo, finished, job.outputs_of)
+        if options.reports:
+            open_report(report, verb, todo, finished, job.outputs_of)
         if recipes:
             index.open(recipes, bool(todo))
         if finished:
@@ -283,7 +286,7 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         if recipes and options.overwrite == "changed":
             kept = [set(job.outputs_of(item)) - set(stale[item]) for item in items]
             if edited := sum(map(index.is_edited, set().union(*kept))):
-                advice = "%d outputs were changed after they were written; they are kept (--overwrite always)"
+                advice = "%d results were changed after they were written; they are kept (--overwrite always)"
                 log.warning(advice, edited)
         if not todo:
             return lacks
@@ -299,7 +302,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
                         raise result.stops_the_run
                     if result.made:
                         index.add(result.made, job.outputs_of(result.item), recipes)
-                    add_row(report, verb, result)
+                    if options.reports:
+                        add_row(report, verb, result)
                     failures += _print_result(result, options)
                     progress.advance(task)
         finally:
@@ -309,8 +313,7 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
         elif failures and is_new:
-            records = [report, options.output / lock_name, *([index.path] if recipes else [])]
-            _remove_what_is_empty(options.output, records)
+            _remove_what_is_empty(options.output, [report, options.output / lock_name, index.path])
         return max(lacks, int(failures > 0))
 
 
@@ -391,7 +394,7 @@ def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
     """Remove a new folder in which only these records are; what another process wrote there stays."""
     if not any(path.is_file() and path not in records for path in folder.rglob("*")):
         for record in records:
-            record.unlink()
+            record.unlink(missing_ok=True)
         for empty in sorted([folder, *folder.rglob("*")], reverse=True):
             empty.rmdir()
 

@@ -131,5 +131,5 @@ def convert_light(
     if end_of_file(batch.output, ends):
         items = [only_item(items, batch.output, several=len(ends) > 1)]
         work = replace(work, alone=batch.output.suffix)
-        batch = replace(batch, output=batch.output.parent)
+        batch = batch.of_file()
     raise typer.Exit(run_items(work, items, batch, settings))

@@ -7,7 +7,6 @@ from typing import Self
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions
 from facerf_cli.cli.options import FramesArgument
 from facerf_cli.errors import UsageError
 from facerf_cli.option import LIGHT, option
@@ -32,7 +31,7 @@ class EstimateLight(PhotoWork, LightOptions):
     networks = LightOptions.networks
     alone_as = ("_light.exr", "_light.json")
 
-    def run(self, inputs: Sequence[str], batch: BatchOptions, wanted: ShotOptions | None = None) -> int:
+    def run(self, inputs: Sequence[str], batch: FileOrFolder, wanted: ShotOptions | None = None) -> int:
         """Estimate the light of photos, and one for each shot; return the exit code."""
         refuse_odd("--width", self.width_px)
         self.photo.check()

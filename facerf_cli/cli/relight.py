@@ -22,6 +22,7 @@ from facerf_cli.work.output_options import NEEDS, STDOUT, SUFFIXES, check_stdout
 from facerf_cli.work.photo_options import networks_of
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
+from facerf_cli.work.verbs import FileOrFolder
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def relight(
     sources: LightSources,
     options: RelightOptions,
     shots: ShotOptions,
-    batch: Annotated[BatchOptions, Without("output", "name")],
+    batch: Annotated[FileOrFolder, Without("output", "name")],
 ) -> None:
     """Relight photos, or OLAT stacks, under environment maps and single lights.
 
@@ -115,12 +116,15 @@ def relight(
             raise UsageError(f"-o {output}: is not what --format says; leave that out, or give a folder")
         one_file = replace(options.output, file_suffix=output.suffix)
         options = replace(options, output=one_file, name=NamePattern.literal(output.stem))
+        batch = replace(batch, output=output).of_file()
         output = output.parent
     elif film is not None:
-        refuse_given(context, ("formats", "ball", "name"), f"is not for -o {output}; leave it out")
+        refuse_given(context, ("formats", "ball", "name", "report"), f"is not for -o {output}; leave it out")
         formats, output = film.formats, film.folder
     elif output == STDOUT:
-        refuse_given(context, ("ball", "dry_run"), "is not for -o -, which writes one image; leave it out")
+        refuse_given(
+            context, ("ball", "dry_run", "report"), "is not for -o -, which writes one image; leave it out"
+        )
         if is_default(context, "formats"):
             formats = ("png",)
     for name, needed in NEEDS.items():

@@ -71,7 +71,7 @@ class Crop:
         longer_px = max(image.shape[:2])
         if not self.side_px <= _LARGEST * longer_px:
             raise InputError(
-                f"crop: it is {self.side_px:.0f} pixels wide and the photo {longer_px}; {GIVE_LANDMARKS}"
+                f"the face is {self.side_px:.0f} pixels wide, and the photo {longer_px}; {GIVE_LANDMARKS}"
             )
         rows = _resampler(image.shape[0], self.y0_px, self.side_px, self.size_px)
         columns = _resampler(image.shape[1], self.x0_px, self.side_px, self.size_px)

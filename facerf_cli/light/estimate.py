@@ -59,9 +59,8 @@ class LightEvidence:
         texels = int(self.mask.sum())
         if texels < _LEAST_TEXELS:
             raise InputError(
-                f"too little of the face is visible to estimate its light: {texels} texels of "
-                f"{self.mask.shape[-1]} x {self.mask.shape[-1]}, at least {_LEAST_TEXELS} are needed; "
-                "give a photo or a matte that shows more of it"
+                f"too little of the face is visible to estimate its light ({texels} points of its texture; "
+                f"{_LEAST_TEXELS} are needed); give a photo or a matte that shows more of it"
             )
         if float(self.photo[:, self.mask].mean()) < _BLACK:
             raise InputError("the face is black in the photo: it shows no light; give a brighter photo")

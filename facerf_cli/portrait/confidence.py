@@ -36,6 +36,7 @@ class Scale:
 
     worst: float
     best: float
+    said: str = ""  # in a line, where the fact's name does not say it
 
     def factor(self, value: float) -> float:
         """From 0.1 at the worst value to 1 at the best."""
@@ -46,15 +47,15 @@ class Scale:
 SCALES = {
     # Landmarks: presence of a head to the Parsing Network; median of their expected errors, in extents;
     # distance of the mesh from that of the mirrored photo, in extents: .007 to .012 where all is well.
-    "faint": Scale(0.3, 0.95),
-    "unclear": Scale(0.05, 0.018),
-    "unsteady": Scale(0.04, 0.018),
+    "faint": Scale(0.3, 0.95, "perhaps no face"),
+    "unclear": Scale(0.05, 0.018, "unclear features"),
+    "unsteady": Scale(0.04, 0.018, "unsure features"),
     # Extent of the face in pixels; its sharpness (`sharpness_of`); eyes' distance over the extent; turn of
     # the fitted head in degrees, of which 45 are supported.
     "small": Scale(20.0, 44.0),
     "blurred": Scale(0.1, 0.18),
     "profile": Scale(0.15, 0.4),
-    "turned": Scale(75.0, SUPPORTED_YAW_DEG),
+    "turned": Scale(75.0, SUPPORTED_YAW_DEG, "turned away"),
     # Share of the face that something covers, that lies beyond the frame, that is clipped in two channels;
     # number of its levels of green.
     "covered": Scale(0.4, 0.1),
@@ -63,9 +64,9 @@ SCALES = {
     "dark": Scale(4.0, 14.0),
     # Matte: overlap of what the networks see of a person around the head; share of the outline behind which
     # another person begins; share of the person that is not joined to the face.
-    "disputed": Scale(0.8, 0.9),
-    "crowded": Scale(0.6, 0.25),
-    "severed": Scale(0.5, 0.2),
+    "disputed": Scale(0.8, 0.9, "unclear outline"),
+    "crowded": Scale(0.6, 0.25, "others close by"),
+    "severed": Scale(0.5, 0.2, "parts apart from the face"),
 }
 
 

@@ -89,13 +89,15 @@ def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
     if which == "largest":
         if len(faces) > 1:
             log.info(
-                "%s: %d faces are found, the largest is taken (--face all or an index)", name, len(faces)
+                "%s: has %d faces, of which the largest is taken (--face all, or 0 for the leftmost)",
+                name,
+                len(faces),
             )
         return [max(faces, key=lambda face: face.area_px * face.score)]
     if not which.isdecimal():
         raise UsageError(f"--face {which}: not a choice; give largest, all or a number from 0")
     if int(which) >= len(faces):
-        raise InputError(f"{name}: {len(faces)} face(s) found, --face {which} is not one; count from 0")
+        raise InputError(f"{name}: has {len(faces)} face(s), and no --face {which}; the leftmost is 0")
     return [faces[int(which)]]
 
 

@@ -352,7 +352,7 @@ class SteadyShot:
     def landmarks_px(self, frame: int) -> np.ndarray:
         """Smoothed landmarks [68, 2] of a frame; raises InputError where the face is lost."""
         if frame not in self._shown:
-            raise InputError(f"frame {frame}: the face is lost, in more frames than are bridged")
+            raise InputError(f"frame {frame}: the face is not seen in more frames than can be filled in")
         found: np.ndarray = self._path[frame]
         return found
 

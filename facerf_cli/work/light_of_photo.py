@@ -178,8 +178,8 @@ def _estimate(
     residual = estimate.evidence.residual(estimate.explained)
     if residual > _UNEXPLAINED:
         log.warning(
-            "%s: no light explains this face well (%.0f %% of it is left over); look at _light.png: perhaps "
-            "the fit is off, or it is not a face",
+            "%s: the light found does not give this face (%.0f %% of it differs); look at _light.png: "
+            "perhaps the face model is off, or it is not a face",
             item.input_path,
             100 * residual,
         )

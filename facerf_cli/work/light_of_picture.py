@@ -31,7 +31,8 @@ def guessed_light(item: Item, image: LinearImage, fov_deg: float | None) -> Pict
     fov_deg = fov_deg or stated_fov_deg(image) or FOV_DEG
     guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
     log.warning(
-        "%s: no face that shows its light; a guess from a picture of %.0f degrees, off by about %.0f %%",
+        "%s: has no face to find the light by; guessed from the picture, taken as %.0f degrees wide (--fov), "
+        "and off by about %.0f %%",
         item.input_path,
         fov_deg,
         100 * guess.error,

@@ -215,8 +215,8 @@ def _say_apart(names: Sequence[str], shared: str) -> None:
     if names:
         preset = next((name for name in names if name in preset_names()), None)
         log.warning(
-            "%s%s: apart from %s, the image of lights with names; for one image give each a name, as in "
-            "fill=40,20, fill=rembrandt or --envmap sky=MAP%s",
+            "%s%s: an image each, since only lights with names share one (%s); to add it there give it a "
+            "name, as in fill=40,20, fill=rembrandt or --envmap sky=MAP%s",
             names[0],
             f" and {len(names) - 1} more" if len(names) > 1 else "",
             shared,

@@ -26,7 +26,13 @@ from facerf_cli.image.strips import resized
 from facerf_cli.network.files import serving_files
 from facerf_cli.person import find_faces
 from facerf_cli.pipeline import head_of
-from facerf_cli.portrait.confidence import SUPPORTED_YAW_DEG, confidence_of, face_facts, touched_sides
+from facerf_cli.portrait.confidence import (
+    SCALES,
+    SUPPORTED_YAW_DEG,
+    confidence_of,
+    face_facts,
+    touched_sides,
+)
 from facerf_cli.portrait.find import Face, FaceBox, face_at
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
@@ -83,8 +89,8 @@ class PhotoFace:
             return {}
         confidence = confidence_of(self.facts)
         touches = [f"touches the frame: {', '.join(self.touches)}"] if self.touches else []
-        why = ", ".join([*confidence.reasons, *touches])
-        log.info("%s: %s%s", self.name, confidence.word, f" ({why})" if why else "")
+        why = ", ".join([*(SCALES[name].said or name for name in confidence.reasons), *touches])
+        log.info("%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else "")
         factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
         rated = {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
         return rated | ({"touches_frame": self.touches} if self.touches else {})
@@ -158,7 +164,7 @@ def read_photo(
             "clip it"
         )
     if image.alpha is not None and not in_shot and not image.alpha.any() and most > 0:
-        log.warning("%s: its alpha is 0 everywhere, over colour; read without alpha", item.input_path)
+        log.warning("%s: is transparent everywhere; its alpha is left out", item.input_path)
         return replace(image, alpha=None)
     return image
 
@@ -271,15 +277,15 @@ def fitted_face(face: PhotoFace, head: Head, matte: np.ndarray | None) -> Fitted
     """A face with its head, and its person's matte [H, W] if given; warns of a fit that is poor."""
     if head.fit.quality == "poor":
         log.warning(
-            "%s: the fit is poor (landmarks are off by %.1f %% of the eyes' distance); look at it with "
-            "`facerf fit-geometry`, or give --landmarks",
+            "%s: the face model fits badly (its points are off by %.1f %% of the eyes' distance): look at it "
+            "with `facerf fit-geometry`, or give the face's points by --landmarks",
             face.name,
             100 * head.fit.error_iod,
         )
     yaw_deg = rotation_to_pose(head.fit.rotation)[0]
     if abs(yaw_deg) > SUPPORTED_YAW_DEG:
         log.warning(
-            "%s: the head is turned by %.0f degrees, and %.0f are supported; look at it with "
+            "%s: the head is turned by %.0f degrees; beyond %.0f it may fail: look at it with "
             "`facerf fit-geometry`",
             face.name,
             abs(yaw_deg),
@@ -338,7 +344,7 @@ def _grey_or_alpha(path: Path, size_px: tuple[int, ...], white: float) -> np.nda
     matte = values.mean(-1).clip(0, 1)
     labelled = (values == values.reshape(matte.size, -1)[matte.argmax()]).all(-1)
     if 0 < matte.max() < white and not matte.min() and not matte[~labelled].any():
-        log.info("%s: has black and one colour, which is read as white", path)
+        log.info("%s: is black and one colour, which counts as white", path)
         return labelled.astype(np.float32)
     return np.asarray(matte)
 

@@ -161,7 +161,7 @@ def _described(
         return face
     found = fitted_face(face, person.head, matte)
     if person.balance is not None and person.balance.is_far and options.white == "photo":
-        log.info("%s: its light is far from white; --white scene takes the colour out", face.name)
+        log.info("%s: its light has a strong colour (--white scene takes it out)", face.name)
     if options.composite == "photo" and matte is None:
         found.see(person.segmentation)
     return found
@@ -252,9 +252,9 @@ def _write_setups(
                 if scene.identity is not None:
                     written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
                 del image
-            group = " of its group" if shared_ev else ""
-            said = [f"exposure {ev:+.2f} EV{group}"] if plan.options.output.shown_suffix else []
-            said += [f"in a room that sends {setup.room:g} back"] if setup.room else []
+            group = " as its group" if shared_ev else ""
+            said = [f"exposed by {ev:+.2f} EV{group}"] if plan.options.output.shown_suffix else []
+            said += [f"{100 * setup.room:g} % of the light from all around (--room)"] if setup.room else []
             if said and not (shared_ev and plan.shots.all):
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
             del relit, each  # of all of its part, beside the next

@@ -303,9 +303,9 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     parse_pose(options.pose)
     parse_lights(options.rig)
     if options.network_alone and not is_field:
-        raise UsageError("--network-alone: is for the fields; leave it out, or use --reflectance field")
+        raise UsageError("--network-alone: is for --reflectance portrait or field; leave it out")
     if options.white != "photo" and not is_field:
-        raise UsageError("--white: is for the fields; leave it out, or use --reflectance field")
+        raise UsageError("--white: is for --reflectance portrait or field; leave it out")
     photo = replace(options.photo, ocio_config=options.output.config)
     photo.check()
     if options.background.kind != "photo" and alone:
@@ -325,7 +325,7 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     if options.light_wrap and any("wrap" in setup.names for setup in setups):
         raise UsageError("--light-wrap: a light has the name wrap, too; give it another")
     if alone and any(setup.has_own for setup in setups):
-        raise UsageError("--light own: is of the whole photo; leave out --pose and --composite face")
+        raise UsageError("--light own: needs the whole photo; leave out --pose and --composite face")
     by_photo = [light for setup in setups for light in setup.by_photo]
     if by_photo and not is_field:
         word = OWN if by_photo[0].own else EVEN

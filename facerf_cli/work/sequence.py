@@ -64,7 +64,7 @@ class ShotFrames:
         alphas = (self.read(number).alpha for number in range(len(self._shot.frames)))
         found = any(alpha is not None and alpha.any() for alpha in alphas)
         if not found:
-            log.warning("%s: its alpha is 0 in every frame; read without alpha", self._shot.base.name)
+            log.warning("%s: is transparent in every frame; its alpha is left out", self._shot.base.name)
         return found
 
     def read(self, number: int) -> LinearImage:
@@ -247,7 +247,7 @@ def _log_cuts_and_gaps(shot: Shot, track: ShotTrack) -> None:
         inside = sightings[take.start : take.stop]
         for first, last in gaps(inside):
             bridged = first > 0 and last + 1 < len(inside) and last - first < LONGEST_GAP
-            result = "bridged by the frames around" if bridged else "not made; cut them off"
+            result = "filled in from the frames around" if bridged else "not relit; cut them off"
             begin, end = take.start + first, take.start + last
             names = f"frame {begin}" if begin == end else f"frames {begin} to {end}"
             log.warning("%s: %s: the face is not seen; %s", shot.base.name, names, result)

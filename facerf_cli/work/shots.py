@@ -98,7 +98,10 @@ def collect_frames(
         photos = []
         for shot in shots:
             if len(shot.frames) == 1:
-                log.warning("%s: is a shot of one frame; number the others alike", shot.frames[0].input_path)
+                log.warning(
+                    "%s: is the only frame of its shot; name the others like it, but for the number",
+                    shot.frames[0].input_path,
+                )
     shots = [replace(shot, cuts=not wanted.no_cuts) for shot in shots]
     _check_shots(shots, photo)
     if shots and batch.shard.of > 1:

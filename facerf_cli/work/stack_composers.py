@@ -196,7 +196,8 @@ def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
     own = torch.from_numpy(header.directions).float()
     if (off_deg := off_rig_deg(plan.setups, own)) > _OFF_RIG_DEG:
         said = (
-            "%s: lacks a light (its nearest is %.1f degrees off): mixed of those around it; or give the photo"
+            "%s: has no light there (the nearest is %.1f degrees away), so those around it are mixed; the "
+            "photo itself takes any light"
         )
         log.warning(said, item.input_path, off_deg)
     lights_of = partial(lights_over_stack, directions=own, sampling=plan.sampling)

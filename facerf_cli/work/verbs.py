@@ -17,7 +17,7 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
-from facerf_cli.option import IMAGE, LIGHT, METHOD, option
+from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.photo_options import (
     PhotoOptions,
@@ -35,6 +35,7 @@ class FileOrFolder(BatchOptions):
 
     Attributes:
         output: Write the results to this folder; or one of them, of one input, to this file, by its suffix.
+        report: Write report.jsonl beside the one file of -o, too.
     """
 
     output: Path = option(
@@ -45,6 +46,11 @@ class FileOrFolder(BatchOptions):
         shown_default=False,
         required=True,
     )
+    report: bool = option(False, in_recipe=False, panel=BATCH)
+
+    def of_file(self) -> Self:
+        """The contract of the one file that `-o` names."""
+        return replace(self, output=self.output.parent, file=self.output, reports=self.report)
 
 
 def end_of_file(output: Path, ends: Sequence[str]) -> str:
@@ -94,7 +100,7 @@ class PhotoWork(Job):
         self.photo.check()
         return self
 
-    def run(self, inputs: Sequence[str], batch: BatchOptions, wanted: ShotOptions | None = None) -> int:
+    def run(self, inputs: Sequence[str], batch: FileOrFolder, wanted: ShotOptions | None = None) -> int:
         """Process photos, and with `wanted` the frames of shots; return the exit code."""
         work, null_separated = self.checked(), self.photo.settings.null_separated
         if wanted is None:
@@ -104,14 +110,14 @@ class PhotoWork(Job):
         batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1)
         return replace(work, shots=Shots(shots)).run_on(items, batch)
 
-    def run_on(self, items: Sequence[Item], batch: BatchOptions) -> int:
+    def run_on(self, items: Sequence[Item], batch: FileOrFolder) -> int:
         """Process items; return the exit code."""
         if end_of_file(batch.output, self.alone_as):
             if batch.name is not None:
                 raise UsageError(f"--name: is not for -o {batch.output}, one file; leave it out")
             item = only_item(items, batch.output, several=self.photo.face == "all")
             work = replace(self, alone=batch.output.suffix)
-            return work.run_on([item], replace(batch, output=batch.output.parent))
+            return work.run_on([item], batch.of_file())
         return run_items(self, items, batch, self.photo.settings)
 
     def ready(self, dry_run: bool) -> Self:

@@ -210,9 +210,9 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
 def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, capsys: Said) -> None:
     run([two], tmp_path / "out", recipe={"lights": 150})
     run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
-    assert "2 made again: made from other options: --lights" in capsys.readouterr().err
+    assert "2 made again: made from other options: the lights" in capsys.readouterr().err
     run([two], tmp_path / "out", recipe={"lights": 300})
-    assert "2 made again: made from other options: --lights" in capsys.readouterr().err
+    assert "2 made again: made from other options: the lights" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
@@ -231,7 +231,7 @@ def test_outputs_that_the_user_changed_are_kept_and_those_of_unknown_origin_made
     run([two], out)
     (out / "a_copy.bin").write_bytes(b"retouched")
     assert run([two], out) == 0
-    assert "1 outputs were changed after they were written; they are kept" in capsys.readouterr().err
+    assert "1 results were changed after they were written; they are kept" in capsys.readouterr().err
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
     run([two], out)
     (out / "a_copy.bin").write_bytes(b"")
@@ -239,7 +239,7 @@ def test_outputs_that_the_user_changed_are_kept_and_those_of_unknown_origin_made
     assert "1 made again: an output is empty" in capsys.readouterr().err
     (out / ".facerf-index.jsonl").unlink()
     run([two], out)
-    assert "2 made again: there is no record" in capsys.readouterr().err
+    assert "2 made again: nothing says what" in capsys.readouterr().err
 
 
 def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) -> None:
@@ -269,7 +269,7 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
     assert call() == 0
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
-    assert "made again" not in said.err and "1 outputs were changed" in said.err
+    assert "made again" not in said.err and "1 results were changed" in said.err
     assert (out / "a_a.bin").read_bytes() == b"retouched"
     (out / "b_a.bin").unlink()
     assert call() == 0
@@ -399,7 +399,7 @@ def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) 
     assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
-    assert other_options(one, other) == "other options: --lights, --matte"
+    assert other_options(one, other) == "other options: the lights, --matte"
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
     (tmp_path / "mattes").mkdir()
     (tmp_path / "mattes" / "a.png").write_bytes(b"1")

@@ -246,7 +246,7 @@ def test_alpha_that_is_0_in_every_frame_is_none(tmp_path: Path, name: str, caplo
             assert [float(alpha.mean()) for alpha in alphas if alpha is not None] == [0, 0, 1]
         else:
             assert alphas == [None] * 3
-        assert (caplog.text.count("its alpha is 0 in every frame; read without alpha") == 1) == (not shown)
+        assert (caplog.text.count("is transparent in every frame; its alpha is left out") == 1) == (not shown)
         caplog.clear()
 
 

@@ -71,7 +71,7 @@ def test_what_a_folder_passes_over_is_counted_and_named(photos: Path, tmp_path: 
     (line,) = [record.getMessage() for record in caplog.records]
     kinds = "2 .nef, 1 .mp4, 1 without suffix, 1 .txt"
     assert sorted(line.partition("(")[2].partition(")")[0].split(", ")) == sorted(kinds.split(", "))
-    assert "passed over: 5 files (" in line and f"linked folder {photos}/x/linked; what is named" in line
+    assert "not read: 5 files (" in line and f"linked folder {photos}/x/linked; name a file" in line
     caplog.clear()
     names(tmp_path, photos / "b.jpg")
     assert not caplog.records
@@ -193,7 +193,7 @@ def test_images_become_the_frames_of_shots(
         for shot in shots
     }
     assert found == expected and len(items) == len(given)
-    assert sum("a shot of one frame" in record.message for record in caplog.records) == sum(
+    assert sum("the only frame of its shot" in record.message for record in caplog.records) == sum(
         len(frames) == 1 for frames in expected.values()
     )
     if "plates" in found:

@@ -185,7 +185,7 @@ def test_alpha_that_is_0_everywhere_over_colour_is_none(tmp_path: Path, name: st
         frame = read_photo(Item(path, tmp_path / "out", "me"), options, in_shot=True)
         assert frame.alpha is not None and (frame.alpha == alpha).all()
         assert (photo.pixels == frame.pixels).all() and photo.pixels.min() > 0.04
-        said = f"{path}: its alpha is 0 everywhere, over colour; read without alpha"
+        said = f"{path}: is transparent everywhere; its alpha is left out"
         assert (photo.alpha is None) == (said in caplog.text) == (not alpha.any())
 
 
@@ -212,7 +212,7 @@ def test_a_label_is_read_as_white(
     truth[:, 20:100] = 1
     matte = person_matte(item, photo, PhotoOptions(Settings(), person=path))
     assert (matte == truth).all()
-    assert (f"{path}: has black and one colour, which is read as white" in caplog.text) == said
+    assert (f"{path}: is black and one colour, which counts as white" in caplog.text) == said
     if mode in ("L", "I;16", "1"):
         assert (read_matte(item, path, (HEIGHT, WIDTH)) == truth).all()
 

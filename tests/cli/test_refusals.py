@@ -114,7 +114,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--room ''": "--room",
         "--room 0.1,0.1": "--room",
         "--reflectance wax": "specular-sh",
-        "--reflectance prt --network-alone": "--network-alone: is for the fields",
+        "--reflectance prt --network-alone": "--network-alone: is for --reflectance portrait or field",
         "--input-colourspace nope": "unknown colour space 'nope'",
         "--identity --composite face": "--identity: is for the whole photo",
         "--aov beauty": "--aov 'beauty': no such layer",

@@ -14,7 +14,7 @@ from facerf_cli.main import main
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.confidence import SCALES
 from tests.exr_layers import exr_layers
-from tests.kinds import Folders, Said
+from tests.kinds import Folders, Patch, Said
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 ENDINGS = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
@@ -50,12 +50,28 @@ def test_every_file_is_there_and_its_landmarks_serve_as_input(cut: Path, tmp_pat
 
 def test_one_file_is_that_of_the_folder(cut: Path, tmp_path: Path, capsys: Said) -> None:
     target = tmp_path / "me.png"
-    for said in ("", "already finished"):
-        assert main(["segment", str(PHOTO), "-o", str(target)]) == 0
+    target.write_bytes(b"another image")
+    line = ["segment", str(PHOTO), "-o", str(target)]
+    assert main([*line, "--overwrite", "never"]) == 0 and target.read_bytes() == b"another image"
+    for said in ("nothing says what", "already finished"):
+        assert main(line) == 0
         assert said in capsys.readouterr().err
     assert target.read_bytes() == (cut / "astronaut_person.png").read_bytes()
-    assert {path.name for path in tmp_path.glob("[!.]*")} == {"me.png", "report.jsonl"}
+    assert list(tmp_path.iterdir()) == [target]
+    target.write_bytes(b"by hand")
+    assert main(line) == 0 and target.read_bytes() == b"by hand"
+    assert "are kept" in capsys.readouterr().err
     assert main(["segment", str(tmp_path / "none.png"), "-o", str(target)]) == 1
+    assert list(tmp_path.iterdir()) == [target]
+    assert main([*line, "--report"]) == 0 and target.read_bytes() == b"by hand"
+    assert {path.name for path in tmp_path.iterdir()} == {"me.png", "report.jsonl"}
+
+
+def test_one_file_is_written_where_no_cache_can_be(tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.setattr("facerf_cli.batch.made_from._in_cache", lambda file: PHOTO / "index.jsonl")
+    for _ in range(2):
+        assert main(["segment", str(PHOTO), "-o", str(tmp_path / "me.png")]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["me.png"]
 
 
 def test_classes_sum_to_the_matte_and_lie_where_face_hair_and_garment_are(
@@ -90,7 +106,8 @@ def test_a_person_before_another_is_not_sure_and_the_line_says_why(tmp_path: Pat
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert row["certainty"] != "sure" and row["factors"]["disputed"] < 0.6
     line = capsys.readouterr().err
-    assert row["certainty"] in line and "disputed, crowded" in line and "touches the frame: bottom" in line
+    assert f"facerf is {row['certainty']} of the person" in line
+    assert "unclear outline, others close by" in line and "touches the frame: bottom" in line
 
 
 def test_a_photos_own_alpha_cuts_its_person_out(layers: dict[str, np.ndarray], tmp_path: Path) -> None:
