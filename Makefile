@@ -14,8 +14,10 @@ $(STAMP): pyproject.toml constraints.txt
 
 setup: $(STAMP)
 
-demo: $(STAMP)
-	$(FACERF) relight examples/astronaut.jpg --envmap examples/maps/*.exr -o out/demo --ball
+demo: out/demo.jpg
+
+out/demo.jpg: | $(STAMP)
+	$(FACERF) demo -o $@
 
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .

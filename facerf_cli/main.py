@@ -37,7 +37,7 @@ from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 VERBS = {
     verb: panel
     for panel, verbs in {
-        "Relight photos": ("relight", "view"),
+        "Relight photos": ("demo", "relight", "view"),
         "Take photos apart": ("estimate-light", "predict-olat", "segment", "fit-geometry"),
         "Make and convert light": ("convert-light", "envmap"),
         "Train and evaluate": (
@@ -56,6 +56,7 @@ _FILES = dict.fromkeys(("check", "doctor", "config"), "installation")  # of verb
 # The networks that verbs use; with some options they use fewer.
 _ALL = networks_of(NETWORKS) | {"light_features"}
 USES: dict[str, frozenset[str]] = {
+    "demo": _ALL,
     "relight": _ALL,
     "view": networks_of(["portrait"]),
     "estimate-light": _ALL - {"portrait"},

@@ -1,6 +1,9 @@
 """Three examples of each verb, for its help and its man page."""
 
 _LINES = """
+facerf demo
+facerf demo -o sheet.png
+facerf demo --checkpoint run/ -o mine.jpg
 facerf relight me.jpg --light 40,20 -o relit.png
 facerf relight photos/ --envmap skies/ --rotate 0:360:24 -o relit/
 facerf relight me.jpg --background beach.jpg --light-from background --light-wrap 0.3 -o relit/

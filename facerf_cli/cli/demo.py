@@ -1,0 +1,77 @@
+"""`facerf demo`: a photo that facerf brings along, relit, on one sheet."""
+
+import logging
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from facerf_cli.batch.inputs import collect_items
+from facerf_cli.cli.examples import examples_of
+from facerf_cli.cli.options import settings_of
+from facerf_cli.cli.relight import RelightJob
+from facerf_cli.errors import UsageError
+from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.light_setups import LightSources
+from facerf_cli.work.output_options import OutputOptions
+from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.relight_options import BackgroundChoice, RelightOptions, plan_relight
+
+_DEMO = Path(__file__).parents[1] / "assets/demo"
+_LIGHTS = ("-75,0", "-35,25", "50,20", "0,60")
+_TILE_PX, _LABEL_PX = 384, 24
+log = logging.getLogger(LOGGER_NAME)
+
+
+def demo(
+    context: typer.Context,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="FILE", help="Write the sheet to this .jpg or .png.")
+    ] = Path("facerf_demo.jpg"),
+) -> None:
+    """Relight a photo that facerf brings along, under four maps and four single lights, on one sheet.
+
+    It takes a quarter of a minute, and no file is overwritten. The photo is of Eileen Collins (NASA, public
+    domain).
+    """
+    if output.suffix.lower() not in (".jpg", ".png"):
+        raise UsageError(f"-o {output}: not an image; give a file that ends in .jpg or .png")
+    if output.exists():
+        raise UsageError(f"{output}: the file exists; give another name with -o")
+    settings, level = settings_of(context), log.level
+    log.setLevel(logging.WARNING if level == logging.INFO else level)  # lines with the photo's long path
+    options = RelightOptions(
+        PhotoOptions(settings),
+        background=BackgroundChoice("envmap"),
+        output=OutputOptions(formats=("png",)),
+    )
+    photo, maps = _DEMO / "astronaut.jpg", sorted(map(str, _DEMO.glob("maps/*.exr")))
+    with tempfile.TemporaryDirectory() as folder:
+        plan = plan_relight(options, LightSources(envmap=maps, light=[*_LIGHTS]), Path(folder))
+        (item,) = collect_items([str(photo)], Path(folder))
+        images = RelightJob(plan).ready(dry_run=False).process(item).outputs
+        words = [*(f"--envmap {Path(one).name}" for one in maps), *(f"--light {one}" for one in _LIGHTS)]
+        _write_sheet(output, [photo, *images], ["the photo", *words])
+    log.setLevel(level)
+    print(output)
+    log.info("a photo of yours: %s", examples_of("relight")[0])
+
+
+def _write_sheet(sheet: Path, images: Sequence[Path], words: Sequence[str]) -> None:
+    """Write images, each over its word, in three columns."""
+    import numpy as np  # --help does without it
+
+    from facerf_cli.files.read import read_image
+    from facerf_cli.files.sheets import contact_sheet, labels
+    from facerf_cli.files.write import write_display
+    from facerf_cli.image.strips import resized
+
+    tiles = [
+        np.concatenate(
+            [resized(read_image(path).pixels, _TILE_PX, _TILE_PX), labels([word], _TILE_PX, _LABEL_PX)]
+        )
+        for path, word in zip(images, words, strict=True)
+    ]
+    write_display(sheet, contact_sheet(np.stack(tiles), columns=3))
