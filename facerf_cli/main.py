@@ -23,7 +23,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from facerf_cli._version import __version__
-from facerf_cli.batch.settings import Settings, device_name
+from facerf_cli.batch.settings import Settings, device_name, torch_device
 from facerf_cli.cli.brief import Verb, Verbs
 from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
@@ -137,7 +137,12 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        print(f"facerf {__version__}")
+        from importlib.metadata import version  # --help does without it
+
+        torch = version("torch")
+        # torch itself knows its devices, and takes a second; a build without GPUs is known by its name.
+        device = "cpu" if torch.endswith("+cpu") else torch_device(Settings())
+        print(f"facerf {__version__} (torch {torch}, device {device})")
         raise typer.Exit()
 
 
@@ -198,7 +203,13 @@ def _global_options(
         ),
     ] = None,
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Print the versions of facerf and torch, and the device.",
+        ),
     ] = False,
 ) -> None:
     if verbose and quiet:
