@@ -1,7 +1,7 @@
 """The command line: verbs, global options, errors to exit codes.
 
-A verb is a function in `facerf_cli/cli/`, in the file of its name, and listed with its panel in `VERBS`; its
-file is imported when the verb runs, or its help is shown. To keep `facerf --help` fast, the modules directly
+A verb is a function in `facerf_cli/cli/`, in the file of its name, and listed with its panel in `_LINES`; its
+file is imported when the verb runs, or its help is shown. To keep help fast, the modules directly
 in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a verb is behind a deferred
 import. A test checks it.
 """
@@ -33,24 +33,38 @@ from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals
 from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 
-# The verbs in the order of a user's day, and their panels of the help, which say what one wants to do.
-VERBS = {
-    verb: panel
-    for panel, verbs in {
-        "Relight photos": ("demo", "relight", "view"),
-        "Take photos apart": ("estimate-light", "predict-olat", "segment", "fit-geometry"),
-        "Make and convert light": ("convert-light", "envmap"),
-        "Train and evaluate": (
-            "synth-stage",
-            "prepare-dataset",
-            "relight-dataset",
-            "train",
-            "evaluate",
-        ),
-        "Look after facerf": ("check", "doctor", "config", "face-model"),
-    }.items()
-    for verb in verbs
+# The help's panels, which say what one wants to do, and a line for each verb, in the order of a user's day.
+_LINES = {
+    "Relight photos": {
+        "demo": "Relight a photo that facerf brings along.",
+        "relight": "Relight photos by environment maps and single lights.",
+        "view": "Make a web page to relight a photo by dragging lights.",
+    },
+    "Take photos apart": {
+        "estimate-light": "Estimate the light of a photo.",
+        "predict-olat": "Predict a person under each single light (OLAT).",
+        "segment": "Cut people out: matte, hair, skin, clothes; landmarks.",
+        "fit-geometry": "Fit a 3D face: mesh, texture, normals.",
+    },
+    "Make and convert light": {
+        "convert-light": "Convert lights for other programs.",
+        "envmap": "Draw environment maps: skies, rooms, studios, streets.",
+    },
+    "Train and evaluate": {
+        "synth-stage": "Photograph synthetic people in a light stage.",
+        "prepare-dataset": "Prepare a light stage's capture for training.",
+        "relight-dataset": "Relight a dataset into training pairs.",
+        "train": "Train the networks.",
+        "evaluate": "Measure the paper's tables, and other methods.",
+    },
+    "Look after facerf": {
+        "check": "Check that all results of a folder are whole.",
+        "doctor": "Show what is installed, and what is missing.",
+        "config": "Show the defaults in force.",
+        "face-model": "Import, fetch, list and show face models.",
+    },
 }
+VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}
 _FILES = dict.fromkeys(("check", "doctor", "config"), "installation")  # of verbs whose file has another name
 
 # The networks that verbs use; with some options they use fewer.
@@ -125,6 +139,17 @@ class _Verbs(Verbs):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.commands = _Commands(self.commands)  # type: ignore[assignment]
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help with a line for each verb, without importing its file."""
+        commands, make = self.commands, typer.core.TyperCommand
+        self.commands = {
+            name: make(name, help=line, rich_help_panel=panel)
+            for panel, verbs in _LINES.items()
+            for name, line in verbs.items()
+        }
+        super().format_help(ctx, formatter)
+        self.commands = commands
 
 
 app = typer.Typer(
