@@ -13,8 +13,8 @@ class ReadSettings:
     """Settings of reading a capture's frames.
 
     Attributes:
-        layout: Read this layout of a capture: stage (with stage.json), extended-yale-b (that database,
-            cropped, as distributed), faceolat, or faceolat-linear (converted without colour calibration).
+        layout: Read this layout: stage (with stage.json), extended-yale-b (cropped),
+            faceolat, or faceolat-linear (without colour calibration).
         subtract_ambient: Subtract each camera's image without lights, where there is one.
         align: Shift frames in which the head has moved back to its place.
     """

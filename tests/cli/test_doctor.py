@@ -89,7 +89,7 @@ def test_extras_and_packages_that_lack_are_named_with_their_commands(lacking: se
     words = " ".join(capsys.readouterr().out.split())
     assert "torch MISSING" in words and "to add what is missing: pip install 'torch>=2.5'" in words
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert set(EXTRAS) == set(extras) - {"dev"}
+    assert set(EXTRAS) == set(extras) - {"dev", "docs"}
 
 
 def test_what_is_missing_or_broken_fails(tmp_path: Path, capsys: Said, monkeypatch: Patch) -> None:

@@ -112,7 +112,7 @@ def test_one_image_on_standard_output(
     (line,) = said.err.decode().splitlines()
     # no path that is gone
     assert re.fullmatch(
-        rf"{given}/astronaut.png under light_\S+: exposed by \S+ EV, \S+ % of the light .*", line
+        rf"{given}/astronaut.png under light_\S+: exposed by \S+ EV, with \S+ % of the light .*", line
     )
     with Image.open(io.BytesIO(said.out)) as image:
         assert image.format == "PNG" and image.size == (SIDE, SIDE)

@@ -130,10 +130,10 @@ def test_the_line_says_which_room_was_taken_and_a_stack_has_none(
 ) -> None:
     line = ["--light", "70,0", "--composite", "face"]
     assert relight(given, tmp_path / "a", *line) == 0
-    assert "3 % of the light from all around (--room)" in capsys.readouterr().err
+    assert "3 % of the light bounced by the room (--room)" in capsys.readouterr().err
     for name, more in (("default", []), ("none", ["--room", "none"]), ("wide", ["--room", "0.5"])):
         assert relight(given, tmp_path / name, "--light", "70,0", *more, photo=stack) == 0
-    assert capsys.readouterr().err.count("in a room") == 1
+    assert capsys.readouterr().err.count("bounced by the room") == 1
     images = {
         name: read_image(next((tmp_path / name).glob("*.exr"))).pixels for name in ("default", "none", "wide")
     }
