@@ -8,6 +8,7 @@ import copy
 import logging
 import math
 import shutil
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -51,6 +52,7 @@ from facerf_cli.training.settings import TrainSettings
 
 CPU = torch.device("cpu")
 _ENDLESS = 1 << 31  # steps that the sampler lists; the loop ends the run
+_PATIENCE_S = 30  # of workers that are asked to end: as long as Slurm waits
 Row = dict[str, Any]  # of log.jsonl
 log = logging.getLogger(LOGGER_NAME)
 
@@ -179,15 +181,26 @@ def drawn_batches(
         sampler=steps,
         num_workers=workers,
         pin_memory=pinned,
+        worker_init_fn=_leave_signals,
         generator=torch.Generator(),  # not the global one, which would differ in a resumed run
     )
     batches = iter(loader)
-    for step in steps:
-        begin_s = time.monotonic()
-        batch = next(batches)
-        if isinstance(batch, FacerfError):
-            raise batch
-        yield Drawn(step, batch, time.monotonic() - begin_s)
+    try:
+        for step in steps:
+            begin_s = time.monotonic()
+            batch = next(batches)
+            if isinstance(batch, FacerfError):
+                raise batch
+            yield Drawn(step, batch, time.monotonic() - begin_s)
+    finally:
+        del batches  # ends its workers, though a traceback may hold this frame
+
+
+def _leave_signals(_: int) -> None:
+    """Let a worker draw on for a while when all processes of a job are asked to end: the run ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.signal(signal.SIGTERM, lambda *_: signal.alarm(_PATIENCE_S))
 
 
 class _Draws(Dataset[Batch | FacerfError]):

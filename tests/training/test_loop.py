@@ -181,6 +181,33 @@ def test_a_killed_run_goes_on_to_the_last_digit(killed: Path, whole: Path, momen
     assert not list((killed / moment).glob(".*part*"))
 
 
+ENDED = """
+import os, signal, sys
+sys.modules["tensorboard"] = None
+from dataclasses import replace
+from facerf_cli.training.loop import train
+from tests.training.test_loop import TINY, toy_objective
+from pathlib import Path
+
+def end(row):
+    if row["step"] == 5:
+        os.killpg(0, signal.SIGTERM)
+
+train(toy_objective(), Path(sys.argv[1]), replace(TINY, workers=2), report=end)
+"""
+
+
+def test_a_signal_to_all_of_its_processes_ends_a_run_between_two_steps(tmp_path: Path, whole: Path) -> None:
+    """Slurm ends a job so, workers and all."""
+    command = [sys.executable, "-c", ENDED, str(tmp_path)]
+    here = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=here, capture_output=True, start_new_session=True)
+    assert done.returncode == 128 + signal.SIGTERM and not done.stderr, done.stderr.decode()
+    assert len(rows_of(tmp_path)) in (5, 6)
+    train(toy_objective(), tmp_path, TINY, resume=True)
+    assert_same_run(tmp_path, whole)
+
+
 def test_more_steps_go_on_from_a_finished_run(tmp_path: Path) -> None:
     train(toy_objective(), tmp_path, replace(TINY, steps=4))
     train(toy_objective(), tmp_path, replace(TINY, steps=6), resume=True)
