@@ -203,12 +203,15 @@ class PersonOrGroup:
         self,
         light: Any,
         lights: Sequence[Light],
-        pose: Pose | None,
+        given: Sequence[Any],
         shown: Iterator[Any],
         layers: Sequence[str],
     ) -> Any:
-        """The images that a caller asked for, or dicts with layers; one for a light, a list for a list."""
-        given = [pose, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
+        """The images that a caller asked for, or dicts with layers; one for a light, a list for a list.
+
+        `given` are what gradients may reach beside the lights.
+        """
+        given = [*given, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
         with _gradients(*given):
             images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
         found = images if layers else [one["image"] for one in images]
@@ -273,7 +276,8 @@ class Person(PersonOrGroup):
             room: Share of the lights' sum that a white room sends back; of maps none.
             alone: The face alone, with alpha [H, W, 4].
 
-        A light or pose of tensors gives tensors, through which gradients flow (docs/gradients.md).
+        A light or pose of tensors gives tensors, through which gradients flow (docs/gradients.md); so does
+        a texture of which a gradient is wanted.
         """
         if not alone and pose is None:
             return self._group.relight(light, background, layers, room)
@@ -281,7 +285,7 @@ class Person(PersonOrGroup):
         if any(one.own_rgb is not None for one in lights):
             raise UsageError("Light.own(): is of the whole photo; leave out pose and alone")
         _check_layers(layers, FACE_LAYERS)
-        return self._answer(light, lights, pose, self._faces(lights, pose, layers), layers)
+        return self._answer(light, lights, [pose, self._wanted], self._faces(lights, pose, layers), layers)
 
     def olat(self, lights: int | Array = 150) -> Array:
         """The person over black under each light alone [L, H, W, 3]; the images add up by a light's weights.
@@ -299,13 +303,14 @@ class Person(PersonOrGroup):
         directions = directions_of(lights)
         turn = None if pose is None else self.head.fit.turn_to(_rotation(pose))
         field = self.reflectance.field if isinstance(self.reflectance, PortraitField) else self.reflectance
-        with _gradients(lights, pose):
+        given = lights, pose, self._wanted
+        with _gradients(*given):
             if isinstance(field, Field):
                 textures = torch.cat(list(field.olats(directions, turn)))
             else:
                 each = Lights.each(directions)
                 textures = field.relit(each.directions, each.weights, turn)
-        return self._out(textures.permute(0, 2, 3, 1).contiguous(), lights, pose)
+        return self._out(textures.permute(0, 2, 3, 1).contiguous(), *given)
 
     def estimate_light(self, lights: int = 150) -> Light:
         """Estimate the light of the photo over a rig; the models of the paper's baselines have their own.
@@ -519,6 +524,12 @@ class Person(PersonOrGroup):
                 del arrays["rgb"]
                 yield {"image": image, **arrays}
 
+    @property
+    def _wanted(self) -> Tensor | None:
+        """The texture, if its gradient is wanted."""
+        texture = self.head.face.texture
+        return texture if texture.requires_grad else None
+
     @cached_property
     def _group(self) -> "Group":
         return Group([self])
@@ -557,7 +568,9 @@ class Group(PersonOrGroup):
         if not kinds <= {"portrait", "field"} and any(one.own_rgb is not None for one in lights):
             raise UsageError("Light.own(): is of the whole photo; leave out baselines")
         _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
-        return self._answer(light, lights, None, self._photos(lights, background, layers), layers)
+        if torch.is_grad_enabled() and any(person._wanted is not None for person in self.people):
+            raise UsageError("texture: has no gradient in the photo; give alone=True, or detach it")
+        return self._answer(light, lights, [], self._photos(lights, background, layers), layers)
 
     @property
     def matte(self) -> Array:

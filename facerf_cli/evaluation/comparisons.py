@@ -132,7 +132,7 @@ def reconstruct(faces: Sequence[Portrait], bench: Bench, with_light: bool = True
         view = face.by(method.models)
         explained = method.explained(view.head)
         light = explained.light
-        predictions[method.name] = method.image(view.head, explained.reflectance, light, view.fit)
+        predictions[method.name] = method.image(view.head, explained.reflectance, light)
         views.append(view)
         if truth is not None:
             estimated = brightest(light.directions.numpy(), light.weights.numpy())

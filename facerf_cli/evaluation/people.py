@@ -57,8 +57,10 @@ class Method:
             raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
         return explain(self.models, head, self.kind, self.network_alone, self.estimator)
 
-    def image(self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit) -> np.ndarray:
-        """The face alone [S, S, 3] under one light, in the pose and the crop of a fit."""
+    def image(
+        self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit | None = None
+    ) -> np.ndarray:
+        """The face alone [S, S, 3] under one light, in the pose and the crop of a fit, else in its own."""
         return Person(self.models, None, head, reflectance).image(light, Target(fit, "face")).pixels
 
     def images(
