@@ -58,8 +58,11 @@ def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
 def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     """Encode sRGB (IEC 61966-2-1), float32 of any shape, also beyond 1; negative values are mirrored."""
     size = np.abs(linear)
-    encoded = np.where(size <= 0.0031308, size * 12.92, 1.055 * size ** (1 / 2.4) - 0.055)
-    return np.copysign(encoded, linear).astype(np.float32, copy=False)
+    encoded = size ** (1 / 2.4)
+    encoded *= 1.055  # in place: twice as fast
+    encoded -= 0.055
+    np.multiply(size, 12.92, out=encoded, where=size <= 0.0031308)
+    return np.copysign(encoded, linear, out=encoded).astype(np.float32, copy=False)
 
 
 @cache
