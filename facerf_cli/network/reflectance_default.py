@@ -152,9 +152,11 @@ class DefaultReflectanceNetwork(SavedNetwork):
         """Decode `to_root` of the textures over the source's exposure [B, L, 3, T, T]; may be negative."""
         faces, count, _ = lights.shape
         maps, base, code = self._light_inputs(self._normals_used(normals_target), lights)
-        x = encoded.bottom.repeat_interleave(count, 0)
-        for up, skip in zip(reversed(self.up), reversed(encoded.skips), strict=True):
-            x = up(x, skip, maps, code, count)
+        x, coarser = encoded.bottom.repeat_interleave(count, 0), [maps]
+        for skip in encoded.skips[1:]:
+            coarser.append(resize(coarser[-1], skip.shape[-1]))
+        for up, skip, some in zip(*map(reversed, (self.up, encoded.skips, coarser)), strict=True):
+            x = up(x, skip, some, code, count)
         gain, bias = self.head(x).float().chunk(2, 1)
         both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
         gain, bias = both.chunk(2, 1)
@@ -171,7 +173,8 @@ class DefaultReflectanceNetwork(SavedNetwork):
         lights_head = lights @ head_to_camera  # row vectors: R^T w
         half = F.normalize(lights + lights.new_tensor([0.0, 0.0, 1.0]), dim=-1)
         cosine = torch.einsum("blc,bcij->blij", lights, normals)
-        gloss = torch.einsum("blc,bcij->blij", half, normals).clamp_min(0) ** 8
+        gloss = torch.einsum("blc,bcij->blij", half, normals).clamp_min(0)
+        gloss = gloss.square().square().square()  # the 8th power
         shadow = resize(self._mean_shadow(lights_head), self.settings.side)
         base = (cosine.clamp_min(0) * shadow + 1e-4).sqrt()
         maps = torch.stack([cosine, gloss, shadow, base], 2).flatten(0, 1)
@@ -184,7 +187,7 @@ class DefaultReflectanceNetwork(SavedNetwork):
     def _mean_shadow(self, lights_head: Tensor) -> Tensor:
         """Visibility of the mean face [B, L, T'', T''], interpolated between the stored directions."""
         weights = (_KERNEL_SHARPNESS * (lights_head @ self.rig.T)).softmax(-1)
-        flat = weights @ (self.mean_visibility.to(weights) / 255).flatten(1)
+        flat = weights @ self.mean_visibility.to(weights).flatten(1) / 255
         return flat.view(*flat.shape[:2], _MAP_SIDE, _MAP_SIDE)
 
 
@@ -208,15 +211,14 @@ class LitUp(nn.Module):
         Args:
             x: Features from below [B * lights, C, h, w].
             skip: What the face's features add [B, C, H, W]: those of `skip`.
-            maps: Maps of the lights [B * lights, C, h, w], of any side.
+            maps: Maps of the lights [B * lights, C, H, W].
             code: Codes of the lights [B * lights, C].
             lights: Lights of each face.
         """
-        side = skip.shape[-1]
         x = self.enter(x)
         if self.scale == 2:
             x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
-        x = x + self.light(resize(maps, side))
+        x = x + self.light(maps)
         x.view(-1, lights, *x.shape[1:]).add_(skip[:, None])
         scale, shift = self.modulation(code)[..., None, None].chunk(2, 1)
         x = F.silu(torch.addcmul(shift, x, 1 + scale))
