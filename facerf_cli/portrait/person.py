@@ -106,10 +106,10 @@ class SeenPerson:
 
     @cached_property
     def finer(self) -> ProxyMaps:
-        """The proxy as finely as the photo shows it, up to `_FINEST` pixels for each of the maps."""
+        """The proxy, not filled, as fine as the photo, up to `_FINEST` pixels for each of the maps."""
         times = min(_FINEST, math.ceil(1 / self.square.scale))
         fine = replace(self.square, size_px=self.square.size_px * times)
-        return proxy_maps(self.proxy, square_camera(self.fit, fine))
+        return proxy_maps(self.proxy, square_camera(self.fit, fine), filled=False)
 
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""

@@ -121,15 +121,15 @@ def square_camera(fit: FaceFit, square: Crop) -> Camera:
     )
 
 
-def proxy_maps(proxy: Proxy, camera: Camera) -> ProxyMaps:
-    """Render normals and positions."""
+def proxy_maps(proxy: Proxy, camera: Camera, filled: bool = True) -> ProxyMaps:
+    """Render normals and positions; not `filled`, they are 0 where the proxy does not cover the square."""
     fragments = rasterize(proxy.vertices, proxy.triangles, camera)
     seen = interpolate(torch.cat([proxy.normals, proxy.vertices], 1), proxy.triangles, fragments)
     covered = fragments.covered.float()
     if not covered.any():
         raise InputError(f"the fitted face lies outside the image; {GIVE_LANDMARKS}")
-    filled = inpaint(seen.permute(2, 0, 1), covered)
-    return ProxyMaps(F.normalize(filled[:3], dim=0), filled[3:], covered)
+    maps = inpaint(seen.permute(2, 0, 1), covered) if filled else seen.permute(2, 0, 1)
+    return ProxyMaps(F.normalize(maps[:3], dim=0), maps[3:], covered)
 
 
 class Shadows:

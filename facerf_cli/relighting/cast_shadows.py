@@ -91,7 +91,7 @@ def visibility(
     found = np.zeros(len(origins), np.float32)
     for ray in range(_RAYS):
         place = (ray * cells + cell + 0.5) / (_RAYS * cells)  # 0 to 1
-        axes = samples[(place * len(samples)).astype(int)]
+        axes = samples if len(samples) == 1 else samples[(place * len(samples)).astype(int)]
         reach_m: np.ndarray | float = _BEYOND_M
         if near:
             axes = axes - origins
