@@ -155,7 +155,8 @@ class DefaultReflectanceNetwork(SavedNetwork):
         x, coarser = encoded.bottom.repeat_interleave(count, 0), [maps]
         for skip in encoded.skips[1:]:
             coarser.append(resize(coarser[-1], skip.shape[-1]))
-        for up, skip, some in zip(*map(reversed, (self.up, encoded.skips, coarser)), strict=True):
+        every = zip(reversed(self.up), reversed(encoded.skips), reversed(coarser), strict=True)
+        for up, skip, some in every:
             x = up(x, skip, some, code, count)
         gain, bias = self.head(x).float().chunk(2, 1)
         both = resize(torch.cat([gain + base, bias], 1), encoded.source_root.shape[-1])
