@@ -233,9 +233,11 @@ def _evaluate(
     if not options.has_field:
         why = "is for the field; give --reflectance field too, or leave it out"
         refuse_given(context, _MADE_BY_FIELD, why)
+    from facerf_cli.evaluation.protocols import PROTOCOLS
     from facerf_cli.evaluation.run import Evaluation
 
-    raise typer.Exit(Evaluation.of(protocol, options, photo, inputs).run())
+    chosen = PROTOCOLS[protocol].choose(options, inputs)
+    raise typer.Exit(Evaluation(PROTOCOLS[protocol], chosen, options, photo).run())
 
 
 def _only_dataset(inputs: Sequence[str]) -> Path | None:

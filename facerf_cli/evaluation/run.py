@@ -4,7 +4,6 @@ import json
 import logging
 import shlex
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -21,7 +20,7 @@ from facerf_cli.evaluation.folders import CASES, LIGHT, MASK, SOURCE, TRUTH, wri
 from facerf_cli.evaluation.measure import Case, Comparison, Row, measure, perceptual_metric
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions, name_of
 from facerf_cli.evaluation.people import Bench
-from facerf_cli.evaluation.protocols import PROTOCOLS, Protocol
+from facerf_cli.evaluation.protocols import Protocol
 from facerf_cli.evaluation.report import (
     FORMAT,
     ItemFigures,
@@ -62,11 +61,6 @@ class Evaluation(Job):
     chosen: Chosen
     options: EvaluateOptions
     photo: PhotoOptions
-
-    @staticmethod
-    def of(name: str, options: EvaluateOptions, photo: PhotoOptions, inputs: Sequence[str]) -> "Evaluation":
-        """The run of a protocol, by its name, on what it chooses of the inputs."""
-        return Evaluation(PROTOCOLS[name], PROTOCOLS[name].choose(options, inputs), options, photo)
 
     @property
     def verb(self) -> str:

@@ -21,8 +21,8 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
 from tests.capture.yale_fixture import write_pgm, write_yale_b
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
+from tests.kinds import Patch, Said
 
-Said = pytest.CaptureFixture[str]
 FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
 
 
@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def toys(monkeypatch: pytest.MonkeyPatch) -> None:
+def toys(monkeypatch: Patch) -> None:
     """A face in every image, and methods without networks."""
     models: Any = FaceModelOnly(load_face_model("builtin"))
     monkeypatch.setattr(run, "bench_of", lambda *_: bench(Lambert("field", models=models)))
@@ -76,7 +76,7 @@ def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> Non
 
 
 def test_an_own_field_is_measured_alone_or_its_row_names_both(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """And the tables name every network that took part, with its digest."""
     mine, out, asked = tmp_path / "mine", tmp_path / "out", []

@@ -11,10 +11,11 @@ from facerf_cli.errors import InputError
 from facerf_cli.evaluation import measure as perceptual
 from facerf_cli.evaluation.measure import perceptual_metric
 from facerf_cli.network.features import Lpips
+from tests.kinds import Patch
 
 
 @pytest.fixture(autouse=True)
-def _small_and_not_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+def _small_and_not_loaded(monkeypatch: Patch) -> None:
     monkeypatch.setattr(perceptual, "Lpips", small)
     perceptual_metric.cache_clear()
 
@@ -43,7 +44,7 @@ def save(path: Path, tensors: dict[str, torch.Tensor]) -> Path:
     return path
 
 
-def known(monkeypatch: pytest.MonkeyPatch, tensors: dict[str, torch.Tensor]) -> None:
+def known(monkeypatch: Patch, tensors: dict[str, torch.Tensor]) -> None:
     """Let these heads be the published ones."""
     network = small()
     network.load_heads(tensors)
@@ -51,7 +52,7 @@ def known(monkeypatch: pytest.MonkeyPatch, tensors: dict[str, torch.Tensor]) -> 
 
 
 def test_a_metric_from_files(
-    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor], monkeypatch: Patch
 ) -> None:
     known(monkeypatch, heads)
     metric = perceptual_metric(save(tmp_path / "heads.pth", heads), vgg)
@@ -62,7 +63,7 @@ def test_a_metric_from_files(
 
 
 def test_heads_of_the_installed_package_are_found_without_importing_it(
-    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, vgg: Path, heads: dict[str, torch.Tensor], monkeypatch: Patch
 ) -> None:
     known(monkeypatch, heads)
     save(tmp_path / "site/lpips/weights/v0.1/vgg.pth", heads)
