@@ -161,7 +161,7 @@ def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
         option.lstrip("-").replace("-", "_"): parameter.name
         for parameter in _options(command)
         for option in parameter.opts
-        if parameter.name not in ("help", "version", "config")
+        if parameter.name not in ("version", "config")
     }
     values = {}
     for key, value in table.items():
@@ -171,7 +171,9 @@ def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
             continue
         if name not in names:
             of_verb = "" if verb == GLOBAL else f"{verb} ".replace(".", " ")
-            raise UsageError(f"--config {path}: [{verb}] {key}: no such option; see `facerf {of_verb}--help`")
+            raise UsageError(
+                f"--config {path}: [{verb}] {key}: no such option; see `facerf {of_verb}--help-all`"
+            )
         values[names[name]] = value
     return values
 
@@ -190,9 +192,9 @@ def config(
     """Show the defaults in force, and where each comes from: a configuration file, or facerf itself.
 
     Without VERB: those that the file of --config (or FACERF_CONFIG) sets. With VERB the others follow, each
-    after a #. The file is TOML with a table for
-    each verb ([relight], [evaluate.yale-b]) and one for global options ([global]); options have the names of
-    the command line, without dashes in front. What the command line gives comes first.
+    after a #. The file is TOML with a table for each verb ([relight], [evaluate.yale-b]) and one for global
+    options ([global]); options have the names of the command line, without dashes in front. What the command
+    line gives comes first.
     """
     root = context.find_root()
     given, source = root.default_map or {}, root.params.get("config")
@@ -210,7 +212,7 @@ def config(
     for parameter in _options(command):
         if parameter.name in given:
             print(f"{parameter.opts[0]} = {_as_text(given[parameter.name])}  ({source})")
-        elif parameter.name != "help" and not parameter.required:
+        elif not parameter.required:
             defaults.append(f"# {parameter.opts[0]} = {_as_text(parameter.get_default(context))}")
     print("\n".join(["# not set, and so by default:", *defaults]))
 
