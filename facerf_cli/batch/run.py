@@ -241,7 +241,8 @@ class BatchOptions:
     def workers(self, settings: Settings) -> Workers:
         """The workers that `--jobs`, `--ray` and `--device` ask for."""
         jobs = self.jobs or (1 if self.ray is None else 0)
-        return Workers(jobs, self.ray, int(settings.device.startswith("cuda")), self.in_a_row)
+        gpus = None if settings.device == "auto" else int(settings.device.startswith("cuda"))
+        return Workers(jobs, self.ray, gpus, self.in_a_row)
 
 
 def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: Settings) -> int:

@@ -99,6 +99,10 @@ class Capture:
         """Path of the frame of a subject seen by a camera under one light."""
         return self.folder / self.pattern.format(subject=subject, camera=camera, light=light)
 
+    def has_frame(self, subject: str, camera: str, light: str) -> bool:
+        """True where the frame of a subject exists."""
+        return self.frame_path(subject, camera, light).is_file()
+
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
         """Read a frame [H, W, 3] as under a light of rgb 1, linear Rec.709, float32.
 

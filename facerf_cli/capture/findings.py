@@ -136,7 +136,7 @@ def select_frames(
         camera: {
             light: MARKED if light in marked else MISSING
             for light in capture.light_ids
-            if not capture.frame_path(subject, camera, light).is_file()
+            if not capture.has_frame(subject, camera, light)
         }
         for camera in capture.cameras
     }

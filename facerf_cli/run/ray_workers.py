@@ -48,15 +48,17 @@ def in_ray(
     items: Sequence[T],
     address: str,
     jobs: int,
-    gpus: int,
+    gpus: int | None,
     broken: Callable[[T, Exception], R],
 ) -> Generator[tuple[int, R]]:
     """Each item's number and result as they come; `jobs` tasks at a time, 0 for as many as there are CPUs.
 
-    A task has one CPU, one thread, and `gpus` GPUs. An item whose worker is lost is tried again, twice.
+    A task has one CPU, one thread, and `gpus` GPUs; None: one where the cluster has any. An item whose worker is lost is tried again, twice.
     Raises `UsageError` where there is no Ray, or none at the address.
     """
     ray = connect(address, jobs)
+    if gpus is None:
+        gpus = int(ray.cluster_resources().get("GPU", 0) >= 1)
     _warn_of_what_lacks(ray, gpus)
     task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=0)(_task)
     shared, site = ray.put(work), _Site.here()

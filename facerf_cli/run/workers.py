@@ -176,12 +176,13 @@ class _Wire:
 class Workers:
     """The choice of workers: `jobs` processes of this machine, or tasks of Ray.
 
-    With Ray, `jobs` tasks run at a time (0: as many as Ray has processors), each with `gpus` GPUs.
+    With Ray, `jobs` tasks run at a time (0: as many as Ray has processors), each with `gpus` GPUs; None: with one
+    where the cluster has any.
     """
 
     jobs: int = 1
     ray: str | None = None  # address; None: this machine, without Ray
-    gpus: int = 0
+    gpus: int | None = 0
     in_a_row: int = 1  # neighbouring items that a process of this machine takes one after the other
 
 

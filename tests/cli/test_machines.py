@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,8 +16,9 @@ from facerf_cli.batch.run import BatchOptions, sums_up
 from facerf_cli.batch.settings import Settings, Shard, torch_device
 from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
+from facerf_cli.run import ray_workers
 from facerf_cli.run.logs import configure_logging
-from facerf_cli.run.workers import Workers
+from facerf_cli.run.workers import Workers, spread
 from tests.cli.folders import rows
 from tests.cli.toy_batch import outputs_of, run
 
@@ -131,3 +133,23 @@ def test_one_of_several_gpus_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found == ["cuda", "cuda", "cuda:1", "cpu"]
     with pytest.raises(UsageError, match=r"--device cuda:2: torch finds no such device; give .*cuda:1"):
         torch_device(Settings(device="cuda:2"))
+
+
+@pytest.mark.parametrize(
+    ("device", "there", "wanted"), [("auto", 8.0, 1), ("auto", 0.0, 0), ("cuda:1", 0.0, 1), ("cpu", 8.0, 0)]
+)
+def test_a_task_of_a_cluster_has_a_gpu_where_one_is_wanted(
+    device: str, there: float, wanted: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: dict[str, int] = {}
+
+    def remote(**needs: int) -> None:
+        asked.update(needs)
+        raise InterruptedError
+
+    ray = SimpleNamespace(cluster_resources=lambda: {"CPU": 4.0, "GPU": there}, remote=remote)
+    monkeypatch.setattr(ray_workers, "connect", lambda *_: ray)
+    workers = BatchOptions(ray="auto").workers(Settings(device=device))
+    with pytest.raises(InterruptedError):
+        list(spread(str, ["item"], workers, lambda item, error: ""))
+    assert asked["num_gpus"] == wanted

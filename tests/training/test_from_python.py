@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from facerf_cli.capture.layouts import read_capture
 from facerf_cli.dataset.dataset import read_dataset, read_stack
 from facerf_cli.dataset.from_arrays import write_dataset
 from facerf_cli.errors import InputError, UsageError
@@ -15,6 +16,7 @@ from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.files import read_metadata
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from tests import astronaut
+from tests.dataset.capture import write_capture
 
 ROOT = Path(__file__).parents[2]
 FRONT = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])
@@ -74,10 +76,31 @@ def test_arrays_that_do_not_fit(people: Any, directions: np.ndarray, said: str, 
         write_dataset(tmp_path / "out", astronaut.models(), people, directions)
 
 
+def test_cameras_of_a_stage_and_a_mirrored_rig(tmp_path: Path) -> None:
+    write_capture(tmp_path / "stage", subjects=1, lights=12)
+    stage, flip = read_capture(tmp_path / "stage"), np.diag([1.0, -1.0, -1.0])
+    cameras, images = {}, {}
+    for name, posed in stage.cameras.items():
+        (fx, fy), (cx, cy) = posed.focal_px, posed.centre_px
+        pose = flip @ np.c_[posed.rotation.numpy(), posed.translation_m.numpy()]
+        cameras[name] = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pose
+        images[name] = np.stack([stage.frame("0000", name, light) for light in range(12)])
+    models, rig = astronaut.models(), stage.directions_world
+    given: dict[str, Any] = {"split": "1/0/0", "crop_px": 64, "cameras": cameras}
+    made = write_dataset(tmp_path / "made", models, {"0000": images}, rig, **given)
+    assert made.cameras == {"0000": ("C0", "C1", "C2")}
+    with pytest.raises(InputError, match="0000/C0: rig: the lights are turned sideways"):
+        write_dataset(tmp_path / "mirrored", models, {"0000": images}, rig * [-1, 1, 1], **given)
+    with pytest.raises(UsageError, match="one array for each of these"):
+        write_dataset(tmp_path / "one", models, {"0000": images["C0"]}, rig, **given)
+
+
 def test_people_of_two_sizes_and_no_face(page: dict[str, Any], tmp_path: Path) -> None:
     models = astronaut.models()
     one = {"a": np.zeros((2, 64, 48, 3), np.float32)}
     with pytest.raises(InputError, match="a: no camera shows a face"):
+        write_dataset(tmp_path / "out", models, one, FRONT, checks=False)
+    with pytest.raises(InputError, match="a/camera: black: most frames are black"):
         write_dataset(tmp_path / "out", models, one, FRONT)
     two = {"a": page["olats"], "b": page["olats"][:, 1:]}
     with pytest.raises(InputError, match=r"b: images of shape \[511, 512, 3\], not \[512, 512, 3\]"):

@@ -90,7 +90,7 @@ def read_frames(
     size = (max(round(posed.height_px / scale), 1), max(round(posed.width_px / scale), 1))
     places, greys, measured, unread = [], [], [], {}
     for place, light in enumerate(capture.light_ids):
-        if not capture.frame_path(subject, camera, light).exists():
+        if not capture.has_frame(subject, camera, light):
             continue
         try:
             pixels = capture.frame(subject, camera, place)
@@ -159,7 +159,7 @@ def check_missing(capture: Capture, subject: str, camera: str) -> Iterator[Findi
     """Report each missing frame of a camera; a camera without frames, or extra files, as one warning."""
     paths = {light: capture.frame_path(subject, camera, light) for light in capture.light_ids}
     marked = capture.marked.get(subject, frozenset())
-    missing = [light for light, path in paths.items() if not path.is_file()]
+    missing = [light for light in paths if not capture.has_frame(subject, camera, light)]
     if len(missing) == len(paths):
         example = next(iter(paths.values()))
         words = f"has no frames ({example}, ...); copy them, or correct the pattern"
