@@ -53,7 +53,8 @@ def in_ray(
 ) -> Generator[tuple[int, R]]:
     """Each item's number and result as they come; `jobs` tasks at a time, 0 for as many as there are CPUs.
 
-    A task has one CPU, one thread, and `gpus` GPUs; None: one where the cluster has any. An item whose worker is lost is tried again, twice.
+    A task has one CPU, one thread, and `gpus` GPUs; None: one where the cluster has any. An item whose worker
+    is lost is tried again, twice.
     Raises `UsageError` where there is no Ray, or none at the address.
     """
     ray = connect(address, jobs)

@@ -176,8 +176,8 @@ class _Wire:
 class Workers:
     """The choice of workers: `jobs` processes of this machine, or tasks of Ray.
 
-    With Ray, `jobs` tasks run at a time (0: as many as Ray has processors), each with `gpus` GPUs; None: with one
-    where the cluster has any.
+    With Ray, `jobs` tasks run at a time (0: as many as Ray has processors), each with `gpus` GPUs (None: with
+    one where the cluster has any).
     """
 
     jobs: int = 1

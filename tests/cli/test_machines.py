@@ -61,8 +61,8 @@ def test_they_reach_the_options(call: Call) -> None:
     assert call() == plain
     assert call("--shard", "3/8", "--jobs", "2") == replace(plain, shard=Shard(3, 8), jobs=2)
     for line, jobs in ((["--jobs", "1"], 1), ([], 0)):
-        assert call("--ray", "local", *line).workers(Settings()) == Workers(jobs, "local", 0, 1)
-    assert call().workers(Settings()) == Workers(1, None, 0, 1)
+        assert call("--ray", "local", *line).workers(Settings()) == Workers(jobs, "local", None, 1)
+    assert call().workers(Settings()) == Workers(1, None, None, 1)
 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
