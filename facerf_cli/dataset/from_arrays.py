@@ -45,7 +45,8 @@ class _Arrays(Capture):
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
         """A frame [H, W, 3]; FrameSizeError for one of another size than the first subject's."""
         given = self.images[subject]
-        pixels = np.asarray((given if isinstance(given, np.ndarray) else given[camera])[light], np.float32)
+        images = given if isinstance(given, np.ndarray) else given[camera]
+        pixels = np.asarray(images[light], np.float32)
         posed = self.cameras[camera]
         wanted = (posed.height_px, posed.width_px, 3)
         if pixels.shape != wanted:
