@@ -40,6 +40,7 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import FaceBox, face_at
+from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
 from facerf_cli.relighting import White
@@ -103,6 +104,7 @@ def fit(
     face: FaceBox | None = None,
     head: Head | None = None,
     steady: SteadyFrame | None = None,
+    normals: Any = None,
 ) -> "Person | list[Person]":
     """Fit a person of a photo, by default that with the largest face, once for all lights.
 
@@ -122,9 +124,12 @@ def fit(
         face: The face, from `find_faces`, in place of the largest one.
         head: The head, where it was fitted before.
         steady: What the frames around it steady, of a frame of a shot (`relighting/sequence.py`).
+        normals: Normals [h, w, 3] of the photo from another method, in place of the networks' in the portrait
+            field: camera space, x to the right, y up and z toward the camera, or y down and z away; 0 where
+            there are none.
 
-    Of a list of photos landmarks and mattes are lists, too. Raises InputError where no face is found or the
-    fit fails.
+    Of a list of photos landmarks, mattes and normals are lists, too. Raises InputError where no face is
+    found, the fit fails, or normals are not those of the face.
     """
     one_of(RelightKind, "reflectance", reflectance)
     if white is not None:
@@ -138,26 +143,32 @@ def fit(
     if landmarks_px is not None and geometry == "network":
         raise UsageError("geometry: 'network' uses no landmarks; leave one out")
     if isinstance(photo, Sequence):
-        marks, mattes = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte))
+        each = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte, normals))
         people = []
-        for number, (one, points, share) in enumerate(zip(photo, marks, mattes, strict=True)):
+        for number, (one, points, share, surface) in enumerate(zip(photo, *each, strict=True)):
             if points is None:
                 (face,) = find_faces(models, one, "largest", geometry, f"photo {number}")
             choices = geometry, reflectance, network_alone, share, texture_side, white
-            people.append(fit(models, one, points, *choices, face))
+            people.append(fit(models, one, points, *choices, face, normals=surface))
         return people
     pixels = _pixels_of("photo", photo)
     if matte is not None:
         matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
         if matte.shape != pixels.shape[:2]:
             raise ValueError(f"matte has shape {list(matte.shape)}, not that of the photo")
+    if normals is not None:
+        if reflectance != "portrait" or steady is not None:
+            raise UsageError("normals: are for the portrait field of a photo alone; leave them out")
+        normals = unit_normals(linear_pixels("normals", normals).detach().numpy(), pixels.shape[:2])
     if head is None:
         if landmarks_px is not None:
             face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
         elif face is None:
             (face,) = find_faces(models, pixels, "largest", geometry)
         head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)
-    found = pipeline.reflectance_of(models, head, reflectance, network_alone, pixels, steady, matte, white)
+    found = pipeline.reflectance_of(
+        models, head, reflectance, network_alone, pixels, steady, matte, white, normals
+    )
     tensors = isinstance(photo, Tensor)
     return Person(models, pixels, head, found, matte, reflectance, network_alone, tensors, white)
 
@@ -479,6 +490,8 @@ class Person(PersonOrGroup):
             **fit_to_arrays(self.head.fit),
         }
         arrays |= {} if self.given_matte is None else {"matte": self.given_matte}
+        if isinstance(self.reflectance, PortraitField) and self.reflectance.person.normals is not None:
+            arrays["given_normals"] = self.reflectance.person.normals
         with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
 
@@ -497,6 +510,7 @@ class Person(PersonOrGroup):
             photo = linear_pixels("photo", arrays["photo"]).numpy()
             cropped = floats(arrays, "cropped", (fitted.crop.size_px, fitted.crop.size_px, 3)).numpy()
             matte = floats(arrays, "matte", photo.shape[:2]).numpy() if "matte" in arrays else None
+            normals = floats(arrays, "given_normals", photo.shape) if "given_normals" in arrays else None
             fitted.vertices_camera(models.face)
             one_of(RelightKind, "kind", kind := str(arrays["kind"]))
             alone = bool(arrays["network_alone"])
@@ -507,7 +521,8 @@ class Person(PersonOrGroup):
             said = f"{path}: not a person that facerf wrote ({error}); fit the photo again"
             raise InputError(said) from None
         head = Head(cropped, fitted, face)
-        return fit(models, photo, matte=matte, reflectance=kind, network_alone=alone, white=white, head=head)
+        choices: dict[str, Any] = {"reflectance": kind, "network_alone": alone, "white": white, "head": head}
+        return fit(models, photo, matte=matte, normals=normals, **choices)
 
     def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
         """The face alone under each light; gradients reach all that it is made of."""

@@ -31,6 +31,7 @@ from facerf_cli.network.inputs import exposure_of, resize
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.correction import Quotient
 from facerf_cli.portrait.find import Face, FaceBox, find_faces
+from facerf_cli.portrait.given_normals import maps_with_normals, with_normals
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
 from facerf_cli.relighting import White
@@ -148,6 +149,7 @@ def reflectance_of(
     steady: SteadyFrame | None = None,
     matte: np.ndarray | None = None,
     white: White | None = None,
+    normals: np.ndarray | None = None,
 ) -> Reflectance:
     """Read the reflectance of a head from its photo.
 
@@ -164,6 +166,7 @@ def reflectance_of(
         matte: The person's share [H, W] of the photo, if it is given.
         white: Under even white light skin has the photo's colours, or those of skin (`white.py`); None leaves
             the network's.
+        normals: Unit normals [H, W, 3] of the photo, which the portrait field takes for the networks'.
     """
     if kind != "field" and kind != "portrait":
         return explain(models, head, kind).reflectance
@@ -183,6 +186,8 @@ def reflectance_of(
         assert photo is not None
         people, others = models.networks.people, head.others
         person = look_at_person(people, models.face, photo, head.fit, matte=matte, others=others)
+        if normals is not None:
+            person = with_normals(person, normals)
         wide = wider_square(person.square, person.segmentation.matte)
         return [person] if wide is None else [person, person.within(wide, photo)]
 
@@ -192,7 +197,7 @@ def reflectance_of(
         source, field = of_face()
         return PortraitField.of(models.face, head, field, source, steady.portrait)
     (source, field), views = both(of_face, of_person)
-    seen = [(one, maps_of(models.networks.portrait, one)) for one in views]
+    seen = [(one, maps_with_normals(maps_of(models.networks.portrait, one), one)) for one in views]
     return PortraitField.of(models.face, head, field, source, seen)
 
 

@@ -17,6 +17,7 @@ from string import Formatter
 from typing import Any
 
 from facerf_cli.errors import UsageError
+from facerf_cli.option import flag
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 
 OF_PHOTOS = ("dir", "parent", "stem", "ext")
@@ -30,7 +31,7 @@ PHOTO_SUFFIXES = frozenset(
     | {".heif", ".avif", ".jp2", ".psd", ".tga", ".bmp", ".gif", ".dpx", ".cin", ".pgm", ".ppm"}
 )
 MAP_SUFFIXES = frozenset({".exr", ".hdr"})
-LANDMARK_SUFFIXES = frozenset({".pts", ".json"})
+_SUFFIXES_OF = {"--landmarks": (".json", ".pts"), "--normals-from": (".npy", ".exr", ".png")}
 COMPANION = "FILE|DIR|PATTERN"  # the placeholder of options that name a file for each input
 FILM_SUFFIXES = frozenset({".mp4", ".mov", ".webm", ".mkv", ".m4v", ".avi", ".mxf", ".mts", ".m2ts"})
 _STACK, _SHEET = "_olat.exr", "_olat.png"  # the contact sheet of a stack is not a photo
@@ -270,7 +271,7 @@ def files_read(given: Any, items: Sequence[Item]) -> Iterator[Path]:
             value, about = getattr(given, part.name), part.metadata.get("option")
             if about and about.metavar == COMPANION and value is not None:
                 for item in items:
-                    yield from filter(os.path.isfile, companions(item, value, f"--{part.name}"))
+                    yield from filter(os.path.isfile, companions(item, value, flag(part.name)))
             else:
                 yield from files_read(value, items)
     elif isinstance(given, (str, Path)) and os.path.isfile(given):
@@ -284,7 +285,7 @@ def companions(item: Item, given: Path, option: str) -> list[Path]:
     `mattes/{dir}/{stem}.png`. A name in Unicode's form NFC is the same in NFD.
     """
     if given.is_dir():
-        suffixes = sorted(LANDMARK_SUFFIXES if option == "--landmarks" else PHOTO_SUFFIXES)
+        suffixes = _SUFFIXES_OF.get(option, sorted(PHOTO_SUFFIXES))
         stem = item.input_path.stem  # of frames of a sequence, whose items have other names
         beside = PurePosixPath(item.name).with_name(stem).as_posix()
         names = [form for name in (item.name, beside, stem) for form in _forms(name)]

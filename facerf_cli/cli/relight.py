@@ -143,6 +143,8 @@ def relight(
         return
     batch = replace(batch, output=output, name=options.name)
     items, taken = collect_frames(inputs, shots, batch, plan.photo)
+    if taken and options.normals_from is not None:
+        raise UsageError("--normals-from: is for photos, not for frames of a shot; leave it out")
     if options.photo_of_stack is not None:
         from facerf_cli.files.olat_stack import is_olat_stack
 

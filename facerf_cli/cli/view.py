@@ -12,7 +12,13 @@ from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import UsageError
 from facerf_cli.option import IMAGE, Without, option
 from facerf_cli.relighting import White
-from facerf_cli.work.photo_options import PhotoOptions, networks_of, white_option
+from facerf_cli.work.photo_options import (
+    PhotoOptions,
+    check_companion,
+    networks_of,
+    normals_option,
+    white_option,
+)
 from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written, end_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
@@ -29,6 +35,7 @@ class MakePage(PhotoWork):
     photo: Annotated[PhotoOptions, Without("texture_side")]
     size_px: int = option(1024, metavar="PX", least=256, most=4096, panel=IMAGE, everyday=True)
     white: White = white_option()
+    normals_from: Path | None = normals_option()
     verb, endings, networks = "view", (_PAGE,), networks_of(["portrait"])
     alone_as = (_PAGE,)
 
@@ -36,7 +43,7 @@ class MakePage(PhotoWork):
         """Write the page of every chosen face."""
         from facerf_cli.work.view_photos import write_pages
 
-        return write_pages(item, self.photo, self.size_px, self.white)
+        return write_pages(item, self.photo, self.size_px, self.white, self.normals_from)
 
 
 def view(
@@ -51,6 +58,7 @@ def view(
     environment maps (.hdr and .exr can be dropped in), exposure, and the command that makes the same image.
     """
     photo, output = work.checked().photo, batch.output
+    check_companion(work.normals_from, "--normals-from")
     items = collect_items(inputs, output, PHOTO_SUFFIXES, null_separated=photo.settings.null_separated)
     many = not end_of_file(output, work.alone_as)
     if many and any(item.name == Path(_INDEX).stem for item in items):

@@ -45,7 +45,10 @@ _OVERHANG = 0.03  # of a person over the square, in sides, that needs no wider o
 
 @dataclass(frozen=True, eq=False)
 class SeenPerson:
-    """A person of a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy."""
+    """A person of a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy.
+
+    `normals` [H, W, 3] of the photo are given (`given_normals.py`), 0 where there are none.
+    """
 
     square: Crop
     image: Tensor
@@ -55,6 +58,7 @@ class SeenPerson:
     fit: FaceFit
     segmentation: Segmentation
     eyes: SeenEyes
+    normals: np.ndarray | None = None
 
     @cached_property
     def exposure(self) -> float:

@@ -1,10 +1,13 @@
 """A view of a portrait field at the photo's own resolution.
 
 Its maps are coarse. The gain is enlarged with the photo as a guide, so that the photo without its light keeps
-every pore and hair; bias, shading and highlights are smooth, but for the photo's edges (`edges.py`).
+every pore and hair; bias, shading and highlights are smooth, but for the photo's edges (`edges.py`). Given
+normals have the photo's resolution: what the maps lack of them changes the shading, to first order, over what
+it changes in the photo's own light.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,6 +32,7 @@ _GLOSS_PX = 0.8  # blur of highlights, which the network draws in pairs of pixel
 _STRAND_RANGE = (0.3, 3.0)  # of an albedo over that of the maps: strands of hair break up its highlights
 _HAIR = ("hair", "beard")
 _SOLID = ("glasses", "headwear", "garment", "hand")  # their edges are kept sharp
+_MOST_CHANGE = 2.0  # of the shading by normals that are finer than the maps
 _SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 
@@ -40,6 +44,7 @@ class ViewRows:
         grid: Places [h, w, 2] in the maps where the pixels find their like, in -1..1.
         albedo: The photo without its light [3, h, w].
         strands: What strands of hair do to highlights [h, w].
+        finer: What given normals have over those of the maps [3, h, w].
     """
 
     rows: slice
@@ -48,14 +53,19 @@ class ViewRows:
     grid: Tensor
     albedo: Tensor
     strands: Tensor
+    finer: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class ViewLight:
-    """Light from the front and from behind: shading and highlights [6, S, S] each, continued and smooth."""
+    """Light from the front and from behind: shading and highlights [6, S, S] each, continued and smooth.
+
+    Where normals are given, `slopes` [9, S, S] are those of the `PortraitLight`.
+    """
 
     front: Tensor
     rear: Tensor
+    slopes: Tensor | None = None
 
 
 class Enlarged:
@@ -79,6 +89,7 @@ class Enlarged:
         lines = self._gain_lines()
         self._albedo_maps = torch.cat([lines, self._filled(self._edges.filled(view.maps.bias[0]))])
         self._gain_maps = torch.cat([lines, self._filled(view.maps.gain[0])])
+        self._own_light = None if view.own is None else self.ready(view.own)
 
     @property
     def pixel_px(self) -> float:
@@ -102,13 +113,29 @@ class Enlarged:
         albedo, hair = self._albedo(pixels, wide), wide[_ALBEDO_MAPS:]
         finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
         strands = torch.lerp(torch.ones_like(finer), finer, hair[1])
-        return ViewRows(rows, columns, pixels, grid, albedo, strands)
+        return ViewRows(rows, columns, pixels, grid, albedo, strands, self._finer(rows, columns, grid))
+
+    @cached_property
+    def _normals(self) -> Tensor:
+        """Normals [3, S, S] of the maps, continued."""
+        return self._filled(self._edges.filled(self._view.maps.normals[0]))
+
+    def _finer(self, rows: slice, columns: slice, grid: Tensor) -> Tensor | None:
+        """Given normals less those of the maps at places [h, w, 2], [3, h, w]; 0 where none are."""
+        if self._view.person.normals is None:
+            return None
+        given = torch.from_numpy(self._view.person.normals[rows, columns]).permute(2, 0, 1)
+        return (given - _enlarged(self._normals, grid)) * given.any(0)
 
     def ready(self, light: PortraitLight) -> ViewLight:
         """Light [3, S, S] that can be read at any pixel, in the photo's units."""
         unit = self._view.exposure.repeat(2, 1, 1)
         front = unit * self._smooth(torch.cat([light.shading, light.highlights]))
-        return ViewLight(front, unit * self._smooth(light.behind) if light.behind.any() else light.behind)
+        rear = unit * self._smooth(light.behind) if light.behind.any() else light.behind
+        if light.slopes is None:
+            return ViewLight(front, rear)
+        slopes = self._filled(self._edges.filled(light.slopes))
+        return ViewLight(front, rear, self._view.exposure.repeat_interleave(3, 0) * slopes)
 
     def radiance(self, light: ViewLight, seen: ViewRows, rims: Rims | None) -> np.ndarray:
         """Radiance [h, w, 3] under light but that from behind; with `rims` that follows [h, w, 6]."""
@@ -125,6 +152,20 @@ class Enlarged:
             parts.append(lit(light.rear, seen.grid + offsets) * (brightness * seen.strands))
         return _by_pixel(torch.cat(parts))
 
+    def change_by_normals(self, light: ViewLight, seen: ViewRows) -> np.ndarray:
+        """Factor [h, w, 3] of an image by given normals, over that of the photo's own light."""
+        if seen.finer is None or self._own_light is None:
+            return np.ones((*seen.grid.shape[:2], 3), np.float32)
+
+        def change(light: ViewLight, finer: Tensor) -> Tensor:
+            assert light.slopes is not None
+            maps = _enlarged(torch.cat([light.front[:3], light.slopes]), seen.grid)
+            shading, slopes = maps[:3], maps[3:]
+            added = (slopes.view(3, 3, *finer.shape[1:]) * finer).sum(1)
+            return (1 + added / shading.clamp_min(1e-6)).clamp(1 / _MOST_CHANGE, _MOST_CHANGE)
+
+        return _by_pixel(change(light, seen.finer) / change(self._own_light, seen.finer))
+
     def flat(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
         """Luminances [h, w, 2] of the photo without its light, by the guided gain and by the coarse one."""
         wide = _enlarged(self._gain_maps, self._grid(rows, columns))
@@ -139,11 +180,12 @@ class Enlarged:
         """Maps [C, S, S] of a layer under a light [3, S, S]; see `PersonInPhoto.layer`."""
         if name == "albedo":
             return self._albedo_maps
+        if name == "normal":
+            return self._normals
         light = light.whole
         maps = {
             "specular": light.highlights.clamp_min(0) * self._view.exposure,
             "shadow": light.reached,
-            "normal": self._view.maps.normals[0],
         }[name]
         return self._filled(self._edges.filled(maps))
 
@@ -154,8 +196,10 @@ class Enlarged:
 
     def layer(self, name: str, maps: Tensor, seen: ViewRows) -> np.ndarray:
         """A layer [h, w, 3] of observed pixels, by its `layer_maps`."""
-        values = seen.albedo * self._view.exposure if name == "albedo" else _enlarged(maps, seen.grid)
-        return _by_pixel(values)
+        if name == "albedo":
+            return _by_pixel(seen.albedo * self._view.exposure)
+        values = _enlarged(maps, seen.grid)
+        return _by_pixel(values if name != "normal" or seen.finer is None else values + seen.finer)
 
     def exposure_ev(self, light: PortraitLight, own: Tensor, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the person under a light [3, S, S] and its own [3]."""

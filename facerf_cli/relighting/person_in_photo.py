@@ -234,6 +234,11 @@ class PersonInPhoto:
             part, own = person[rows, _within(common, among)], _within(common, window)
             detail = self._detail.pixels(relit.detail, seen.detail, seen.inside)[:, own]
             part += seen.face_share[:, own, None] * (detail - part)
+        if self._field.person.normals is not None:
+            used = self._used(relit.views, seen)
+            person = person * _joined(
+                [view.change_by_normals(light, one) for view, light, one in used], seen.parts
+            )
         return self._finish[0].given(person + behind if behind.size else person, seen.grain)
 
     def layer(self, name: str, relit: PersonLight, seen: PersonRows) -> dict[str, np.ndarray]:

@@ -54,13 +54,15 @@ class PortraitLight:
 
     Radiance is albedo times shading, plus highlights; both hold the photo's correction. `reached` is the
     share of the light that is not in shadow. Light from behind is kept apart, as it is drawn as rims:
-    `behind` [M, 6, S, S] are its shading and highlights.
+    `behind` [M, 6, S, S] are its shading and highlights. Where normals are given, which are finer than the
+    maps, `slopes` [M, 9, S, S] are the change of the shading of r, g, b with the normal's x, y, z.
     """
 
     shading: Tensor
     highlights: Tensor
     reached: Tensor
     behind: Tensor
+    slopes: Tensor | None = None
 
     def __getitem__(self, number: int) -> "PortraitLight":
         """One of the sums: maps [3, S, S]."""
@@ -69,7 +71,8 @@ class PortraitLight:
     @property
     def tensors(self) -> tuple[Tensor, ...]:
         """All maps."""
-        return self.shading, self.highlights, self.reached, self.behind
+        maps = (self.shading, self.highlights, self.reached, self.behind, self.slopes)
+        return tuple(one for one in maps if one is not None)
 
     @property
     def whole(self) -> "PortraitLight":
@@ -97,7 +100,7 @@ class SteadyFrame:
 class _Some(NamedTuple):
     """Some lights: maps [l, S, S] and weights [M, l, 3]; `sent` is what would arrive without shadows.
 
-    `behind` [l] is the share of each that comes from behind.
+    `behind` [l] is the share of each that comes from behind; `toward` is [l, 3, 1, 1] or [l, 3, S, S].
     """
 
     shading: Tensor
@@ -106,6 +109,7 @@ class _Some(NamedTuple):
     sent: Tensor
     weights: Tensor
     behind: Tensor
+    toward: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +120,18 @@ class PortraitView:
     maps: PortraitMaps  # of one person; albedo in the units of the network's input
     exposure: Tensor  # [3, 1, 1] radiance of the photo over that of the maps in the photo's light
     correction: Correction | None = None
+    own: PortraitLight | None = None  # the photo's light, where normals are given
 
     @staticmethod
     def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
         """The view of a person with its maps, corrected by the photo's estimated light."""
         found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
-        return found if source is None else found._corrected(source)
+        if source is None:
+            return found
+        found = found._corrected(source)
+        if person.normals is None:
+            return found
+        return replace(found, own=found.lit(source.light.directions, source.light.weights[None])[0])
 
     def _without_baked_in(self, key: Tensor, share: float) -> "PortraitView":
         """The view without shade and glare of the photo in its albedo, by the shading [S, S] of the key.
@@ -183,7 +193,7 @@ class PortraitView:
             ):
                 maps = self._shaded(lights, self.person.visibility(lights.detach()))
                 sent = torch.ones(len(lights), 1, 1)
-                yield _Some(*maps, sent, some, from_behind(lights))
+                yield _Some(*maps, sent, some, from_behind(lights), lights[..., None, None])
 
     def _near(self, points: PointLights, weights: Tensor) -> Iterator[_Some]:
         """Batches of the points of a near light with rgb weights [M, 3]."""
@@ -195,7 +205,8 @@ class PortraitView:
             visible = self.person.visibility_of_points(points.places_m[batch])
             shade, glow, arrives = self._shaded(toward[batch], visible)
             some = weights[:, None].expand(-1, len(sent), -1)
-            yield _Some(sent * shade, sent * glow, sent * arrives, sent, some, behind.expand(len(sent)))
+            share, along = behind.expand(len(sent)), toward[batch].permute(0, 3, 1, 2)
+            yield _Some(sent * shade, sent * glow, sent * arrives, sent, some, share, along)
 
     def lit(
         self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
@@ -209,8 +220,10 @@ class PortraitView:
         batches = (self._far(directions, weights), *(self._near(*light) for light in near))
         albedo = self.maps.albedo[0].mean(0)
         behind = torch.zeros(len(weights), 6, *size[1:])
-        for shade, glow, arrives, whole, some, share in itertools.chain(*batches):
+        slopes = None if self.person.normals is None else torch.zeros(len(weights), 9, *size[1:])
+        for shade, glow, arrives, whole, some, share, toward in itertools.chain(*batches):
             shades, glows = (x.expand(3, *x.shape) for x in (shade, glow))
+            factor = torch.ones(3, 1, 1, 1)
             if self.correction is not None:
                 factor, added = self.correction.terms(albedo * shade + glow)
                 shades, glows = shade * factor, torch.addcmul(added, glow, factor)
@@ -218,12 +231,16 @@ class PortraitView:
             front = some - rear
             shading = shading + torch.einsum("mlc,clij->mcij", front, shades)
             highlights = highlights + torch.einsum("mlc,clij->mcij", front, glows)
+            if slopes is not None:
+                lit = (toward * self.maps.normals).sum(1) > 0
+                change = torch.einsum("mlc,clij,lkij->mckij", front, factor * arrives * lit, toward)
+                slopes = slopes + change.flatten(1, 2)
             if share.any():
                 both = [torch.einsum("mlc,clij->mcij", rear, part) for part in (shades, glows)]
                 behind = behind + torch.cat(both, 1)
             reached = reached + torch.einsum("mlc,lij->mcij", some, arrives)
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
-        return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6), behind)
+        return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6), behind, slopes)
 
     def mirrored(self, lights: Lights, centre_m: Tensor) -> Tensor:
         """Radiance [M, N, 3, s, s] that N irises mirror under M sums of lights that reach them.

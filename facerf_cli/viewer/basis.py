@@ -175,7 +175,8 @@ def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
             maps = [*relit.tensors, relit.mirrored, relit.mouth]
             total = [one + of_all for one, of_all in zip(maps, total, strict=True)] if total else maps
     texture, *maps, mirrored, mouth = (one / len(rig) for one in total)
-    views = tuple(PortraitLight(*maps[at : at + 4]) for at in range(0, len(maps), 4))
+    count = len(maps) // len(field.views)
+    views = tuple(PortraitLight(*maps[at : at + count]) for at in range(0, len(maps), count))
     mean = Relit(texture, views=views, mirrored=mirrored, mouth=mouth)
     add(replace(mean, mirrored=torch.zeros_like(mirrored)))  # eyes, which do not mirror a room
     shown = people.light_layer([mean])
@@ -193,7 +194,9 @@ def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) ->
     def shrunk(view: PortraitView) -> PortraitView:
         square = view.person.square.of_scaled(scale)
         eyes = view.person.eyes.scaled(scale)
-        person = replace(view.person, square=square, segmentation=segmentation, eyes=eyes)
+        normals = view.person.normals
+        normals = None if normals is None else resized(normals, height, width)
+        person = replace(view.person, square=square, segmentation=segmentation, eyes=eyes, normals=normals)
         return replace(view, person=person)
 
     return replace(field, views=tuple(map(shrunk, field.views)))

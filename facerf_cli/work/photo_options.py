@@ -51,6 +51,17 @@ def white_option() -> Any:
     )
 
 
+def normals_option() -> Any:
+    """Make the field of `--normals-from`."""
+    return option(
+        None,
+        "Relight by normals of another method (.npy, .exr, .png).",
+        metavar=COMPANION,
+        shown_default=False,
+        panel=METHOD,
+    )
+
+
 @dataclass(frozen=True)
 class FieldOptions:
     """The making of the field of a photo."""

@@ -34,6 +34,7 @@ from facerf_cli.portrait.confidence import (
     touched_sides,
 )
 from facerf_cli.portrait.find import Face, FaceBox, face_at
+from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
@@ -304,6 +305,26 @@ def read_matte(item: Item, given: Path, size_px: tuple[int, ...], in_shot: bool 
     if not in_shot and not matte.any():
         log.warning("%s: the matte is black, and leaves out all of %s", path, item.input_path)
     return matte
+
+
+def read_normals(item: Item, given: Path | None, size_px: tuple[int, ...]) -> np.ndarray | None:
+    """A photo's normals [H, W, 3] of `--normals-from`, at its size, 0 where none are; None if not given.
+
+    An EXR and NumPy's file hold vectors; in other images 0..1 stand for -1..1.
+    """
+    if given is None:
+        return None
+    path = companion(item, given, "--normals-from")
+    with beside(size_px, images=1):
+        if path.suffix.lower() == ".npy":
+            from facerf_cli.evaluation.folders import read_array
+
+            normals = read_array(path)
+        else:
+            normals = read_image(path, "linear", non_finite="zero", with_alpha=False).pixels
+            normals = normals if path.suffix.lower() == ".exr" else 2 * normals - 1
+    with naming(path):
+        return unit_normals(normals, (size_px[0], size_px[1]))
 
 
 def person_matte(

@@ -40,6 +40,7 @@ from facerf_cli.work.photos import (
     person_matte,
     provenance,
     read_matte,
+    read_normals,
     read_photo,
     rotation_of,
 )
@@ -93,6 +94,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
         matte = person_matte(item, image.pixels, plan.photo)
         faces = find_people(item, image, plan.photo, to_fit=True)
     photo, background = image.pixels, options.background.kind
+    normals = read_normals(item, options.normals_from, photo.shape[:2])
     check_faces(item, faces[-1].number, plan)
     target = Target(composite="face")
     if in_photo:
@@ -119,6 +121,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
                     face=face.found,
                     head=known and known.head,
                     steady=known and known.steady,
+                    normals=normals,
                 )
             fitted.append((_described(face, person, matte, options), person))
         people = [face for face, _ in fitted]

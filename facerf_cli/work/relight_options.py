@@ -39,6 +39,7 @@ from facerf_cli.work.photo_options import (
     check_companion,
     for_other_photos,
     network_alone_option,
+    normals_option,
     parse_pose,
     white_option,
 )
@@ -191,6 +192,7 @@ class RelightOptions:
     identity: bool = option(False, in_recipe=False, panel=METHOD)
     network_alone: bool = network_alone_option()
     white: White = white_option()
+    normals_from: Path | None = normals_option()
     fps: Fraction | None = option(
         None, metavar="RATE", in_recipe=False, shown_default="24", parse=film_rate, panel=IMAGE
     )
@@ -319,6 +321,11 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
         raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
     check_companion(options.matte, "--matte")
     check_companion(options.photo_of_stack, "--photo")
+    check_companion(options.normals_from, "--normals-from")
+    if options.normals_from is not None and (alone or options.reflectance != "portrait"):
+        raise UsageError(
+            "--normals-from: is for the portrait field; leave out --reflectance, --pose and --composite face"
+        )
     of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
     how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
     setups = collect_setups(sources, output, photo.settings.seed, how, options.background.path)

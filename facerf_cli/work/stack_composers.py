@@ -229,6 +229,8 @@ def _check_stack(item: Item, plan: RelightPlan) -> None:
         wrong = "a stack holds the white with which it was predicted; give its photo"
     elif options.network_alone:
         wrong = "a stack holds the field as predicted; give its photo"
+    elif options.normals_from is not None:
+        wrong = "a stack holds the normals with which it was predicted; give its photo"
     elif plan.photo.has_given_person:
         wrong = "a stack holds its person's matte; give its photo"
     elif options.photo_of_stack is None and any(setup.has_own for setup in plan.setups):

@@ -36,6 +36,7 @@ from facerf_cli.work.photos import (
     load_models_once,
     naming,
     provenance,
+    read_normals,
     read_photo,
     rotation_of,
     write_each,
@@ -70,7 +71,9 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             {"exr": write_olat_stack, "npz": write_olat_npz}[work.format](stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
-            write_page(page, item, work.photo, image.pixels, face, work.size_px, work.white)
+            write_page(
+                page, item, work.photo, image.pixels, face, work.size_px, work.white, work.normals_from
+            )
         return face.described()
 
     tags, facts = write_each(item, image, work.photo, write)
@@ -120,10 +123,10 @@ def _of_person(
     alpha, matte = (
         None if one is None else resized(one, *photo.shape[:2]) for one in (image.alpha, face.matte)
     )
+    normals = read_normals(item, work.normals_from, photo.shape[:2])
+    choices: dict[str, Any] = {"network_alone": work.network_alone, "white": work.white}
     with naming(item.input_path):
-        person = fit(
-            models, photo, matte=matte, network_alone=work.network_alone, white=work.white, head=head
-        )
+        person = fit(models, photo, matte=matte, head=head, normals=normals, **choices)
     subject = person.composed(Target(alpha=alpha, background="none"))
 
     def olats() -> Iterator[Tensor]:

@@ -21,8 +21,10 @@ from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.photo_options import (
     PhotoOptions,
+    check_companion,
     network_alone_option,
     networks_of,
+    normals_option,
     parse_pose,
     white_option,
 )
@@ -183,6 +185,7 @@ class PredictOlat(PhotoWork):
     size_px: int = option(1024, metavar="PX", least=64, most=16384, panel=IMAGE)
     network_alone: bool = network_alone_option()
     white: White = white_option()
+    normals_from: Path | None = normals_option()
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
     format: Literal["exr", "npz", "relight"] = option("exr", panel=IMAGE)
     page: bool = option(False, panel=IMAGE)
@@ -217,7 +220,11 @@ class PredictOlat(PhotoWork):
             raise UsageError(
                 "--page: shows the photo's own pose and light; give neither --pose nor --network-alone"
             )
-        return replace(self, frame=self.frame or ("photo" if self.pose is None else "face"))
+        check_companion(self.normals_from, "--normals-from")
+        work = replace(self, frame=self.frame or ("photo" if self.pose is None else "face"))
+        if self.normals_from is not None and work.frame != "photo":
+            raise UsageError("--normals-from: is for the whole person; use --frame photo with it")
+        return work
 
 
 LARGEST_MAP_PX, MOST_ORDER = 8192, 20

@@ -11,6 +11,7 @@ from urllib.parse import quote
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
+from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head, shrunk_photo
 from facerf_cli.files.atomic import atomic_path
@@ -31,6 +32,7 @@ from facerf_cli.work.photos import (
     face_model,
     load_models_once,
     naming,
+    read_normals,
     read_photo,
     write_each,
 )
@@ -43,16 +45,19 @@ _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elev
 
 
 def write_pages(
-    item: Item, options: PhotoOptions, size_px: int, white: White
+    item: Item, options: PhotoOptions, size_px: int, white: White, normals_from: Path | None = None
 ) -> tuple[list[str], dict[str, Any]]:
     """Write a page for each chosen face of a photo, or for a stack; their tags, and facts for the report."""
     if is_olat_stack(item.input_path):
+        if normals_from is not None:
+            raise InputError(f"{item.input_path}: a stack holds its normals; leave out --normals-from")
         tag = options.first_tag
         return [tag], write_page_of_stack(item.output(tag + ".html"), item, options, size_px)
     image = read_photo(item, options)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        write_page(item.output(face.tag + ".html"), item, options, image.pixels, face, size_px, white)
+        path = item.output(face.tag + ".html")
+        write_page(path, item, options, image.pixels, face, size_px, white, normals_from)
         return face.described()
 
     return write_each(item, image, options, write)
@@ -66,15 +71,18 @@ def write_page(
     face: FittedFace,
     size_px: int,
     white: White,
+    normals_from: Path | None = None,
 ) -> None:
     """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
     photo, head = shrunk_photo(photo, face.head, size_px)
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
+    normals = read_normals(item, normals_from, photo.shape[:2])
     with naming(item.input_path):
-        basis, plate = of_photo(load_models_once(options), photo, head, matte, white)
+        basis, plate = of_photo(load_models_once(options), photo, head, matte, white, normals)
     title = item.input_path.name + face.tag.replace("_", " ")
-    whites = ["--white", white] if white != "photo" else []
-    words = [str(item.input_path), *photo_words(options, face.number), *whites]
+    more = ["--white", white] if white != "photo" else []
+    more += [] if normals_from is None else ["--normals-from", str(normals_from)]
+    words = [str(item.input_path), *photo_words(options, face.number), *more]
     _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte))
 
 
@@ -84,9 +92,10 @@ def of_photo(
     head: Head,
     matte: np.ndarray | None = None,
     white: White | None = None,
+    normals: np.ndarray | None = None,
 ) -> tuple[Basis, Plate]:
-    """The basis of a photo's person, whose matte [H, W] may be given, and what a page shows around it."""
-    person = fit(models, photo, matte=matte, white=white, head=head)
+    """The basis of a photo's person, and what a page shows around it; matte and normals may be given."""
+    person = fit(models, photo, matte=matte, white=white, head=head, normals=normals)
     people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
     return basis, Plate(photo, people.matte, photo - people.own_layer(), person.even_brightness)
