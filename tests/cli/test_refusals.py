@@ -194,7 +194,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--split half": "--split",
         "--crop 97": "--crop",
         "--crop 0": "--crop",
-        "--layout multipie": "there is extended-yale-b, stage",
+        "--layout multipie": "there is extended-yale-b, faceolat, faceolat-linear, stage",
         "--checks only --shard 1/2": "--shard: --checks only checks all subjects; omit it",
         "--pattern x": "--pattern is for --describe",
     },
