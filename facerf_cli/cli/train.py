@@ -19,6 +19,7 @@ _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
     "appearance_features": ("joint",),
     "photos": ("joint",),
+    "synthhuman": ("parsing",),
     "light_features": ("joint", "reflectance"),
     "form": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),

@@ -19,6 +19,7 @@ from facerf_cli.dataset.crops import mean_translation_m, open_photos, require_cr
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
+from facerf_cli.dataset.synthhuman import SynthHuman
 from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
@@ -209,7 +210,8 @@ class _TrainedStage:
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
         objective = ParsingObjectiveSettings(held_out_people=self.make.sizes.held_out_heads)
-        return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective)
+        images = SynthHuman(options.synthhuman) if options.synthhuman else None
+        return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective, images)
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""

@@ -28,6 +28,7 @@ from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Patch, Said
 from tests.network.test_own_forms import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset
+from tests.training.synthhuman_folder import write_synthhuman
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 
@@ -256,9 +257,11 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(
         }
         save_file(person_of, bank / "portraits" / f"{person:05}.safetensors")
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "parsing", "--preset", "tiny", "--heads", "5"]
-    assert main([*line, "--bank", str(bank), "--steps", "1", "--workers", "0"]) == 0
+    images = ["--synthhuman", str(write_synthhuman(tmp_path, 2))]
+    assert main([*line, *images, "--bank", str(bank), "--steps", "5", "--workers", "0"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["parsing"] and "CC0" in metadata["licence"]
+    assert "SynthHuman: CDLA-Permissive-2.0" in metadata["licence"]
     assert metadata["provenance"]["heads"].startswith("synthetic people drawn from builtin")
     require_served(tmp_path, "parsing", shipped)
 
