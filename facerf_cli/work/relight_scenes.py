@@ -68,10 +68,11 @@ class LitScene:
         people = zip(self.faces, self.evens, strict=True)
         return [self.lights_of(as_lit(self.setups, *one)) for one in people]
 
-    @cached_property
+    @property
     def ends(self) -> list[int]:
         """The end of each setup among the sums of `lights`, after a first 0."""
-        return list(accumulate((1 + len(with_room(setup).names) for setup in self.setups), initial=0))
+        alone = (len(with_room(setup).names) if setup.names else 0 for setup in self.setups)
+        return list(accumulate((1 + lights for lights in alone), initial=0))
 
     @property
     def parts(self) -> list[slice]:
