@@ -90,6 +90,7 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
     assert row["certainty"] == "sure" and set(row["touches_frame"]) == {"bottom"}
 
 
+@pytest.mark.slow
 def test_a_group_is_relit_as_on_the_command_line(tmp_path: Path) -> None:
     """Two people: the same calls give the same image, its alpha and its layers."""
     one = astronaut.photo()

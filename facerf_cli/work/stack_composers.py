@@ -235,6 +235,8 @@ def _check_stack(item: Item, plan: RelightPlan) -> None:
         wrong = "a stack holds its person's matte; give its photo"
     elif options.photo_of_stack is None and any(setup.has_own for setup in plan.setups):
         wrong = "the photo's own light (own) needs its photo; give that with --photo"
+    elif options.photo_of_stack is None and options.background.kind not in ("photo", "none"):
+        wrong = "a stack shows its person alone; for --background give its photo with --photo"
     elif any(light.even for setup in plan.setups for light in setup.by_photo):
         wrong = "even light (even) has the brightness of a photo; give that, or from=around"
     elif any(light.at_m is not None for setup in plan.setups for light in setup.lights):

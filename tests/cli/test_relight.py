@@ -358,6 +358,8 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
     assert right > 1.5 * left
     assert relight(given, tmp_path / "a", *near, photo=stack) == 1
     assert "a stack holds far lights" in capsys.readouterr().err
+    assert relight(given, tmp_path / "a", "--light", "30,0", "--background", "0,0,0", photo=stack) == 1
+    assert "a stack shows its person alone; for --background give its photo" in capsys.readouterr().err
     assert relight(given, tmp_path / "b", "--light", "from=30,0;size_deg=20", photo=stack) == 0
 
 

@@ -241,6 +241,7 @@ def require_served(tmp_path: Path, name: str, shipped: tuple[list[str], np.ndarr
     assert all(served["file"] == SHIPPED[other].name for other, served in row["networks"].items())
 
 
+@pytest.mark.slow
 def test_the_parsing_network_trains_on_a_bank_of_portraits(
     tmp_path: Path, shipped: tuple[list[str], np.ndarray]
 ) -> None:

@@ -50,6 +50,7 @@ def drawn(folder: Path, seed: int) -> PortraitSample:
     return stored.draw([0], 3, torch.Generator().manual_seed(seed))
 
 
+@pytest.mark.slow
 def test_images_are_linear_in_light_and_looks_differ_in_albedo(view: StoredView) -> None:
     """But for the highlights of weak lights, of which only the brightest twelve are kept."""
     single = torch.eye(14)[:, :, None].expand(-1, -1, 3)
