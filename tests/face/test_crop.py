@@ -113,7 +113,7 @@ def test_tensors_and_crops_of_another_world_are_refused():
     with pytest.raises(ValueError, match=r"\[H, W, C\]"):
         Crop(0, 0, 8, 8).apply(torch.zeros(8, 8).numpy())
     # Points far outside the photo once took 23 GB: the weights grow with the crop's side.
-    with pytest.raises(InputError, match="pixels wide and the photo 12"):
+    with pytest.raises(InputError, match="pixels wide, and the photo 12"):
         Crop(0, 0, 1e8, 8).apply(np.ones((12, 9, 3), np.float32))
 
 
