@@ -19,7 +19,7 @@ _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
     "appearance_features": ("joint",),
     "photos": ("joint",),
-    "synthhuman": ("parsing",),
+    "synthhuman": _PEOPLE_STAGES,
     "light_features": ("joint", "reflectance"),
     "form": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),

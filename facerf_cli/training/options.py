@@ -50,7 +50,8 @@ class TrainOptions:
         texture_size: Unwrap a dataset to textures of this side; the stages joint and appearance-features
             read its crops at this side, too.
         photos: Train on photos of faces, too, in a fifth of the batches of the stage joint.
-        synthhuman: Train on images of SynthHuman, too, in a quarter of the samples of the stage parsing.
+        synthhuman: Train on images of SynthHuman, too: by their alpha in the stage parsing, their normals in
+            the stage portrait.
         heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
         fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint, the one whose
             coefficients the Geometry Network learns.

@@ -3,7 +3,7 @@
 Errors of single lights, which sums of lights follow from, and of their contrast; of the photo under its
 light, so that it comes back; and of normals and albedo, which make training on synthetic people hold for
 others (Yeh et al., *Learning to relight portrait images via a virtual light stage and synthetic-to-real
-adaptation*, 2022).
+adaptation*, 2022). Some batches are people of SynthHuman, of whom the normals alone are known.
 """
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.dataset.synthhuman import LICENCE, SeenNormals, SynthHumanNormals
 from facerf_cli.network.inputs import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
@@ -45,6 +46,7 @@ class PortraitObjectiveSettings:
     normals: float = 0.5
     contrast: float = 0.5
     scale: float = 0.05
+    synthhuman: float = 0.2  # share of batches, if its people are given
     targets: int = 12
     held_out_people: int = 16
     held_out_draws: int = 3
@@ -60,14 +62,24 @@ class PortraitObjective(Objective):
         portraits: PortraitSource,
         network: PortraitNetwork | None = None,
         settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
+        synthhuman: SynthHumanNormals | None = None,
     ) -> None:
-        super().__init__({"portrait": network or PortraitNetwork()}, portraits.provenance)
-        self.portraits = portraits
+        provenance = portraits.provenance
+        if synthhuman:
+            provenance = provenance | {"licence": f"{provenance['licence']}; {LICENCE}"}
+        super().__init__({"portrait": network or PortraitNetwork()}, provenance)
+        self.portraits, self.synthhuman = portraits, synthhuman
         self.settings = settings
         self.people, self.held_out = portraits.people(settings.held_out_people)
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
-        """Draw `count` samples of random people, all in squares of one side (see `Objective.draw`)."""
+        """Draw `count` samples of random people, all in squares of one side (see `Objective.draw`).
+
+        On `synthhuman` of the steps they are people of SynthHuman.
+        """
+        chance = float(torch.rand((), generator=seeded(step, 1)))
+        if self.synthhuman is not None and chance < self.settings.synthhuman:
+            return concatenate([self.synthhuman.draw(generator_of(i)) for i in range(count)])
         sides = self.portraits.sides_px(self.people)
         side = sides[int(torch.randint(len(sides), (), generator=seeded(step)))]
         targets = self.settings.targets
@@ -79,9 +91,12 @@ class PortraitObjective(Objective):
         """Draw a sample of a held-out person."""
         return self.portraits.draw([person], self.settings.targets, generator)
 
-    def forward(self, batch: PortraitSample) -> dict[str, Tensor]:
+    def forward(self, batch: PortraitSample | SeenNormals) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over samples."""
         maps, settings = self._maps(batch), self.settings
+        if isinstance(batch, SeenNormals):
+            share = batch.alpha / batch.alpha.mean((1, 2, 3), keepdim=True).clamp_min(1e-3)
+            return {"normals": settings.normals * (_turned(maps, batch.normals) * share).mean()}
         found, own = maps.olats(batch.lights, _larger(batch.visible, batch.inputs.image)), _own(maps, batch)
         scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1])
         alpha = (1 - batch.shares[:, :1])[:, None]
@@ -93,7 +108,7 @@ class PortraitObjective(Objective):
         own_off = (_root(own * scale[:, 0]) - _root(_smaller(batch.own))) * _smaller(small[0]) / small[1]
         albedo_off = (_root(maps.albedo * scale[:, 0]) - _root(batch.albedo)) * small[0] / small[1]
         labelled = batch.labelled.view(-1, 1, 1, 1)
-        turned = 1 - (maps.normals * F.normalize(batch.true_normals, dim=1)).sum(1, keepdim=True)
+        turned = _turned(maps, batch.true_normals)
         return {
             "lights": off.abs().mean(),
             "edges": settings.edges * edges,
@@ -104,7 +119,7 @@ class PortraitObjective(Objective):
             "scale": settings.scale * scale.log().abs().mean(),
         }
 
-    def _maps(self, batch: PortraitSample) -> PortraitMaps:
+    def _maps(self, batch: PortraitSample | SeenNormals) -> PortraitMaps:
         with self.mixed_precision():
             maps: PortraitMaps = self.network(batch.inputs)
         return maps
@@ -129,6 +144,11 @@ class PortraitObjective(Objective):
         if "neck_shoulders" in metrics:  # in wider squares arms count as neck
             metrics["neck"] = metrics["neck_shoulders"]
         return Validation(metrics, tiled(rows))
+
+
+def _turned(maps: PortraitMaps, truth: Tensor) -> Tensor:
+    """1 less the cosine [B, 1, S, S] to true normals [B, 3, S, S]."""
+    return 1 - (maps.normals * F.normalize(truth, dim=1)).sum(1, keepdim=True)
 
 
 def _measured(found: Tensor, sample: PortraitSample) -> Tensor:

@@ -19,7 +19,7 @@ from facerf_cli.dataset.crops import mean_translation_m, open_photos, require_cr
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
-from facerf_cli.dataset.synthhuman import SynthHuman
+from facerf_cli.dataset.synthhuman import SynthHuman, SynthHumanNormals
 from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
@@ -225,7 +225,11 @@ class _TrainedStage:
             source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
         settings = PortraitObjectiveSettings(held_out_people=self._held_out_of_few)
         settings = replace(settings, targets=2) if few else settings
-        return self._kind(PortraitObjective)(source, network, settings)
+        seen = None
+        if options.synthhuman:
+            images, cache = SynthHuman(options.synthhuman), self._bank / "synthhuman"
+            seen = SynthHumanNormals(images, cache, self.networks, options.jobs)
+        return self._kind(PortraitObjective)(source, network, settings, seen)
 
     def _stored_transport(self) -> StoredTransport:
         """Synthetic people; those that are missing in the bank are baked and looked at first."""

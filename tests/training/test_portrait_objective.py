@@ -2,18 +2,26 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from facerf_cli.dataset.synthhuman import LICENCE, SeenNormals, SynthHuman, SynthHumanNormals
+from facerf_cli.errors import InputError
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
+from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork, PortraitSettings
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSettings
+from tests import astronaut
+from tests.kinds import Patch
+from tests.training.synthhuman_folder import write_seen_synthhuman
 
 SIDE, RIG = 16, rig_directions(12)
 SETTINGS = PortraitObjectiveSettings(held_out_people=1, held_out_draws=1, targets=2)
@@ -185,3 +193,39 @@ def test_a_batch_has_squares_of_one_side() -> None:
         (side,) = set(stage.portraits.asked)
         asked.append(side)
     assert set(asked) == {SIDE, 2 * SIDE}
+
+
+def test_people_of_synthhuman_teach_normals_alone(tmp_path: Path, monkeypatch: Patch) -> None:
+    """Five steps, some of them on a made-up folder, whose y is down and z away from the camera."""
+    monkeypatch.setattr("facerf_cli.dataset.synthhuman.in_shards", lambda work, items, jobs: work(items))
+    own = astronaut.person().normals
+    images = SynthHuman(write_seen_synthhuman(tmp_path, own * np.array([1, -1, -1], np.float32)))
+    people = SynthHumanNormals(images, tmp_path / "cache", SHIPPED_NETWORKS, 1)
+    samples = [people.draw(torch.Generator().manual_seed(seed)) for seed in range(8)]
+    for sample in samples:  # some are mirrored
+        shown = sample.alpha[:, 0] > 0.9
+        agreed = (sample.inputs.normals[:, 0] * sample.normals[:, 0])[shown]
+        assert shown.float().mean() > 0.1 and agreed.mean() > 0.1
+    assert len({round(float(one.alpha[..., :80].sum())) for one in samples}) == 2
+    settings = replace(SETTINGS, synthhuman=0.5)
+    network = PortraitNetwork(PortraitSettings((4, 4, 4, 4, 4)))
+    stage = PortraitObjective(Portraits(), network, settings, people)
+    assert stage.provenance["licence"] == f"MIT; {LICENCE}"
+    drawn = [stage.draw(2, lambda i: torch.Generator().manual_seed(i), step) for step in range(20)]
+    batches = [batch for batch in drawn if isinstance(batch, SeenNormals)]
+    assert 5 <= len(batches) <= 15
+    optimizer = torch.optim.Adam(stage.parameters(), 3e-3)
+    losses = []
+    for batch in batches[:5]:
+        (loss,) = stage(batch).values()
+        optimizer.zero_grad()
+        loss.backward()
+        assert all(part.grad is not None for part in stage.parameters())
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < losses[0]
+    answer = cast(PortraitNetwork, Answer(perfect()._replace(normals=sample.normals)))
+    assert float(PortraitObjective(Portraits(), answer, settings, people)(sample)["normals"]) < 1e-3
+    write_seen_synthhuman(tmp_path, np.zeros_like(own))
+    with pytest.raises(InputError, match="no image shows a face that its normals agree with"):
+        SynthHumanNormals(images, tmp_path / "other", SHIPPED_NETWORKS, 1)
