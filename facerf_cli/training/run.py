@@ -205,17 +205,18 @@ class _TrainedStage:
     def parsing(self) -> Objective:
         """The Parsing Network on photos of synthetic people, which are taken first where they are missing."""
         options, folder, tiny = self.options, self._bank / "portraits", self.options.preset == "tiny"
+        images = SynthHuman(options.synthhuman) if options.synthhuman else None  # before hours of baking
         people, models, provenance = self._whole_people(self.make.sizes.held_out_heads)
         settings = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
         objective = ParsingObjectiveSettings(held_out_people=self.make.sizes.held_out_heads)
-        images = SynthHuman(options.synthhuman) if options.synthhuman else None
         return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective, images)
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""
         options, few = self.options, self.options.preset == "tiny"
+        images = SynthHuman(options.synthhuman) if options.synthhuman else None
         source: PortraitSource
         network = self.make.network("portrait")
         if options.dataset:
@@ -225,10 +226,7 @@ class _TrainedStage:
             source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
         settings = PortraitObjectiveSettings(held_out_people=self._held_out_of_few)
         settings = replace(settings, targets=2) if few else settings
-        seen = None
-        if options.synthhuman:
-            images, cache = SynthHuman(options.synthhuman), self._bank / "synthhuman"
-            seen = SynthHumanNormals(images, cache, self.networks, options.jobs)
+        seen = images and SynthHumanNormals(images, self._bank / "synthhuman", self.networks, options.jobs)
         return self._kind(PortraitObjective)(source, network, settings, seen)
 
     def _stored_transport(self) -> StoredTransport:
