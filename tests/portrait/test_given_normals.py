@@ -17,6 +17,7 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.main import main
 from facerf_cli.person import Person, fit
 from facerf_cli.portrait.given_normals import unit_normals
+from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.work.photos import read_normals
 from tests import astronaut
@@ -96,6 +97,15 @@ def test_bumps_are_lit_by_their_side_and_the_photos_own_light_gives_the_photo_ba
     own, photo = person.estimate_light(24), astronaut.photo()
     errors = [((one.relight(own) - photo)[inside] ** 2).mean() for one in (person, smooth)]
     assert errors[0] < 1.3 * errors[1]
+
+
+def test_bumps_change_nothing_in_the_photos_own_light(person: Person) -> None:
+    view, photo = field_of(person).views[0], astronaut.photo()
+    assert view.own is not None
+    enlarged, rows, columns = Enlarged(view, photo.shape[:2], 0.0), slice(100, 140), slice(200, 260)
+    seen = enlarged.observe(photo[rows, columns], rows, columns)
+    assert seen.finer is not None and seen.finer.abs().max() > 0.2
+    np.testing.assert_allclose(enlarged.change_by_normals(enlarged.ready(view.own), seen), 1, atol=1e-5)
 
 
 def test_a_person_with_normals_is_saved_and_loaded(person: Person, tmp_path: Path) -> None:
