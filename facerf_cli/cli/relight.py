@@ -98,11 +98,11 @@ def relight(
 ) -> None:
     """Relight photos, or OLAT stacks, under environment maps and single lights.
 
-    Each image is a scene-linear EXR with the matte as layer person.A, and a PNG at --exposure.
-    A background that keeps its look has its own values in the EXR at --exposure 0, else those over 2^EV.
-    A film, or images with --sequence, is one shot between cuts: one identity, and one light by which the
-    field is corrected; frames steady each other's pose, expression and matte. -o FILE.mp4 or
-    FILE.mov joins frames to a film, with the sound of the film that they come from.
+    Each image is a scene-linear EXR with the person's matte as layer person.A, and a PNG that is exposed to
+    be seen; -o FILE is one image alone. A background that keeps its look has its own values in the EXR at
+    --exposure 0, else those over 2^EV. A film, or images with --sequence, is one shot between cuts: one
+    identity, in one light; frames steady each other's pose, expression and matte. -o FILE.mp4 or FILE.mov
+    joins frames to a film, with the sound of the film that they come from.
 
     -o - writes one image to standard output. A stack is relit by its own lights: --lights does not apply, and
     --light between them is a sum of the three around it.
@@ -141,7 +141,7 @@ def relight(
     if output == STDOUT:
         _write_to_stdout(inputs, plan)
         return
-    batch = replace(batch, output=output, name=options.name)
+    batch = replace(batch, output=output, name=None if file else options.name)
     items, taken = collect_frames(inputs, shots, batch, plan.photo)
     if taken and options.normals_from is not None:
         raise UsageError("--normals-from: is for photos, not for frames of a shot; leave it out")

@@ -19,7 +19,7 @@ Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's
 # and how far above the box's centre the crop's lies.
 _PER_BOX, _ABOVE_BOX = 1.48, 0.02
 MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead
-GIVE_LANDMARKS = "give its landmarks (--landmarks FILE of verbs on photos; in Python landmarks_px)"
+GIVE_LANDMARKS = "give its landmarks (--landmarks FILE)"
 _LARGEST = 16  # sides of a crop over the photo's longer side; more would resample beyond all bounds
 _SMALLEST_FACE_PX = 4.0  # landmarks within fewer pixels cannot be a face
 _EYES, _MOUTH = slice(36, 48), slice(48, 68)

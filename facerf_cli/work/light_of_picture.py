@@ -32,7 +32,7 @@ def guessed_light(item: Item, image: LinearImage, fov_deg: float | None) -> Pict
     guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
     log.warning(
         "%s: has no face to find the light by; guessed from the picture, taken as %.0f degrees wide (--fov), "
-        "and off by about %.0f %%",
+        "and such guesses are off by about %.0f %%",
         item.input_path,
         fov_deg,
         100 * guess.error,

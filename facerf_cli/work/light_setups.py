@@ -216,10 +216,11 @@ def _say_apart(names: Sequence[str], shared: str) -> None:
         preset = next((name for name in names if name in preset_names()), None)
         log.warning(
             "%s%s: an image each, since only lights with names share one (%s); to add it there give it a "
-            "name, as in fill=40,20, fill=rembrandt or --envmap sky=MAP%s",
+            "name, as in %s or --envmap sky=MAP%s",
             names[0],
             f" and {len(names) - 1} more" if len(names) > 1 else "",
             shared,
+            f"a={preset}" if preset else "fill=40,20, fill=rembrandt",
             f" ({preset} alone is the preset, {preset}=AZ,EL a light of that name)" if preset else "",
         )
 

@@ -256,13 +256,10 @@ def _write_setups(
                     written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
                 del image
             group = " as its group" if shared_ev else ""
-            said = [f"exposed by {ev:+.2f} EV{group}"] if plan.options.output.shown_suffix else []
-            said += (
-                [f"with {100 * setup.room:g} % of the light bounced by the room (--room)"]
-                if setup.room
-                else []
-            )
-            if said and not (shared_ev and plan.shots.all):
+            said = [f"exposed by {ev:+.2f} EV{group}"]
+            if setup.room:
+                said.append(f"with {100 * setup.room:g} % of the light bounced by the room (--room)")
+            if not (shared_ev and plan.shots.all):
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
             del relit, each  # of all of its part, beside the next
     return written

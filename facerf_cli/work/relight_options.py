@@ -53,6 +53,7 @@ Composite = Literal["photo", "face"]
 ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
 _FIELDS = ("field", "portrait")
+_OF_EVERY_IMAGE = ("person", "class", "rgb", "rgba")  # names of layers
 _LAYERS = ("matte", "albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
 _FORMS = "photo, envmap, none, an image file, black or another name, #RRGGBB or R,G,B"
@@ -264,8 +265,13 @@ class RelightPlan:
     def of_items(self, items: Sequence[Item], shots: Shots) -> Self:
         """This plan for some photos, and frames of shots; UsageError where two images have one path."""
         for path in self.outputs_of(items[0]) if self.options.output.file_suffix else ():
+            if len(self.setups) > 1:
+                raise UsageError(
+                    f"-o {path}: is one file, and these lights make {len(self.setups)} images; give a "
+                    "folder, or names to lights that shine together, as in key=60,25"
+                )
             all_faces = self.photo.face == "all" and self.options.composite == "face"
-            only_item(items, path, several=all_faces or len(self.setups) > 1)
+            only_item(items, path, several=all_faces)
         paths: set[Path] = set()
         for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
             if path in paths:
@@ -329,8 +335,10 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
     how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
     setups = collect_setups(sources, output, photo.settings.seed, how, options.background.path)
-    if options.light_wrap and any("wrap" in setup.names for setup in setups):
-        raise UsageError("--light-wrap: a light has the name wrap, too; give it another")
+    layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
+    for name in (name for setup in setups for name in setup.names):
+        if name in layers:
+            raise UsageError(f"a light has the name {name}, as a layer of the EXR; give it another")
     if alone and any(setup.has_own for setup in setups):
         raise UsageError("--light own: needs the whole photo; leave out --pose and --composite face")
     by_photo = [light for setup in setups for light in setup.by_photo]
