@@ -571,6 +571,13 @@ class Group(PersonOrGroup):
 
     people: Sequence[Person]
 
+    def __post_init__(self) -> None:
+        photos = [person.photo for person in self.people if person.photo is not None]
+        if not photos or len(photos) < len(self.people):
+            raise ValueError("people: give one or more, fitted in their photo")
+        if any(photo is not photos[0] and not np.array_equal(photo, photos[0]) for photo in photos):
+            raise ValueError("people: are of several photos; give those of one")
+
     def relight(
         self,
         light: Light | Array | Sequence[Light | Array],
@@ -704,7 +711,8 @@ def _pixels_of(name: str, photo: Array) -> np.ndarray:
 
 def _rotation(pose: Pose) -> Tensor:
     """The head_to_camera rotation [3, 3] of a pose in degrees, to which gradients flow."""
-    angles = torch.stack([torch.as_tensor(angle, dtype=torch.float64).cpu() for angle in pose])
+    each = pose if isinstance(pose, Sequence | Tensor | np.ndarray) else [pose]
+    angles = torch.stack([torch.as_tensor(angle, dtype=torch.float64).cpu() for angle in each])
     if angles.shape != (3,) or not angles.isfinite().all():
         raise ValueError(f"pose is {pose}, not yaw, pitch and roll in degrees")
     return pose_to_rotation(*angles)

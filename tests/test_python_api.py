@@ -90,6 +90,14 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
     assert row["certainty"] == "sure" and set(row["touches_frame"]) == {"bottom"}
 
 
+def test_a_group_is_of_one_photo(person: facerf.Person) -> None:
+    other = replace(person, photo=person.photo[:, ::-1])
+    for people, said in (([], "give one or more"), ([person, other], "of several photos")):
+        with pytest.raises(ValueError, match=said):
+            facerf.Group(people)
+    assert "box_px" in repr(astronaut.face()) and len(repr(astronaut.face())) < 200
+
+
 @pytest.mark.slow
 def test_a_group_is_relit_as_on_the_command_line(tmp_path: Path) -> None:
     """Two people: the same calls give the same image, its alpha and its layers."""

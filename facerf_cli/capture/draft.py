@@ -122,7 +122,7 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
     except UsageError as error:
         raise UsageError(f"{folder}: {error}") from None
     lights, about_lights = _read_lights(folder, [one for one in lists if one not in calibrations], frames)
-    cameras, about_cameras = _read_cameras(folder, calibrations, frames)
+    cameras, about_cameras = _read_cameras(folder, calibrations, frames, lights.unit_m or 1.0)
     content = _content(folder, pattern, frames, headers, lights, cameras)
     words = ", ".join(counted(len(frames.ids(field)), field) for field in FIELDS)
     missing, expected = frames.expected - len(frames.paths), frames.expected
@@ -193,19 +193,20 @@ def _read_lights(folder: Path, lists: Sequence[str], frames: Frames) -> tuple[Dr
 
 
 def _read_cameras(
-    folder: Path, calibrations: Sequence[str], frames: Frames
+    folder: Path, calibrations: Sequence[str], frames: Frames, unit_m: float
 ) -> tuple[dict[str, dict[str, Any]], str]:
     """Cameras of the images from Metashape's XML, and a note about it."""
     if not calibrations:
         return {}, ""
     try:
-        known = read_metashape(folder / calibrations[0])
+        known = read_metashape(folder / calibrations[0], unit_m)
     except InputError as error:
         return {}, f"left out: a calibration: {error}"
     found = {name: known[name] for name in frames.ids("camera") if name in known}
     if not found:
         return {}, f"left out: a calibration: {folder / calibrations[0]}: has no camera of the images' names"
-    return found, f"check: cameras: from {_list(calibrations[:1])}, whose unit is taken as a metre"
+    unit = "a metre" if unit_m == 1 else "that of the lights"
+    return found, f"check: cameras: from {_list(calibrations[:1])}, whose unit is taken as {unit}"
 
 
 def _content(

@@ -34,6 +34,7 @@ class DraftLights:
 
     entries: dict[str, dict[str, Vector]] = field(default_factory=dict)
     centre_m: Vector | None = None
+    unit_m: float | None = None  # of the list, where that is of positions
     kind: str = "directions"
     assumed: str = "x right, y up, z toward the camera, as world space"
 
@@ -45,11 +46,15 @@ def draft_lights(found: Mapping[str, Vector], everything: Sequence[Vector]) -> D
     distances = np.linalg.norm(vectors - middle, axis=1)
     radius = float(distances.mean())
     if np.linalg.norm(middle) < _ASIDE * radius or np.abs(distances / radius - 1).max() > _OFF:
-        return DraftLights({light: {"direction": _rounded(_unit(vector))} for light, vector in found.items()})
+        entries = {light: {"direction": _rounded(_unit(vector))} for light, vector in found.items()}
+        words = DraftLights.assumed
+        if abs(radius - 1) > _ASIDE:
+            words += ", whose lengths are left out: a light that is near needs its 'position' in metres"
+        return DraftLights(entries, assumed=words)
     unit_m, unit = (1e-3, "millimetres") if radius > _LARGEST_STAGE else (1.0, "metres")
     entries = {light: {"position": _rounded(unit_m * np.array(vector))} for light, vector in found.items()}
     words = f"taken as {unit} in the axes of the cameras; 'centre' is the middle of their sphere"
-    return DraftLights(entries, _rounded(unit_m * middle), "positions", words)
+    return DraftLights(entries, _rounded(unit_m * middle), unit_m, "positions", words)
 
 
 def sphere_middle(points: np.ndarray) -> np.ndarray:

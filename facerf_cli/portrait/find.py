@@ -51,8 +51,8 @@ class FaceBox:
 
     box_px: Box
     score: float
-    view: SquareView | None = field(default=None, kw_only=True)
-    others: Sequence[OtherHead] | None = field(default=None, kw_only=True)
+    view: SquareView | None = field(default=None, kw_only=True, repr=False)
+    others: Sequence[OtherHead] | None = field(default=None, kw_only=True, repr=False)
 
     @property
     def area_px(self) -> float:
@@ -65,7 +65,7 @@ class FaceBox:
 class Face(FaceBox):
     """A face with its landmarks [68, 2] in the photo's pixels; `view` also holds others, and their errors."""
 
-    landmarks_px: np.ndarray
+    landmarks_px: np.ndarray = field(repr=False)
 
     @property
     def box(self) -> FaceBox:

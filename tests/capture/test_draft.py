@@ -292,7 +292,7 @@ def test_positions_and_cameras_of_a_stage_are_drafted_in_its_axes(given_stage: P
     pattern = "{camera}/{subject}/{light}.exr"
     stage = draft_stage(given_stage, SUFFIXES, pattern)
     assert noted(stage, "positions from lights.json, taken as millimetres")
-    assert noted(stage, "cameras: from calibration.xml, whose unit is taken as a metre")
+    assert noted(stage, "cameras: from calibration.xml, whose unit is taken as that of the lights")
     assert stage["centre"] == pytest.approx([0.64, 1.7, 0.5], abs=1e-3)
     assert stage["lights"][3]["position"] == pytest.approx([0.64, 1.7 + 1.6 * 0.6, 0.5 + 1.6 * 0.8], abs=1e-6)
     (camera,) = stage["cameras"]
@@ -303,6 +303,7 @@ def test_positions_and_cameras_of_a_stage_are_drafted_in_its_axes(given_stage: P
     (given_stage / "lights.json").write_text('{"L03": [0, 3, 4], "L07": [0, 0, 1]}')
     lights = {light["id"]: light for light in draft_stage(given_stage, SUFFIXES, pattern)["lights"]}
     assert lights["L03"]["direction"] == [0, 0.6, 0.8] and lights["L00"]["direction"] is None
+    assert noted(draft_stage(given_stage, SUFFIXES, pattern), "whose lengths are left out")
     (given_stage / "lights.json").write_text("7")
     assert noted(draft_stage(given_stage, SUFFIXES, pattern), "is no list of lights")
     (given_stage / "calibration.xml").write_text(LENS.replace('label="A"', 'label="B"'))
