@@ -124,6 +124,15 @@ def test_of_the_texture(person: facerf.Person, light: facerf.Light, loss: Loss, 
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
+def test_black_texels_do_not_lead_the_gradient(person: facerf.Person, light: facerf.Light) -> None:
+    texture = torch.from_numpy(person.texture)
+    texture[20:24, 20:24] = 1e-7  # where the square root is steep
+    texture.requires_grad_()
+    person.with_texture(texture).relight(light, alone=True)[..., :3].square().mean().backward()
+    squares = texture.grad.square().sum(-1)
+    assert squares[20:24, 20:24].sum() < 0.5 * squares.sum()
+
+
 def test_a_texture_keeps_its_gradient_under_lights_of_numpy_or_is_refused(
     person: facerf.Person, light: facerf.Light
 ) -> None:

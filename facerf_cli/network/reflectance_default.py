@@ -28,6 +28,7 @@ from facerf_cli.network.inputs import (
 
 _MAP_SIDE = 64  # of the stored normals and shadows of the mean face
 _DARKEST = 1e-8  # radiance at which the slope of the square root is still finite
+_STEEP = 1e-3  # radiance below which gradients do not grow any more
 _LIGHT_MAPS = 4  # cosine, gloss, shadow and base gain
 _LIGHT_FEATURES = 12  # numbers that describe a light: camera and head direction, products of the latter
 _CODE_CHANNELS = 96  # of the light's code, which modulates the decoder
@@ -131,7 +132,11 @@ class DefaultReflectanceNetwork(SavedNetwork):
     def encode(self, texture: Tensor, normals_source: Tensor, visible: Tensor) -> DefaultEncoded:
         """Encode linear textures and camera-space normals [B, 3, T, T]; visible [B, 1, T, T] in 0..1."""
         exposure = exposure_of(texture, visible)
-        source_root = (texture / exposure).clamp_min(_DARKEST).sqrt()
+        radiance = texture / exposure
+        source_root = radiance.clamp_min(_DARKEST).sqrt()
+        if radiance.requires_grad:  # else black texels, where the root is steep, lead the gradient
+            bounded = source_root.detach() / (radiance.detach() + _STEEP).sqrt()
+            radiance.register_hook(bounded.mul)  # type: ignore[no-untyped-call]
         side = self.settings.side
         small = [resize(x, side) for x in (source_root, visible, self._normals_used(normals_source))]
         template = F.interpolate(self.template[None], (side, side), mode="bilinear", align_corners=False)
