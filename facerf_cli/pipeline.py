@@ -339,7 +339,7 @@ def estimate_light(
         return LightEstimate(balanced(weights), evidence, evidence.relit(weights), key_share=share)
 
     def layers(x: Tensor) -> list[Tensor]:
-        return [layer.cpu() for layer in features.layers((x / exposure).to(models.device))]
+        return features.layers((x / exposure).to(models.device))
 
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
     refined = refine_light(evidence, weights, layers, estimator.non_negative)
