@@ -51,6 +51,7 @@ def person() -> facerf.Person:
     return facerf.fit(astronaut.models(), astronaut.photo(), reflectance="field", texture_side=64)
 
 
+@pytest.mark.slow
 def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
     photo, size = page["photo"], page["photo"].shape[:2]
     for name in (
@@ -79,6 +80,7 @@ def test_the_page_runs_and_its_shapes_are_true(page: dict[str, Any]) -> None:
     assert one.depth[inside].min() > 0.3 and one.depth[inside].max() < 2
 
 
+@pytest.mark.slow
 def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Path) -> None:
     line = ["relight", str(PHOTO), "--light", "60,30", "--room", "0.06", "--exposure", "0"]
     assert main([*line, "-o", str(tmp_path)]) == 0
@@ -123,6 +125,7 @@ def test_a_group_is_relit_as_on_the_command_line(tmp_path: Path) -> None:
     assert set(found) == {"image", "person.A", "depth"} and found["depth"].any()
 
 
+@pytest.mark.slow
 def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: Path) -> None:
     sun = ROOT / "examples/maps/low_sun.exr"
     line = [
@@ -144,6 +147,7 @@ def test_a_map_is_behind_as_on_the_command_line(page: dict[str, Any], tmp_path: 
     np.testing.assert_allclose(facerf.read_image(written), relit, rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_lights_add_up_and_a_white_map_of_one_gives_the_face_its_brightness(page: dict[str, Any]) -> None:
     one, rim = page["person"], facerf.Light.single(-70, 0, (1, 0.1, 0.1))
     first, second, both = one.relight([KEY, rim, sum([KEY, 2 * rim])], background="none")
@@ -170,6 +174,7 @@ def test_lights_add_up_and_a_white_map_of_one_gives_the_face_its_brightness(page
     assert np.linalg.norm(shown[inner] - one.landmarks[inner], axis=1).mean() < 0.02 * size_px
 
 
+@pytest.mark.slow
 def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """What does not depend on the light is made once, whatever the lights."""
     one = page["person"]

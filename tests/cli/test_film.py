@@ -335,6 +335,7 @@ def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> Non
     assert "cuts at" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_each_take_has_its_light(given: Path, tmp_path: Path) -> None:
     write_source(tmp_path / "cut.mp4", [frame_of(0)] * 2 + [np.ascontiguousarray(frame_of(0)[:, ::-1])] * 2)
     out = tmp_path / "out"

@@ -138,6 +138,7 @@ def test_several_images_are_refused_before_anything_is_loaded(
         check_stdout(1, ("png",))
 
 
+@pytest.mark.slow
 def test_a_configuration_of_a_show_names_spaces_in_and_out(given: Path, tmp_path: Path) -> None:
     """In its space "Half" values are half of linear Rec.709; its view takes square roots."""
     (tmp_path / "show.ocio").write_text(

@@ -151,6 +151,7 @@ def test_jobs_and_a_second_run_change_no_byte(given: Given, prepared: Dataset, t
     assert tree(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bytes(given: Given, prepared: Dataset, tmp_path: Path) -> None:
     line = [sys.executable, "-m", "facerf_cli", "prepare-dataset", str(given[0]), "-o", str(tmp_path)]
     run = subprocess.Popen(

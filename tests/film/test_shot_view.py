@@ -80,7 +80,7 @@ def test_a_frame_is_the_mean_of_both_sides_and_of_none_beyond_a_lost_face(monkey
     assert first_class(view, 10) == pytest.approx(10, abs=1e-3)
     assert first_class(view, 19) < 19 - 0.3  # frames after it are lost
     assert first_class(view, 20 + LONGEST_GAP + 1) > 20 + LONGEST_GAP + 1.3
-    with pytest.raises(InputError, match="frame 25: the face is lost"):
+    with pytest.raises(InputError, match="frame 25: the face is not seen"):
         view.segmentation(25)
 
 

@@ -79,6 +79,7 @@ def test_turned_photos(landmarks_px, turns):
     assert left < face.landmarks_px[30, 0] < right and top < face.landmarks_px[30, 1] < bottom
 
 
+@pytest.mark.slow
 def test_several_faces_from_left_to_right_and_one_of_24_pixels(landmarks_px):
     small = np.zeros_like(PHOTO)
     small[100:300, 90:270] = resized(PHOTO, 0.5)
