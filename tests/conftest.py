@@ -104,7 +104,7 @@ def _the_same_photo_costs_once() -> None:
         pipeline.reflectance_of,
         lambda models, *rest: (
             *(getattr(models.networks, name) for name in ("reflectance", "portrait", "parsing")),
-            (models.face, models.source_colours, rest),
+            (models.face, models.source_colours, id(models.networks.reflectance), rest),
         ),
         lambda models, head, kind="field", *_: kind == "portrait",
         most=3,
