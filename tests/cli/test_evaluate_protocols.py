@@ -222,6 +222,7 @@ def test_an_old_list_of_pairs_is_frozen_on_a_dataset_of_other_pairs(
         assert "does not fit" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("doubles")
 def test_people_of_a_dataset_by_every_protocol(folder: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     assert run("reconstruction", folder, "-o", tmp_path / "r", "--every", "6", "--joint-fit") == 0

@@ -120,6 +120,7 @@ def test_all_frames_have_the_one_light_of_the_picture_behind_them(
     assert "me.mp4" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_interrupted_film_goes_on_where_it_was(given: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     out, made = tmp_path / "relit.mp4", []
     line = ("relight", given / "me.mp4", "--light", "70,20", "-o", out, "--exposure", "0", *CHEAP)
@@ -179,6 +180,7 @@ def test_a_photo_under_a_turning_map_becomes_a_film(given: Path, tmp_path: Path)
         assert float(stream.average_rate) == pytest.approx(30000 / 1001, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
     given: Path, tmp_path: Path, caplog: Log
 ) -> None:

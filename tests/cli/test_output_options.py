@@ -78,6 +78,7 @@ def test_every_format_holds_the_same_image(given: Path, tmp_path: Path, capsys: 
     assert 3 * small < usual
 
 
+@pytest.mark.slow
 def test_the_soft_view_changes_the_bright_person_alone(given: Path, tmp_path: Path) -> None:
     line = ["--light", "40,10,3,3,3", "--exposure", "0.5", "--format", "png16,exr"]
     stem = "astronaut_light_40_10_3_3_3"

@@ -93,6 +93,7 @@ def test_arrays_are_those_of_the_stack(given: Path, tmp_path: Path) -> None:
     assert all(f"`{name}`" in page for name in named)
 
 
+@pytest.mark.slow
 def test_the_format_of_web_viewers_has_the_lights_from_in_front(given: Path, tmp_path: Path) -> None:
     line = ["--lights", "40", "--frame", "photo", "--size", "128", "--format", "relight"]
     assert predict(given, tmp_path, *line) == 0
@@ -119,6 +120,7 @@ def test_the_format_of_web_viewers_asks_for_its_memory(given: Path, tmp_path: Pa
     assert not (tmp_path / "astronaut_relight").exists()
 
 
+@pytest.mark.slow
 def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr("facerf_cli.viewer.basis.rig_directions", lambda: rig_directions(12))
     line = ["--lights", SIDES, "--frame", "photo", "--size", "256", "--page"]

@@ -49,6 +49,7 @@ ORDER = Finding("error", "order", "0001", "the lamps are in another order", "C0"
 CLIPPED = Finding("warning", "clipped", "0001", "3 frames are clipped", "C0")
 
 
+@pytest.mark.slow
 def test_broken_frames_are_left_out_and_errors_stop_their_subject(
     capture: Path, tmp_path: Path, capsys: Said, plant: Plant
 ) -> None:
@@ -69,6 +70,7 @@ def test_broken_frames_are_left_out_and_errors_stop_their_subject(
     assert read_dataset(tmp_path).fewer_lights == {}
 
 
+@pytest.mark.slow
 def test_warnings_stop_strict_runs_and_too_many_broken_frames_all(
     capture: Path, tmp_path: Path, capsys: Said, plant: Plant
 ) -> None:

@@ -19,6 +19,7 @@ def photos() -> dict[str, Tensor]:
     return photos_of("builtin", 0, 3, SMALL)
 
 
+@pytest.mark.slow
 def test_photos_differ_by_light_and_share_their_truth(photos: dict[str, Tensor]) -> None:
     assert photos["pictures"].shape == (2, 3, 3, 64, 64) and photos["alpha"].shape == (2, 64, 64)
     assert photos["landmarks_px"].shape == (2, 68 + len(MORE_LANDMARKS), 2)
