@@ -34,7 +34,9 @@ def test_from_a_capture_to_the_papers_tables_and_figures(tmp_path: Path) -> None
             == methods
         )
     assert list((run / "photos/.facerf-faces").glob("*.json")) and not (run / "mean-face/photos").exists()
-    both = [csv.DictReader((run / "tables" / table / "images.csv").open()) for table in "13"]
+    both = [
+        csv.DictReader((run / "tables" / table / "images.csv").read_text().splitlines()) for table in "13"
+    ]
     one, other = ({row["case"] for row in rows} for rows in both)
     assert one == other
     assert list((run / "figures").glob("olat-*.png")) and (run / "figures/transfer.png").exists()
