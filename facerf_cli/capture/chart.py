@@ -18,13 +18,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from skimage.draw import polygon
 from skimage.transform import estimate_transform
 
-from facerf_cli.capture.capture import Capture, ChartCorrection, correct_colours, read_frame
+from facerf_cli.capture.capture import BlackLevel, Capture, ChartCorrection, correct_colours, read_frame
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.write import write_display
@@ -241,7 +240,7 @@ def _refuse(image: Path, faults: Iterator[str]) -> None:
         raise InputError(f"{image}: {fault}")
 
 
-def _faults_of_light(image: Path, patches: Patches, black_level: Any) -> Iterator[str]:
+def _faults_of_light(image: Path, patches: Patches, black_level: BlackLevel) -> Iterator[str]:
     """Faults of patches that are too small, dark, noisy, clipped or grey to measure."""
     if patches.counts.min() < _LEAST_PX:
         yield (

@@ -18,12 +18,12 @@ a gamma of 2.2.
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
-from facerf_cli.capture.capture import Capture, find_subjects
+from facerf_cli.capture.capture import BlackLevel, Capture, find_subjects
 from facerf_cli.capture.light_lists import sphere_middle
 from facerf_cli.capture.metashape import read_metashape
 from facerf_cli.capture.stage_json import MOST_LIGHTS, CameraEntry
@@ -146,7 +146,7 @@ def _is_dark(take: str) -> bool:
     return take.startswith(_DARK_TAKES) and person.isdecimal() and int(person) in _DARK_PEOPLE
 
 
-def _colours(path: Path) -> tuple[np.ndarray, Any]:
+def _colours(path: Path) -> tuple[np.ndarray, BlackLevel]:
     """The matrix [3, 3] and the black level of each channel, of a text of 3 x 4 numbers."""
     advice = "copy it, or give images that were converted with colour calibration"
     if not path.is_file():
@@ -158,4 +158,5 @@ def _colours(path: Path) -> tuple[np.ndarray, Any]:
         matrix = np.full((3, 4), np.nan)
     if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix[:, :3]) < 3:
         raise InputError(f"{path}: is not a matrix of 3 x 4 numbers; {advice}")
-    return matrix[:, :3], tuple(matrix[:, 3].tolist())
+    red, green, blue = matrix[:, 3].tolist()
+    return matrix[:, :3], (red, green, blue)

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +41,11 @@ from facerf_cli.synth.random_fields import Uniform
 LICENCE = "SynthHuman: CDLA-Permissive-2.0"
 _SMALLEST = 0.5  # crop, in shorter sides of the image
 _AROUND = 48  # lights all around whose shadows are summarised, as of photos
+
+
+def with_licence(provenance: dict[str, Any]) -> dict[str, Any]:
+    """The provenance of a training that these images join."""
+    return provenance | {"licence": f"{provenance['licence']}; {LICENCE}"}
 
 
 class SynthHuman:

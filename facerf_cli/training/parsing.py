@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.synthhuman import LICENCE, SynthHuman
+from facerf_cli.dataset.synthhuman import SynthHuman, with_licence
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.inputs import concatenate
@@ -56,9 +56,8 @@ class ParsingObjective(Objective):
         settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
         synthhuman: SynthHuman | None = None,
     ) -> None:
-        network, provenance = network or ParsingNetwork(), portraits.provenance
-        if synthhuman:
-            provenance = provenance | {"licence": f"{provenance['licence']}; {LICENCE}"}
+        network = network or ParsingNetwork()
+        provenance = with_licence(portraits.provenance) if synthhuman else portraits.provenance
         super().__init__({"parsing": network}, provenance)
         self.portraits, self.synthhuman = portraits, synthhuman
         self.side = network.side

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.synthhuman import LICENCE, SeenNormals, SynthHumanNormals
+from facerf_cli.dataset.synthhuman import SeenNormals, SynthHumanNormals, with_licence
 from facerf_cli.network.inputs import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
@@ -64,9 +64,7 @@ class PortraitObjective(Objective):
         settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
         synthhuman: SynthHumanNormals | None = None,
     ) -> None:
-        provenance = portraits.provenance
-        if synthhuman:
-            provenance = provenance | {"licence": f"{provenance['licence']}; {LICENCE}"}
+        provenance = with_licence(portraits.provenance) if synthhuman else portraits.provenance
         super().__init__({"portrait": network or PortraitNetwork()}, provenance)
         self.portraits, self.synthhuman = portraits, synthhuman
         self.settings = settings

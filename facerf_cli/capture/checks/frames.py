@@ -182,12 +182,9 @@ def extra_names(capture: Capture, subject: str, camera: str) -> list[str]:
     prefix, after = path.name.split(mark)
     files = [file.name for file in path.parent.glob("*") if file.is_file() and file.name[0] != "."]
     fitting = [name for name in files if name.startswith(prefix) and name.endswith(after)]
-    names = {name[len(prefix) : len(name) - len(after)] for name in fitting} - {
-        "",
-        *capture.light_ids,
-        *capture.ignored,
-    }
-    return sorted(name for name in names if not unlisted_kind(name))
+    names = {name[len(prefix) : len(name) - len(after)] for name in fitting}
+    others = names - {"", *capture.light_ids, *capture.ignored}
+    return sorted(name for name in others if not unlisted_kind(name))
 
 
 def check_readable(frames: CameraFrames, unread: Mapping[str, InputError]) -> Iterator[Finding]:
