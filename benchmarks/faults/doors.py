@@ -100,7 +100,7 @@ def _fit(path: Path) -> None:
 
 
 def _array(path: Path) -> None:
-    from facerf_cli.evaluation.folders import read_array
+    from facerf_cli.files.arrays import read_array
 
     read_array(path)
 

@@ -12,9 +12,9 @@ from facerf_cli.batch.inputs import PHOTO_SUFFIXES, NamePattern, collect_items
 from facerf_cli.batch.run import _exist, print_path
 from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import InputError
-from facerf_cli.evaluation.folders import read_array
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.files.arrays import read_array
 from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.files.read import decode
 from facerf_cli.files.texts import is_regular, read_toml, require_regular
