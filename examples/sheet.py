@@ -26,7 +26,7 @@ STEPS = {
     "{}_low_sun.png": ["relight", "--background", "envmap", "--envmap", *MAPS],
     "{}_stage.png": [],  # by the line above
     "{}_light_-60_20.png": ["relight", "--light=-60,20"],
-    "{}_light_own+rim.png": ["relight", "--light=own", "--light=rim=-120,10,4"],
+    "{}_light_own+rim.png": ["relight", "--light=own", "--light=rim=145,15,10"],
     "{}_person.png": ["segment"],
 }
 CELL_PX, MARGIN, WHITE = 260, 0.55, (255, 255, 255, 255)  # the margin in sides of the face's crop
