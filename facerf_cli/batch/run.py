@@ -273,7 +273,7 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         finished = [item for item, paths in stale.items() if not paths]
         again = Counter(next(filter(None, paths.values()), "") for paths in stale.values())
         if options.dry_run:
-            _log_made_again(again)
+            _log_to_make_again(again)
             return max(lacks, _list_what_would_be_done(todo, finished, job))
         report = options.output / f"report{options.shard.suffix}.jsonl"
         if options.reports:
@@ -283,7 +283,7 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         if finished:
             advice = "" if options.overwrite == "never" else " from the same inputs and options"
             log.info("%d of %d already finished%s", len(finished), len(items), advice)
-        _log_made_again(again)
+        _log_to_make_again(again)
         if recipes and options.overwrite == "changed":
             kept = [set(job.outputs_of(item)) - set(stale[item]) for item in items]
             if edited := sum(map(index.is_edited, set().union(*kept))):
@@ -400,10 +400,10 @@ def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
             empty.rmdir()
 
 
-def _log_made_again(reasons: Counter[str]) -> None:
+def _log_to_make_again(reasons: Counter[str]) -> None:
     for reason, count in sorted(reasons.items()):
         if reason:
-            log.info("%d made again: %s", count, reason)
+            log.info("%d to make again: %s", count, reason)
 
 
 def _list_what_would_be_done(todo: Sequence[Item], finished: Sequence[Item], job: Job) -> int:
