@@ -227,6 +227,8 @@ def test_spaces_and_views_are_named_by_their_beginning_in_any_spelling() -> None
     assert ours.named_space("DISPLAY-P3") is ours.DISPLAY_P3 and ours.named_space("rec 2020") is ours.REC2020
     with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(similar names: ACEScg"):
         ours.named_space("ACEScgg")
+    with pytest.raises(UsageError, match=r"similar names: linear Rec\.709(, (?!lin_rec709)[^,;]+){2};"):
+        ours.named_space("lin_rec709x")  # which has five names
     with pytest.raises(UsageError, match=r"known: linear Rec\.709, sRGB"):
         ours.named_space("qqqqq")
     assert ours.named_view("un-tone").name == "Un-tone-mapped"

@@ -197,8 +197,10 @@ def named_space(name: str, config: str = "") -> ColourSpace:
     space = find_space(name, config)
     if space is None:
         ours = [known.name for known in _ALIASES]
-        near = difflib.get_close_matches(name, [*ours, *ocio.names(config).values()], 3, 0.5)
-        hint = f"similar names: {', '.join(near)}" if near else f"known: {', '.join(ours)}"
+        names = {known.casefold(): known for known in ours} | ocio.names(config)
+        near = difflib.get_close_matches(name.casefold(), names, len(names), 0.5)
+        similar = dict.fromkeys(known.name for one in near if (known := find_space(names[one], config)))
+        hint = f"similar names: {', '.join([*similar][:3])}" if similar else f"known: {', '.join(ours)}"
         raise UsageError(f"unknown colour space '{name}' ({hint}; and the names of the OCIO configuration)")
     return space
 

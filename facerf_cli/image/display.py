@@ -24,12 +24,12 @@ def check(config: str) -> None:
 
 @cache  # hundreds, asked of OpenColorIO one by one
 def names(config: str = "") -> dict[str, str]:
-    """Map case-folded names, aliases and roles of the configuration to their spelling."""
+    """Map case-folded names, aliases and roles of the configuration to the names of their spaces."""
     found = _opened(config)
     spaces = [name for name in found.getColorSpaceNames() if not found.isData(name)]
     spaces += [alias for name in spaces for alias in found.getAliases(name)]
     spaces += found.getRoles()
-    return {name.casefold(): name for name in spaces}
+    return {name.casefold(): found.resolve(name) for name in spaces}
 
 
 def display(config: str = "") -> str:
