@@ -35,6 +35,13 @@ class Light:
     keys: tuple[int, ...] = ()
     __array_ufunc__ = None  # so that numpy leaves `array * light` to the light
 
+    def __post_init__(self) -> None:
+        """Raise ValueError for arrays of other shapes."""
+        directions, weights = list(np.shape(self.directions)), list(np.shape(self.weights))
+        if directions != weights or directions[1:] != [3]:
+            shapes = f"shapes {directions} and {weights}; give [L, 3] and [L, 3] (r, g, b of each light)"
+            raise ValueError(f"directions and weights have {shapes}")
+
     @staticmethod
     def single(azimuth_deg: float, elevation_deg: float, rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
         """One light; azimuth > 0 is the image's right, elevation > 0 above.
@@ -122,9 +129,6 @@ class Light:
     def on_cpu(self) -> RigLight:
         """The lights as float32 tensors on the CPU; raises ValueError for what is no light."""
         directions, weights = unit_directions(self.directions), as_tensor(self.weights)
-        if directions.shape != weights.shape:
-            shapes = f"{list(directions.shape)} and {list(weights.shape)}"
-            raise ValueError(f"directions and weights have shapes {shapes}, not [L, 3]")
         if not weights.isfinite().all():
             raise ValueError("weights are not all finite")
         return RigLight(directions, weights)
