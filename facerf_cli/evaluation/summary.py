@@ -22,6 +22,10 @@ ALL = "all images"
 _DIGITS = 12  # of a digest
 _MOST_VALUES = 12  # of a fact that breaks tables down, where the protocol names none
 _PIPED_WIDTH = 100  # columns of text where standard output is no terminal
+_ANGLES = {
+    "turn": "turn: the angle between the poses of the head in source and target.",
+    "angle": "angle: the angle between the light and the camera's axis.",
+}
 
 
 PublishedFigure = Mapping[str, str]  # a row of published.csv, for orientation; '' where it says nothing
@@ -188,12 +192,16 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for value in sorted(by_value, key=natural):
             groups.append(CaseGroup(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
+    facts = {group.fact for group in groups}.intersection(
+        name.removesuffix("_deg") for row in rows for name in row.facts if name.endswith("_deg")
+    )
+    notes = [words for fact, words in _ANGLES.items() if fact in facts]
     if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
-        note = (
+        notes.append(
             f"Of {counted(len(dark), 'image')} the truth is near black (root mean square below "
             f"{NEAR_BLACK}): left out of Si-MSE."
         )
-        layout = replace(layout, notes=(*layout.notes, note))
+    layout = replace(layout, notes=(*layout.notes, *notes))
     return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
 
 
