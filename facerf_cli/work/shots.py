@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -34,6 +35,8 @@ _FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames 
 _RATE = Fraction(24)
 _MOST_RATE = 1000
 _DIGITS = 4  # of a film's frame numbers, or more
+_NUMBERED = re.compile(r"(.*?)(\d{2,})(\D*\.\w+)", re.DOTALL)
+_FEWEST_FRAMES = 3  # that look like a shot
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ def collect_frames(
                     "%s: is the only frame of its shot; name the others like it, but for the number",
                     shot.frames[0].input_path,
                 )
+    elif frames := _consecutive(photos):
+        log.info("%s to %s: each is taken alone; give --sequence if they are one shot", *frames)
     shots = [replace(shot, cuts=not wanted.no_cuts) for shot in shots]
     _check_shots(shots, photo)
     if shots and batch.shard.of > 1:
@@ -135,6 +140,21 @@ def _of_images(photos: Sequence[Item]) -> list[Shot]:
         groups.setdefault(place.with_name(stem), []).append((int(number), item.name, item))
     shots = ((stem.name, [item for *_, item in sorted(group)]) for stem, group in groups.items())
     return [Shot(frames[0].output_base.with_name(name), tuple(frames)) for name, frames in shots]
+
+
+def _consecutive(photos: Sequence[Item]) -> tuple[Path, str] | None:
+    """The first and last of images whose names differ in consecutive numbers of as many digits."""
+    groups: dict[tuple[object, ...], list[tuple[int, Path]]] = {}
+    for item in photos:
+        if match := _NUMBERED.fullmatch(item.input_path.name):
+            before, number, after = match.groups()
+            key = item.input_path.parent, before, len(number), after
+            groups.setdefault(key, []).append((int(number), item.input_path))
+    for group in map(sorted, groups.values()):
+        (first, path), (last, last_path) = group[0], group[-1]
+        if len(group) >= _FEWEST_FRAMES and last - first == len(group) - 1:
+            return path, last_path.name
+    return None
 
 
 def recipe_of_shots(shots: Sequence[Shot], digest_of: DigestOf) -> Recipe:

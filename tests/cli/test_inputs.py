@@ -202,6 +202,29 @@ def test_images_become_the_frames_of_shots(
     assert sorted(item.name for item in photos) == sorted(given) and not none
 
 
+@pytest.mark.parametrize(
+    ("names", "hints"),
+    [
+        ("shot.0009 shot.0010 shot.0011 a.01 a.02 a.03", 1),
+        ("shot.0009 shot.0010", 0),
+        ("shot.0009 shot.0010 shot.0012", 0),
+        ("v2_08_left v2_09_left v2_10_left", 1),
+        ("me1 me2 me3", 0),
+        ("me99 me100 me101", 0),
+    ],
+)
+def test_numbered_photos_may_be_a_shot(names: str, hints: int, tmp_path: Path, caplog: Log) -> None:
+    folder = tmp_path / "plates"
+    folder.mkdir()
+    for name in names.split():
+        (folder / f"{name}.png").touch()
+    caplog.set_level(logging.INFO)
+    for sequence in (False, True):
+        batch = BatchOptions(output=tmp_path / "out")
+        collect_frames([str(folder)], ShotOptions(sequence), batch, PhotoOptions(Settings()))
+        assert sum("give --sequence if" in record.message for record in caplog.records) == hints
+
+
 def test_sequences_meet_by_the_names_of_their_images(tmp_path: Path) -> None:
     for name in ("shot_0001", "shot0001"):
         (tmp_path / f"{name}.png").touch()
