@@ -16,7 +16,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from facerf_cli.batch.inputs import Item, NamePattern, file_pattern, files_read, refuse_read
 from facerf_cli.batch.made_from import (
@@ -30,7 +30,7 @@ from facerf_cli.batch.made_from import (
     lines_of,
     read_row,
 )
-from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard
+from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard, torch_device
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
 from facerf_cli.files.texts import is_regular, require_regular
@@ -51,6 +51,8 @@ log = logging.getLogger(LOGGER_NAME)
 
 class Job:
     """The work of a verb on each of its items; a frozen dataclass, which workers get in other processes."""
+
+    items_a_process: ClassVar[int] = 0  # for which it pays to start one that nobody asked for; 0: never
 
     @property
     def verb(self) -> str:
@@ -171,6 +173,7 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
     return row | {name: value for name, value in outcome.facts.items() if name not in row}
 
 
+_JOB_BYTES = 2 << 30  # that a process which is not asked for may have
 _FILE_SUFFIX = re.compile(
     r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|avif|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
     r"|mp4|mov|m4v|webm|avi|mkv)",
@@ -219,7 +222,13 @@ class BatchOptions:
     overwrite: Overwrite = option("changed", in_recipe=False, panel=BATCH, everyday=True)
     dry_run: bool = option(False, in_recipe=False, panel=BATCH)
     jobs: int | None = option(
-        None, in_recipe=False, flags=("--jobs", "-j"), shown_default="1", least=1, panel=BATCH, everyday=True
+        None,
+        in_recipe=False,
+        flags=("--jobs", "-j"),
+        shown_default="1; up to one a processor for many photos",
+        least=1,
+        panel=BATCH,
+        everyday=True,
     )
     shard: Shard = option(
         Shard(), metavar="K/N", in_recipe=False, shown_default="all items", parse=Shard.parse, panel=BATCH
@@ -238,11 +247,23 @@ class BatchOptions:
     in_a_row: int = field(default=1, metadata=NOT_IN_RECIPE)  # neighbouring items that a process takes
     print_outputs: bool = field(default=True, metadata=NOT_IN_RECIPE)  # on stdout
 
-    def workers(self, settings: Settings) -> Workers:
-        """The workers that `--jobs`, `--ray` and `--device` ask for."""
-        jobs = self.jobs or (1 if self.ray is None else 0)
+    def workers(self, settings: Settings, unasked: int = 1) -> Workers:
+        """The workers that `--jobs`, `--ray` and `--device` ask for; so many jobs where none is named."""
+        jobs = self.jobs or (unasked if self.ray is None else 0)
         gpus = None if settings.device == "auto" else int(settings.device.startswith("cuda"))
         return Workers(jobs, self.ray, gpus, self.in_a_row)
+
+
+def jobs_that_pay(items: int, items_a_process: int, settings: Settings) -> int:
+    """Processes for so many items where `--jobs` is not given: a photo keeps two processors half busy.
+
+    One for a GPU, and with `--memory`, which is a ceiling for each.
+    """
+    if items_a_process == 0 or settings.memory_bytes is not None:
+        return 1
+    memory_for = memory.default_limit() // _JOB_BYTES
+    jobs = min(items // items_a_process, os.cpu_count() or 1, memory_for)
+    return jobs if jobs > 1 and torch_device(settings).type == "cpu" else 1
 
 
 def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: Settings) -> int:
@@ -291,7 +312,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
                 log.warning(advice, edited)
         if not todo:
             return lacks
-        failures, workers = 0, options.workers(settings)
+        jobs = jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
+        failures, workers = 0, options.workers(settings, jobs)
         at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
         work = partial(_run_one, job.process, bool(recipes), settings.job_bytes(at_once))
         memory.collect_as_usual()

@@ -22,7 +22,7 @@ from facerf_cli.work.output_options import NEEDS, STDOUT, SUFFIXES, check_stdout
 from facerf_cli.work.photo_options import networks_of
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
-from facerf_cli.work.verbs import FileOrFolder
+from facerf_cli.work.verbs import PHOTOS_A_PROCESS, FileOrFolder
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class RelightJob(Job):
 
     plan: RelightPlan
     verb = "relight"
+    items_a_process = PHOTOS_A_PROCESS
 
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""

@@ -67,6 +67,7 @@ def end_of_file(output: Path, ends: Sequence[str]) -> str:
     return found
 
 
+PHOTOS_A_PROCESS = 4  # take longer than its start
 Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the faces that were written; facts for the report
 
 
@@ -74,6 +75,7 @@ Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the faces that were
 class PhotoWork(Job):
     """A verb that writes files for each chosen face of a photo."""
 
+    items_a_process = PHOTOS_A_PROCESS
     photo: PhotoOptions
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names

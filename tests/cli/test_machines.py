@@ -12,7 +12,7 @@ import typer
 
 from facerf_cli import main
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, sums_up
+from facerf_cli.batch.run import BatchOptions, jobs_that_pay, sums_up
 from facerf_cli.batch.settings import Settings, Shard, torch_device
 from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
@@ -63,6 +63,49 @@ def test_they_reach_the_options(call: Call) -> None:
     for line, jobs in ((["--jobs", "1"], 1), ([], 0)):
         assert call("--ray", "local", *line).workers(Settings()) == Workers(jobs, "local", None, 1)
     assert call().workers(Settings()) == Workers(1, None, None, 1)
+
+
+@pytest.mark.parametrize(
+    ("items", "a_process", "processors", "gigabytes", "settings", "jobs"),
+    [
+        (7, 4, 2, 16, Settings(device="cpu"), 1),
+        (8, 4, 2, 16, Settings(device="cpu"), 2),
+        (99, 4, 16, 16, Settings(device="cpu"), 8),  # 2 GB for each
+        (40, 4, 16, 64, Settings(device="cpu"), 10),
+        (99, 0, 16, 64, Settings(device="cpu"), 1),
+        (99, 4, 16, 64, Settings(device="cpu", memory_bytes=1 << 30), 1),
+        (99, 4, 16, 64, Settings(device="cuda"), 1),
+    ],
+)
+def test_processes_start_unasked_where_they_pay(
+    monkeypatch: pytest.MonkeyPatch,
+    items: int,
+    a_process: int,
+    processors: int,
+    gigabytes: int,
+    settings: Settings,
+    jobs: int,
+) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: processors)
+    monkeypatch.setattr("facerf_cli.run.memory.default_limit", lambda jobs=1: gigabytes << 30)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    assert jobs_that_pay(items, a_process, settings) == jobs
+
+
+def test_a_folder_gets_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    seen: list[int] = []
+
+    def counted(work: Any, items: Any, workers: Workers, broken: Any) -> Any:
+        seen.append(workers.jobs)
+        return map(work, items)
+
+    monkeypatch.setattr("facerf_cli.batch.run.spread", counted)
+    monkeypatch.setattr("facerf_cli.batch.run.jobs_that_pay", lambda items, *_: 10 * items)
+    (tmp_path / "photos").mkdir()
+    for name in "ab":
+        (tmp_path / "photos" / f"{name}.png").write_bytes(b"good")
+    assert [run(tmp_path / "photos", tmp_path / f"out{jobs}", jobs=jobs) for jobs in (None, 3)] == [0, 0]
+    assert seen == [20, 3]
 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
