@@ -3,6 +3,7 @@
 The people are those of a bank (`transport.py`), or of a dataset (`dataset/portraits.py`).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,8 +20,10 @@ from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_x, reached_by
 from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading
+from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.relighting.white import BARE
 from facerf_cli.synth.bank import files_in, split_people
-from facerf_cli.synth.bank.face_crops import gaussian_blurred
+from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
 from facerf_cli.synth.bank.portraits import Lamp, background_of, draw_photo_light
 from facerf_cli.synth.bank.texture_samples import in_front
 from facerf_cli.synth.bank.transport import seen_path
@@ -31,6 +34,8 @@ from facerf_cli.synth.shading import Material
 _LAMP = Lamp(0.3, 0.01, 2, 0.3, 1.0)
 _GREY = 0.2  # share of grey photos
 SMALL = 4  # pixels along each side that are averaged where the photo's own light is summed
+_SHADOWED = 0.25  # share of photos in the shadow of something that they do not show
+_PHONES, _CONTRAST = 0.2, 0.4  # shares of photos that a phone sharpens, and whose contrast a camera raises
 _EMPTY_BYTES = 1000  # a file without tensors is smaller
 _BRIGHTEST = 8.0  # of targets; brighter highlights are clipped
 # Lights from behind: elevation and least azimuth, and the share of targets that they get beside their own.
@@ -191,15 +196,17 @@ def sample_of(
     scale = MEAN_RADIANCE / _mean_over(albedo, skin)
     stored = backgrounds[_below(len(backgrounds), generator)]
     background = 4 * background_of(stored, side, generator) * lit.behind
-    photo = _as_taken(images[0] / _mean_over(images[0], skin) + background, generator)
+    lit_skin = images[0] / _mean_over(images[0], skin)
+    photo = _as_taken(lit_skin * _foreign_shadow(side, generator) + background, generator)
     rows = int(seen.get("rows", side))
     photo = photo[:, torch.arange(side).clamp(max=rows - 1)]  # as a square beyond a photo's edge shows it
     shares = lit.shares.clone()
     shares[:, rows:] = 0
     shares[0, rows:] = 1
     normals, sides = seen["normals"].float(), seen.get("sides", torch.tensor(SIDES))
+    even = without_colour_of_shade(photo, classes[BARE].sum(0))  # as `relighting.portrait_field.maps_of` does
     inputs = PortraitInputs(
-        image=photo / _mean_over(photo, skin) * MEAN_RADIANCE,
+        image=photo / _mean_over(photo, skin) * MEAN_RADIANCE * even,
         classes=classes,
         normals=normals,
         depth=seen["depth"].float(),
@@ -259,13 +266,42 @@ def _mean_over(image: Tensor, weight: Tensor) -> Tensor:
     return ((image.mean(0) * weight).sum() / weight.sum().clamp_min(1e-3)).clamp_min(1e-6)
 
 
+def _foreign_shadow(side: int, generator: torch.Generator) -> Tensor:
+    """Draw the share [3, S, S] of light that something outside the photo lets pass, often all of it.
+
+    A straight or round edge of any softness; what passes has a colour.
+    """
+    uniform = Uniform(generator)
+    if torch.rand((), generator=generator) > _SHADOWED:
+        return torch.ones(3, side, side)
+    at = torch.linspace(-1, 1, side)
+    y, x = torch.meshgrid(at, at, indexing="ij")
+    angle, near, bend = uniform(0, 2 * math.pi), uniform(-0.5, 0.5), uniform(-0.6, 0.6)
+    along, across = turned(x, y, angle)
+    distance = along - near + bend * across.square()
+    softness = torch.exp(uniform(math.log(0.01), math.log(0.4)))
+    passes = uniform(0.15, 0.8) * torch.exp(uniform(-0.15, 0.15, 3, 1, 1))
+    return torch.lerp(passes, torch.ones(3, 1, 1), torch.sigmoid(distance / softness))
+
+
 def _as_taken(image: Tensor, generator: torch.Generator) -> Tensor:
-    """Take a photo of a scene [3, S, S] with a mean of about 1: clipping, blur, tone curve and noise."""
+    """Take a photo of a scene [3, S, S] with a mean of about 1.
+
+    Clipping, blur or a phone's smoothing and sharpening, tone curve, contrast and noise.
+    """
     uniform = Uniform(generator)
     image = (image / uniform(1.6, 6.0)).clamp(0, 1)
-    if torch.rand((), generator=generator) < 0.4:
+    camera = torch.rand((), generator=generator)
+    if camera < 0.4:
         image = gaussian_blurred(image, float(uniform(0.3, 1.2)))
+    elif camera < 0.4 + _PHONES:
+        smooth = torch.lerp(image, gaussian_blurred(image, float(uniform(0.8, 2))), uniform(0, 0.8))
+        sharper = smooth - gaussian_blurred(smooth, float(uniform(0.7, 1.5)))
+        image = (smooth + uniform(0.3, 1.2) * sharper).clamp(0, 1)
     image = image ** torch.exp(uniform(-0.22, 0.22))
+    if torch.rand((), generator=generator) < _CONTRAST:
+        root = image.sqrt()  # nearly as it is shown
+        image = torch.lerp(root, root.square() * (3 - 2 * root), uniform(0, 0.6)).square()
     noise = torch.randn(image.shape, generator=generator) * uniform(0, 0.02)
     return (image + noise * (image + 0.02).sqrt()).clamp(0, 1)
 

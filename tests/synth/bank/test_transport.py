@@ -19,7 +19,8 @@ from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.raster.camera import project
 from facerf_cli.synth import bank
-from facerf_cli.synth.bank import Files, transport
+from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.synth.bank import Files, portrait_samples, transport
 from facerf_cli.synth.bank.portrait_samples import (
     PortraitSample,
     StoredTransport,
@@ -137,10 +138,49 @@ def test_a_photo_that_ends_shows_its_last_row_beyond(folder: Path) -> None:
     stored = StoredTransport(folder, backgrounds(), {"licence": "MIT"})
     sample = stored.draw([0], 3, torch.Generator().manual_seed(1), side)
     image = sample.inputs.image
-    assert torch.equal(image[..., rows:, :], image[..., rows - 1 : rows, :].expand(-1, -1, side - rows, -1))
+    beyond, last = image[..., rows:, :], image[..., rows - 1 : rows, :]
+    assert (beyond - last).abs().max() < 0.01  # the colour of shade is evened over some pixels
     assert sample.shares[:, 0, rows:].min() == 1 and sample.shares[:, 0, :rows].min() == 0
     assert sample.inputs.classes[:, 0, rows + 1 :].min() > 0.99
     assert sample.inputs.covered[..., rows:, :].max() == 1
+
+
+def test_shadows_of_what_is_not_seen_fall_on_a_quarter_of_photos() -> None:
+    generator = torch.Generator().manual_seed(0)
+    shares = [portrait_samples._foreign_shadow(32, generator) for _ in range(200)]
+    shadowed = [share for share in shares if share.min() < 0.99]
+    assert 0.18 < len(shadowed) / 200 < 0.32
+    assert all(0.1 < share.min() and share.max() <= 1 for share in shares)
+    assert sum(float(share.max() - share.min()) > 0.15 for share in shadowed) > 0.7 * len(shadowed)
+
+
+def test_phones_sharpen_and_raise_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = torch.where(torch.arange(32) < 16, 0.6, 1.4).expand(3, 32, 32)
+
+    def of_step(phones: float, contrast: float) -> tuple[float, float]:
+        """The most by which a photo overshoots, and the mean difference of the sides over their mean."""
+        monkeypatch.setattr(portrait_samples, "_PHONES", phones)
+        monkeypatch.setattr(portrait_samples, "_CONTRAST", contrast)
+        photos = [portrait_samples._as_taken(step, torch.Generator().manual_seed(seed)) for seed in range(40)]
+        lines = torch.stack(photos).sqrt().mean((1, 2))
+        high, low = lines[:, 24:28].mean(1), lines[:, 4:8].mean(1)
+        overshoot = (lines[:, 16:20].amax(1) / high - 1).max()
+        return float(overshoot), float(((high - low) / (high + low)).mean())
+
+    (plain, flat), (sharp, _), (_, steep) = of_step(0, 0), of_step(1, 0), of_step(0, 1)
+    assert plain < 0.02 < 0.04 < sharp and steep > 1.02 * flat
+
+
+def test_the_network_sees_shaded_skin_in_the_colour_of_lit_skin(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    even = drawn(folder, 3)
+    monkeypatch.setattr(portrait_samples, "without_colour_of_shade", lambda image, skin: torch.ones(3, 1, 1))
+    plain = drawn(folder, 3).inputs.image[0]
+    skin = even.inputs.classes[0, portrait_samples.BARE].sum(0)
+    factors = without_colour_of_shade(plain, skin)
+    assert factors.min() < 0.95
+    torch.testing.assert_close(even.inputs.image[0], plain * factors, rtol=1e-4, atol=1e-5)
 
 
 def test_half_of_the_squares_show_what_those_of_photos_do() -> None:
