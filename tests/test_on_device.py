@@ -15,8 +15,9 @@ import pytest
 import torch
 
 import facerf_cli as facerf
+from facerf_cli.evaluation.measure import lpips_by
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
-from facerf_cli.network.features import LightNetwork, LightSettings
+from facerf_cli.network.features import LightNetwork, LightSettings, Lpips
 from facerf_cli.network.inputs import head_rotation
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork, PortraitSettings
@@ -96,6 +97,16 @@ def test_a_step_and_a_validation_mix_no_devices(bank: Bank, stage: Callable[[Ban
         metrics = objective.validate().metrics
     assert all(parameter.grad is not None for parameter in objective.networks.parameters())
     assert np.isfinite(metrics[objective.chooses_by])
+
+
+def test_lpips_is_measured_on_the_device() -> None:
+    network = Lpips(1 / 16).requires_grad_(False)
+    images = np.random.default_rng(0).random((2, 24, 32, 3)).astype(np.float32)
+    expected = lpips_by(network)(*images)
+    with fake_device.counted() as counts:
+        found = lpips_by(fake_device.moved(network))(*images)
+    assert found == pytest.approx(expected) and expected > 0
+    assert counts.calls > 10 and counts.waits.total() == 1
 
 
 def test_a_heads_rotation_is_found_on_the_device() -> None:

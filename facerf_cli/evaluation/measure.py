@@ -57,6 +57,7 @@ class Comparison:
     light: np.ndarray | None = None
 
 
+CPU = torch.device("cpu")
 NEAR_BLACK = 0.02  # root mean square: the Si-MSE of a darker truth is below .0004 for any image
 SOURCE = "source, not relit"  # the row of the source's Face dis
 _PACKAGE, _FILE = "lpips", "weights/v0.1/vgg.pth"  # Zhang et al., LPIPS v0.1, BSD 2-Clause
@@ -67,9 +68,9 @@ _DIGEST = "9153a2043dccf3b525d4f13db916e93ef040548ea923b6f2100de5ebac141a78"
 
 @cache
 def perceptual_metric(
-    heads: Path | None, vgg_weights: str | Path
+    heads: Path | None, vgg_weights: str | Path, device: torch.device = CPU
 ) -> Callable[[np.ndarray, np.ndarray], float]:
-    """Load LPIPS of two sRGB images [H, W, 3] in 0..1, once a process.
+    """Load LPIPS of two sRGB images [H, W, 3] in 0..1, computed on a device, once a process.
 
     `heads` is the file of `--lpips` (None: that of the installed package), `vgg_weights` the value of
     `--vgg-weights`. Raises UsageError or InputError for weights that are missing or others.
@@ -83,13 +84,18 @@ def perceptual_metric(
     if _digest(network) != _DIGEST:
         raise InputError(f"{path}: not the published heads of LPIPS v0.1 on VGG; {_ADVICE}")
     load_vgg(vgg_weights, network.trunk)
-    network.eval().requires_grad_(False)
+    return lpips_by(network.eval().requires_grad_(False).to(device))
+
+
+def lpips_by(network: Lpips) -> Callable[[np.ndarray, np.ndarray], float]:
+    """LPIPS of two sRGB images [H, W, 3] in 0..1, on the network's device."""
+    device = network.heads[0].device
 
     def distance(prediction_srgb: np.ndarray, truth_srgb: np.ndarray) -> float:
         if min(truth_srgb.shape[:2]) < SMALLEST_PX:
             raise InputError(f"LPIPS: needs images of {SMALLEST_PX} px a side; leave --vgg-weights out")
         both = srgb_to_linear(np.stack([prediction_srgb, truth_srgb]))
-        tensors = torch.from_numpy(both).permute(0, 3, 1, 2)
+        tensors = torch.from_numpy(both).permute(0, 3, 1, 2).to(device)
         return float(network(tensors[:1], tensors[1:]))
 
     return distance
@@ -150,12 +156,14 @@ class Row:
     values: Mapping[str, float]
 
 
-def measure(comparison: Comparison, measures: Measures, faces: bool = True) -> list[Row]:
+def measure(
+    comparison: Comparison, measures: Measures, faces: bool = True, device: torch.device = CPU
+) -> list[Row]:
     """Measure each method's prediction, and with `faces` Face dis, of the source too if its face is known.
 
     Each Si-MSE is NaN where the truth `is_near_black`. Face dis and LPIPS compare images as `shown` returns
-    them, in any space. Raises InputError where a prediction has another size than the truth or values that
-    are not finite, or where the mask is empty.
+    them, in any space; LPIPS is computed on the device. Raises InputError where a prediction has another size
+    than the truth or values that are not finite, or where the mask is empty.
     """
     _check(comparison)
     case, landmarks_px = comparison.case, comparison.landmarks_px if faces else None
@@ -167,7 +175,8 @@ def measure(comparison: Comparison, measures: Measures, faces: bool = True) -> l
         values = _pixel_values(prediction, comparison, measures.space)
         ours = shown(prediction, truth, mask)
         if measures.vgg_weights is not None:
-            values["lpips"] = perceptual_metric(measures.lpips, measures.vgg_weights)(ours, true)
+            lpips = perceptual_metric(measures.lpips, measures.vgg_weights, device)
+            values["lpips"] = lpips(ours, true)
         if descriptor is not None and landmarks_px is not None:
             values["face_distance"] = float(np.linalg.norm(face_descriptor(ours, landmarks_px) - descriptor))
         values |= comparison.extra.get(method, {})

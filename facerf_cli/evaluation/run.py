@@ -14,6 +14,7 @@ from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, keyed, recipe_of
 from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
+from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.bench import bench_of, networks_named, networks_used
 from facerf_cli.evaluation.folders import CASES, LIGHT, MASK, SOURCE, TRUTH, write_cases
@@ -112,7 +113,8 @@ class Evaluation(Job):
             if uses:  # what would fail each item fails before anything is measured
                 self.bench()
             if measures.vgg_weights is not None:
-                perceptual_metric(measures.lpips, measures.vgg_weights)
+                device = torch_device(self.photo.settings)
+                perceptual_metric(measures.lpips, measures.vgg_weights, device)
             self._remove_summary()
         return self
 
@@ -160,7 +162,8 @@ class Evaluation(Job):
             if not own.predictions:
                 rows.append(Row(case.name, case.person, "", case.facts, {}))
                 continue
-            rows += measure(own, measures, "face_distance" in self.metrics)
+            faces, device = "face_distance" in self.metrics, torch_device(self.photo.settings)
+            rows += measure(own, measures, faces, device)
             strips[case.name] = draw_strip(own, scaled, self._marks(case.name, "field"))
         if not rows:
             raise InputError(f"{item.input_path}: no image can be measured; check the input")

@@ -101,7 +101,7 @@ def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.M
         seen.append((ours, true))
         return 0.25
 
-    monkeypatch.setattr(module, "perceptual_metric", lambda heads, vgg: metric)
+    monkeypatch.setattr(module, "perceptual_metric", lambda heads, vgg, device: metric)
     rows, truth = measure(comparison, Measures(vgg_weights="imagenet")), comparison.truth
     assert [row.values["lpips"] for row in rows] == [0.25, 0.25]
     np.testing.assert_array_equal(seen[0][0], shown(comparison.predictions["near"], truth, comparison.mask))
