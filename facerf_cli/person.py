@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, overload
 import numpy as np
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from facerf_cli import pipeline
 from facerf_cli.baselines import RelightKind
@@ -23,7 +24,7 @@ from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import require_regular
-from facerf_cli.image.strips import covering, in_strips
+from facerf_cli.image.strips import covering, in_strips, strips
 from facerf_cli.light.envmap import Backdrop, check_envmap
 from facerf_cli.light.light import (
     Array,
@@ -313,7 +314,7 @@ class Person(PersonOrGroup):
         """The face's UV texture under each light alone [L, T, T, 3], by the neural field; see `olat`."""
         directions = directions_of(lights)
         turn = None if pose is None else self.head.fit.turn_to(_rotation(pose))
-        field = self.reflectance.field if isinstance(self.reflectance, PortraitField) else self.reflectance
+        field = self._field
         given = lights, pose, self._wanted
         with _gradients(*given):
             if isinstance(field, Field):
@@ -450,7 +451,7 @@ class Person(PersonOrGroup):
         from PIL import Image
 
         fit, (u, v) = self.head.fit, grid_uv().numpy().T
-        texture = Image.fromarray(to_display(_by_pixel(self.head.face.texture).detach().numpy()))
+        texture = Image.fromarray(to_display(_by_pixel(self._face.texture).detach().numpy()))
         vertices = self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy()
         visual = trimesh.visual.TextureVisuals(np.stack([u, 1 - v], -1), image=texture)
         return trimesh.Trimesh(vertices, grid_triangles().numpy(), visual=visual, process=False)
@@ -462,27 +463,24 @@ class Person(PersonOrGroup):
 
     @property
     def texture(self) -> Array:
-        """The photo's texture [T, T, 3] of the face, scene-linear; hidden texels are filled."""
-        return self._out(_by_pixel(self.head.face.texture))
+        """The photo's texture [T, T, 3] of the face, scene-linear, or another; hidden texels are filled."""
+        return self._out(_by_pixel(self._face.texture))
 
     def with_texture(self, texture: Array) -> "Person":
         """The person with another texture [T, T, 3] of the face, to which gradients flow; the rest stays."""
-        planes, reflectance = as_tensor(texture).permute(2, 0, 1), self.reflectance
-        if planes.shape != self.head.face.texture.shape:
+        planes, found, field = as_tensor(texture).permute(2, 0, 1), self.reflectance, self._field
+        if planes.shape != self._face.texture.shape:
             raise ValueError(f"texture has shape {list(texture.shape)}, not {list(self.texture.shape)}")
-        face = replace(self.head.face, texture=planes)
-        if isinstance(reflectance, PortraitField):
-            reflectance = replace(reflectance, field=replace(reflectance.field, face=face))
-        elif isinstance(reflectance, Field):
-            reflectance = replace(reflectance, face=face)
-        else:
+        if not isinstance(field, Field):
             raise UsageError(f"with_texture: is for the fields, not for {self.kind}")
-        return replace(self, head=replace(self.head, face=face), reflectance=reflectance)
+        field = replace(field, face=replace(field.face, texture=planes))
+        whole = replace(found, field=field) if isinstance(found, PortraitField) else field
+        return replace(self, reflectance=whole)
 
     def save(self, path: str | Path) -> None:
         """Write photo, fit and texture as .npz; `Person.load` reads the rest from the photo."""
         arrays: dict[str, Any] = {"photo": self.photo, "cropped": self.head.cropped, "kind": self.kind}
-        maps = {name: getattr(self.head.face, name) for name in FaceTexture.__dataclass_fields__}
+        maps = {name: getattr(self._face, name) for name in FaceTexture.__dataclass_fields__}
         arrays |= {name: tensor.detach().numpy() for name, tensor in maps.items()}
         arrays |= {
             "network_alone": self.network_alone,
@@ -542,8 +540,36 @@ class Person(PersonOrGroup):
     @property
     def _wanted(self) -> Tensor | None:
         """The texture, if its gradient is wanted."""
-        texture = self.head.face.texture
+        texture = self._face.texture
         return texture if texture.requires_grad else None
+
+    @property
+    def _field(self) -> Reflectance:
+        """The reflectance of the face."""
+        return self.reflectance.field if isinstance(self.reflectance, PortraitField) else self.reflectance
+
+    @property
+    def _face(self) -> FaceTexture:
+        """The face as it is relit: the photo's, or that of `with_texture`."""
+        return self._field.face if isinstance(self._field, Field) else self.head.face
+
+    def _has_gradients_in_photo(self) -> bool:
+        """If gradients reach texture or Reflectance Network; UsageError where others are wanted."""
+        field, portrait = self._field, isinstance(self.reflectance, PortraitField)
+        wanted = isinstance(field, Field) and field.has_gradients
+        if wanted and not portrait:
+            raise UsageError(
+                "texture and network: have no gradient in the photo with reflectance='field'; "
+                "give alone=True, or detach them"
+            )
+        if portrait and torch.is_grad_enabled():
+            network: Any = self.models.networks.portrait
+            if any(values.requires_grad for values in network.parameters()):
+                raise UsageError(
+                    "Portrait Network: has no gradient in the photo; take its maps' (docs/gradients.md), or "
+                    "freeze it by requires_grad_(False)"
+                )
+        return wanted
 
     @cached_property
     def _group(self) -> "Group":
@@ -590,9 +616,8 @@ class Group(PersonOrGroup):
         if not kinds <= {"portrait", "field"} and any(one.own_rgb is not None for one in lights):
             raise UsageError("Light.own(): is of the whole photo; leave out baselines")
         _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
-        if torch.is_grad_enabled() and any(person._wanted is not None for person in self.people):
-            raise UsageError("texture: has no gradient in the photo; give alone=True, or detach it")
-        return self._answer(light, lights, [], self._photos(lights, background, layers), layers)
+        textures = [person._wanted for person in self.people]
+        return self._answer(light, lights, textures, self._photos(lights, background, layers), layers)
 
     @property
     def matte(self) -> Array:
@@ -623,7 +648,7 @@ class Group(PersonOrGroup):
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
     ) -> Iterator[Any]:
-        """The photo under each light, as dicts of arrays; gradients reach the weights alone."""
+        """The photo under each light, as dicts of arrays; gradients reach weights, textures, networks."""
         people, behind = self.composed_once, None
         if not isinstance(background, str):
             pixels = np.array(background)[None, None] if isinstance(background, tuple) else background
@@ -632,21 +657,29 @@ class Group(PersonOrGroup):
             one_of(Literal["photo", "none"], "background", background)
         if straight := isinstance(background, str) and background == "none":
             people = replace(people, background="none")
+        of_faces = any([person._has_gradients_in_photo() for person in self.people])
         for part in batches(len(lights), people.nbytes):
             some = sums_of(lights[part])
             if some.directions.requires_grad:
                 raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
-            with torch.no_grad():
-                relit = list(people.relit(some))
+            with torch.set_grad_enabled(of_faces):  # of weights `_OfWeights` has those
+                relit = list(people.relit(replace(some, weights=some.weights.detach()) if of_faces else some))
             each = Lights.each(some.directions, some.keys)
             for weights, own, one in zip(some.weights, some.owns, relit, strict=True):
-                arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
+                with torch.no_grad():
+                    arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
                 image = torch.from_numpy(arrays.pop("rgb"))
                 if weights.requires_grad:
                     image = _OfWeights.apply(weights, each, people, image)  # type: ignore[no-untyped-call]
                 if own is not None and own.requires_grad:
                     layer = people.own_image() if straight else people.own_layer()
                     image = image + (own - own.detach()) * torch.from_numpy(layer)
+                if of_faces:
+                    light, every = people.ready(one), strips(people.size_px)
+                    faces = torch.cat(
+                        [checkpoint(people.of_faces, light, rows, use_reentrant=False) for rows in every]
+                    )
+                    image = image + (faces - faces.detach())
                 if straight:
                     image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
                 found = {"person.A": people.matte, **arrays} if layers else arrays

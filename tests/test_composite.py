@@ -110,7 +110,7 @@ def compose(
 
 def detailed(detail: PhotoDetail, texture: Tensor, rows: slice) -> np.ndarray:
     """The photo's pixels in rows of the window under a relit texture."""
-    return detail.pixels(detail.ready(texture), detail.observe(rows), rows)
+    return detail.pixels(detail.ready(texture), detail.observe(rows), rows).numpy()
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:

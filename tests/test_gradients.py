@@ -15,8 +15,11 @@ from torch import Tensor
 
 import facerf_cli as facerf
 from facerf_cli.errors import UsageError
+from facerf_cli.image.strips import strips
+from facerf_cli.light.light import sums_of
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.portrait_field import PortraitField, maps_of
+from facerf_cli.relighting.relightable import Relit
 from tests import astronaut
 
 ROOT = Path(__file__).parents[1]
@@ -124,6 +127,57 @@ def test_of_the_texture(person: facerf.Person, light: facerf.Light, loss: Loss, 
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
+@pytest.mark.parametrize("shown", [{}, {"background": "none"}, {"background": (0.1, 0.2, 0.3)}])
+def test_of_texture_and_weights_in_the_photo(person: facerf.Person, shown: dict[str, Any]) -> None:
+    texture = torch.from_numpy(person.texture)
+    rows = torch.linspace(-1, 2, astronaut.photo().shape[0], dtype=torch.float64)[:, None, None]
+    weights = torch.tensor([[2.0, 1.5, 1.0], [0.5, 0.8, 1.2]])
+
+    def lit(texture: Tensor, weights: Tensor = weights) -> Tensor:
+        both = replace(facerf.Light.single(60, 30) + facerf.Light.single(-50, 10), weights=weights)
+        return (person.with_texture(texture).relight(both, **shown)[..., :3] * rows).sum()
+
+    found, expected = compared(lit, texture, 0.1, texture)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=1e-3)
+    textured = texture.clone().requires_grad_()
+    found, expected = compared(lambda weights: lit(textured, weights), weights, 0.1)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
+    assert textured.grad is not None
+
+
+def test_of_relit_textures_in_the_photo(person: facerf.Person) -> None:
+    """Noise, which grain and the edges of shadows change; the photo is linear in it."""
+    people = person._group.composed_once
+    keys = facerf.Light.single(60, 30), facerf.Light.single(-50, 10)
+    (one,) = next(people.relit(sums_of([keys[0] + keys[1]])))
+    generator = torch.Generator().manual_seed(2)
+    noise, marks = (torch.randn(size, generator=generator) for size in ((3, 64, 64), (*people.size_px, 3)))
+
+    def moved(one: Relit, step: Any) -> Relit:
+        assert one.mouth is not None
+        alone = tuple((moved(key, step), shadow) for key, shadow in one.keys)
+        return replace(one, texture=one.texture + step * noise, mouth=one.mouth + step * noise, keys=alone)
+
+    step = torch.zeros((), requires_grad=True)
+    light = people.ready([moved(one, step)])
+    faces = torch.cat([people.of_faces(light, rows) for rows in strips(people.size_px)])
+    (found,) = torch.autograd.grad((faces.double() * marks).sum(), step)
+    less, more = (torch.from_numpy(people.image([moved(one, end)]).pixels) for end in (-1, 1))
+    expected = float(((more - less).double() * marks).sum() / 2)
+    assert abs(expected) > 1 and float(found) == pytest.approx(expected, rel=LINEAR)
+
+
+def test_another_texture_is_seen_in_the_photo(person: facerf.Person) -> None:
+    key = facerf.Light.single(60, 30)
+    face = person.relight(key, alone=True)[..., 3] > 0.9
+    relit, same, darker = (
+        person.with_texture(share * person.texture).relight(key) for share in (1, 1 + 1e-7, 0.5)
+    )
+    np.testing.assert_allclose(same, relit, atol=1e-5)
+    assert 0.5 < darker[face].mean() / relit[face].mean() < 0.65  # a part of the portrait field's stays
+    np.testing.assert_array_equal(darker[:40], relit[:40])
+
+
 def test_black_texels_do_not_lead_the_gradient(person: facerf.Person, light: facerf.Light) -> None:
     texture = torch.from_numpy(person.texture)
     texture[20:24, 20:24] = 1e-7  # where the square root is steep
@@ -141,9 +195,11 @@ def test_a_texture_keeps_its_gradient_under_lights_of_numpy_or_is_refused(
     person.with_texture(texture).relight(plain, alone=True).sum().backward()
     assert texture.grad is not None and texture.grad.abs().sum() > 0
     assert person.with_texture(texture).uv_olat(plain.directions).requires_grad
-    with pytest.raises(UsageError, match="texture: has no gradient in the photo; give alone=True"):
-        person.with_texture(texture).relight(plain)
+    assert person.with_texture(texture).relight(plain).requires_grad
     assert isinstance(person.with_texture(texture.detach()).relight(plain), np.ndarray)
+    face = facerf.fit(person.models, astronaut.photo(), reflectance="field", texture_side=64)
+    with pytest.raises(UsageError, match="texture and network: have no gradient in the photo with reflect"):
+        face.with_texture(texture).relight(plain)
 
 
 def test_of_the_directions_of_a_light(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
@@ -182,9 +238,11 @@ def test_of_the_weights_of_the_reflectance_network(
         assert gradient.abs().sum() > 0
     first.requires_grad_(False)
     weight = network.head.weight.requires_grad_(True)
-    found, expected = slopes(lambda: loss(person.relight(light, alone=True)), weight, 0.03)
+    each = ({"alone": True}, {}, {"background": "none"})
+    pairs = [slopes(lambda x=x: loss(person.relight(light, **x)), weight, 0.03) for x in each]
     weight.requires_grad_(False)
-    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+    for found, expected in pairs:
+        assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
 def test_values_without_gradients_stay_so(person: facerf.Person, light: facerf.Light, tmp_path: Path) -> None:
@@ -215,6 +273,8 @@ def test_of_the_maps_of_the_portrait(models: Models, person: facerf.Person, ligh
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
 
     weight = next(portrait.parameters()).requires_grad_(True)
+    with pytest.raises(UsageError, match="Portrait Network: has no gradient in the photo"):
+        person.relight(light)
 
     def seen() -> Tensor:
         again = replace(view, maps=maps_of(portrait, view.person))

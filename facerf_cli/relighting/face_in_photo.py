@@ -25,6 +25,7 @@ from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.face_alone import exposure_of_face, face_layer, relit_faces, require_face_layers
+from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.photo_detail import DARK, TINY, DetailRows, PhotoDetail, RelitDetail
 from facerf_cli.relighting.relightable import Relit
 
@@ -64,7 +65,8 @@ class FaceInPhoto:
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
         self._detail = PhotoDetail(head.face, self.view, self.own)
-        self.surround = Surround(self.vertices_m, crop, head.face.texture, self.size_px[1])
+        face = reflectance.face if isinstance(reflectance, Field) else head.face
+        self.surround = Surround(self.vertices_m, crop, face.texture, self.size_px[1])
 
     @property
     def nbytes(self) -> int:
@@ -100,7 +102,7 @@ class FaceInPhoto:
             inside = self.view.rows_inside(rows)
             part = found[self.view.rows_of(inside, rows), self.view.window[1]]
             share = self.view.mask[inside].numpy()[..., None]
-            part += share * (self._detail.pixels(relit.detail, detail, inside) - part)
+            part += share * (self._detail.pixels(relit.detail, detail, inside).numpy() - part)
         return found
 
     def layer(

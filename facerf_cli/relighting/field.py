@@ -61,7 +61,7 @@ class Field:
         'Network Architecture'). The encoder runs once a field, the decoder once a light.
         """
         network, face, device = self._network, self.face, self.models.device
-        encoded = self._encode() if self._has_gradients else self._encoded
+        encoded = self._encode() if self.has_gradients else self._encoded
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals, grey = normals[None].to(device), is_grey(face.texture)
 
@@ -81,7 +81,7 @@ class Field:
         return replace(self, face=shrunk(self.face)).relit(rig, torch.full((1, _AROUND, 3), 1 / _AROUND))[0]
 
     @property
-    def _has_gradients(self) -> bool:
+    def has_gradients(self) -> bool:
         """If the encoded face has gradients, which serve one `backward` alone."""
         network: Any = self._network
         taken = (self.face.texture, *network.parameters())

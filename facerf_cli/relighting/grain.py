@@ -17,6 +17,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from facerf_cli.image.strips import STRIP_PX, box_means, strips
 
@@ -119,6 +122,17 @@ class Grain:
         low, pixels = self._blurred(relit, seen.inside, seen.reached)[seen.own], relit[seen.own]
         weight, detail = (values[seen.rows, seen.columns, None] for values in (self._weight, self._detail))
         return np.asarray(pixels + weight * (detail * low - pixels))
+
+    def given_to(self, relit: Tensor, seen: GrainRows) -> Tensor:
+        """`given` of a tensor, with gradients."""
+        inside, reached = map(torch.from_numpy, (seen.inside, seen.reached))
+        planes, span = (relit * inside[..., None]).permute(2, 0, 1), 2 * self._reach + 1
+        for _ in range(2):
+            planes = F.avg_pool2d(F.pad(planes, [self._reach] * 4, mode="replicate"), span, 1)
+        low, pixels = (planes.permute(1, 2, 0) / reached)[seen.own], relit[seen.own]
+        halves = (values[seen.rows, seen.columns, None] for values in (self._weight, self._detail))
+        weight, detail = (torch.from_numpy(values).float() for values in halves)
+        return (1 - weight) * pixels + weight * detail * low
 
     def _blurred(self, values: np.ndarray, inside: np.ndarray, reached: np.ndarray) -> np.ndarray:
         """Some rows of an image [h, W, C], blurred inside the person, by two boxes."""

@@ -10,6 +10,8 @@ from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import in_strips
@@ -101,6 +103,17 @@ class PeopleInPhoto(Relightable):
     def own_image(self) -> np.ndarray:
         """The people [H, W, 3] as photographed, not multiplied by alpha."""
         return in_strips(partial(self._as_photographed, over=_straight), *self.size_px)["own"]
+
+    def of_faces(self, relit: Sequence[Any], rows: slice) -> Tensor:
+        """The part [h, W, 3] of rows of the image that the faces' textures give, with gradients."""
+        present, over = self._present(rows), _over if self.keeps_photo else _straight
+        parts = []
+        for one in present:
+            if not isinstance(one.person, PersonInPhoto):
+                continue
+            share = over(present, [np.full(1, other is one, np.float32) for other in present])
+            parts.append(one.person.of_face(relit[one.number], rows) * torch.from_numpy(share))
+        return torch.stack(parts).sum(0)
 
     def _present(self, rows: slice) -> list[_Present]:
         """The people in some rows: the first, and of a crowd few others."""

@@ -209,37 +209,82 @@ class PersonInPhoto:
     def pixels(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
         """Pixels [h, W, 3] of observed rows, without the photo's own light; 0 where nobody is."""
         rows, among = seen.grain.rows, seen.grain.columns
-        by_maps = pixels = self._by_maps(relit, seen)
-        columns, weight = self._views[0].weight(rows, among)
-        if weight.any():
-            pixels = by_maps.copy()
-            part = _within(columns, among)
-            for alone, shadow in relit.keys:  # a shadow is that of the narrower view
-                change = weight * (self._views[0].change(shadow, rows, columns) - 1)
-                if change.any():
-                    image = by_maps if alone is None else self._by_maps(alone, seen)
-                    pixels[:, part] += image[:, part] * change[..., None]
+        by_maps = self._by_maps(relit, seen)
+        pixels = by_maps.copy() if relit.keys else by_maps
+        for alone, part, change in self._shadows(relit, rows, among):
+            image = by_maps if alone is None else self._by_maps(alone, seen)
+            pixels[:, part] += image[:, part] * change
         return self._finish[1].lit(self._spread(pixels, among), relit.mirrored, rows)
+
+    def of_face(self, relit: PersonLight, rows: slice) -> Tensor:
+        """The part [h, W, 3] of rows of the photo that the face's textures give, with gradients.
+
+        `pixels` are this part, which is linear in the textures, and others that do not depend on them.
+        """
+        seen, found = self.observe(rows), torch.zeros(rows.stop - rows.start, self.size_px[1], 3)
+        if seen.detail is None:
+            return found
+        columns = seen.grain.columns
+        by_maps = self._face_by_maps(relit, seen)
+        found[:, columns] = by_maps
+        for alone, part, change in self._shadows(relit, rows, columns):
+            image = by_maps if alone is None else self._face_by_maps(alone, seen)
+            found[:, columns][:, part] += image[:, part] * torch.from_numpy(change)
+        ones, nothing = np.ones(found.shape, np.float32), [np.zeros_like(image) for image in relit.mirrored]
+        return found * torch.from_numpy(self._finish[1].lit(ones, nothing, rows))
+
+    def _shadows(
+        self, relit: PersonLight, rows: slice, among: slice
+    ) -> Iterator[tuple[PersonLight | None, slice, np.ndarray]]:
+        """Each key light alone, and columns among those given in which its shadow changes it by [h, w, 1].
+
+        A shadow is that of the narrower view.
+        """
+        columns, weight = self._views[0].weight(rows, among)
+        for alone, shadow in relit.keys if weight.any() else ():
+            change = weight * (self._views[0].change(shadow, rows, columns) - 1)
+            if change.any():
+                yield alone, _within(columns, among), change[..., None]
+
+    def _face_by_maps(self, relit: PersonLight, seen: PersonRows) -> Tensor:
+        """The part [h, w, 3] of `_by_maps` that the face's textures give, with gradients."""
+        person = torch.zeros(*seen.grain.inside.shape, 3)
+        at, share, detail = self._face_at(relit, seen)
+        person[at] = torch.from_numpy(share) * detail
+        if self._field.person.normals is not None:
+            person = person * torch.from_numpy(self._change_by_normals(relit, seen))
+        return self._finish[0].given_to(person, seen.grain)
+
+    def _face_at(
+        self, relit: PersonLight, seen: PersonRows
+    ) -> tuple[tuple[slice, slice], np.ndarray, Tensor]:
+        """Rows and columns of observed pixels that show the face, its share [h, w, 1], its own pixels."""
+        assert seen.detail is not None
+        rows, among = self.view.rows_of(seen.inside, seen.grain.wide), seen.grain.columns
+        window = self.view.window[1]
+        start = max(window.start, among.start)
+        common = slice(start, max(start, min(window.stop, among.stop)))
+        own = _within(common, window)
+        detail = self._detail.pixels(relit.detail, seen.detail, seen.inside)[:, own]
+        return (rows, _within(common, among)), seen.face_share[:, own, None], detail
 
     def _by_maps(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
         """Observed pixels [h, w, 3] without what only the photo's pixels show: shadows' edges, and eyes."""
         rims = self._rims if relit.from_behind else None
-        used, among = self._used(relit.views, seen), seen.grain.columns
+        used = self._used(relit.views, seen)
         shown = [view.radiance(light, rows, rims) for view, light, rows in used]
         person, behind = np.split(_joined(shown, seen.parts), [3], -1)
         if seen.detail is not None:  # the field of the face knows no hair around it
-            rows, window = self.view.rows_of(seen.inside, seen.grain.wide), self.view.window[1]
-            start = max(window.start, among.start)
-            common = slice(start, max(start, min(window.stop, among.stop)))
-            part, own = person[rows, _within(common, among)], _within(common, window)
-            detail = self._detail.pixels(relit.detail, seen.detail, seen.inside)[:, own]
-            part += seen.face_share[:, own, None] * (detail - part)
+            at, share, detail = self._face_at(relit, seen)
+            person[at] += share * (detail.numpy() - person[at])
         if self._field.person.normals is not None:
-            used = self._used(relit.views, seen)
-            person = person * _joined(
-                [view.change_by_normals(light, one) for view, light, one in used], seen.parts
-            )
+            person = person * self._change_by_normals(relit, seen)
         return self._finish[0].given(person + behind if behind.size else person, seen.grain)
+
+    def _change_by_normals(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
+        """Factor [h, w, 3] of observed pixels by given normals."""
+        used = self._used(relit.views, seen)
+        return _joined([view.change_by_normals(light, one) for view, light, one in used], seen.parts)
 
     def layer(self, name: str, relit: PersonLight, seen: PersonRows) -> dict[str, np.ndarray]:
         """A layer [h, W, C] of observed rows, by the names that it has in a file.

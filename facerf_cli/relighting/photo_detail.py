@@ -52,7 +52,7 @@ class RelitDetail:
     """A relit texture with the change of light on the skin [6, T, T], and k [3]."""
 
     textures: Tensor
-    mean_change: np.ndarray
+    mean_change: Tensor
 
 
 class PhotoDetail:
@@ -90,17 +90,18 @@ class PhotoDetail:
 
         `mouth` [3, T, T] is relit by what falls into the mouth.
         """
-        mean_change = (mean_colour(texture, self.trusted) / self.mean_source.clamp(min=TINY)).numpy()
+        mean_change = mean_colour(texture, self.trusted) / self.mean_source.clamp(min=TINY)
         around = inpaint(texture, self.trusted)
         if mouth is not None:
             around = torch.lerp(around, inpaint(mouth, self.trusted), _CAVITY * self._mouth)
         return RelitDetail(torch.cat([texture, around / self._around_source]), mean_change)
 
-    def pixels(self, relit: RelitDetail, seen: DetailRows, inside: slice) -> np.ndarray:
+    def pixels(self, relit: RelitDetail, seen: DetailRows, inside: slice) -> Tensor:
         """The photo's pixels [h, w, 3] in rows of the window under the light of a relit texture."""
-        skin, change = np.split(self._view.render(relit.textures, inside).numpy(), 2, -1)
-        skin = skin * seen.gain + relit.mean_change * seen.bias
-        return np.asarray(skin + seen.own * (change * seen.pixels - skin))
+        skin, change = self._view.render(relit.textures, inside).chunk(2, -1)
+        pixels, gain, bias, own = map(torch.from_numpy, (seen.pixels, seen.gain, seen.bias, seen.own))
+        skin = skin * gain + relit.mean_change * bias
+        return skin + own * (change * pixels - skin)
 
 
 def _steady_colours(pixels: np.ndarray, around: np.ndarray, dark: float) -> np.ndarray:
