@@ -1,6 +1,6 @@
 """Normals of a real scanned head: mean angle to the truth, and sharpness, by view.
 
-    python benchmarks/emily_normals.py [--emily DIR] [--given]
+    python benchmarks/emily_normals.py [--emily DIR] [--given] [--checkpoint FILE]
 
 DIR holds seven views of the Wikihuman Project's Digital Emily 2 (MIT, github.com/hpd/DigitalEmily), half
 as large as its renders: `view_N.jpg`, and `truth_N.npz` from its mesh through the scene's cameras: `normal`
@@ -16,7 +16,7 @@ import numpy as np
 from _common import SHARED, arguments, print_header, print_row, required
 from PIL import Image
 
-from facerf_cli.api import Light, fit, load_models
+from facerf_cli.api import Light, Models, fit, load_models
 from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import linear_to_srgb
 
@@ -29,18 +29,22 @@ def main() -> None:
     parser = arguments(__doc__)
     parser.add_argument("--emily", type=Path, help="folder of the views")
     parser.add_argument("--given", action="store_true", help="give the true normals")
+    parser.add_argument(
+        "--checkpoint", type=Path, nargs="*", default=[], help="networks in place of the shipped"
+    )
     given = parser.parse_args()
+    models = load_models(given.checkpoint)
     folder = required(given.emily, "views of Digital Emily", "--emily", SHARED / "bench" / "emily")
     images = ("face's images, of 255", "rest's") if given.given else ()
     print_header("view", "face, degrees", "rest, degrees", "sharpness", *images)
-    rows = [measured(folder, view, given.given) for view in VIEWS]
+    rows = [measured(models, folder, view, given.given) for view in VIEWS]
     for view, row in (*zip(VIEWS, rows, strict=True), ("mean", np.mean(rows, 0))):
         print_row(str(view), *(f"{value:.2f}" for value in row))
 
 
-def measured(folder: Path, view: int, given: bool) -> tuple[float, ...]:
+def measured(models: Models, folder: Path, view: int, given: bool) -> tuple[float, ...]:
     """Mean angles in degrees over the face and the rest, the sharpness in the face, and changes of images."""
-    models, path = load_models(), folder / f"view_{view}.jpg"
+    path = folder / f"view_{view}.jpg"
     photo, file = read_image(path).pixels, np.load(folder / f"truth_{view}.npz", allow_pickle=False)
     truth, known = unit(file["normal"].astype(np.float32))
     person = fit(models, photo)

@@ -1,6 +1,6 @@
 """Whole heads of real people under single flashes, relit by facerf: relative error and SSIM by region.
 
-    python benchmarks/whole_heads.py [--data DIR] [--every N] [--people yaleB15,...]
+    python benchmarks/whole_heads.py [--data DIR] [--every N] [--people yaleB15,...] [--checkpoint FILE]
 
 Pairs and scores are those of `portrait.py`; each source is fitted once. The twin is the photo left as it is.
 """
@@ -25,9 +25,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of the frames")
     parser.add_argument("--every", type=int, default=1, help="of the sources, only each Nth")
     parser.add_argument("--people", default="yaleB01,yaleB11,yaleB15")
+    parser.add_argument(
+        "--checkpoint", type=Path, nargs="*", default=[], help="networks in place of the shipped"
+    )
     given = parser.parse_args()
     data = required(given.data, "uncropped frames of Extended Yale B", "--data", WHOLE_YALE_B)
-    models, people = load_models(), given.people.split(",")
+    models, people = load_models(given.checkpoint), given.people.split(",")
     pairs = [pair for pair in portrait.pairs(data) if pair[0] in people]
     sources = sorted({pair[:2] for pair in pairs})[:: given.every]
     relit: dict[portrait.Pair, np.ndarray] = {}
