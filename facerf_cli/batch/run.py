@@ -202,7 +202,7 @@ class BatchOptions:
         overwrite: Make again results that exist: never; those that were made from other inputs, options or
             networks (changed); or always.
         dry_run: List what would be read and written; write nothing.
-        jobs: Process this many items at a time.
+        jobs: Process so many items at a time.
         shard: Process every Nth item only, from the Kth on; other machines take the rest.
         ray: Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).
         name: Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is
@@ -225,7 +225,7 @@ class BatchOptions:
         None,
         in_recipe=False,
         flags=("--jobs", "-j"),
-        shown_default="1; up to one a processor for many photos",
+        shown_default="auto",
         least=1,
         panel=BATCH,
         everyday=True,
