@@ -127,7 +127,14 @@ def test_of_the_texture(person: facerf.Person, light: facerf.Light, loss: Loss, 
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
-@pytest.mark.parametrize("shown", [{}, {"background": "none"}, {"background": (0.1, 0.2, 0.3)}])
+@pytest.mark.parametrize(
+    "shown",
+    [
+        {"background": "none"},
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"background": (0.1, 0.2, 0.3)}, marks=pytest.mark.slow),
+    ],
+)
 def test_of_texture_and_weights_in_the_photo(person: facerf.Person, shown: dict[str, Any]) -> None:
     texture = torch.from_numpy(person.texture)
     rows = torch.linspace(-1, 2, astronaut.photo().shape[0], dtype=torch.float64)[:, None, None]
