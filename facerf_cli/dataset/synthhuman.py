@@ -33,6 +33,7 @@ from facerf_cli.portrait.given_normals import unit_normals, with_normals
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import Networks
+from facerf_cli.relighting.shade import even_shade_of
 from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.bank.parsing import PortraitCrops
 from facerf_cli.synth.bank.transport import person_in
@@ -114,6 +115,7 @@ class SynthHumanNormals:
         seen = {name: values.float() for name, values in load_file(file).items()}
         normals, alpha = seen.pop("true_normals"), seen.pop("alpha")
         inputs = PortraitInputs(**seen)
+        inputs = replace(inputs, image=inputs.image * even_shade_of(inputs.image[0], inputs.classes[0]))
         if torch.rand((), generator=generator) < 0.5:
             inputs, normals, alpha = inputs.mirrored(), mirrored_x(normals.flip(-1)), alpha.flip(-1)
         return SeenNormals(inputs, normals, alpha)

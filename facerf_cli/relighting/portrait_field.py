@@ -33,7 +33,7 @@ from facerf_cli.relighting.baked_in import without_baked_in
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.rims import from_behind
-from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.relighting.shade import even_shade_of
 from facerf_cli.relighting.source_light import SourceLight, share_of_lamp
 from facerf_cli.relighting.white import BARE, Balance
 from facerf_cli.run.threads import in_threads
@@ -345,7 +345,7 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """
     rig = rig_directions(_SUMMARY_LIGHTS)
     inputs = person.inputs(rig, person.visibility(rig))
-    even = without_colour_of_shade(inputs.image[0], inputs.classes[0, BARE].sum(0))
+    even = even_shade_of(inputs.image[0], inputs.classes[0])
     inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device
     on_device = inputs.to(device)

@@ -9,6 +9,7 @@ photo as it is, and gives it back in its own light.
 from torch import Tensor
 
 from facerf_cli.raster.texture import blurred_within
+from facerf_cli.relighting.white import BARE
 
 _REACH = 0.03  # blur of colours, in sides: what is narrower, as freckles are, is the skin's own
 _SHADE = (0.3, 0.8)  # brightness over that of lit skin, below which all is shade, and from which on none
@@ -34,3 +35,8 @@ def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
     change = typical * colour.mean(0) / colour.clamp_min(_TINY)
     amount = blurred_within(shade[None], skin, near)[0] * (2 * skin).clamp(max=1)
     return change.clamp(1 / _MOST, _MOST) ** amount
+
+
+def even_shade_of(image: Tensor, classes: Tensor) -> Tensor:
+    """Factors of bare skin, by classes [C, S, S], for an image that the Portrait Network is to see."""
+    return without_colour_of_shade(image, classes[BARE].sum(0))

@@ -207,6 +207,9 @@ def test_people_of_synthhuman_teach_normals_alone(tmp_path: Path, monkeypatch: P
         agreed = (sample.inputs.normals[:, 0] * sample.normals[:, 0])[shown]
         assert shown.float().mean() > 0.1 and agreed.mean() > 0.1
     assert len({round(float(one.alpha[..., :80].sum())) for one in samples}) == 2
+    with monkeypatch.context() as patched:  # shaded skin is seen as in photos
+        patched.setattr("facerf_cli.dataset.synthhuman.even_shade_of", lambda image, classes: 0 * image)
+        assert not people.draw(torch.Generator()).inputs.image.any()
     settings = replace(SETTINGS, synthhuman=0.5)
     network = PortraitNetwork(PortraitSettings((4, 4, 4, 4, 4)))
     stage = PortraitObjective(Portraits(), network, settings, people)

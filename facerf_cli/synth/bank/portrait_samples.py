@@ -20,8 +20,7 @@ from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_x, reached_by
 from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading
-from facerf_cli.relighting.shade import without_colour_of_shade
-from facerf_cli.relighting.white import BARE
+from facerf_cli.relighting.shade import even_shade_of
 from facerf_cli.synth.bank import files_in, split_people
 from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
 from facerf_cli.synth.bank.portraits import Lamp, background_of, draw_photo_light
@@ -204,9 +203,8 @@ def sample_of(
     shares[:, rows:] = 0
     shares[0, rows:] = 1
     normals, sides = seen["normals"].float(), seen.get("sides", torch.tensor(SIDES))
-    even = without_colour_of_shade(photo, classes[BARE].sum(0))  # as `relighting.portrait_field.maps_of` does
     inputs = PortraitInputs(
-        image=photo / _mean_over(photo, skin) * MEAN_RADIANCE * even,
+        image=photo / _mean_over(photo, skin) * MEAN_RADIANCE * even_shade_of(photo, classes),
         classes=classes,
         normals=normals,
         depth=seen["depth"].float(),

@@ -19,6 +19,7 @@ from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.raster.camera import project
 from facerf_cli.relighting.shade import without_colour_of_shade
+from facerf_cli.relighting.white import BARE
 from facerf_cli.synth import bank
 from facerf_cli.synth.bank import Files, portrait_samples, transport
 from facerf_cli.synth.bank.portrait_samples import (
@@ -175,9 +176,9 @@ def test_the_network_sees_shaded_skin_in_the_colour_of_lit_skin(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     even = drawn(folder, 3)
-    monkeypatch.setattr(portrait_samples, "without_colour_of_shade", lambda image, skin: torch.ones(3, 1, 1))
+    monkeypatch.setattr(portrait_samples, "even_shade_of", lambda image, classes: torch.ones(3, 1, 1))
     plain = drawn(folder, 3).inputs.image[0]
-    skin = even.inputs.classes[0, portrait_samples.BARE].sum(0)
+    skin = even.inputs.classes[0, BARE].sum(0)
     factors = without_colour_of_shade(plain, skin)
     assert factors.min() < 0.95
     torch.testing.assert_close(even.inputs.image[0], plain * factors, rtol=1e-4, atol=1e-5)
