@@ -122,6 +122,8 @@ class Item:
     name: str  # path in the output folder, without suffix; the item's identity there
     mirrored: PurePosixPath | None = None  # of a file: path in its input folder, or name alone
     stale: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs to be made; empty: all
+    kept: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs that stay as they are
+    key: str = field(default="", compare=False)  # of the one file of -o, for its metadata
     frame: int | None = field(default=None, compare=False)  # of a film, from 0
 
     @property
@@ -217,20 +219,47 @@ def _as_frames(found: Sequence[tuple[Path, PurePosixPath]]) -> Iterator[tuple[Pa
 
 
 def _refuse_meeting(items: Sequence[Item], pattern: NamePattern | None) -> None:
-    """Raise UsageError for two items with one name; case counts only where one folder holds both."""
+    """Raise UsageError for two items with one name."""
     by_name: dict[str, Item] = {}
     for item in items:
-        plain = unicodedata.normalize("NFC", item.name)
-        other = by_name.setdefault(plain.casefold(), item)
-        same = plain == unicodedata.normalize("NFC", other.name)  # in some file systems, and to the eye
-        apart = not same and other.input_path.parent == item.input_path.parent
-        if other is not item and not apart:
+        # Two forms of Unicode are one name in some file systems, and to the eye.
+        other = by_name.setdefault(unicodedata.normalize("NFC", item.name), item)
+        if other is not item:
             alike = "--name names them alike; give it more fields, such as {stem} and {ext}"
             by_path = (
                 f"would both be written as {item.name}; rename one, name the folder that holds both, or "
                 "give --name where the verb has it, such as '{dir}/{stem}_{ext}'"
             )
             raise UsageError(f"{other.input_path} and {item.input_path}: {alike if pattern else by_path}")
+
+
+def check_case(outputs: Sequence[Path], folder: Path) -> None:
+    """Raise UsageError for outputs that are one file where the file system ignores case; warn elsewhere."""
+    by_name: dict[str, Path] = {}
+    alike = [
+        (other, path)
+        for path in outputs
+        if (other := by_name.setdefault(unicodedata.normalize("NFC", str(path)).casefold(), path)) != path
+    ]
+    if not alike:
+        return
+    first, second = alike[0]
+    if _ignores_case(folder):
+        raise UsageError(
+            f"{first} and {second}: would be one file, since the file system ignores case; rename one input, "
+            "or pass --name"
+        )
+    log.warning("%s and %s: differ only in case; on macOS and Windows they would be one file", first, second)
+
+
+def _ignores_case(folder: Path) -> bool:
+    """Tell whether the file system of a folder ignores case, by a name in it or in the next folder above."""
+    above = folder.absolute()
+    here = next(path for path in (above, *above.parents) if path.is_dir())
+    for name in os.listdir(here):
+        if (other := name.swapcase()) != name:
+            return os.path.exists(here / other) and os.path.samefile(here / name, here / other)
+    return False
 
 
 def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:

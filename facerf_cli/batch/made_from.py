@@ -2,14 +2,19 @@
 
 A key joins the digests of an output's recipe (all options and files that shape it) and of its input.
 `.facerf-index.jsonl` has a row for each output (its key and SHA-256), for each recipe, and for each file
-that was read (size, time, inode and SHA-256: an unchanged one is not read again). The last row of a name
+that was read (size, times, inode and SHA-256: an unchanged one is not read again). The last row of a name
 counts. With `--shard` each process writes an index of its own and reads all. That of the one file that `-o`
-names is in the user's cache, so that nothing lies beside the file.
+names is in the user's cache, so that nothing lies beside the file; this file also carries its key.
+
+A file is replaced only if facerf wrote it and it has not changed since (`FolderIndex.refusal`). Therefore
+the digest of an output is noted before the output gets its name, in a journal per process
+(`.facerf-index.MACHINE-PROCESS.jsonl`), which the next run merges: outputs of a killed run are recognised.
 """
 
 import dataclasses
 import hashlib
 import json
+import mmap
 import os
 import os.path
 import stat
@@ -20,9 +25,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from facerf_cli.batch.settings import Shard
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.settings import Overwrite, Shard
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.atomic import atomic_path, is_temporary, machine_id
 from facerf_cli.files.texts import file_sha256, is_regular, parse_json, regular_size, require_regular
 from facerf_cli.option import flag
 from facerf_cli.run.logs import json_line
@@ -239,10 +245,14 @@ class FolderIndex:
         self.path = _in_cache(file) if file else folder / f".facerf-index{shard.suffix}.jsonl"
         # A cache that cannot be written to costs the next run the same work again, not this one.
         self._lost: tuple[type[Exception], ...] = (FacerfError, OSError) if file else ()
+        self._is_single = file is not None
         self.outputs: dict[str, Row] = {}
+        self._unfinished: list[Row] = []  # outputs of items that a killed run did not finish
+        self._digests: dict[str, set[str]] = {}  # by output: what facerf has written there
+        self._of_item: dict[Any, set[str]] = {}  # by command and item: its outputs
         self._files: dict[str, Row] = {}
         self._recipes: dict[str, Recipe] = {}
-        for path in [self.path] if file else sorted(folder.glob(_INDEXES)):
+        for path in [self.path, *self._journals()] if file else sorted(folder.glob(_INDEXES)):
             for row in json_rows(path):
                 self._take(row)
         self._new: list[Row] = []  # files read since the rows were last written
@@ -253,9 +263,12 @@ class FolderIndex:
         elif "output" in row:
             name = str(row["output"])
             if not name.startswith("/") and ".." not in name.split("/"):
-                self.outputs[name] = row
-                if "recipe" in row:  # as it was before there were keys
-                    row["key"] = _key(str(row["recipe"]), str(row.get("input")))
+                if "key" in row:
+                    self.outputs[name] = row
+                else:
+                    self._unfinished.append(row)
+                self._digests.setdefault(name, set()).add(str(row.get("sha256")))
+                self._of_item.setdefault((row.get("verb"), row.get("item")), set()).add(name)
         elif "sha256" in row:
             self._files[str(row.get("file"))] = row
 
@@ -273,6 +286,23 @@ class FolderIndex:
             self._note(known)
         return str(known["sha256"])
 
+    def to_make(
+        self, read: Path, outputs: Sequence[Path], recipes: Keyed, overwrite: Overwrite
+    ) -> dict[Path, str]:
+        """Return the outputs of an input that must be made, and why: '' where they never were.
+
+        Raises InputError for one that would replace a file which facerf did not write, or which has changed.
+        """
+        if overwrite == "always":
+            return dict.fromkeys(outputs, "")
+        if overwrite == "never":
+            return {path: "" for path in outputs if not is_there(path)}
+        stale = self.why_again(read, outputs, recipes)
+        for path in stale:
+            if refusal := self.refusal(path):
+                raise InputError(refusal)
+        return stale
+
     def why_again(self, read: Path, outputs: Sequence[Path], recipes: Keyed) -> dict[Path, str]:
         """The outputs of an input that must be made, and why: '' where they never were."""
         stale, digest = {}, None
@@ -281,23 +311,44 @@ class FolderIndex:
             if size is None:
                 stale[path] = "" if row is None else "an output is missing"
                 continue
-            if row is None or row.get("verb") != self._verb:
-                stale[path] = "nothing says what they were made from"
-                continue
             key, recipe = _of_output(recipes, number)
-            before, _, read_before = str(row.get("key")).partition(" ")
             digest = digest or self._digest_or_none(read)
-            if before != key:
-                stale[path] = f"made from {other_options(self._recipes.get(before, {}), recipe)}"
+            before, _, read_before = str(row.get("key")).partition(" ") if row else ("", "", "")
+            if row is None or row.get("verb") != self._verb:
+                reason = "nothing says what they were made from"
+            elif before != key:
+                reason = f"made from {other_options(self._recipes.get(before, {}), recipe)}"
             elif read_before != digest[:_INPUT]:
-                stale[path] = "made from another input"
-            elif size == 0:
-                stale[path] = "an output is empty"
+                reason = "made from another input"
+            else:
+                reason = "" if size else "an output is empty"
+            if reason and not (self._is_single and _carries(path, _key(key, digest))):
+                stale[path] = reason
         return stale
+
+    def refusal(self, path: Path) -> str:
+        """Say why an output must not be replaced; '' if facerf wrote what is there, or nothing is there."""
+        if regular_size(path) == 0 or not path.exists():
+            return ""
+        written = self._digests.get(self._name(path))
+        if written and self._digest_or_none(path) in written:
+            return ""
+        state = "was changed after facerf wrote it" if written else "was not written by facerf"
+        return f"{path}: {state}; move it, choose another -o, or pass --overwrite always"
 
     def is_edited(self, path: Path) -> bool:
         """True if an output is not as it was written."""
-        return self._digest_or_none(path) != self.outputs[self._name(path)].get("sha256")
+        return self._name(path) in self.outputs and self.refusal(path) != ""
+
+    def key_of(self, read: Path, recipe: str) -> str:
+        """Return the key of an output that is made from an input by the recipe of a digest."""
+        return _key(recipe, self._digest_or_none(read))
+
+    def replaceable(self, item: Item) -> set[Path]:
+        """Return all files that this command has written for an item and that facerf may replace."""
+        names = self._of_item.get((self._verb, item.name), set())
+        paths = (self._folder / name for name in names)
+        return {path for path in paths if path.exists() and not self.refusal(path)}
 
     def open(self, recipes: Keyed, has_work: bool) -> None:
         """Write the rows, for the outputs that follow, or since files were read that they do not know."""
@@ -307,11 +358,21 @@ class FolderIndex:
         self._new.clear()
         rows: list[Mapping[str, Any]] = list(self._files.values())
         rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
-        rows += self.outputs.values()
-        with suppress(*self._lost), atomic_path(self.path) as temporary:
-            temporary.write_text(lines_of(rows), encoding="utf-8")
+        rows += [*self._unfinished, *self.outputs.values()]
+        with suppress(*self._lost):
+            with atomic_path(self.path) as temporary:
+                temporary.write_text(lines_of(rows), encoding="utf-8")
+            self.close()
 
-    def add(self, made: Made, outputs: Sequence[Path], recipes: Keyed) -> None:
+    def close(self) -> None:
+        """Remove the journals of this index, all rows of which it has."""
+        for journal in self._journals():
+            journal.unlink(missing_ok=True)
+
+    def _journals(self) -> list[Path]:
+        return sorted(self.path.parent.glob(f"{self.path.stem}.*.jsonl"))
+
+    def add(self, item: str, made: Made, outputs: Sequence[Path], recipes: Keyed) -> None:
         """Add the rows of an item that was made; `outputs` are those that have a recipe, in their order."""
         self._note(made.read)
         keys = {self._name(path): _of_output(recipes, number)[0] for number, path in enumerate(outputs)}
@@ -320,7 +381,16 @@ class FolderIndex:
             self._note(row)
             name = self._name(Path(row["file"]))
             key = _key(keys.get(name, ""), made.read["sha256"])
-            rows.append({"output": name, "verb": self._verb, "sha256": row["sha256"], "key": key})
+            digest = {"sha256": row["sha256"], "key": key}
+            rows.append({"output": name, "verb": self._verb, "item": item, **digest})
+        self._append(rows)
+
+    def own(self, path: Path) -> None:
+        """Note a file that belongs to no item, such as the list of all pages, as written by facerf."""
+        row = {"output": self._name(path), "verb": self._verb, "sha256": read_row(path)["sha256"]}
+        self._append([row])
+
+    def _append(self, rows: Iterable[Row]) -> None:
         with suppress(*self._lost), self.path.open("a", encoding="utf-8") as stream:
             stream.write(lines_of([*rows, *self._new]))
         self._new.clear()
@@ -340,6 +410,81 @@ class FolderIndex:
         if text.startswith(self._prefix) and ".." not in text:  # as all of a verb's; ten times faster
             return text[len(self._prefix) :].replace(os.sep, "/")
         return Path(os.path.relpath(path, self._folder)).as_posix()
+
+
+class Writes:
+    """Decides which files the writes of an item may replace, and journals the digests of what it writes.
+
+    Attributes:
+        written: SHA-256 of each file in the output folder that the item has written.
+        left: Files that were left as they are.
+    """
+
+    def __init__(self, item: Item, folder: Path, verb: str, index: Path, overwrite: Overwrite) -> None:
+        self.written: dict[Path, str] = {}
+        self.left: set[Path] = set()
+        self._item, self._folder, self._overwrite = item, folder, overwrite
+        self._row = {"verb": verb, "item": item.name}
+        self._journal = index.with_name(f"{index.stem}.{machine_id()}-{os.getpid()}.jsonl")
+
+    def __call__(self, path: Path, temporary: Path) -> bool:
+        """Tell whether a file or folder takes the place of what is at a path; see `atomic.asking`.
+
+        Raises InputError for a file that is not facerf's.
+        """
+        if is_temporary(path) or not path.is_relative_to(self._folder):
+            return True
+        there = {file for file in _files(path) if file.stat().st_size}
+        if there & self._item.kept or (there and self._overwrite == "never"):
+            self.left.add(path)
+            return False
+        if self._overwrite == "changed" and (others := there - self._item.stale):
+            raise InputError(
+                f"{min(others)}: was not written by facerf, or was changed since; move it, choose another "
+                "-o, or pass --overwrite always"
+            )
+        for file in _files(temporary):
+            self._note(path / file.relative_to(temporary), file_sha256(file))
+        return True
+
+    def _note(self, path: Path, digest: str) -> None:
+        self.written[path] = digest
+        row = {"output": path.relative_to(self._folder).as_posix(), **self._row, "sha256": digest}
+        with suppress(OSError):  # only the next run after a kill needs it
+            descriptor = os.open(self._journal, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+            try:
+                os.write(descriptor, lines_of([row]).encode())
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+
+    def rows(self, outputs: Iterable[Path]) -> tuple[Row, ...]:
+        """Return rows of all that was written, and of outputs that were written by other means."""
+        rows = [
+            {"file": os.path.abspath(path), **_state(path.stat()), "sha256": digest}
+            for path, digest in self.written.items()
+        ]
+        rows += [read_row(path) for path in outputs if path not in self.written.keys() | self.left]
+        return tuple(rows)
+
+
+def is_there(path: Path) -> bool:
+    """True for a folder, and for a file that is not empty: a full disk or a copy may leave empty ones."""
+    return path.is_dir() or bool(is_regular(path) and path.stat().st_size)
+
+
+def _files(path: Path) -> list[Path]:
+    """Return a file, or all files of a folder; nothing for a path where nothing is."""
+    if path.is_dir():
+        return [file for file in path.rglob("*") if file.is_file()]
+    return [path] if path.exists() else []
+
+
+def _carries(path: Path, key: str) -> bool:
+    """Tell whether a file contains a key, as the metadata of the file of `-o FILE` does."""
+    with suppress(OSError, ValueError), path.open("rb") as file:  # ValueError: an empty file
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ).find(key.encode()) >= 0
+    return False
 
 
 def _in_cache(file: Path) -> Path:

@@ -4,6 +4,7 @@ A verb passes a `Job` to `run_items`. It raises `InputError` for a faulty item (
 other `FacerfError` concerns the whole run and ends it.
 """
 
+import itertools
 import logging
 import os
 import re
@@ -11,20 +12,29 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
-from facerf_cli.batch.inputs import Item, NamePattern, file_pattern, files_read, refuse_read
+from facerf_cli.batch.inputs import (
+    Item,
+    NamePattern,
+    check_case,
+    file_pattern,
+    files_read,
+    refuse_read,
+)
 from facerf_cli.batch.made_from import (
     DigestOf,
     FolderIndex,
     Keyed,
     Made,
     Recipe,
+    Writes,
+    is_there,
     json_rows,
     keyed,
     lines_of,
@@ -32,11 +42,19 @@ from facerf_cli.batch.made_from import (
 )
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard, torch_device
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_leftovers
-from facerf_cli.files.texts import is_regular, require_regular
+from facerf_cli.files.atomic import all_or_none, alone_in, asking, atomic_path, sweep_leftovers
+from facerf_cli.files.texts import is_regular, regular_size, require_regular
 from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
-from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, printable_line, progress_bar, unexpected
+from facerf_cli.run.logs import (
+    LOGGER_NAME,
+    STDERR,
+    counted,
+    escaped,
+    printable_line,
+    progress_bar,
+    unexpected,
+)
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, ending, process_died, spread
 
@@ -114,9 +132,12 @@ def open_report(
 ) -> None:
     """Start the report: older rows stay, except those of items that are about to be made again.
 
-    A run without `--shard` takes over the rows of earlier shards.
+    A run without `--shard` takes over the rows of earlier shards. Raises UsageError for a file of this name
+    that is not a report.
     """
     rows = {(row.get("verb"), row.get("item")): row for row in rows_of(path)}
+    if not rows and regular_size(path) and not path.read_bytes().startswith(b'{"verb"'):
+        raise UsageError(f"{path}: was not written by facerf; move it, or choose another -o")
     for shard in sorted(path.parent.glob(_SHARD_REPORTS)) if path.name == REPORT_NAME else ():
         for row in rows_of(shard):
             key = row.get("verb"), row.get("item")
@@ -271,60 +292,62 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
 
     Raises UsageError where the output folder cannot be used, or an output is a file to be read.
     """
-    outputs = (path for item in items for path in job.outputs_of(item))
+    outputs = [path for item in items for path in job.outputs_of(item)]
     refuse_read(outputs, files_read((items, job), items))
     items, verb = options.shard.share(items), job.verb
-    is_new, lock_name = not options.output.exists(), f".facerf-lock{options.shard.suffix}"
+    lock_name = f".facerf-lock{options.shard.suffix}"
     with ExitStack() as stack:
         if not options.dry_run:
             try:
                 stack.enter_context(alone_in(options.output, lock_name))
             except OSError as error:
                 raise unusable(options.output, error) from error
+        check_case(outputs, options.output)
         index = FolderIndex(options.output, verb, options.shard, options.file)
         recipes = keyed(job.recipes_of(index.digest_of))
-        stale = _stale(job, items, recipes, options, index)
+        stale, refused = _planned(job, items, recipes, options, index)
         lacks = 0
         if any(stale.values()):
             usable = job.ready(options.dry_run)
             if usable is not job:
                 lacks, job, recipes = 1, usable, keyed(usable.recipes_of(index.digest_of))
-                stale = _stale(job, items, recipes, options, index)
-        todo = [replace(item, stale=frozenset(paths)) for item, paths in stale.items() if paths]
+                stale, refused = _planned(job, items, recipes, options, index)
+        todo = [_to_make(item, job, paths, index, recipes, options) for item, paths in stale.items() if paths]
         finished = [item for item, paths in stale.items() if not paths]
+        kept = {item: [path for path in job.outputs_of(item) if path not in stale[item]] for item in stale}
         again = Counter(next(filter(None, paths.values()), "") for paths in stale.values())
+        if count := sum(map(len, kept.values())):
+            log.info("%d of %d results are finished and kept", count, count + sum(map(len, stale.values())))
         if options.dry_run:
             _log_to_make_again(again)
-            return max(lacks, _list_what_would_be_done(todo, finished, job))
+            for result in refused:
+                _print_result(result, options)
+            return max(lacks, int(bool(refused)), _list_what_would_be_done(stale))
         report = options.output / f"report{options.shard.suffix}.jsonl"
         if options.reports:
-            open_report(report, verb, todo, finished, job.outputs_of)
+            open_report(report, verb, [*todo, *(one.item for one in refused)], finished, job.outputs_of)
         if recipes:
             index.open(recipes, bool(todo))
-        if finished:
-            advice = "" if options.overwrite == "never" else " from the same inputs and options"
-            log.info("%d of %d already finished%s", len(finished), len(items), advice)
         _log_to_make_again(again)
         if recipes and options.overwrite == "changed":
-            kept = [set(job.outputs_of(item)) - set(stale[item]) for item in items]
-            if edited := sum(map(index.is_edited, set().union(*kept))):
-                advice = "%d results were changed after they were written; they are kept (--overwrite always)"
-                log.warning(advice, edited)
-        if not todo:
+            of_item = ((paths, files_read((item, job), [item])) for item, paths in kept.items())
+            warn_of_edited(sum(keep(index, paths, read) for paths, read in of_item))
+        if not (todo or refused):
             return lacks
         jobs = jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
         failures, workers = 0, options.workers(settings, jobs)
         at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
-        work = partial(_run_one, job.process, bool(recipes), settings.job_bytes(at_once))
+        owner = (options.output, verb, index.path, options.overwrite) if recipes else None
+        work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
         memory.collect_as_usual()
         try:
             with _progress(settings) as progress, ending(spread(work, todo, workers, _broken)) as results:
                 task = progress.add_task(verb, total=len(todo))
-                for result in results:
+                for result in itertools.chain(refused, results):
                     if result.stops_the_run is not None:
                         raise result.stops_the_run
                     if result.made:
-                        index.add(result.made, job.outputs_of(result.item), recipes)
+                        index.add(result.item.name, result.made, job.outputs_of(result.item), recipes)
                     if options.reports:
                         add_row(report, verb, result)
                     failures += _print_result(result, options)
@@ -333,22 +356,61 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
                 for folder in {path.parent for item in todo for path in job.outputs_of(item)}:
                     sweep_leftovers(folder)
+        index.close()
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
-        elif failures and is_new:
-            _remove_what_is_empty(options.output, [report, options.output / lock_name, index.path])
         return max(lacks, int(failures > 0))
 
 
-def _stale(
+def _planned(
     job: Job, items: Sequence[Item], recipes: Keyed, options: BatchOptions, index: FolderIndex
-) -> dict[Item, dict[Path, str]]:
-    """The outputs of each item that must be made, and why; see `FolderIndex.why_again`."""
-    if options.overwrite == "changed" and recipes:
-        return {item: index.why_again(item.input_path, job.outputs_of(item), recipes) for item in items}
-    keep = options.overwrite != "always"
-    each = {item: job.outputs_of(item) for item in items}
-    return {item: {} if keep and _exist(paths) else dict.fromkeys(paths, "") for item, paths in each.items()}
+) -> tuple[dict[Item, dict[Path, str]], list[ItemResult]]:
+    """Return the outputs of each item that must be made, and why; and items that may not replace a file."""
+    stale: dict[Item, dict[Path, str]] = {}
+    refused: list[ItemResult] = []
+    for item in items:
+        outputs = job.outputs_of(item)
+        if not recipes:
+            done = options.overwrite != "always" and _exist(outputs)
+            stale[item] = {} if done else dict.fromkeys(outputs, "")
+            continue
+        try:
+            stale[item] = index.to_make(item.input_path, outputs, recipes, options.overwrite)
+        except InputError as error:
+            refused.append(ItemResult(item, 0.0, error=str(error)))
+    return stale, refused
+
+
+def _to_make(
+    item: Item, job: Job, stale: Mapping[Path, str], index: FolderIndex, recipes: Keyed, options: BatchOptions
+) -> Item:
+    """Return an item with the outputs that its work may replace and keeps, and the key of its one file."""
+    outputs = set(job.outputs_of(item))
+    others = index.replaceable(item) - outputs if recipes else set()
+    key = index.key_of(item.input_path, recipes[0][0]) if recipes and options.file else ""
+    return replace(item, stale=frozenset({*stale, *others}), kept=frozenset(outputs - set(stale)), key=key)
+
+
+def keep(index: FolderIndex, outputs: Sequence[Path], read: Iterable[Path]) -> int:
+    """Set the time of finished outputs that are older than a file they were made from, as Make expects.
+
+    Returns how many of them were changed after facerf wrote them.
+    """
+    edited = sum(map(index.is_edited, outputs))
+    with suppress(OSError):
+        newest_ns = max((path.stat().st_mtime_ns for path in read), default=0) if outputs else 0
+        for path in outputs:
+            if path.stat().st_mtime_ns < newest_ns:
+                os.utime(path)
+    return edited
+
+
+def warn_of_edited(count: int) -> None:
+    """Log that outputs were changed by the user and stay as they are."""
+    if count:
+        was = "was" if count == 1 else "were"
+        said = "%s %s changed after facerf wrote them; they are kept (--overwrite always replaces them)"
+        log.warning(said, counted(count, "result"), was)
 
 
 def sums_up(
@@ -371,8 +433,16 @@ def sums_up(
     return not left
 
 
-def _run_one(process: Callable[[Item], Outcome], indexed: bool, memory_bytes: int, item: Item) -> ItemResult:
-    """Run `process` on an item and return an `ItemResult`, whatever happens."""
+def _run_one(
+    process: Callable[[Item], Outcome],
+    owner: tuple[Path, str, Path, Overwrite] | None,
+    memory_bytes: int,
+    item: Item,
+) -> ItemResult:
+    """Run `process` on an item and return an `ItemResult`, whatever happens.
+
+    `owner` is the output folder, the command, its index and --overwrite, of a job that has recipes.
+    """
     start_s = time.perf_counter()
     memory.set_limit(memory_bytes)
 
@@ -381,13 +451,20 @@ def _run_one(process: Callable[[Item], Outcome], indexed: bool, memory_bytes: in
 
     try:
         can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
-        read = read_row(item.input_path) if indexed and can_be_read else None
+        read = read_row(item.input_path) if owner and can_be_read else None
         if item.is_file:
             require_regular(item.input_path)
-        with all_or_none() if item.is_file else nullcontext():
+        with ExitStack() as stack:
+            writes = Writes(item, *owner) if owner else None
+            if writes:
+                stack.enter_context(asking(writes))
+            if item.is_file:
+                stack.enter_context(all_or_none())
             outcome = process(item)
-        made = Made(read, tuple(map(read_row, outcome.outputs))) if read else None
-        return result(outcome=outcome, made=made)
+        if writes is None:
+            return result(outcome=outcome)
+        outcome = replace(outcome, outputs=[path for path in outcome.outputs if path not in writes.left])
+        return result(outcome=outcome, made=Made(read, writes.rows(outcome.outputs)) if read else None)
     except InputError as error:
         return result(error=str(error), trace=traceback.format_exc())
     except FacerfError as error:
@@ -405,21 +482,7 @@ def _broken(item: Item, error: Exception) -> ItemResult:
 
 
 def _exist(outputs: Sequence[Path]) -> bool:
-    return bool(outputs) and all(map(_is_there, outputs))
-
-
-def _is_there(path: Path) -> bool:
-    """True for a folder, and for a file that is not empty: a full disk or a copy may leave empty ones."""
-    return path.is_dir() or (is_regular(path) and path.stat().st_size > 0)
-
-
-def _remove_what_is_empty(folder: Path, records: Sequence[Path]) -> None:
-    """Remove a new folder in which only these records are; what another process wrote there stays."""
-    if not any(path.is_file() and path not in records for path in folder.rglob("*")):
-        for record in records:
-            record.unlink(missing_ok=True)
-        for empty in sorted([folder, *folder.rglob("*")], reverse=True):
-            empty.rmdir()
+    return bool(outputs) and all(map(is_there, outputs))
 
 
 def _log_to_make_again(reasons: Counter[str]) -> None:
@@ -428,12 +491,12 @@ def _log_to_make_again(reasons: Counter[str]) -> None:
             log.info("%d to make again: %s", count, reason)
 
 
-def _list_what_would_be_done(todo: Sequence[Item], finished: Sequence[Item], job: Job) -> int:
-    for item in todo:
-        for path in job.outputs_of(item):
+def _list_what_would_be_done(stale: Mapping[Item, Mapping[Path, str]]) -> int:
+    for item, paths in stale.items():
+        for path in paths:
             print_path(f"{item.input_path} -> {path}")
-    log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
-    missing = [item for item in (*todo, *finished) if item.is_file and not os.path.exists(item.input_path)]
+    log.info("dry run: %s would be made", counted(sum(map(len, stale.values())), "result"))
+    missing = [item for item in stale if item.is_file and not os.path.exists(item.input_path)]
     for item in missing:
         log.error("%s: no such file; check the path", item.input_path)
     return int(bool(missing))

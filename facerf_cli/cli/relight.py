@@ -156,12 +156,12 @@ def relight(
     images = [path for item in items for path in plan.outputs_of(item)]
     balls = [path for setup in plan.maps if options.ball for path in _balls_of(setup, plan, output)]
     refuse_read([film.path] if film else images + balls, files_read((items, plan, sources), items))
-    key = film.key_of_new(items, taken, images, plan.recipes_of, batch) if film else ""
-    if film is not None and not key:
+    recipes = film.recipes_of_new(items, taken, images, plan.recipes_of, batch) if film else []
+    if film is not None and not recipes:
         return
     code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
     if film is not None:
-        code = film.joined(images, taken, key, code)
+        code = film.joined(items, images, taken, recipes, code)
     elif options.ball and not batch.dry_run and batch.shard.number == 1:
         _write_balls(plan, batch)
     raise typer.Exit(code)

@@ -7,9 +7,10 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
+from facerf_cli.batch.made_from import FolderIndex
 from facerf_cli.batch.run import sums_up
 from facerf_cli.cli.options import InputsArgument
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.option import IMAGE, Without, option
 from facerf_cli.relighting import White
 from facerf_cli.work.photo_options import (
@@ -63,9 +64,14 @@ def view(
     many = not end_of_file(output, work.alone_as)
     if many and any(item.name == Path(_INDEX).stem for item in items):
         raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
+    index = FolderIndex(output, work.verb)
+    refusal = index.refusal(output / _INDEX) if many and batch.overwrite != "always" else ""
+    if refusal and batch.overwrite == "changed":
+        raise InputError(refusal)
     code = work.run_on(items, batch)
-    if many and not batch.dry_run and sums_up(items, work.outputs_of, batch):
+    if many and not (refusal or batch.dry_run) and sums_up(items, work.outputs_of, batch):
         from facerf_cli.work.view_photos import write_index
 
         write_index(output / _INDEX, items, photo)
+        index.own(output / _INDEX)
     raise typer.Exit(code)

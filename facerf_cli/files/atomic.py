@@ -18,7 +18,7 @@ import platform
 import secrets
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,6 +37,7 @@ _LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, that its temporary
 _OF_ONE_PATH = {errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EILSEQ}
 _open: set[Path] = set()  # temporary folders of this process
 _watched: list[list[Path]] = []  # what was written since each `all_or_none` began
+_asked: list[Callable[[Path, Path], bool]] = []  # before a file is replaced; see `asking`
 _swept: set[Path] = set()  # folders whose leftovers this process has removed
 log = logging.getLogger(LOGGER_NAME)
 
@@ -59,6 +60,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
             if not temporary.exists():
                 raise FacerfError(f"{path}: could not be written")
             _sync_all(temporary)
+            if not all([ask(path, temporary) for ask in _asked]):
+                return
             if temporary.is_dir() and path.is_dir() and not path.is_symlink():
                 os.replace(path, room / f"{path.name}.old")
             os.replace(temporary, path)
@@ -77,7 +80,7 @@ def hidden_folder(path: Path) -> Iterator[Path]:
     if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # for each file it would be quadratic
         _swept.add(absolute)
         sweep_leftovers(path.parent)
-    name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{machine_id()}-{os.getpid()}-{secrets.token_hex(4)}"
     room = path.parent / name
     _open.add(room)
     try:  # before it is there: an interrupt may come at any time
@@ -86,6 +89,19 @@ def hidden_folder(path: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(room, ignore_errors=True)
         _open.discard(room)
+
+
+@contextmanager
+def asking(ask: Callable[[Path, Path], bool]) -> Iterator[None]:
+    """Call `ask(path, temporary)` before each output of the block is renamed, in any thread.
+
+    If it returns False, the file at `path` stays as it is. It may raise.
+    """
+    _asked.append(ask)
+    try:
+        yield
+    finally:
+        _asked.pop()
 
 
 @contextmanager
@@ -117,11 +133,16 @@ def _remove_own() -> None:
         shutil.rmtree(room, ignore_errors=True)
 
 
+def is_temporary(path: Path) -> bool:
+    """Tell whether a path is in a temporary folder of `atomic_path`."""
+    return any(part.startswith(".") and _MARK in part for part in path.parts)
+
+
 clean_by(_remove_own)
 atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
 
 
-def _machine() -> str:
+def machine_id() -> str:
     """An id of this machine, since machines that share a folder may use the same process ids."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
@@ -129,9 +150,9 @@ def _machine() -> str:
 def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
     machine, _, rest = leftover.name.rpartition(_MARK)[2].partition("-")
     owner = rest.partition("-")[0]
-    if len(machine) != len(_machine()) or not owner.isdecimal():
+    if len(machine) != len(machine_id()) or not owner.isdecimal():
         return False
-    if machine == _machine():
+    if machine == machine_id():
         return not _runs(int(owner))
     try:
         return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S

@@ -131,16 +131,6 @@ def _begun(
     return stream, _Sounds(av, container, timing.sound, form.copied) if timing.sound else None
 
 
-def comment_of(path: Path) -> str:
-    """The comment in a film's metadata; empty for what is no film."""
-    av = require_av(path)
-    try:
-        with av.open(str(path)) as container:
-            return str(container.metadata.get("comment", ""))
-    except (av.error.FFmpegError, OSError, ValueError):
-        return ""
-
-
 def _timed(images: Sequence[Path], timing: Timing) -> Iterator[tuple[int, int, Path]]:
     """Start and length of each frame, in ticks."""
     starts = [round(time_s * _CLOCK) for time_s in timing.times_s]

@@ -47,6 +47,7 @@ class Provenance:
     face_model: str = ""
     face_model_licence: str = ""
     source_type: str = COMPOSITE_SOURCE_TYPE
+    key: str = ""  # of the file of `-o FILE`, by which a later run recognises it
 
     def attributes(self) -> dict[str, str | int]:
         """Metadata for a file's header; empty fields are left out."""
@@ -59,17 +60,19 @@ class Provenance:
             "facerf:checkpoint": self.checkpoint_name,
             "facerf:face_model": self.face_model,
             "facerf:face_model_licence": self.face_model_licence,
+            "facerf:key": self.key,
         }
         return {name: value for name, value in attributes.items() if value != ""}
 
 
-def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "") -> dict[str, Any]:
+def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "", key: str = "") -> dict[str, Any]:
     """Metadata of weighted sums of a stack's images, from the stack's own metadata.
 
     They are marked as synthetic even if the stack holds photographs, since their light did not exist.
     """
     default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
-    return default.attributes() | dict(stack) | Provenance(source_type="").attributes()
+    of_stack = {name: value for name, value in stack.items() if name != "facerf:key"}
+    return default.attributes() | of_stack | Provenance(source_type="", key=key).attributes()
 
 
 def json_line(row: Mapping[str, Any]) -> str:

@@ -163,11 +163,14 @@ def _brightest(some: Brightest) -> dict[str, Any]:
     }
 
 
-def page(title: str, photo: Sequence[str], document: Mapping[str, Any], strip: str) -> str:
-    """The page of a photo; `photo` is its path and options on a command line, `strip` a JPEG in base64."""
+def page(title: str, photo: Sequence[str], document: Mapping[str, Any], strip: str, key: str = "") -> str:
+    """Return the page of a photo.
+
+    `photo` is its path and options on a command line, `strip` a JPEG in base64, `key` that of `-o FILE`.
+    """
     data = json_text({**document, "title": title, "source": shlex.join(photo)}).replace("<", "\\u003c")
     script = '"use strict";\n' + "".join(map(_text, SCRIPTS))
-    return _filled("page.html", script, title=title, data=data, strip=strip)
+    return _filled("page.html", script, title=title, data=data, strip=strip, key=key)
 
 
 def index_page(entries: Sequence[IndexEntry]) -> str:

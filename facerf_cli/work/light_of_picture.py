@@ -56,7 +56,7 @@ def write_guess(
     guess = guessed_light(item, image, options.fov_deg)
     facts: dict[str, Any] = {"light_from": "picture", "guess_error": round(guess.error, 3)}
     said = {f"facerf:light_{name}": value for name, value in facts.items()}
-    metadata = {**Provenance(item.input_path.name).attributes(), **said}
+    metadata = {**Provenance(item.input_path.name, key=item.key).attributes(), **said}
     envmap, base = resampled(guess.envmap, width_px // 2), item.output("_light")
     write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)
     directions = rig_by_text(options.rig)

@@ -250,12 +250,13 @@ def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
 
 def stamp(item: Item) -> dict[str, str | int]:
     """Metadata for parts of a photo, which stay photographs."""
-    return Provenance(item.input_path.name, source_type="").attributes()
+    return Provenance(item.input_path.name, source_type="", key=item.key).attributes()
 
 
 def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
     """Metadata for the outputs of a photo."""
-    return Provenance(item.input_path.name, checkpoint_name, **face_model(options).stamp).attributes()
+    stamp_of_model = face_model(options).stamp
+    return Provenance(item.input_path.name, checkpoint_name, **stamp_of_model, key=item.key).attributes()
 
 
 def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:

@@ -19,9 +19,18 @@ from facerf_cli.batch.inputs import (
     collect_items,
     fields_of,
 )
-from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf, key_of
-from facerf_cli.batch.run import BatchOptions, folder_not_file
-from facerf_cli.batch.settings import Overwrite
+from facerf_cli.batch.made_from import (
+    DigestOf,
+    FolderIndex,
+    Keyed,
+    Made,
+    Recipe,
+    RecipesOf,
+    key_of,
+    keyed,
+    read_row,
+)
+from facerf_cli.batch.run import BatchOptions, folder_not_file, keep, warn_of_edited
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import BATCH, option
@@ -214,17 +223,22 @@ class FilmOutput:
         """The format of the frames."""
         return (_FORMATS[self.path.suffix.lower()],)
 
-    def key_of_new(
+    @property
+    def _index(self) -> FolderIndex:
+        return FolderIndex(self.path.parent, "relight", file=self.path)
+
+    def recipes_of_new(
         self,
         items: Sequence[Item],
         shots: Sequence[Shot],
         images: Sequence[Path],
         recipes_of: RecipesOf,
         batch: BatchOptions,
-    ) -> str:
-        """Identify what a film of images is made from; empty in a dry run and if it is finished.
+    ) -> Keyed:
+        """Return the recipe of a film of images; nothing in a dry run, or if the film is finished.
 
-        Raises UsageError unless the images are the frames of one film.
+        Raises UsageError unless the images are the frames of one film, and InputError where the film would
+        replace a file that is not facerf's.
         """
         photos = len(items) - sum(len(shot.frames) for shot in shots)
         one = len(items) == len(images) if shots else len(images) > 1
@@ -235,30 +249,27 @@ class FilmOutput:
             )
         if self.rate and shots and shots[0].film:
             raise UsageError("--fps: a film keeps its own times; leave it out")
-        if batch.dry_run:
-            print(f"{items[0].input_path} -> {self.path}")
-            return ""
-        from facerf_cli.files.film_writer import check_writable
-
         digest_of = cache(file_sha256)
         made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
-        key = key_of(made_from)
-        if self._is_finished(key, batch.overwrite):
-            log.info("%s: already finished", self.path)
-            return ""
+        recipes = keyed([{"film": key_of(made_from)}])
+        read, index = items[0].input_path, self._index
+        if not index.to_make(read, [self.path], recipes, batch.overwrite):
+            log.info("%s: is finished and kept", self.path)
+            if batch.overwrite == "changed" and not batch.dry_run:
+                warn_of_edited(keep(index, [self.path], [item.input_path for item in items]))
+            return []
+        if batch.dry_run:
+            print(f"{read} -> {self.path}")
+            return []
         if shots and shots[0].film:
+            from facerf_cli.files.film_writer import check_writable
+
             check_writable(self.path, shots[0].film)
-        return key
+        return recipes
 
-    def _is_finished(self, key: str, overwrite: Overwrite) -> bool:
-        """True if the film is there and need not be made again: its metadata say what it was made from."""
-        from facerf_cli.files.film_writer import comment_of
-
-        if overwrite == "always" or not self.path.is_file():
-            return False
-        return overwrite == "never" or key in comment_of(self.path)
-
-    def joined(self, images: Sequence[Path], shots: Sequence[Shot], key: str, code: int) -> int:
+    def joined(
+        self, items: Sequence[Item], images: Sequence[Path], shots: Sequence[Shot], recipes: Keyed, code: int
+    ) -> int:
         """Write the film from its frames, in order, and remove them, unless some failed; the exit code."""
         if code or not all(path.exists() for path in images):
             log.error("%s: not written, since frames failed; the others stay in %s", self.path, self.folder)
@@ -271,7 +282,14 @@ class FilmOutput:
         timing = film_timing(source) if source else Timing.steady(len(images), self.rate or _RATE)
         facts = Provenance(source.name if source else "").attributes()
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
-        write_film(self.path, images, timing, f"Synthetic: relit by a trained model; {said}; made from {key}")
+        read, index = items[0].input_path, self._index
+        key = index.key_of(read, recipes[0][0])
+        index.open(recipes, has_work=True)
+        write_film(
+            self.path, images, timing, f"Synthetic: relit by a trained model; {said}; facerf:key={key}"
+        )
+        made = Made(read_row(read), (read_row(self.path),))
+        index.add(self.path.name, made, [self.path], recipes)
         records = [*self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")]
         for path in (*images, *(shot.track for shot in shots), *records):
             path.unlink(missing_ok=True)

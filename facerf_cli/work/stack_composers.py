@@ -214,7 +214,7 @@ def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
         subject = FaceAlone(face_model(plan.photo), head, StackTextures(item.input_path))
         facts = fit_facts(head.fit)
     lit = plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups)
-    metadata = attributes_of_sum(header.metadata, item.input_path.name)
+    metadata = attributes_of_sum(header.metadata, item.input_path.name, item.key)
     return LitScene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
 
 

@@ -83,7 +83,7 @@ def write_page(
     more = ["--white", white] if white != "photo" else []
     more += [] if normals_from is None else ["--normals-from", str(normals_from)]
     words = [str(item.input_path), *photo_words(options, face.number), *more]
-    _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte))
+    _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte), item.key)
 
 
 def of_photo(
@@ -113,7 +113,8 @@ def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: 
     )
     size = basis.guide.shape[:2]
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
-    _write(path, item.input_path.name, [str(item.input_path), *photo_words(options)], basis, plate, head)
+    words = [str(item.input_path), *photo_words(options)]
+    _write(path, item.input_path.name, words, basis, plate, head, item.key)
     return {"lights": len(header.directions)}
 
 
@@ -125,10 +126,16 @@ def head_place(crop: Crop, matte: np.ndarray) -> tuple[float, float, float]:
 
 
 def _write(
-    path: Path, title: str, words: Sequence[str], basis: Basis, plate: Plate, head: tuple[float, float, float]
+    path: Path,
+    title: str,
+    words: Sequence[str],
+    basis: Basis,
+    plate: Plate,
+    head: tuple[float, float, float],
+    key: str,
 ) -> None:
     document = packed(basis, plate, head, page_maps())
-    text = page(title, words, document, _strip(basis, plate))
+    text = page(title, words, document, _strip(basis, plate), key)
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 

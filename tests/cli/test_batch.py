@@ -1,10 +1,11 @@
 """The contract of every verb that walks folders (docs/design.md), with a verb that only copies bytes."""
 
-import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Never
@@ -12,11 +13,12 @@ from typing import Never
 import pytest
 
 from facerf_cli.batch import made_from as folder_index
-from facerf_cli.batch.inputs import Item, collect_items
+from facerf_cli.batch.inputs import Item, _ignores_case, collect_items
 from facerf_cli.batch.made_from import DigestOf, Recipe, other_options, recipe_of
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
-from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
 from facerf_cli.run.logs import configure_logging
@@ -209,6 +211,12 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
 
 def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, capsys: Said) -> None:
     run([two], tmp_path / "out", recipe={"lights": 150})
+    (two / "a.png").write_bytes(b"A")
+    capsys.readouterr()
+    run([two], tmp_path / "out", recipe={"lights": 150}, dry_run=True)
+    said = capsys.readouterr()
+    assert [Path(line).name for line in said.out.splitlines()] == ["a_copy.bin"]
+    assert "1 of 2 results are finished" in said.err and "1 result would be made" in said.err
     run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
     assert "2 to make again: made from other options: the lights" in capsys.readouterr().err
     run([two], tmp_path / "out", recipe={"lights": 300})
@@ -224,22 +232,141 @@ def test_overwrite(two: Path, tmp_path: Path, capsys: Said, overwrite: str, expe
     assert "".join(made(capsys)) == expected
 
 
-def test_outputs_that_the_user_changed_are_kept_and_those_of_unknown_origin_made_again(
+def test_outputs_that_the_user_changed_are_kept_and_empty_ones_made_again(
     two: Path, tmp_path: Path, capsys: Said
 ) -> None:
     out = tmp_path / "out"
     run([two], out)
     (out / "a_copy.bin").write_bytes(b"retouched")
     assert run([two], out) == 0
-    assert "1 results were changed after they were written; they are kept" in capsys.readouterr().err
+    assert "1 result was changed after they were written; they are kept" in capsys.readouterr().err
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
     run([two], out)
     (out / "a_copy.bin").write_bytes(b"")
     run([two], out)
     assert "1 to make again: an output is empty" in capsys.readouterr().err
-    (out / ".facerf-index.jsonl").unlink()
-    run([two], out)
-    assert "2 to make again: nothing says what" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("edited", [True, False])
+def test_a_file_of_the_user_fails_its_item_only(
+    two: Path, tmp_path: Path, capsys: Said, edited: bool
+) -> None:
+    """As a retouched result, or a file that facerf never wrote, which other options would replace."""
+    out = tmp_path / "out"
+    if edited:
+        run([two], out, recipe={"lights": 1})
+    out.mkdir(exist_ok=True)
+    mine = out / "a_copy.bin"
+    mine.write_bytes(b"mine")
+    for dry_run in (True, False):
+        capsys.readouterr()
+        assert run([two], out, recipe={"lights": 2}, dry_run=dry_run) == 1
+        said = capsys.readouterr()
+        assert said.err.count(f"error: {mine}: was ") == 1 and "--overwrite always" in said.err
+        assert "b_copy.bin" in said.out and "a_copy.bin" not in said.out
+    assert mine.read_bytes() == b"mine" and rows(out)["a"]["status"] == "failed"
+    assert run([two], out, recipe={"lights": 2}, overwrite="never") == 0 and mine.read_bytes() == b"mine"
+    assert run([two], out, recipe={"lights": 2}, overwrite="always") == 0 and mine.read_bytes() == b"a"
+
+
+def test_copies_are_recognised_by_their_content_with_the_index_and_not_without(
+    two: Path, tmp_path: Path, capsys: Said
+) -> None:
+    run([two], tmp_path / "out")
+    for name in ("copied", "bare"):
+        shutil.copytree(tmp_path / "out", tmp_path / name)
+        for path in (tmp_path / name).glob("*.bin"):
+            os.utime(path, (1, 1))
+    (tmp_path / "bare/.facerf-index.jsonl").unlink()
+    capsys.readouterr()
+    assert run([two], tmp_path / "copied", recipe={"lights": 2}) == 0 and made(capsys) == ["a", "b"]
+    (tmp_path / "bare/a_copy.bin").write_bytes(b"")  # holds nothing that could be lost
+    assert run([two], tmp_path / "bare") == 1 and made(capsys) == ["a"]
+
+
+def test_a_file_beside_the_outputs_follows_the_same_rule(two: Path, tmp_path: Path, capsys: Said) -> None:
+    """As those of further faces, of which no run knows before it has looked at the photo."""
+    out, beside = tmp_path / "out", tmp_path / "out/a_face1.bin"
+
+    @dataclass(frozen=True)
+    class Several(Copy):
+        def __call__(self, item: Item) -> Outcome:
+            for ending in ("_face1.bin", "_copy.bin"):
+                with atomic_path(item.output(ending)) as temporary:
+                    temporary.write_bytes(str(self.recipe).encode())
+            return Outcome([item.output("_copy.bin"), item.output("_face1.bin")])
+
+    def call(number: int, **options: object) -> int:
+        items = collect_items([str(two / "a.png")], out)
+        return run_items(Several(out, {"lights": number}), items, BatchOptions(out, **options), Settings())
+
+    assert call(1) == call(2) == 0 and beside.read_bytes() == b"{'lights': 2}"
+    beside.write_bytes(b"mine")
+    assert call(3) == 1 and beside.read_bytes() == b"mine"
+    assert f"{beside}: was " in capsys.readouterr().err
+    (out / "a_copy.bin").unlink()
+    assert call(2, overwrite="never") == 0 and beside.read_bytes() == b"mine"
+    assert capsys.readouterr().out.split() == [str(out / "a_copy.bin")]
+    assert call(3) == 1 and beside.read_bytes() == b"mine", "a file that was left is not facerf's"
+
+
+def test_outputs_of_a_run_that_was_killed_are_facerfs(tmp_path: Path) -> None:
+    """The process ends after an output has its name, before the run has noted the item."""
+    (tmp_path / "a.png").write_bytes(b"late")
+    code = "import sys, pathlib, tests.cli.toy_batch as toy; toy.run(*map(pathlib.Path, sys.argv[1:]))"
+    command = [sys.executable, "-c", code, str(tmp_path / "a.png"), str(tmp_path / "out")]
+    assert subprocess.run(command, env=ENVIRONMENT, capture_output=True).returncode == -signal.SIGKILL
+    assert (tmp_path / "out/a_copy.bin").read_bytes() == b"late"
+    assert run([tmp_path / "a.png"], tmp_path / "out") == 0
+    assert rows(tmp_path / "out")["a"]["status"] == "done"
+    assert [path.name for path in (tmp_path / "out").glob(".facerf*")] == [".facerf-index.jsonl"]
+
+
+def test_a_report_of_another_program_stays(two: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/report.jsonl").write_text('{"test": "passed"}\n')
+    with pytest.raises(UsageError, match=r"report\.jsonl: was not written by facerf"):
+        run([two], tmp_path / "out")
+    assert (tmp_path / "out/report.jsonl").read_text() == '{"test": "passed"}\n'
+
+
+@pytest.mark.parametrize("ignores", [True, False])
+def test_outputs_that_differ_only_in_case(
+    tmp_path: Path, monkeypatch: Patch, capsys: Said, ignores: bool
+) -> None:
+    for name in ("Me", "me"):
+        (tmp_path / f"{name}.png").write_bytes(name.encode())
+    monkeypatch.setattr("facerf_cli.batch.inputs._ignores_case", lambda folder: ignores)
+    photos = [tmp_path / "Me.png", tmp_path / "me.png"]
+    if ignores:
+        with pytest.raises(UsageError, match="ignores case"):
+            run(photos, tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+    else:
+        assert run(photos, tmp_path / "out") == 0
+        assert "differ only in case" in capsys.readouterr().err
+
+
+def test_the_case_of_a_file_system_is_found_by_a_name_in_it(tmp_path: Path, monkeypatch: Patch) -> None:
+    (tmp_path / "a").touch()
+    assert not _ignores_case(tmp_path / "new")
+    os.link(tmp_path / "a", tmp_path / "A")  # both names are one file, as where case is ignored
+    assert _ignores_case(tmp_path / "new")
+
+
+def test_finished_outputs_are_newer_than_their_input(two: Path, tmp_path: Path) -> None:
+    """Make compares times: an input that was touched would be made again for ever."""
+    out, touched = tmp_path / "out/a_copy.bin", two / "a.png"
+    run([two], tmp_path / "out")
+    before = (tmp_path / "out/b_copy.bin").stat().st_mtime_ns
+    later = time.time_ns() - 10**9
+    os.utime(out, ns=(later - 10**10, later - 10**10))
+    os.utime(touched, ns=(later, later))
+    run([two], tmp_path / "out", dry_run=True)
+    assert out.stat().st_mtime_ns < touched.stat().st_mtime_ns
+    run([two], tmp_path / "out")
+    assert out.stat().st_mtime_ns > touched.stat().st_mtime_ns and out.read_bytes() == b"a"
+    assert (tmp_path / "out/b_copy.bin").stat().st_mtime_ns == before
 
 
 def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) -> None:
@@ -254,9 +381,10 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
             return [{"light": light} for light in lights]
 
         def __call__(self, item: Item) -> Outcome:
-            for path in item.stale:
-                path.write_bytes(b"made")
-            return Outcome([path for path in self.outputs_of(item) if path in item.stale])
+            for path in self.outputs_of(item):
+                with atomic_path(path) as temporary:
+                    temporary.write_bytes(b"made")
+            return Outcome(self.outputs_of(item))
 
     def call() -> int:
         configure_logging()
@@ -269,7 +397,7 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
     assert call() == 0
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
-    assert "make again" not in said.err and "1 results were changed" in said.err
+    assert "make again" not in said.err and "1 result was changed" in said.err
     assert (out / "a_a.bin").read_bytes() == b"retouched"
     (out / "b_a.bin").unlink()
     assert call() == 0
@@ -326,30 +454,14 @@ def test_shards_know_what_the_others_made(two: Path, tmp_path: Path, capsys: Sai
     assert {row["status"] for row in rows(tmp_path / "out").values()} == {"done"}
 
 
-def test_a_single_photo_that_fails_leaves_no_folder(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(b"bad")
-    assert run([tmp_path / "a.png"], tmp_path / "out") == 1
-    assert not (tmp_path / "out").exists()
-    (tmp_path / "out").mkdir()
-    assert run([tmp_path / "a.png"], tmp_path / "out") == 1
-    assert (tmp_path / "out" / "report.jsonl").exists()  # a folder that was there stays
-
-
-def test_an_index_with_recipes_and_inputs_apart_is_understood(
-    two: Path, tmp_path: Path, capsys: Said
-) -> None:
-    """As rows of outputs were before they had a key."""
-    run([two], tmp_path / "out")
-    index, older = tmp_path / "out/.facerf-index.jsonl", []
-    for row in map(json.loads, index.read_text().splitlines()):
-        if "key" in row:
-            photo = two / row["output"].replace("_copy.bin", ".png")
-            row |= {"recipe": row.pop("key").split()[0], "input": file_sha256(photo)}
-        older.append(json.dumps(row) + "\n")
-    index.write_text("".join(older))
-    capsys.readouterr()
-    run([two], tmp_path / "out")
-    assert made(capsys) == []
+def test_a_first_photo_that_fails_keeps_its_row(two: Path, tmp_path: Path) -> None:
+    """As with xargs, which makes a run of each photo."""
+    (two / "a.png").write_bytes(b"bad")
+    assert [run([photo], tmp_path / "out") for photo in sorted(two.iterdir())] == [1, 0]
+    assert {name: row["status"] for name, row in rows(tmp_path / "out").items()} == {
+        "a": "failed",
+        "b": "done",
+    }
 
 
 def test_a_finished_folder_loads_nothing_for_its_work(two: Path, tmp_path: Path) -> None:
@@ -361,22 +473,6 @@ def test_a_finished_folder_loads_nothing_for_its_work(two: Path, tmp_path: Path)
     assert run([two], tmp_path / "out") == 0
     items = collect_items([str(two)], tmp_path / "out")
     assert run_items(Lazy(tmp_path), items, BatchOptions(tmp_path / "out"), Settings()) == 0
-
-
-def test_a_photo_that_fails_removes_nothing_that_another_process_wrote(tmp_path: Path) -> None:
-    """As when two shards of one photo each begin in a new folder."""
-    out = tmp_path / "out"
-    (tmp_path / "a.png").touch()
-
-    class Fail(Copy):
-        def __call__(self, item: Item) -> Outcome:
-            (out / "other").mkdir()
-            (out / "other" / "b_copy.bin").write_bytes(b"b")
-            raise InputError(f"{item.input_path}: is bad")
-
-    given = collect_items([str(tmp_path / "a.png")], out)
-    run_items(Fail(out), given, BatchOptions(out), Settings())
-    assert (out / "other" / "b_copy.bin").read_bytes() == b"b" and (out / "report.jsonl").exists()
 
 
 @dataclass(frozen=True)

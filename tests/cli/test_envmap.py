@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.files.atomic import _machine
+from facerf_cli.files.atomic import machine_id
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
@@ -18,7 +18,7 @@ def test_writes_seeded_maps_and_skips_finished_ones(tmp_path: Path, capsys: Said
     line = ["envmap", "-o", str(tmp_path), "--count", "3", "--size", "32", "--seed", "5"]
     assert main(line) == 0
     written = [Path(path) for path in capsys.readouterr().out.splitlines()]
-    assert sorted(tmp_path.iterdir()) == written
+    assert sorted(tmp_path.glob("[!.]*")) == written
     image = read_image(written[1])
     pixels, kind = draw_sky(1, 5, 32)
     assert written[1].name == f"00001_{kind}.exr"
@@ -64,12 +64,28 @@ def test_maps_of_other_options_are_made_again(tmp_path: Path, capsys: Said, chan
     assert capsys.readouterr().out.splitlines()[0] == str(damaged)
 
 
+def test_no_file_of_the_user_is_replaced(tmp_path: Path, capsys: Said) -> None:
+    line = ["envmap", "-o", str(tmp_path), "--count", "1", "--size", "32", "--kind", "sun"]
+    assert main(line) == 0
+    for name in ("00000_sun.exr", "envmaps.png"):
+        before = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(b"mine")
+        for more in ([], ["--dry-run"]):
+            assert main([*line, "--seed", "7", *more]) == 1
+            assert f"{tmp_path / name}: was changed" in capsys.readouterr().err
+        assert (tmp_path / name).read_bytes() == b"mine"
+        (tmp_path / name).write_bytes(before)
+    assert main([*line, "--seed", "7"]) == 0, "all are facerf's again"
+
+
 def test_a_run_that_was_ended_before_its_sheet_is_finished(tmp_path: Path, capsys: Said) -> None:
     line = ["envmap", "-o", str(tmp_path), "--count", "2", "--size", "32"]
     assert main(line) == 0
     sheet = tmp_path / "envmaps.png"
     os.utime(sheet, (0, 0))
-    left = tmp_path / f".envmaps.part-{_machine()}-{2**22 + 1}-0123456789abcdef"  # beyond Linux's process ids
+    left = (
+        tmp_path / f".envmaps.part-{machine_id()}-{2**22 + 1}-0123456789abcdef"
+    )  # beyond Linux's process ids
     left.mkdir()
     capsys.readouterr()
     assert main(line) == 0

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +170,9 @@ def test_a_still_photo_under_a_turning_map_is_smooth(given: Path, tmp_path: Path
     assert np.abs(left).max() < 4e-3 * flat.max()
 
 
-def test_a_photo_under_a_turning_map_becomes_a_film(given: Path, tmp_path: Path) -> None:
+def test_a_photo_under_a_turning_map_becomes_a_film(
+    given: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
+) -> None:
     write_exr(tmp_path / "grey.exr", np.full((8, 16, 3), 0.3, np.float32))
     out = tmp_path / "me.mov"
     line = ("--envmap", tmp_path / "grey.exr", "--rotate", "0:360:3", "--fps", "30000/1001", "-o", out)
@@ -178,6 +181,21 @@ def test_a_photo_under_a_turning_map_becomes_a_film(given: Path, tmp_path: Path)
         (stream,) = container.streams
         assert stream.codec_context.name == "prores" and stream.frames == 3
         assert float(stream.average_rate) == pytest.approx(30000 / 1001, rel=1e-3)
+        assert "facerf:key=" in container.metadata["comment"]
+    before = out.read_bytes()
+    for cache in ("here", "elsewhere"):  # a fresh cache knows the film by the key that it carries
+        in_cache = partial(lambda cache, file: tmp_path / cache / f"{file.name}.jsonl", cache)
+        monkeypatch.setattr("facerf_cli.batch.made_from._in_cache", in_cache)
+        capsys.readouterr()
+        assert facerf(given, "relight", given / "small.png", *line, *CHEAP) == 0
+        assert "is finished" in capsys.readouterr().err and out.read_bytes() == before
+    other = (*line, *CHEAP, "--white", "scene")
+    for more in ((), ("--dry-run",)):
+        assert facerf(given, "relight", given / "small.png", *other, *more) == 1
+        assert f"{out}: was not written by facerf" in capsys.readouterr().err
+    assert out.read_bytes() == before and not out.with_name("me.mov.frames").exists()
+    assert facerf(given, "relight", given / "small.png", *other, "--overwrite", "always") == 0
+    assert facerf(given, "relight", given / "small.png", *line, *CHEAP) == 0, "it is facerf's, by the index"
 
 
 @pytest.mark.slow

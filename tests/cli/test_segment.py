@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
 from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
 from facerf_cli.main import main
@@ -53,10 +55,12 @@ def test_one_file_is_that_of_the_folder(cut: Path, tmp_path: Path, capsys: Said)
     target.write_bytes(b"another image")
     line = ["segment", str(PHOTO), "-o", str(target)]
     assert main([*line, "--overwrite", "never"]) == 0 and target.read_bytes() == b"another image"
-    for said in ("nothing says what", "already finished"):
-        assert main(line) == 0
-        assert said in capsys.readouterr().err
-    assert target.read_bytes() == (cut / "astronaut_person.png").read_bytes()
+    assert main(line) == 1 and target.read_bytes() == b"another image"
+    assert f"{target}: was not written by facerf" in capsys.readouterr().err
+    target.unlink()
+    assert main(line) == 0
+    assert np.array_equal(*(np.asarray(Image.open(one)) for one in (target, cut / "astronaut_person.png")))
+    assert main(line) == 0 and "1 of 1 results are finished" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == [target]
     target.write_bytes(b"by hand")
     assert main(line) == 0 and target.read_bytes() == b"by hand"
@@ -65,6 +69,25 @@ def test_one_file_is_that_of_the_folder(cut: Path, tmp_path: Path, capsys: Said)
     assert list(tmp_path.iterdir()) == [target]
     assert main([*line, "--report"]) == 0 and target.read_bytes() == b"by hand"
     assert {path.name for path in tmp_path.iterdir()} == {"me.png", "report.jsonl"}
+
+
+@pytest.mark.parametrize("name", ["me.png", "me.exr"])
+def test_one_file_is_recognised_without_its_index(
+    cut: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said, name: str
+) -> None:
+    """As in a fresh container; made from other options it is another file, which stays."""
+    target, other = tmp_path / name, ["--landmarks", str(cut / "astronaut_landmarks.json")]
+    line = ["segment", str(PHOTO), "-o", str(target)]
+    assert main(line) == 0
+    before, header = target.read_bytes(), read_header(target)
+    assert header is not None and len(header.metadata["facerf:key"]) == 33
+    monkeypatch.setattr("facerf_cli.batch.made_from._in_cache", lambda file: tmp_path / "fresh/index.jsonl")
+    capsys.readouterr()
+    assert main(line) == 0 and "1 of 1 results are finished" in capsys.readouterr().err
+    for more in (["--dry-run"], []):
+        assert main([*line, *other, *more]) == 1
+        assert f"{target}: was not written by facerf" in capsys.readouterr().err
+    assert target.read_bytes() == before
 
 
 def test_one_file_is_written_where_no_cache_can_be(tmp_path: Path, monkeypatch: Patch) -> None:

@@ -70,6 +70,16 @@ def test_the_command_of_a_page_has_the_options_that_it_was_made_with() -> None:
     assert photo_words(PhotoOptions(shipped)) == []
 
 
+def test_the_users_own_index_stays(tmp_path: Path, capsys: Said) -> None:
+    (tmp_path / "index.html").write_text("mine")
+    line = ["view", str(Path(__file__).parents[2] / "examples/astronaut.jpg"), "-o", str(tmp_path)]
+    for more in ([], ["--dry-run"]):
+        assert main([*line, *more]) == 1
+        assert f"{tmp_path / 'index.html'}: was not written by facerf" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
+    assert (tmp_path / "index.html").read_text() == "mine"
+
+
 def test_links_of_an_index_are_addresses(tmp_path: Path) -> None:
     item = Item(tmp_path / "a.jpg", tmp_path / "50% #1?", "50% #1?")
     (tmp_path / "50% #1?.html").write_text('<meta name="facerf:strip" content="AA==">')

@@ -11,7 +11,7 @@ import pytest
 
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files import atomic
-from facerf_cli.files.atomic import _machine, alone_in, atomic_path
+from facerf_cli.files.atomic import alone_in, atomic_path, machine_id
 from tests.kinds import Log, Patch
 from tests.processes import wait_until
 
@@ -28,7 +28,11 @@ def _dead_process() -> int:
 
 
 def test_leftovers_of_a_killed_process_go_with_the_next_write(tmp_path: Path) -> None:
-    dead, alive, elsewhere = (f"{_machine()}-{_dead_process()}", f"{_machine()}-{os.getppid()}", "0123abcd-1")
+    dead, alive, elsewhere = (
+        f"{machine_id()}-{_dead_process()}",
+        f"{machine_id()}-{os.getppid()}",
+        "0123abcd-1",
+    )
     (tmp_path / f".a.part-{dead}-00ff").mkdir()
     (tmp_path / f".a.part-{dead}-00ff" / "a.exr").write_text("half")
     (tmp_path / f".a.part-{elsewhere}2-00ff").mkdir()

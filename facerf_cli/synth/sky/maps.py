@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from facerf_cli._version import __version__
+from facerf_cli.batch.made_from import FolderIndex
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Overwrite
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import sweep_leftovers
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.light_files import read_map_file
@@ -45,6 +46,11 @@ def write_envmaps(
     if not batch.dry_run:
         sweep_leftovers(batch.output)
     new = {path for path in maps if _is_to_be_made(path, maps[path], size_px, batch.overwrite)}
+    sheet, index_of = batch.output / SHEET, FolderIndex(batch.output, "envmap")
+    if batch.overwrite == "changed":
+        for path in [*sorted(new), sheet]:
+            if refusal := index_of.refusal(path):
+                raise InputError(refusal)
     for index, (path, facts) in enumerate(maps.items()):
         if path not in new:
             log.info("%s: already exists (--overwrite always makes it again)", path)
@@ -52,11 +58,12 @@ def write_envmaps(
         if not batch.dry_run:
             pixels, _ = draw_sky(index, seed, size_px, kinds)
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
+            index_of.own(path)
         print(path, flush=True)
-    sheet = batch.output / SHEET
     if new or _is_older(sheet, maps):
         if not batch.dry_run:
             write_sheet(list(maps), sheet)
+            index_of.own(sheet)
             log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
         print(sheet, flush=True)
 
