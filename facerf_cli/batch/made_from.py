@@ -328,7 +328,7 @@ class FolderIndex:
 
     def refusal(self, path: Path) -> str:
         """Say why an output must not be replaced; '' if facerf wrote what is there, or nothing is there."""
-        if regular_size(path) == 0 or not path.exists():
+        if regular_size(path) == 0 or not os.path.exists(path):
             return ""
         written = self._digests.get(self._name(path))
         if written and self._digest_or_none(path) in written:
@@ -348,7 +348,7 @@ class FolderIndex:
         """Return all files that this command has written for an item and that facerf may replace."""
         names = self._of_item.get((self._verb, item.name), set())
         paths = (self._folder / name for name in names)
-        return {path for path in paths if path.exists() and not self.refusal(path)}
+        return {path for path in paths if os.path.exists(path) and not self.refusal(path)}
 
     def open(self, recipes: Keyed, has_work: bool) -> None:
         """Write the rows, for the outputs that follow, or since files were read that they do not know."""
@@ -477,7 +477,7 @@ def _files(path: Path) -> list[Path]:
     """Return a file, or all files of a folder; nothing for a path where nothing is."""
     if path.is_dir():
         return [file for file in path.rglob("*") if file.is_file()]
-    return [path] if path.exists() else []
+    return [path] if os.path.exists(path) else []
 
 
 def _carries(path: Path, key: str) -> bool:

@@ -4,7 +4,6 @@ A verb passes a `Job` to `run_items`. It raises `InputError` for a faulty item (
 other `FacerfError` concerns the whole run and ends it.
 """
 
-import itertools
 import logging
 import os
 import re
@@ -332,34 +331,51 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         if recipes and options.overwrite == "changed":
             of_item = ((paths, files_read((item, job), [item])) for item, paths in kept.items())
             warn_of_edited(sum(keep(index, paths, read) for paths, read in of_item))
-        if not (todo or refused):
-            return lacks
-        jobs = jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
-        failures, workers = 0, options.workers(settings, jobs)
-        at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
-        owner = (options.output, verb, index.path, options.overwrite) if recipes else None
-        work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
-        memory.collect_as_usual()
-        try:
-            with _progress(settings) as progress, ending(spread(work, todo, workers, _broken)) as results:
-                task = progress.add_task(verb, total=len(todo))
-                for result in itertools.chain(refused, results):
-                    if result.stops_the_run is not None:
-                        raise result.stops_the_run
-                    if result.made:
-                        index.add(result.item.name, result.made, job.outputs_of(result.item), recipes)
-                    if options.reports:
-                        add_row(report, verb, result)
-                    failures += _print_result(result, options)
-                    progress.advance(task)
-        finally:
-            if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
-                for folder in {path.parent for item in todo for path in job.outputs_of(item)}:
-                    sweep_leftovers(folder)
-        index.close()
+
+        def done(result: ItemResult) -> int:
+            """Record and print the result of an item; return 1 for a failure."""
+            if result.made:
+                index.add(result.item.name, result.made, job.outputs_of(result.item), recipes)
+            if options.reports:
+                add_row(report, verb, result)
+            return _print_result(result, options)
+
+        failures = sum(map(done, refused))
+        if todo:
+            owner = (options.output, verb, index.path, options.overwrite) if recipes else None
+            with ending(_results(job, todo, owner, options, settings)) as results:
+                failures += sum(map(done, results))
+            index.close()
         if failures and len(items) > 1:
             log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
         return max(lacks, int(failures > 0))
+
+
+Owner = tuple[Path, str, Path, Overwrite]  # output folder, command, its index, --overwrite
+
+
+def _results(
+    job: Job, todo: Sequence[Item], owner: Owner | None, options: BatchOptions, settings: Settings
+) -> Iterator[ItemResult]:
+    """Process items by workers, with a progress bar; yield their results."""
+    workers = options.workers(
+        settings, jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
+    )
+    at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
+    work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
+    memory.collect_as_usual()
+    try:
+        with _progress(settings) as progress, ending(spread(work, todo, workers, _broken)) as results:
+            task = progress.add_task(job.verb, total=len(todo))
+            for result in results:
+                if result.stops_the_run is not None:
+                    raise result.stops_the_run
+                yield result
+                progress.advance(task)
+    finally:
+        if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
+            for folder in {path.parent for item in todo for path in job.outputs_of(item)}:
+                sweep_leftovers(folder)
 
 
 def _planned(
@@ -406,11 +422,11 @@ def keep(index: FolderIndex, outputs: Sequence[Path], read: Iterable[Path]) -> i
 
 
 def warn_of_edited(count: int) -> None:
-    """Log that outputs were changed by the user and stay as they are."""
+    """Log that results were changed by the user and stay as they are."""
     if count:
-        was = "was" if count == 1 else "were"
-        said = "%s %s changed after facerf wrote them; they are kept (--overwrite always replaces them)"
-        log.warning(said, counted(count, "result"), was)
+        was, them = ("was", "it") if count == 1 else ("were", "them")
+        said = "kept %s that %s changed after facerf wrote %s (--overwrite always replaces %s)"
+        log.warning(said, counted(count, "result"), was, them, them)
 
 
 def sums_up(
@@ -435,13 +451,13 @@ def sums_up(
 
 def _run_one(
     process: Callable[[Item], Outcome],
-    owner: tuple[Path, str, Path, Overwrite] | None,
+    owner: Owner | None,
     memory_bytes: int,
     item: Item,
 ) -> ItemResult:
     """Run `process` on an item and return an `ItemResult`, whatever happens.
 
-    `owner` is the output folder, the command, its index and --overwrite, of a job that has recipes.
+    A job without recipes has no `owner`: it replaces its outputs.
     """
     start_s = time.perf_counter()
     memory.set_limit(memory_bytes)

@@ -64,7 +64,7 @@ def test_one_file_is_that_of_the_folder(cut: Path, tmp_path: Path, capsys: Said)
     assert list(tmp_path.iterdir()) == [target]
     target.write_bytes(b"by hand")
     assert main(line) == 0 and target.read_bytes() == b"by hand"
-    assert "are kept" in capsys.readouterr().err
+    assert "kept 1 result that was changed" in capsys.readouterr().err
     assert main(["segment", str(tmp_path / "none.png"), "-o", str(target)]) == 1
     assert list(tmp_path.iterdir()) == [target]
     assert main([*line, "--report"]) == 0 and target.read_bytes() == b"by hand"
