@@ -359,13 +359,11 @@ class FolderIndex:
         rows: list[Mapping[str, Any]] = list(self._files.values())
         rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
         rows += [*self._unfinished, *self.outputs.values()]
-        with suppress(*self._lost):
-            with atomic_path(self.path) as temporary:
-                temporary.write_text(lines_of(rows), encoding="utf-8")
-            self.close()
+        with suppress(*self._lost), atomic_path(self.path) as temporary:
+            temporary.write_text(lines_of(rows), encoding="utf-8")
 
     def close(self) -> None:
-        """Remove the journals of this index, all rows of which it has."""
+        """Remove the journals at the end of a run, which has added the rows of all its items."""
         for journal in self._journals():
             journal.unlink(missing_ok=True)
 
@@ -459,12 +457,12 @@ class Writes:
                 os.close(descriptor)
 
     def rows(self, outputs: Iterable[Path]) -> tuple[Row, ...]:
-        """Return rows of all that was written, and of outputs that were written by other means."""
+        """Return rows of all that was written, and of outputs that were not written by `atomic_path`."""
         rows = [
             {"file": os.path.abspath(path), **_state(path.stat()), "sha256": digest}
             for path, digest in self.written.items()
         ]
-        rows += [read_row(path) for path in outputs if path not in self.written.keys() | self.left]
+        rows += [read_row(path) for path in outputs if path not in self.written]
         return tuple(rows)
 
 

@@ -347,9 +347,11 @@ def test_outputs_that_differ_only_in_case(
         assert "differ only in case" in capsys.readouterr().err
 
 
-def test_the_case_of_a_file_system_is_found_by_a_name_in_it(tmp_path: Path, monkeypatch: Patch) -> None:
-    (tmp_path / "a").touch()
-    assert not _ignores_case(tmp_path / "new")
+def test_the_case_of_a_file_system_is_found_by_a_name_in_it(tmp_path: Path) -> None:
+    for name in "aA":
+        (tmp_path / name).write_text(name)
+        assert not _ignores_case(tmp_path / "new")
+    (tmp_path / "A").unlink()
     os.link(tmp_path / "a", tmp_path / "A")  # both names are one file, as where case is ignored
     assert _ignores_case(tmp_path / "new")
 

@@ -61,7 +61,7 @@ def test_a_folder_may_be_given_from_inside_and_a_link_has_its_own_name(
     monkeypatch.chdir(folders)  # the same run by another way
     line = [f"--method={folders / name}" for name in ("good", "link")]
     assert main(["evaluate", "compare", str(folders / "truth"), *line, "-o", str(folders / "out")]) == 0
-    assert "6 of 6 already finished" in capsys.readouterr().err
+    assert "results are finished and kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_table_1_of_held_out_people(folder: Path, tmp_path: Path, capsys: Said) 
     assert {row["case"] for row in images(out)} == {f"{p.subject}/{p.index:05d}" for p in held_out}
     assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
     assert run("olat", folder, "-o", out, "--every", "4", "--network-alone", "--joint-fit") == 0
-    assert "already finished" in capsys.readouterr().err
+    assert "results are finished and kept" in capsys.readouterr().err
 
 
 def test_a_checkpoint_of_another_layout_is_said_once(tmp_path: Path, capsys: Said) -> None:
