@@ -58,14 +58,13 @@ _LINES = {
         "evaluate": "Measure the paper's tables, and other methods.",
     },
     "Look after facerf": {
-        "check": "Check that all results of a folder are whole.",
         "doctor": "Show what is installed, and what is missing.",
         "config": "Show the defaults in force.",
         "face-model": "Import, fetch, list and show face models.",
     },
 }
 VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}
-_FILES = dict.fromkeys(("check", "doctor", "config"), "installation")  # of verbs whose file has another name
+_FILES = dict.fromkeys(("doctor", "config"), "installation")  # of verbs whose file has another name
 
 # The networks that verbs use; with some options they use fewer.
 _ALL = networks_of(NETWORKS) | {"light_features"}

@@ -48,10 +48,9 @@ def _stack(path: Path) -> None:
 
 
 def _light(path: Path) -> None:
-    from facerf_cli.files.light_files import face_model_of_map, read_light_file
+    from facerf_cli.files.light_files import read_light_file
 
     read_light_file(path)
-    face_model_of_map(path)
 
 
 def _map(path: Path) -> None:
@@ -177,9 +176,8 @@ def _configuration(path: Path) -> None:
 
 
 def _index(path: Path) -> None:
-    from facerf_cli.batch.made_from import FolderIndex, check_outputs, keyed
+    from facerf_cli.batch.made_from import FolderIndex, keyed
 
-    list(check_outputs(path.parent))
     recipes, index = keyed([{"verb": "segment", "files": {}}]), FolderIndex(path.parent, "segment")
     index.why_again(path, [path.parent / "x.png"], recipes)
     index.open(recipes, has_work=True)

@@ -218,18 +218,6 @@ def is_made_from(path: Path, text: str) -> bool:
         return False
 
 
-def check_outputs(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Read all outputs in a folder's index; yield each, and `whole`, `missing`, `empty` or `changed`."""
-    for name, row in sorted(FolderIndex(folder).outputs.items()):
-        path = folder / name
-        if not is_regular(path):
-            yield path, "missing"
-        elif not path.stat().st_size:
-            yield path, "empty"
-        else:
-            yield path, "whole" if read_row(path)["sha256"] == row.get("sha256") else "changed"
-
-
 class FolderIndex:
     """The index of an output folder: outputs, by their path in it, and their keys; files; recipes."""
 
@@ -426,23 +414,22 @@ class Writes:
         self._journal = index.with_name(f"{index.stem}.{machine_id()}-{os.getpid()}.jsonl")
 
     def __call__(self, path: Path, temporary: Path) -> bool:
-        """Tell whether a file or folder takes the place of what is at a path; see `atomic.asking`.
+        """Tell whether a file takes the place of what is at a path; see `atomic.asking`.
 
         Raises InputError for a file that is not facerf's.
         """
         if is_temporary(path) or not path.is_relative_to(self._folder):
             return True
-        there = {file for file in _files(path) if file.stat().st_size}
-        if there & self._item.kept or (there and self._overwrite == "never"):
+        exists = is_there(path)
+        if exists and (path in self._item.kept or self._overwrite == "never"):
             self.left.add(path)
             return False
-        if self._overwrite == "changed" and (others := there - self._item.stale):
+        if exists and self._overwrite == "changed" and path not in self._item.stale:
             raise InputError(
-                f"{min(others)}: was not written by facerf, or was changed since; move it, choose another "
-                "-o, or pass --overwrite always"
+                f"{path}: was not written by facerf, or was changed since; move it, choose another -o, or "
+                "pass --overwrite always"
             )
-        for file in _files(temporary):
-            self._note(path / file.relative_to(temporary), file_sha256(file))
+        self._note(path, file_sha256(temporary))
         return True
 
     def _note(self, path: Path, digest: str) -> None:
@@ -469,13 +456,6 @@ class Writes:
 def is_there(path: Path) -> bool:
     """True for a folder, and for a file that is not empty: a full disk or a copy may leave empty ones."""
     return path.is_dir() or bool(is_regular(path) and path.stat().st_size)
-
-
-def _files(path: Path) -> list[Path]:
-    """Return a file, or all files of a folder; nothing for a path where nothing is."""
-    if path.is_dir():
-        return [file for file in path.rglob("*") if file.is_file()]
-    return [path] if os.path.exists(path) else []
 
 
 def _carries(path: Path, key: str) -> bool:

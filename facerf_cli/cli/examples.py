@@ -15,7 +15,7 @@ facerf estimate-light me.jpg --width 1024 --sh-order 4 -o light/
 facerf estimate-light shot.mp4 -o light/
 facerf predict-olat me.jpg -o stacks/
 facerf predict-olat me.jpg --lights '40,20;-40,20' --frame uv -o stacks/
-facerf predict-olat me.jpg --format relight -o web/
+facerf predict-olat me.jpg --page -o olat/
 facerf segment me.jpg -o cut.png
 facerf segment group.jpg --face all -o cut/
 facerf segment photos/ --jobs 4 -o cut/
@@ -40,9 +40,6 @@ facerf relight-dataset dataset/ --envmaps procedural:500 --per-subject 1000 --la
 facerf train -o try/ --preset tiny --steps 50
 facerf train --dataset dataset/ -o run/ --max-time 2h
 facerf train -o run/ --resume
-facerf check relit/
-facerf check stacks/ -q
-facerf check relit/ --log-json
 facerf doctor
 facerf doctor --json
 facerf doctor --checkpoint run/

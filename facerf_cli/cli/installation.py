@@ -1,16 +1,13 @@
-"""The installation (`doctor`), an output folder (`check`), and defaults of options (`config`)."""
+"""The installation (`doctor`) and defaults of options (`config`)."""
 
 import logging
 import textwrap
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from facerf_cli.batch.made_from import check_outputs
-from facerf_cli.batch.run import print_path
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_toml
@@ -23,28 +20,6 @@ _LIMIT_BYTES = 1 << 20
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH, _HEAD = 100, 13  # columns of the screen, and of a section's or part's name
 log = logging.getLogger(LOGGER_NAME)
-
-
-def check(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Output folder of a verb.", show_default=False)
-    ],
-) -> None:
-    """Read all outputs of a folder again, and list those that are not as they were written.
-
-    Prints a line for each output that is missing, empty or changed; exits 1 if there is one. Changed files
-    may be damaged, or edited by hand. Run the verb again to make missing and empty ones, and with
-    --overwrite always the others.
-    """
-    counts: Counter[str] = Counter()
-    for path, state in check_outputs(folder):
-        counts[state] += 1
-        if state != "whole":
-            print_path(f"{path}: {state}")
-    if not counts:
-        raise UsageError(f"{folder}: no index of outputs; give the output folder of a verb that reads photos")
-    log.info("%s", ", ".join(f"{count} {state}" for state, count in sorted(counts.items())))
-    raise typer.Exit(int(counts["whole"] < counts.total()))
 
 
 def doctor(

@@ -1,6 +1,5 @@
 """`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
-import itertools
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -13,11 +12,11 @@ import typer
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, files_read, refuse_read
 from facerf_cli.batch.made_from import DigestOf, Recipe
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, print_path, run_items
+from facerf_cli.batch.run import Job, Outcome, run_items
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.option import Without
-from facerf_cli.work.light_setups import LightSetup, LightSources, PhotoLight
+from facerf_cli.work.light_setups import LightSources, PhotoLight
 from facerf_cli.work.output_options import NEEDS, STDOUT, SUFFIXES, check_stdout, format_of_file
 from facerf_cli.work.photo_options import networks_of
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
@@ -112,7 +111,7 @@ def relight(
     film = None if file else film_output(output, options.fps)
     if file is not None:
         formats = (file,) if is_default(context, "formats") else formats
-        refuse_given(context, ("ball", "name", "fps"), f"is not for -o {output}, one image; leave it out")
+        refuse_given(context, ("name", "fps"), f"is not for -o {output}, one image; leave it out")
         if [SUFFIXES[name] for name in formats] != [SUFFIXES[file]]:
             raise UsageError(f"-o {output}: is not what --format says; leave that out, or give a folder")
         one_file = replace(options.output, file_suffix=output.suffix)
@@ -120,12 +119,10 @@ def relight(
         batch = replace(batch, output=output).of_file()
         output = output.parent
     elif film is not None:
-        refuse_given(context, ("formats", "ball", "name", "report"), f"is not for -o {output}; leave it out")
+        refuse_given(context, ("formats", "name", "report"), f"is not for -o {output}; leave it out")
         formats, output = film.formats, film.folder
     elif output == STDOUT:
-        refuse_given(
-            context, ("ball", "dry_run", "report"), "is not for -o -, which writes one image; leave it out"
-        )
+        refuse_given(context, ("dry_run", "report"), "is not for -o -, which writes one image; leave it out")
         if is_default(context, "formats"):
             formats = ("png",)
     for name, needed in NEEDS.items():
@@ -154,16 +151,13 @@ def relight(
     plan = plan.of_items(items, Shots(taken))
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
-    balls = [path for setup in plan.maps if options.ball for path in _balls_of(setup, plan, output)]
-    refuse_read([film.path] if film else images + balls, files_read((items, plan, sources), items))
+    refuse_read([film.path] if film else images, files_read((items, plan, sources), items))
     recipes = film.recipes_of_new(items, taken, images, plan.recipes_of, batch) if film else []
     if film is not None and not recipes:
         return
     code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
     if film is not None:
         code = film.joined(items, images, taken, recipes, code)
-    elif options.ball and not batch.dry_run and batch.shard.number == 1:
-        _write_balls(plan, batch)
     raise typer.Exit(code)
 
 
@@ -176,24 +170,3 @@ def _write_to_stdout(inputs: Sequence[str], plan: RelightPlan) -> None:
         (path,) = RelightJob(plan).ready(dry_run=False).process(items[0]).outputs
         sys.stdout.buffer.write(path.read_bytes())
         sys.stdout.buffer.flush()
-
-
-def _balls_of(setup: LightSetup, plan: RelightPlan, folder: Path) -> list[Path]:
-    """The files of the balls under a map, of each format."""
-    return [
-        folder / "balls" / f"{setup.name}{setup.frame}{suffix}" for suffix in plan.options.output.suffixes
-    ]
-
-
-def _write_balls(plan: RelightPlan, options: BatchOptions) -> None:
-    """Write the balls under each map to `balls/NAME` in each format, unless they are there."""
-    files = {setup: _balls_of(setup, plan, options.output) for setup in plan.maps}
-    always = options.overwrite == "always"
-    missing = [setup for setup, paths in files.items() if always or not all(map(Path.exists, paths))]
-    if missing:
-        from facerf_cli.work.lights import readable, write_balls
-
-        drawn = readable(missing)
-        write_balls(drawn, [files[setup][0] for setup in drawn], plan.exposure_rule, plan.options.output)
-        for path in itertools.chain.from_iterable(files[setup] for setup in drawn):
-            print_path(path)

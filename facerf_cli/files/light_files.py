@@ -20,7 +20,6 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
-from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, LINEAR_BYTES, LinearImage, read_image
 from facerf_cli.light.envmap import check_envmap
 from facerf_cli.light.forms import LightForms
@@ -214,16 +213,6 @@ def _in_sphere(path: Path | str, image: LinearImage) -> np.ndarray:
     place = sphere[top : top + height, left : left + width]
     place[:] = image.pixels[: place.shape[0], : place.shape[1]]  # roundings may differ by a pixel
     return sphere
-
-
-def face_model_of_map(path: Path) -> dict[str, str]:
-    """Return the attributes that name the face model with which a light was estimated, if there are any."""
-    if path.suffix.lower() == ".json":
-        attributes = read_light_file(path)[1]
-    else:
-        header = read_header(path)
-        attributes = header.metadata if header else {}
-    return {name: str(value) for name, value in attributes.items() if name.startswith("facerf:face_model")}
 
 
 @lru_cache(maxsize=2)  # converting a rig takes seconds, and relight reads the same light several times

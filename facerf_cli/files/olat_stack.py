@@ -8,7 +8,6 @@ stack, the head's rotation and the fit, so that a stack can be relit without its
 """
 
 import json
-import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,7 +21,6 @@ from pydantic import Field, PlainValidator
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.read import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
@@ -99,28 +97,6 @@ def _parts(header: StackHeader, olats: Iterable[Tensor]) -> Iterator[np.ndarray]
     if count != len(header.directions):
         raise ValueError(f"{count} lights, not {len(header.directions)}")
     yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
-
-
-def write_olat_npz(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
-    """Write a stack as arrays for NumPy, without pickles; its `olats` are [L, H, W, 3] float16.
-
-    Its other arrays have the names of `StackHeader`'s fields, those of the fit begin with `fit_`.
-    """
-    shape, beyond = (len(header.directions), *header.seen.shape, 3), 0
-    rest = {name: getattr(header, name) for name in _ARRAYS}
-    rest |= {f"fit_{name}": value for name, value in header.fit.items()} | header.metadata
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as file:
-        with file.open("olats.npy", "w", force_zip64=True) as entry:
-            description = {"descr": "<f2", "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(entry, description)
-            for batch in olats:
-                data, clamped = half_floats(path, batch.permute(0, 2, 3, 1).cpu().numpy())
-                beyond += clamped
-                entry.write(data.astype("<f2").tobytes())
-        for name, value in rest.items():
-            with file.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.asarray(value), allow_pickle=False)
-    warn_of_clamped(path, beyond)
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:

@@ -13,18 +13,14 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.light.entries import MapSource, StudioLight
-from facerf_cli.light.envmap import MapKeys, ball, lights_around, rotated_weights, without_keys
+from facerf_cli.light.envmap import MapKeys, lights_around, rotated_weights, without_keys
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow, rig_by_text
-from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
+from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
-from facerf_cli.work.output_options import OutputOptions
-from facerf_cli.work.outputs import Exposure, OutputImage, write_output
 from facerf_cli.work.photo_options import LightOptions
-from facerf_cli.work.photos import face_model
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map
 _LIGHT_WIDTH_PX = 512  # of the map of a photo's light
-_BALL_PX = 256
 FarLight = tuple[int, Tensor, Tensor]  # its setup, directions [n, 3] and rgb weights [n, 3]
 log = logging.getLogger(LOGGER_NAME)
 
@@ -217,27 +213,3 @@ def _map_weights(
         colours = torch.stack([intensity_of(light) for light in lights])
         weights.index_add_(0, torch.tensor(rows), of_map * colours[:, None])
     return weights, keys
-
-
-def write_balls(
-    setups: Sequence[LightSetup], paths: Sequence[Path], exposure: float | str, output: OutputOptions
-) -> None:
-    """Write, in every format, a mirror ball and a diffuse ball under each setup's map as it is rotated."""
-    for setup, path in zip(setups, paths, strict=True):
-        light = setup.envmap
-        assert light is not None and light.envmap is not None
-        envmap = read_map(light.envmap)
-        both = [ball(envmap, _BALL_PX, kind, light.rotate_deg) for kind in ("mirror", "diffuse")]
-        pixels = (torch.cat(both, 1) * intensity_of(light)).numpy()
-        chosen: Exposure = exposure if isinstance(exposure, float) else "auto"
-        write_output(path, OutputImage(pixels), chosen, output, _metadata_of(light.envmap))
-
-
-def _metadata_of(envmap: MapSource) -> dict[str, str | int]:
-    """Metadata of an image that shows a light; an estimated light depends on the face model."""
-    if isinstance(envmap, PhotoLight):
-        return Provenance(envmap.name, **face_model(envmap.options.photo).stamp).attributes()
-    from facerf_cli.files.light_files import face_model_of_map
-
-    made = Provenance(envmap.name).attributes()
-    return {**made, **face_model_of_map(envmap)} if isinstance(envmap, Path) else made

@@ -140,7 +140,6 @@ class RelightOptions:
         photo_of_stack: Put an OLAT stack back on its photo, at the photo's resolution.
         identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
             (an extra).
-        ball: Write a mirror ball and a diffuse ball under each map, too.
         fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too).
         name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
     """
@@ -189,7 +188,6 @@ class RelightOptions:
     photo_of_stack: Path | None = option(
         None, metavar=COMPANION, flags=("--photo",), shown_default=False, panel=IMAGE
     )
-    ball: bool = option(False, in_recipe=False, panel=IMAGE)
     identity: bool = option(False, in_recipe=False, panel=METHOD)
     network_alone: bool = network_alone_option()
     white: White = white_option()
@@ -349,8 +347,6 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
         setups = tuple(replace(one, exposure_ev=0.0) if one.has_scale else one for one in setups)
     if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
         raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
-    if options.ball and all(setup.envmap is None for setup in setups):
-        raise UsageError("--ball: shows maps; give --envmap, or leave it out")
     sweeps = sources.rotate is not None and is_sweep(sources.rotate)
     dark = options.background.is_dark
     filled = replace(

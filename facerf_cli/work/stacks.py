@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,24 +11,20 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.errors import InputError
 from facerf_cli.face.fit import fit_to_arrays
 from facerf_cli.face.head import shrunk_photo
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.face.view import render_face, see_face
-from facerf_cli.files.olat_stack import StackHeader, write_olat_npz, write_olat_stack
+from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.read import LinearImage
-from facerf_cli.files.relight_web import write_relight_web
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import write_display
-from facerf_cli.image.colour import SOFT_VIEW, auto_exposure_ev, encode_display
 from facerf_cli.image.strips import resized
 from facerf_cli.light.studio_points import Lights, rig_by_text
 from facerf_cli.person import Target, fit
 from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
-from facerf_cli.run import memory
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
@@ -41,21 +36,17 @@ from facerf_cli.work.photos import (
     rotation_of,
     write_each,
 )
-from facerf_cli.work.plan import IMAGE_PX, require_face
+from facerf_cli.work.plan import require_face
 from facerf_cli.work.verbs import PredictOlat, Written
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
-_FRONT, _FEWEST_FRONT = 0.05, 9  # least z of a light from in front; below so many nothing is interpolated
-_FEWER = "fewer --lights or a smaller --size"
 _AT_ONCE, _AT_ONCE_PX = 8, 1 << 23  # lights of a person in the photo's frame, and pixels of their images
 
 
 def write_stacks(item: Item, work: PredictOlat) -> Written:
     """Predict and write the stack of each chosen face of a photo."""
     directions = rig_by_text(work.lights)
-    if work.format == "relight":
-        directions = _from_in_front(item, directions)
     image = read_photo(item, work.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
@@ -65,10 +56,7 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             header, olats = _of_person(item, image, face, directions, work, tiles)
         else:
             header, olats = _of_face(item, face, directions, work, tiles)
-        if work.format == "relight":
-            _write_relight_web(stack.parent, header, olats)
-        else:
-            {"exr": write_olat_stack, "npz": write_olat_npz}[work.format](stack, header, olats)
+        write_olat_stack(stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for page in pages:
             write_page(
@@ -78,34 +66,6 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
 
     tags, facts = write_each(item, image, work.photo, write)
     return tags, facts | {"lights": len(directions)}
-
-
-def _from_in_front(item: Item, directions: Tensor) -> Tensor:
-    """The lights that web viewers show; InputError if they are too few."""
-    front = directions[directions[:, 2] > _FRONT]
-    if len(front) < _FEWEST_FRONT:
-        raise InputError(
-            f"{item.input_path}: --format relight needs {_FEWEST_FRONT} lights from in front, not "
-            f"{len(front)}; give more --lights"
-        )
-    return front
-
-
-def _write_relight_web(folder: Path, header: StackHeader, olats: Iterator[Tensor]) -> None:
-    """Write the images, exposed alike so that the brightest is well shown."""
-    lights, (height, width) = len(header.directions), header.seen.shape
-    memory.require(f"--format relight of {lights} lights", lights * height * width * IMAGE_PX, _FEWER)
-    halves, brightest = [], torch.zeros(height, width)
-    for batch in olats:
-        halves.append(batch.half())
-        brightest = torch.maximum(brightest, batch.mean(1).amax(0))
-    ev = auto_exposure_ev(brightest[..., None].expand(-1, -1, 3).numpy(), header.seen)
-    shown = np.empty((lights, height, width, 3), np.uint8)
-    for image, half in zip(shown, (half for batch in halves for half in batch), strict=True):
-        exposed = half.float().permute(1, 2, 0).numpy() * np.float32(2.0**ev)
-        image[:] = np.round(encode_display(exposed, SOFT_VIEW) * 255)
-    del halves
-    write_relight_web(folder, shown, header.directions, {"exposure_ev": ev})
 
 
 def _of_person(

@@ -174,8 +174,6 @@ class PredictOlat(PhotoWork):
             textures, which other poses can be rendered from.
         size_px: Scale larger photos down to this longer side, with --frame photo.
         precision: Compute the network in this precision; bf16 where the device has instructions for it.
-        format: Write OpenEXR; NumPy's arrays (_olat.npz); or a folder for the web viewers Relight and
-            OpenLIME, front lights only.
         page: Write the web page of `facerf view`, _page.html, too.
     """
 
@@ -189,20 +187,18 @@ class PredictOlat(PhotoWork):
     white: White = white_option()
     normals_from: Path | None = normals_option()
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
-    format: Literal["exr", "npz", "relight"] = option("exr", panel=IMAGE)
     page: bool = option(False, panel=IMAGE)
     verb = "predict-olat"
 
     @property
     def endings(self) -> tuple[str, ...]:
         """Ends of the stack, its contact sheet and, if wanted, its page."""
-        stack = "_relight/info.json" if self.format == "relight" else f"_olat.{self.format}"
-        return (stack, "_olat.png", *(["_page.html"] if self.page else []))
+        return ("_olat.exr", "_olat.png", *(["_page.html"] if self.page else []))
 
     @property
     def alone_as(self) -> tuple[str, ...]:
         """The stack."""
-        return () if self.format == "relight" else self.endings[:1]
+        return self.endings[:1]
 
     @property
     def networks(self) -> frozenset[str]:
@@ -216,8 +212,6 @@ class PredictOlat(PhotoWork):
         self.photo.check()
         if self.frame == "photo" and self.pose is not None:
             raise UsageError("--pose: turns the head out of its photo; use --frame face or uv with it")
-        if self.format == "relight" and self.frame == "uv":
-            raise UsageError("--format relight: shows images, not UV textures; use --frame photo or face")
         if self.page and (self.network_alone or self.pose is not None):
             raise UsageError(
                 "--page: shows the photo's own pose and light; give neither --pose nor --network-alone"

@@ -20,7 +20,6 @@ from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.main import main
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
@@ -404,19 +403,6 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
     (out / "b_a.bin").unlink()
     assert call() == 0
     assert "1 to make again: an output is missing" in capsys.readouterr().err
-
-
-def test_check_reads_all_outputs_again(two: Path, tmp_path: Path, capsys: Said) -> None:
-    out = tmp_path / "out"
-    run([two], out)
-    capsys.readouterr()
-    assert main(["check", str(out)]) == 0
-    assert "2 whole" in capsys.readouterr().err
-    (out / "a_copy.bin").write_bytes(b"A")  # as long as before
-    (out / "b_copy.bin").unlink()
-    assert main(["check", str(out)]) == 1
-    said = capsys.readouterr()
-    assert said.out.split("\n")[:2] == [f"{out / 'a_copy.bin'}: changed", f"{out / 'b_copy.bin'}: missing"]
 
 
 def test_a_finished_folder_is_read_without_writing_or_reading_much(

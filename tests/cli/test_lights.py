@@ -2,7 +2,6 @@
 
 import math
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
-from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
 from facerf_cli.light.sh import CONVENTION
@@ -25,9 +23,7 @@ from facerf_cli.work.lights import (
     off_rig_deg,
     readable,
     single_lights,
-    write_balls,
 )
-from facerf_cli.work.output_options import OutputOptions
 
 HEIGHT_PX = 16
 
@@ -206,34 +202,6 @@ def test_lamps_of_a_stack_are_shared_by_the_lights_around_them() -> None:
     assert math.isclose(math.cos(math.radians(off_rig_deg(setups, directions))), float(apart), rel_tol=1e-5)
 
 
-def balls(setups: Sequence[LightSetup], output: Path, exposure_ev: float | None) -> None:
-    """Write the balls of the setups with a map, named as `relight --ball` names them."""
-    maps = [setup for setup in setups if setup.envmap is not None]
-    paths = [output / "balls" / f"{setup.name}{setup.frame}.exr" for setup in maps]
-    write_balls(maps, paths, exposure_ev, OutputOptions())
-
-
-def test_balls_show_which_way_a_map_is_turned_and_name_its_face_model(tmp_path: Path) -> None:
-    envmap = write_map(tmp_path / "one.exr", (0.25, 0.49))
-    setups = collect_setups(LightSources(envmap=[str(envmap)], light=["0,0"]), tmp_path / "out")
-    balls(setups, tmp_path / "out", None)
-    ball = read_image(tmp_path / "out/balls/one.exr").pixels
-    diffuse = ball[:, ball.shape[1] // 2 :, 0]
-    half = diffuse.shape[1] // 2
-    assert diffuse[:, half:].sum() > 5 * diffuse[:, :half].sum()
-    assert sorted(path.name for path in (tmp_path / "out/balls").iterdir()) == ["one.exr", "one.png"]
-    marks = {"facerf:face_model": "mine", "facerf:face_model_licence": "MIT"}
-    write_exr(tmp_path / "a.exr", np.ones((16, 32, 3), np.float32), metadata=marks)
-    light = LightRecord(rig_directions()[:3], torch.ones(3, 3), "three", None, marks)
-    write_light(tmp_path / "b.json", light)
-    setups = collect_setups(
-        LightSources(envmap=[str(tmp_path / name) for name in ("a.exr", "b.json")]), tmp_path / "out"
-    )
-    balls(setups, tmp_path / "out", 0.0)
-    for name in ("a.exr", "b.exr"):
-        assert read_image(tmp_path / "out/balls" / name).metadata.items() >= marks.items()
-
-
 def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
     assert main(["envmap", "-o", str(tmp_path), "--count", "2", "--seed", "3"]) == 0
     files = collect_setups(LightSources(envmap=[str(tmp_path)], rotate="0:360:2"), tmp_path / "out")
@@ -242,8 +210,6 @@ def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
     assert readable(drawn) == drawn
     rigs = [lights_over_rig(setups, "12", "cell").weights for setups in (files, drawn)]
     np.testing.assert_allclose(rigs[0], rigs[1], rtol=2e-3, atol=1e-4)
-    balls(drawn[:1], tmp_path / "out", None)
-    assert (tmp_path / f"out/balls/{drawn[0].name}.0000.png").exists()
 
 
 @pytest.mark.parametrize("word", ["procedural:", "procedural:x", "procedural:10000"])

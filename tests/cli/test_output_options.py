@@ -125,7 +125,7 @@ def test_one_image_on_standard_output(
 
 
 @pytest.mark.parametrize(
-    "words", ["--light 1,2", "--format exr,png", "--ball", "--dry-run", "--face all", str(PATH.parent)]
+    "words", ["--light 1,2", "--format exr,png", "--dry-run", "--face all", str(PATH.parent)]
 )
 def test_several_images_are_refused_before_anything_is_loaded(
     given: Path, words: str, capsysbinary: pytest.CaptureFixture[bytes], monkeypatch: Patch

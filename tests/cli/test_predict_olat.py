@@ -18,7 +18,6 @@ from facerf_cli.main import main
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.viewer.page import strip_of
 from tests.astronaut import PATH as PHOTO
-from tests.files.test_relight_web import Decoder
 from tests.kinds import Patch, Said
 from tests.stacks import OlatStack, read_olat_stack
 
@@ -76,48 +75,6 @@ def test_the_person_in_the_photos_frame_goes_back_on_the_photo(given: Path, tmp_
     np.testing.assert_allclose(whole.pixels[:20, -20:], photo[:20, -20:], atol=2e-3)  # the background
     assert main(["relight", str(path), *lit, str(tmp_path / "alone")]) == 0
     assert read_image(tmp_path / "alone/astronaut_olat_light_70_0.exr").alpha is not None
-
-
-def test_arrays_are_those_of_the_stack(given: Path, tmp_path: Path) -> None:
-    stack = stack_of(given, tmp_path, "--lights", SIDES)
-    assert predict(given, tmp_path / "me.npz", "--lights", SIDES, "--format", "npz") == 0
-    with np.load(tmp_path / "me.npz", allow_pickle=False) as file:
-        arrays = dict(file)
-    np.testing.assert_array_equal(arrays["olats"].transpose(0, 3, 1, 2), stack.olats.numpy())
-    for name in ("directions", "rotation", "source", "seen", "normals"):
-        np.testing.assert_allclose(arrays[name], getattr(stack.header, name), atol=1e-3, rtol=1e-3)
-    np.testing.assert_array_equal(arrays["fit_landmarks_px"], stack.header.fit["landmarks_px"])
-    assert arrays["kind"] == "texture" and arrays["facerf:synthetic"] == 1
-    page = (Path(__file__).parents[2] / "docs/formats.md").read_text()
-    named = {name for name in arrays if not name.startswith(("fit_", "facerf:"))}
-    assert all(f"`{name}`" in page for name in named)
-
-
-@pytest.mark.slow
-def test_the_format_of_web_viewers_has_the_lights_from_in_front(given: Path, tmp_path: Path) -> None:
-    line = ["--lights", "40", "--frame", "photo", "--size", "128", "--format", "relight"]
-    assert predict(given, tmp_path, *line) == 0
-    folder = tmp_path / "astronaut_relight"
-    decoder = Decoder(folder)
-    front = rig_directions(40)[rig_directions(40)[:, 2] > 0.05].numpy()
-    np.testing.assert_allclose(decoder.lights, front, atol=1e-4)
-    assert (decoder.info["width"], decoder.info["height"]) == (128, 128)
-    from_right, from_left = (
-        decoder.image(azel_to_direction(azimuth, 0).numpy())[20:45, 44:68].mean((0, 2))
-        for azimuth in (60, -60)
-    )
-    assert (from_right / from_left.clip(1))[-6:].mean() > (from_right / from_left.clip(1))[:6].mean()
-    assert not (tmp_path / "astronaut_olat.exr").exists() and (tmp_path / "astronaut_olat.png").exists()
-    few = ["--lights", SIDES, "--frame", "photo", "--size", "128", "--format", "relight"]
-    assert predict(given, tmp_path / "few", *few) == 1
-
-
-def test_the_format_of_web_viewers_asks_for_its_memory(given: Path, tmp_path: Path, capsys: Said) -> None:
-    line = ["predict-olat", str(PHOTO), "--landmarks", str(given / "astronaut.json"), "-o", str(tmp_path)]
-    line += ["--lights", "2000", "--frame", "face", "--size", "256", "--format", "relight"]
-    assert main(["--memory", "0.5", "--checkpoint", str(given / "lambert.safetensors"), *line]) == 1
-    assert "fewer --lights or a smaller --size" in capsys.readouterr().err
-    assert not (tmp_path / "astronaut_relight").exists()
 
 
 @pytest.mark.slow

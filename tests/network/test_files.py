@@ -44,7 +44,7 @@ def test_a_runs_folder_stands_for_its_best_checkpoint(tmp_path: Path) -> None:
     assert serving_files([checkpoint_file(tmp_path)])["portrait"] == best
 
 
-@pytest.mark.parametrize("verb", ["envmap", "segment", "train", "evaluate", "synth-stage", "check"])
+@pytest.mark.parametrize("verb", ["envmap", "segment", "train", "evaluate", "synth-stage"])
 def test_every_verb_refuses_a_file_without_use(tmp_path: Path, verb: str, capsys: Said) -> None:
     path = checkpoint(tmp_path / "a.st", "appearance_features")
     assert main([verb, "x", "-o", str(tmp_path / "out"), "--checkpoint", str(path)]) == 2
