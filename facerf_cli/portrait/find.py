@@ -8,6 +8,7 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -47,12 +48,14 @@ class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
     There is no view of a face that was given. The photo's other heads are there where they were looked for.
+    `number` counts the faces that were found from the left, from 0.
     """
 
     box_px: Box
     score: float
     view: SquareView | None = field(default=None, kw_only=True, repr=False)
     others: Sequence[OtherHead] | None = field(default=None, kw_only=True, repr=False)
+    number: int = field(default=0, kw_only=True)
 
     @property
     def area_px(self) -> float:
@@ -70,7 +73,7 @@ class Face(FaceBox):
     @property
     def box(self) -> FaceBox:
         """The face without its landmarks."""
-        return FaceBox(self.box_px, self.score, view=self.view, others=self.others)
+        return FaceBox(self.box_px, self.score, view=self.view, others=self.others, number=self.number)
 
 
 def face_at(landmarks_px: np.ndarray) -> Face:
@@ -79,7 +82,10 @@ def face_at(landmarks_px: np.ndarray) -> Face:
     return Face((left, top, right, bottom), math.inf, landmarks_px)
 
 
-def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
+_Found = TypeVar("_Found", bound=FaceBox)
+
+
+def choose_face(faces: Sequence[_Found], which: str, name: str) -> Sequence[_Found]:
     """Choose among faces ordered from left to right: the largest, all, or the one at an index from 0.
 
     'largest' multiplies size by detector score: a badge on a sleeve can be as large as the face above it.
@@ -106,7 +112,7 @@ def find_faces(
     pixels_linear: np.ndarray,
     name: str,
     which: str = "largest",
-) -> list[Face]:
+) -> Sequence[Face]:
     """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
 
     Raises NoFaceError, with the image's name, where there is none.
@@ -136,7 +142,7 @@ def detect_faces(
     faces = [face for mesh in meshes if (face := _as_face(people, image_srgb, mesh))]
     faces.sort(key=lambda face: face.box_px[0])
     heads = [OtherHead(face.landmarks_px) for face in faces]
-    return [replace(one, others=heads[:n] + heads[n + 1 :]) for n, one in enumerate(faces)]
+    return [replace(one, others=heads[:n] + heads[n + 1 :], number=n) for n, one in enumerate(faces)]
 
 
 def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
