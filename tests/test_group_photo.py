@@ -1,7 +1,7 @@
 """Several people in one image, by people with known answers."""
 
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,7 +13,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import LinearImage
-from facerf_cli.portrait.find import FaceBox, choose_face
+from facerf_cli.portrait.find import Face, FaceBox, choose_face
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run import memory
@@ -126,21 +126,14 @@ def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by
 
 
 @pytest.mark.parametrize(("which", "numbers"), [("largest", [1]), ("1", [1]), ("0", [0]), ("all", [0, 1])])
-def test_a_face_has_its_number_among_all_where_lights_are_for_faces(
+def test_a_chosen_face_keeps_its_number_from_the_left(
     monkeypatch: pytest.MonkeyPatch, which: str, numbers: list[int]
 ) -> None:
-    """The largest is found first, and others only by a search for everyone."""
-    small, large = (FaceBox((k, 0, k + side, side), 1.0, number=k) for k, side in ((0, 1), (1, 3)))
+    faces = [Face((k, 0, k + side, side), 1.0, POINTS, number=k) for k, side in ((0, 1), (1, 3))]
     monkeypatch.setattr(photos, "load_models_once", lambda *_: None)
-    monkeypatch.setattr(
-        photos,
-        "find_faces",
-        lambda models, photo, which, *_: (
-            [replace(large, number=0)] if which == "largest" else choose_face([small, large], which, "a.png")
-        ),
-    )
+    monkeypatch.setattr(photos, "find_faces", lambda models, photo, which, *_: choose_face(faces, which, "a"))
     item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
-    people = photos.find_people(item, image, PhotoOptions(Settings(), face=which), everyone=True)
+    people = photos.find_people(item, image, PhotoOptions(Settings(), face=which))
     assert [face.number for face in people] == numbers
 
 

@@ -8,7 +8,6 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -82,10 +81,7 @@ def face_at(landmarks_px: np.ndarray) -> Face:
     return Face((left, top, right, bottom), math.inf, landmarks_px)
 
 
-_Found = TypeVar("_Found", bound=FaceBox)
-
-
-def choose_face(faces: Sequence[_Found], which: str, name: str) -> Sequence[_Found]:
+def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
     """Choose among faces ordered from left to right: the largest, all, or the one at an index from 0.
 
     'largest' multiplies size by detector score: a badge on a sleeve can be as large as the face above it.
@@ -112,7 +108,7 @@ def find_faces(
     pixels_linear: np.ndarray,
     name: str,
     which: str = "largest",
-) -> Sequence[Face]:
+) -> list[Face]:
     """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
 
     Raises NoFaceError, with the image's name, where there is none.

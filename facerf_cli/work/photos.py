@@ -34,7 +34,7 @@ from facerf_cli.portrait.confidence import (
     face_facts,
     touched_sides,
 )
-from facerf_cli.portrait.find import Face, FaceBox, choose_face, face_at
+from facerf_cli.portrait.find import Face, FaceBox, face_at
 from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
@@ -208,21 +208,16 @@ def facts_of_found(faces: Sequence[PhotoFace], options: PhotoOptions) -> dict[st
 
 
 def find_people(
-    item: Item, image: LinearImage, options: PhotoOptions, to_fit: bool = False, everyone: bool = False
+    item: Item, image: LinearImage, options: PhotoOptions, to_fit: bool = False
 ) -> list[PhotoFace]:
-    """Find the faces that the options choose, from left to right, with landmarks or what a fit needs.
-
-    If `everyone`, all faces are searched for, so that the largest has its number among them.
-    """
+    """Find the faces that the options choose, from left to right, with landmarks or what a fit needs."""
     faces: Sequence[FaceBox]
     if options.landmarks is not None:
         faces = [_given(item, image, options.landmarks)]
     else:
         geometry = options.geometry if to_fit else "landmarks"
         path = str(item.input_path)
-        which = "all" if everyone else options.face
-        faces = find_faces(load_models_once(options), image.pixels, which, geometry, path)
-        faces = choose_face(faces, options.face, path) if everyone else faces
+        faces = find_faces(load_models_once(options), image.pixels, options.face, geometry, path)
     found = []
     for face in faces:
         name, number, (left, top, right, bottom) = str(item.input_path), face.number, face.box_px

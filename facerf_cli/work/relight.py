@@ -92,7 +92,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
     else:
         image = read_photo(item, plan.photo)
         matte = person_matte(item, image.pixels, plan.photo)
-        faces = find_people(item, image, plan.photo, to_fit=True, everyone=bool(plan.lit_faces))
+        faces = find_people(item, image, plan.photo, to_fit=True)
     photo, background = image.pixels, options.background.kind
     normals = read_normals(item, options.normals_from, photo.shape[:2])
     check_faces(item, [face.number for face in faces], plan)
