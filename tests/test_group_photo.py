@@ -1,7 +1,9 @@
 """Several people in one image, by people with known answers."""
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +13,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import LinearImage
-from facerf_cli.portrait.find import FaceBox
+from facerf_cli.portrait.find import Face, FaceBox, choose_face
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run import memory
@@ -20,8 +22,10 @@ from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import PhotoFace
 from facerf_cli.work.plan import beside_people, require_people
+from facerf_cli.work.sequence import OpenShot
 
 SIZE = (4, 6)
+POINTS = np.arange(136.0).reshape(68, 2)
 
 
 @dataclass
@@ -119,6 +123,33 @@ def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by
     memory.set_limit(100 << 20)
     with pytest.raises(InputError, match=r"3 people in one image: needs .* --composite face"):
         require_people(3, (4, 6))
+
+
+@pytest.mark.parametrize(("which", "numbers"), [("largest", [1]), ("1", [1]), ("0", [0]), ("all", [0, 1])])
+def test_a_chosen_face_keeps_its_number_from_the_left(
+    monkeypatch: pytest.MonkeyPatch, which: str, numbers: list[int]
+) -> None:
+    faces = [Face((k, 0, k + side, side), 1.0, POINTS, number=k) for k, side in ((0, 1), (1, 3))]
+    monkeypatch.setattr(photos, "load_models_once", lambda *_: None)
+    monkeypatch.setattr(photos, "find_faces", lambda models, photo, which, *_: choose_face(faces, which, "a"))
+    item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
+    people = photos.find_people(item, image, PhotoOptions(Settings(), face=which))
+    assert [face.number for face in people] == numbers
+
+
+def test_the_face_of_a_shot_has_the_number_by_which_it_was_chosen() -> None:
+    head = SimpleNamespace(
+        landmarks_px=None, fit=SimpleNamespace(crop=SimpleNamespace(to_photo=lambda _: POINTS))
+    )
+    steady = SimpleNamespace(head=head, segmentation=SimpleNamespace(matte=None))
+    shot: Any = SimpleNamespace(
+        take_of=lambda _: SimpleNamespace(window=lambda *_: steady),
+        shot=SimpleNamespace(frames=[Item(Path("a.0001.png"), Path("a.0001"), "a.0001")]),
+        frames=SimpleNamespace(image=lambda _: None),
+        _naming=lambda _: nullcontext(),
+        _options=PhotoOptions(Settings(), face="2"),
+    )
+    assert OpenShot.fitted(shot, 0)[1].number == 2
 
 
 def test_people_leave_less_memory_for_lights_at_once() -> None:

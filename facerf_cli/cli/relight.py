@@ -1,5 +1,6 @@
 """`facerf relight`: photos, or OLAT stacks, under environment maps and single lights."""
 
+import logging
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -16,12 +17,15 @@ from facerf_cli.batch.run import Job, Outcome, run_items
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.option import Without
+from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.light_setups import LightSources, PhotoLight
 from facerf_cli.work.output_options import NEEDS, STDOUT, SUFFIXES, check_stdout, format_of_file
 from facerf_cli.work.photo_options import networks_of
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
 from facerf_cli.work.verbs import PHOTOS_A_PROCESS, FileOrFolder
+
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
@@ -130,12 +134,11 @@ def relight(
             refuse_given(context, (name,), f"is for {', '.join(needed)}; add that to --format")
     options = replace(options, output=replace(options.output, formats=formats))
     plan = plan_relight(options, sources, output)
-    if (
-        film
-        and not film.holds_alpha
-        and (plan.options.background.kind == "none" or plan.options.composite == "face")
-    ):
+    has_alpha = plan.options.background.kind == "none" or plan.options.composite == "face"
+    if film and has_alpha and not film.holds_alpha:
         raise UsageError(f"-o {film.path}: has no alpha; give FILE.mov, a folder, or --background COLOUR")
+    if has_alpha and "jpg" in formats:
+        log.warning("JPEG has no alpha, so the person is over black; use png, tiff or exr to keep alpha")
     if output == STDOUT:
         _write_to_stdout(inputs, plan)
         return

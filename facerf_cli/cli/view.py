@@ -55,7 +55,7 @@ def view(
     """Make a web page in which a photo, or an OLAT stack, is relit by moving lights.
 
     A folder of pages has a list of them, index.html; -o me.html writes one page. A page is
-    one file of about 4 MB, which a browser opens without a server or a network: single lights, rotated
+    one file of about 5 MB, which a browser opens without a server or a network: single lights, rotated
     environment maps (.hdr and .exr can be dropped in), exposure, and the command that makes the same image.
     """
     photo, output = work.checked().photo, batch.output

@@ -103,7 +103,6 @@ def write_exr(
         one.nchannels = sum(spec.nchannels for spec in specs)
         one.channelnames = tuple(name for spec in specs for name in spec.channelnames)
         one.channelformats = tuple(spec.format for spec in specs for _ in range(spec.nchannels))
-        one.format = oiio.TypeDesc(oiio.FLOAT)
         one.erase_attribute("name")
         specs = [one]
     beyond = 0

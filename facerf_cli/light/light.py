@@ -88,7 +88,7 @@ class Light:
         """The light in a picture [H, W, 3] behind the person, scene-linear: a guess, on the picture's scale.
 
         `fov_deg` is the angle of view across its width, 1 to 170 degrees. `light.picture.light_of_picture`
-        gives the map, and how far such guesses are off. Raises ValueError for another picture or angle.
+        also gives the map and its expected error. Raises ValueError for another picture or angle.
         """
         guess = light_of_picture(linear_pixels("picture", picture).detach(), fov_deg)
         return Light.from_envmap(guess.envmap.numpy(), lights=lights)

@@ -37,7 +37,8 @@ class PictureLight:
 
     Attributes:
         envmap: Lat-long map [128, 256, 3], scene-linear, on the picture's scale; its centre is at -z.
-        error: Expected relative error of the light on a matte white ball: what such guesses missed by.
+        error: Expected error of the light: the RMS difference between the irradiance of a matte white ball
+            under it, at the best exposure, and under the true light, relative to the latter's RMS.
     """
 
     envmap: Tensor

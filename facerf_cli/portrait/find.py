@@ -47,12 +47,14 @@ class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
     There is no view of a face that was given. The photo's other heads are there where they were looked for.
+    `number` counts the faces that were found from the left, from 0.
     """
 
     box_px: Box
     score: float
     view: SquareView | None = field(default=None, kw_only=True, repr=False)
     others: Sequence[OtherHead] | None = field(default=None, kw_only=True, repr=False)
+    number: int = field(default=0, kw_only=True)
 
     @property
     def area_px(self) -> float:
@@ -70,7 +72,7 @@ class Face(FaceBox):
     @property
     def box(self) -> FaceBox:
         """The face without its landmarks."""
-        return FaceBox(self.box_px, self.score, view=self.view, others=self.others)
+        return FaceBox(self.box_px, self.score, view=self.view, others=self.others, number=self.number)
 
 
 def face_at(landmarks_px: np.ndarray) -> Face:
@@ -136,7 +138,7 @@ def detect_faces(
     faces = [face for mesh in meshes if (face := _as_face(people, image_srgb, mesh))]
     faces.sort(key=lambda face: face.box_px[0])
     heads = [OtherHead(face.landmarks_px) for face in faces]
-    return [replace(one, others=heads[:n] + heads[n + 1 :]) for n, one in enumerate(faces)]
+    return [replace(one, others=heads[:n] + heads[n + 1 :], number=n) for n, one in enumerate(faces)]
 
 
 def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:

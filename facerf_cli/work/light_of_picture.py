@@ -27,12 +27,12 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 def guessed_light(item: Item, image: LinearImage, fov_deg: float | None) -> PictureLight:
-    """Guess a picture's light; a line says that it is a guess, and how far such guesses are off."""
+    """Estimate a picture's light, and warn that it is a guess and of the error to expect."""
     fov_deg = fov_deg or stated_fov_deg(image) or FOV_DEG
     guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
     log.warning(
-        "%s: has no face to find the light by; guessed from the picture, taken as %.0f degrees wide (--fov), "
-        "and such guesses are off by about %.0f %%",
+        "%s: has no face to find the light by, so the light is a guess from the picture, %.0f degrees wide "
+        "(--fov); the shading that it gives a matte white ball is expected to be wrong by %.0f %% (RMS)",
         item.input_path,
         fov_deg,
         100 * guess.error,

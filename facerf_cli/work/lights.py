@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
+from facerf_cli.files.image_metadata import read_header
 from facerf_cli.light.entries import MapSource, StudioLight
 from facerf_cli.light.envmap import MapKeys, lights_around, rotated_weights, without_keys
 from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow, rig_by_text
@@ -21,6 +22,7 @@ from facerf_cli.work.photo_options import LightOptions
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map
 _LIGHT_WIDTH_PX = 512  # of the map of a photo's light
+_CLIPPED = 2.0  # above what display values have in linear Rec.709, of any gamut
 FarLight = tuple[int, Tensor, Tensor]  # its setup, directions [n, 3] and rgb weights [n, 3]
 log = logging.getLogger(LOGGER_NAME)
 
@@ -39,7 +41,15 @@ def _maps_of(setups: Sequence[LightSetup]) -> list[MapSource]:
 def _is_readable(envmap: MapSource) -> bool:
     try:
         if not isinstance(envmap, DrawnMap):
-            read_map(envmap)
+            brightest = float(read_map(envmap).max())
+            header = read_header(envmap) if isinstance(envmap, Path) else None
+            if header and not header.is_floating and brightest < _CLIPPED:
+                log.warning(
+                    "%s: its %d-bit values are clipped at white, so its highlights are missing and its light "
+                    "is too flat; use an .hdr or .exr map",
+                    envmap,
+                    header.bits,
+                )
     except InputError as error:
         log.error("%s", error)
         return False

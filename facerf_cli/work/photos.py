@@ -219,8 +219,8 @@ def find_people(
         path = str(item.input_path)
         faces = find_faces(load_models_once(options), image.pixels, options.face, geometry, path)
     found = []
-    for number, face in enumerate(faces):
-        name, (left, top, right, bottom) = str(item.input_path), face.box_px
+    for face in faces:
+        name, number, (left, top, right, bottom) = str(item.input_path), face.number, face.box_px
         if len(faces) > 1:
             x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
             name += f": face {number} from the left, at x {x_px}, y {y_px} px"

@@ -95,7 +95,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
         faces = find_people(item, image, plan.photo, to_fit=True)
     photo, background = image.pixels, options.background.kind
     normals = read_normals(item, options.normals_from, photo.shape[:2])
-    check_faces(item, faces[-1].number, plan)
+    check_faces(item, [face.number for face in faces], plan)
     target = Target(composite="face")
     if in_photo:
         shown = None

@@ -246,6 +246,12 @@ class RelightPlan:
         """The setups that are maps."""
         return [setup for setup in self.setups if setup.envmap is not None]
 
+    @property
+    def lit_faces(self) -> set[int]:
+        """The numbers of the faces that have lights of their own."""
+        lights = (light for setup in self.setups for light in setup.lights)
+        return {light.face for light in lights if light.face is not None}
+
     def outputs_of(self, item: Item) -> list[Path]:
         """A file of each format for each setup."""
         return [path for setup in self.setups for path in self._images(item, setup)]
@@ -270,6 +276,11 @@ class RelightPlan:
                 )
             all_faces = self.photo.face == "all" and self.options.composite == "face"
             only_item(items, path, several=all_faces)
+        which = self.photo.face
+        relit = {int(which)} if which.isdecimal() else set()
+        if (which.isdecimal() or shots.all) and (others := self.lit_faces - relit):
+            advice = f"add --face {min(others) if shots.all else 'all'}"
+            raise UsageError(f"--light face={min(others)}: --face {which} is not that face; {advice}")
         paths: set[Path] = set()
         for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
             if path in paths:

@@ -125,10 +125,11 @@ def backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:
     return behind
 
 
-def check_faces(item: Item, last: int, plan: RelightPlan) -> None:
-    """Raise InputError where a light is for a face whose number is beyond the last one's."""
-    most = max((light.face or 0 for setup in plan.setups for light in setup.lights), default=0)
-    if most > last:
+def check_faces(item: Item, relit: Sequence[int], plan: RelightPlan) -> None:
+    """Raise InputError if a light is for a face that is not among the relit ones, given by their numbers."""
+    if others := plan.lit_faces.difference(relit):
+        numbers = ", ".join(map(str, relit))
         raise InputError(
-            f"{item.input_path}: a light is for face {most}, and the last is {last}; add --face all"
+            f"{item.input_path}: a light is for face {min(others)}, but only face {numbers} is relit; "
+            "add --face all, or remove that light"
         )

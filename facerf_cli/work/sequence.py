@@ -290,9 +290,9 @@ class OpenShot:
             steady = take.window(number, portrait)
         head, matte = steady.head, steady.segmentation.matte
         found = face_at(head.fit.crop.to_photo(head.landmarks_px))
-        face = FittedFace(
-            "", str(self.shot.frames[number].input_path), found, head=head, steady=steady, matte=matte
-        )
+        which, name = self._options.face, str(self.shot.frames[number].input_path)
+        left = int(which) if which.isdecimal() else 0
+        face = FittedFace("", name, found, number=left, head=head, steady=steady, matte=matte)
         return self.frames.image(number), face
 
     @contextmanager

@@ -191,7 +191,7 @@ def _fit_of(item: Item) -> Iterator[None]:
 def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
     """A stack under its own lights."""
     _check_stack(item, plan)
-    check_faces(item, 0, plan)
+    check_faces(item, [0], plan)
     header = read_olat_header(item.input_path)
     own = torch.from_numpy(header.directions).float()
     if (off_deg := off_rig_deg(plan.setups, own)) > _OFF_RIG_DEG:

@@ -130,6 +130,7 @@ def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(
     assert (
         "beach.png: has no face to find the light by" in shown and "guess" in shown and "60 degrees" in shown
     )
+    assert f" {100 * row['guess_error']:.0f} %" in shown.partition("matte white ball")[2]
     expected = read_image(tmp_path / "beach_light.exr").pixels
     assert expected.shape == (256, 512, 3) and read_light(tmp_path / "beach_light.json").weights.min() >= 0
     assert (expected[115, 500] > 3 * expected[115, 12]).all()  # u just below 1 is the picture's left

@@ -385,6 +385,8 @@ def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "0"), "not a rate"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4"), "is one film"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--face", "all"), "--face INDEX"),
+        (("{film}", "--light", "20,0;face=0", "-o", "{out}"), "add --face 0"),
+        (("{film}", "--light", "20,0;face=0", "-o", "{out}", "--face", "1"), "add --face 0"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--geometry", "network"), "fitted to landmarks"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--landmarks", "{photo}"), "frames of a film"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--shard", "1/2"), "belong together"),

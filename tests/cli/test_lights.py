@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 import torch
 
@@ -142,6 +143,26 @@ def test_bad_maps_cost_a_line_and_not_the_others(tmp_path: Path, caplog: pytest.
         collect_setups(LightSources(envmap=given, light=["0,0"], rotate="0:360:2"), tmp_path / "out")
     )
     assert [setup.name + setup.frame for setup in setups] == ["good.0000", "good.0001", "light_0_0"]
+
+
+@pytest.mark.parametrize(("name", "bits"), [("a.jpg", 8), ("a.png", 8), ("a.tif", 16), ("a.hdr", 0)])
+def test_a_map_of_display_values_has_one_warning_for_its_missing_highlights(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, bits: int
+) -> None:
+    spec = oiio.ImageSpec(32, 16, 3, f"uint{bits}" if bits else "float")
+    image = oiio.ImageBuf(spec)
+    oiio.ImageBufAlgo.fill(image, (1.0, 0.9, 0.8))
+    assert image.write(str(tmp_path / name))
+    sources = LightSources(
+        envmap=[str(tmp_path / name), f"sky={tmp_path / name}"],
+        light=["key=0,0", f"name=side;map={tmp_path / name}"],
+        rotate="0:360:2",
+    )
+    for _ in range(2):
+        readable(collect_setups(sources, tmp_path / "out"))
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    clipped = [text for text in warnings if "clipped" in text]
+    assert len(clipped) == bool(bits) and all(f"{tmp_path / name}: " in text for text in clipped)
 
 
 @pytest.mark.parametrize("azimuth_deg", [90.0, 11.25, -45.0])

@@ -16,6 +16,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.files.write import write_exr
 from facerf_cli.image import colour
+from facerf_cli.main import main
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas
 from tests.astronaut import PATH
@@ -186,6 +187,24 @@ def test_one_image_goes_to_the_file_that_is_named(given: Path, tmp_path: Path, c
     with Image.open(tmp_path / "out.v2.jpeg") as image:
         assert image.format == "JPEG"
     assert not list(tmp_path.glob("*.exr"))
+
+
+@pytest.mark.parametrize(
+    ("output", "words", "warns"),
+    [
+        ("out", ["--background", "none", "--format", "exr,jpg"], True),
+        ("x.jpg", ["--background", "none"], True),
+        ("x.jpeg", ["--composite", "face"], True),
+        ("out", ["--background", "none", "--format", "png"], False),
+        ("x.jpg", ["--background", "black"], False),
+    ],
+)
+def test_alpha_that_a_jpeg_loses_is_warned_of(
+    tmp_path: Path, capsys: Said, output: str, words: list[str], warns: bool
+) -> None:
+    line = ["relight", str(PATH), *LIGHT, "-o", str(tmp_path / output), "--dry-run"]
+    assert main([*line, *words]) == 0
+    assert ("JPEG has no alpha" in capsys.readouterr().err) == warns
 
 
 def test_layers_are_parts_or_channels_of_one_and_data_have_no_colour_space(

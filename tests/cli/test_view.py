@@ -1,6 +1,7 @@
 """`facerf view`: where pages go, and what is refused. No network is run."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,8 @@ from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.view_photos import write_index
 from tests.kinds import Said
 from tests.stacks import header_of
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -52,6 +55,18 @@ def test_a_captured_stack_is_shown_by_its_own_lights(tmp_path: Path) -> None:
     assert len(data["ratios"]) == 12 and data["size"] == [32, 24] and not data["background"]
     assert "left" in data["words"] and "own" not in data["words"]  # it has no photo
     assert data["exposure"]["plate"] is None and data["source"].endswith("captured.exr")
+
+
+@pytest.mark.slow
+def test_a_page_of_1024_pixels_is_as_large_as_the_documents_say(
+    shared_data: Path, tmp_path: Path, capsys: Said
+) -> None:
+    page = tmp_path / "page.html"
+    assert main(["view", str(shared_data / "photos_look/ffhq_00104.png"), "-o", str(page)]) == 0
+    assert main(["view", "--help"]) == 0
+    for text in (capsys.readouterr().out, (ROOT / "docs/viewer.md").read_text()):
+        (stated,) = re.findall(r"one file of about\s+(\d+)\s+MB", text)
+        assert round(page.stat().st_size / 1e6) == int(stated)
 
 
 def test_the_command_of_a_page_has_the_options_that_it_was_made_with() -> None:

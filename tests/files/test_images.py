@@ -248,6 +248,23 @@ def test_parts_of_an_exr_and_their_number_formats(tmp_path: Path) -> None:
     np.testing.assert_allclose(exr_layers(path)["class.skin"], 1 - ALPHA, atol=1e-3)
 
 
+@pytest.mark.parametrize("floats", [(), ("depth", "position", "uv")])
+def test_channels_of_a_single_part_have_the_number_formats_of_parts(
+    tmp_path: Path, floats: tuple[str, ...]
+) -> None:
+    path, values = tmp_path / "a.exr", {"depth": ALPHA, "position": RGB - 1, "uv": RGB[..., :2]}
+    layers = {name: one for name, one in LAYERS.items() if name != "depth"}
+    write_exr(path, RGB, ALPHA, {**layers, **{name: values[name] for name in floats}}, single=True)
+    spec = oiio.ImageBuf(str(path)).spec()
+    kinds = {name: str(spec.channelformat(index)) for index, name in enumerate(spec.channelnames)}
+    assert kinds == {name: "float" if name.split(".")[0] in floats else "half" for name in kinds}
+    stored = exr_layers(path)
+    np.testing.assert_array_equal(stored["normal.Y"], np.float16(2 * RGB[..., 1] - 1))
+    if floats:
+        np.testing.assert_array_equal(stored["depth"], ALPHA)
+        np.testing.assert_array_equal(stored["position.Z"], RGB[..., 2] - 1)
+
+
 @pytest.mark.parametrize(
     ("name", "interop_id"),
     [("ACEScg", "lin_ap1_scene"), ("lin_rec2020", "lin_rec2020_scene"), ("ACES2065-1", "lin_ap0_scene"),

@@ -1,5 +1,5 @@
-# facerf on the processor. Build at the root of the repository:
-#   docker build -f integrations/docker/Dockerfile -t facerf .
+# facerf on the processor. Build and run:
+#   docker build -t facerf .
 #   docker run --rm -v "$PWD:/work" facerf relight me.jpg --light 40,25 -o out
 FROM python:3.12-slim
 
@@ -8,8 +8,13 @@ RUN apt-get update \
     && apt-get install --yes --no-install-recommends libgomp1 libstdc++6 \
     && rm -rf /var/lib/apt/lists/*
 
-COPY pyproject.toml README.md LICENSE MANIFEST.in constraints.txt /src/
+# All that the wheel holds (pyproject.toml: package-data and data-files).
+COPY pyproject.toml MANIFEST.in constraints.txt LICENSE README.md MODEL_CARD.md CHANGELOG.md /src/
 COPY facerf_cli /src/facerf_cli
+COPY man /src/man
+COPY completions /src/completions
+COPY docs /src/docs
+COPY examples /src/examples
 RUN pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu -c /src/constraints.txt /src \
     && rm -rf /src
 
