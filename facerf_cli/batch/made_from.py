@@ -2,7 +2,7 @@
 
 A key joins the digests of an output's recipe (all options and files that shape it) and of its input.
 `.facerf-index.jsonl` has a row for each output (its key and SHA-256), for each recipe, and for each file
-that was read (size, time, inode and SHA-256: an unchanged one is not read again). The last row of a name
+that was read (size, times, inode and SHA-256: an unchanged one is not read again). The last row of a name
 counts. With `--shard` each process writes an index of its own and reads all. That of the one file that `-o`
 names is in the user's cache, so that nothing lies beside the file.
 """
@@ -160,7 +160,7 @@ def read_row(path: Path) -> Row:
 
 @lru_cache(maxsize=8)  # every frame of a film has the film as its input
 def _digest(path: Path, *_: int) -> str:
-    """SHA-256 of a file in a state: its size, time and inode."""
+    """SHA-256 of a file in a state: its size, times and inode."""
     return file_sha256(path)
 
 
@@ -365,4 +365,9 @@ def _key(recipe: str, input_sha256: str) -> str:
 
 
 def _state(state: os.stat_result) -> dict[str, int]:
-    return {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "inode": state.st_ino}
+    return {
+        "size": state.st_size,
+        "mtime_ns": state.st_mtime_ns,
+        "inode": state.st_ino,
+        "ctime_ns": state.st_ctime_ns,
+    }
