@@ -164,10 +164,14 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version  # --help does without it
 
-        torch = version("torch")
-        # torch itself knows its devices, and takes a second; a build without GPUs is known by its name.
-        device = "cpu" if torch.endswith("+cpu") else torch_device(Settings())
-        print(f"facerf {__version__} (torch {torch}, device {device})")
+        build, device = version("torch"), "cpu"
+        if not build.endswith(
+            "+cpu"
+        ):  # only torch itself knows its devices, and its build; it takes a second
+            import torch
+
+            build, device = torch.__version__, torch_device(Settings())
+        print(f"facerf {__version__} (torch {build}, device {device})")
         raise typer.Exit()
 
 
