@@ -37,6 +37,7 @@ from facerf_cli.files.texts import is_regular, require_regular
 from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, printable_line, progress_bar, unexpected
+from facerf_cli.run.machine import processors
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, ending, process_died, spread
 
@@ -262,7 +263,7 @@ def jobs_that_pay(items: int, items_a_process: int, settings: Settings) -> int:
     if items_a_process == 0 or settings.memory_bytes is not None:
         return 1
     memory_for = memory.default_limit() // _JOB_BYTES
-    jobs = min(items // items_a_process, os.cpu_count() or 1, memory_for)
+    jobs = min(items // items_a_process, processors(), memory_for)
     return jobs if jobs > 1 and torch_device(settings).type == "cpu" else 1
 
 
@@ -314,7 +315,7 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
             return lacks
         jobs = jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
         failures, workers = 0, options.workers(settings, jobs)
-        at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
+        at_once = min(workers.jobs or processors(), len(todo))
         work = partial(_run_one, job.process, bool(recipes), settings.job_bytes(at_once))
         memory.collect_as_usual()
         try:
