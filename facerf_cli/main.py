@@ -165,10 +165,8 @@ def _print_version(wanted: bool) -> None:
         from importlib.metadata import version  # --help does without it
 
         build, device = version("torch"), "cpu"
-        if not build.endswith(
-            "+cpu"
-        ):  # only torch itself knows its devices, and its build; it takes a second
-            import torch
+        if not build.endswith("+cpu"):
+            import torch  # which knows its build and its devices, and takes a second
 
             build, device = torch.__version__, torch_device(Settings())
         print(f"facerf {__version__} (torch {build}, device {device})")

@@ -365,9 +365,5 @@ def _key(recipe: str, input_sha256: str) -> str:
 
 
 def _state(state: os.stat_result) -> dict[str, int]:
-    return {
-        "size": state.st_size,
-        "mtime_ns": state.st_mtime_ns,
-        "inode": state.st_ino,
-        "ctime_ns": state.st_ctime_ns,
-    }
+    times = {"mtime_ns": state.st_mtime_ns, "ctime_ns": state.st_ctime_ns}
+    return {"size": state.st_size, "inode": state.st_ino, **times}

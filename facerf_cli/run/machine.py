@@ -26,20 +26,17 @@ def memory_bytes() -> int:
 def _cgroup_limits() -> Iterator[int]:
     """Yield the limits in bytes of the cgroup of this process and of its ancestors; see cgroups(7)."""
     with suppress(OSError, ValueError):  # not Linux
-        groups = [line.split(":", 2) for line in _lines("cgroup")]
-        paths = {name: group[2] for group in groups if group[2:] for name in group[1].split(",")}
-        for line in _lines("mountinfo"):
-            mount, _, source = line.partition(" - ")
-            controller, file = _LIMITS.get(source.split(" ")[0], ("", ""))
-            if file and controller in paths:
+        groups, mounts = ((_PROC / name).read_text(errors="replace") for name in ("cgroup", "mountinfo"))
+        rows = [line.split(":", 2) for line in groups.splitlines()]
+        paths = {name: path for _, names, path in rows for name in names.split(",")}  # '' is version 2
+        for line in mounts.splitlines():
+            mount, _, kind = line.partition(" - ")
+            name, file = _LIMITS.get(kind.split(" ")[0], ("", ""))
+            if file and name in paths:
                 top, point = mount.split(" ")[3:5]
                 # In a container, a path outside of it may stand there; then the mount's own limit is met.
-                folder = Path(point, os.path.relpath(paths[controller], top))
+                folder = Path(point, os.path.relpath(paths[name], top))
                 for cgroup in (folder, *folder.parents):
                     with suppress(OSError, ValueError):  # none there, or "max"
                         if (limit := int((cgroup / file).read_text())) > 0:
                             yield limit
-
-
-def _lines(name: str) -> list[str]:
-    return (_PROC / name).read_text(errors="replace").splitlines()

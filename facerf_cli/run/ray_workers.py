@@ -118,11 +118,8 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
         "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
     }
     if address == LOCAL:
-        options |= {
-            "num_cpus": jobs or processors(),
-            "object_store_memory": _STORE_BYTES,
-            "include_dashboard": False,
-        }
+        options |= {"num_cpus": jobs or processors(), "object_store_memory": _STORE_BYTES}
+        options["include_dashboard"] = False
     else:
         _require_listener(address)
     ours = signal.getsignal(signal.SIGTERM)
