@@ -163,10 +163,12 @@ def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version  # --help does without it
 
-        torch = version("torch")
-        # torch itself knows its devices, and takes a second; a build without GPUs is known by its name.
-        device = "cpu" if torch.endswith("+cpu") else torch_device(Settings())
-        print(f"facerf {__version__} (torch {torch}, device {device})")
+        build, device = version("torch"), "cpu"
+        if not build.endswith("+cpu"):
+            import torch  # which knows its build and its devices, and takes a second
+
+            build, device = torch.__version__, torch_device(Settings())
+        print(f"facerf {__version__} (torch {build}, device {device})")
         raise typer.Exit()
 
 

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,9 @@ def test_every_global_option_is_known_to_the_mover_and_none_is_moved_from_behind
 
 
 @pytest.mark.usefixtures("fresh_command_line")
-def test_version_and_help(capsys: Said) -> None:
+@pytest.mark.parametrize("package", [version("torch"), "2.13.0"])  # PyPI's CUDA build has no +cu130
+def test_version_and_help(package: str, capsys: Said, monkeypatch: Patch) -> None:
+    monkeypatch.setattr("importlib.metadata.version", lambda _: package)
     assert main.main(["--version"]) == 0
     said = (
         rf"facerf {re.escape(__version__)} \(torch {re.escape(torch.__version__)}, device (cpu|cuda|mps)\)\n"

@@ -166,7 +166,7 @@ def read_row(path: Path) -> Row:
 
 @lru_cache(maxsize=8)  # every frame of a film has the film as its input
 def _digest(path: Path, *_: int) -> str:
-    """SHA-256 of a file in a state: its size, time and inode."""
+    """SHA-256 of a file in a state: its size, times and inode."""
     return file_sha256(path)
 
 
@@ -488,4 +488,5 @@ def _key(recipe: str, input_sha256: str) -> str:
 
 
 def _state(state: os.stat_result) -> dict[str, int]:
-    return {"size": state.st_size, "mtime_ns": state.st_mtime_ns, "inode": state.st_ino}
+    times = {"mtime_ns": state.st_mtime_ns, "ctime_ns": state.st_ctime_ns}
+    return {"size": state.st_size, "inode": state.st_ino, **times}

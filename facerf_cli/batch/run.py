@@ -54,6 +54,7 @@ from facerf_cli.run.logs import (
     progress_bar,
     unexpected,
 )
+from facerf_cli.run.machine import processors
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, ending, process_died, spread
 
@@ -282,7 +283,7 @@ def jobs_that_pay(items: int, items_a_process: int, settings: Settings) -> int:
     if items_a_process == 0 or settings.memory_bytes is not None:
         return 1
     memory_for = memory.default_limit() // _JOB_BYTES
-    jobs = min(items // items_a_process, os.cpu_count() or 1, memory_for)
+    jobs = min(items // items_a_process, processors(), memory_for)
     return jobs if jobs > 1 and torch_device(settings).type == "cpu" else 1
 
 
@@ -361,7 +362,7 @@ def _results(
     workers = options.workers(
         settings, jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
     )
-    at_once = min(workers.jobs or os.cpu_count() or 1, len(todo))
+    at_once = min(workers.jobs or processors(), len(todo))
     work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
     memory.collect_as_usual()
     try:

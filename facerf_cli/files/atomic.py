@@ -35,6 +35,8 @@ _MARK = ".part-"
 _LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, that its temporary folder repeats
 # Errors of one output's name or folder, which cost its item; others, as of a full disk, end the run.
 _OF_ONE_PATH = {errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EILSEQ}
+_NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}  # NFS, SMB and Lustre without them
+_UNLOCKED = "%s: the file system has no locks (%s), so run only one facerf there at a time"
 _open: set[Path] = set()  # temporary folders of this process
 _watched: list[list[Path]] = []  # what was written since each `all_or_none` began
 _asked: list[Callable[[Path, Path], bool]] = []  # before a file is replaced; see `asking`
@@ -212,6 +214,7 @@ def _sync_folder(folder: Path) -> None:
 def alone_in(folder: Path, name: str) -> Iterator[None]:
     """Hold the lock `name` of a folder, which is created; wait for a process that holds it, and say so.
 
+    Where the file system has no locks, warn and go on.
     Folders that were created and are empty in the end are removed. Raises OSError where the folder cannot be
     written to.
     """
@@ -219,8 +222,13 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
 
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / name
-    lock = FileLock(path)
-    _acquire(lock, path)
+    lock = FileLock(path, fallback_to_soft=False)  # which would outlive a killed process
+    try:
+        _acquire(lock, path)
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        log.warning(_UNLOCKED, folder, error.strerror)
     try:
         with suppress(PermissionError):  # Windows keeps a locked file shut
             path.write_text(str(os.getpid()))

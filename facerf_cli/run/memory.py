@@ -6,16 +6,14 @@
 import ctypes
 import gc
 import math
-import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from typing import cast
 
 from facerf_cli.errors import InputError
+from facerf_cli.run.machine import memory_bytes
 
-SHARE = 0.5  # of the machine's memory that all jobs of a run have together, by default
-_CGROUP = Path("/sys/fs/cgroup/memory.max")  # of a container
+SHARE = 0.5  # of `memory_bytes` that all jobs of a run have together, by default
 _GB = 1 << 30
 _RELIT_HELD = 4  # relit maps are held this many times while lights are added to them
 _M_ARENA_MAX = -8  # of malloc.h
@@ -35,11 +33,8 @@ def limit_bytes() -> int:
 
 
 def default_limit(jobs: int = 1) -> int:
-    """A job's part of `SHARE` of the memory of the machine, or of its container."""
-    most = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with suppress(OSError, ValueError):  # no container, or one without a limit
-        most = min(most, int(_CGROUP.read_text()))
-    return int(SHARE * most) // max(1, jobs)
+    """A job's part of `SHARE` of the memory that this process may use."""
+    return int(SHARE * memory_bytes()) // max(1, jobs)
 
 
 @contextmanager

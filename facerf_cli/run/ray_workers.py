@@ -21,6 +21,7 @@ from typing import Any, TypeVar
 from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import LOGGER_NAME, log_to_queue, one_line
+from facerf_cli.run.machine import processors
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -117,7 +118,8 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
         "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
     }
     if address == LOCAL:
-        options |= {"num_cpus": jobs or None, "object_store_memory": _STORE_BYTES, "include_dashboard": False}
+        options |= {"num_cpus": jobs or processors(), "object_store_memory": _STORE_BYTES}
+        options["include_dashboard"] = False
     else:
         _require_listener(address)
     ours = signal.getsignal(signal.SIGTERM)

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, log_to_queue
+from facerf_cli.run.machine import processors
 from facerf_cli.run.stopping import end_on_signals
 
 T = TypeVar("T")
@@ -86,7 +87,7 @@ def _start_worker(workers: dict[Any, _Worker], jobs: int) -> None:
     spawn = multiprocessing.get_context("spawn")  # torch does not survive a fork once its threads run
     ours, theirs = spawn.Pipe()
     level = logging.getLogger(LOGGER_NAME).level
-    threads = max(1, (os.cpu_count() or 1) // jobs)
+    threads = max(1, processors() // jobs)
     process = spawn.Process(target=_serve, args=(theirs, level, threads))
     process.start()
     theirs.close()  # so that the worker holds the only other end, and its death closes the pipe

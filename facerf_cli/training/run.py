@@ -31,6 +31,7 @@ from facerf_cli.network.files import serving_files
 from facerf_cli.network.installed import installed
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, STDERR
+from facerf_cli.run.machine import processors
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.synth.bank.heads import add_views, bake_heads, load_bank
 from facerf_cli.synth.bank.parsing import StoredPortraits
@@ -85,7 +86,7 @@ def run_training(options: TrainOptions) -> None:
             stack.enter_context(alone_in(options.output, ".facerf-lock"))
         workers = options.workers
         if workers is None:
-            workers = _WORKERS_ON_GPU if device.type == "cuda" else int((os.cpu_count() or 1) > 1)
+            workers = _WORKERS_ON_GPU if device.type == "cuda" else int(processors() > 1)
         training, networks = replace(options.training, workers=workers), _networks(options, device)
         trained, start = _load_start(options)
         with first_process_first():

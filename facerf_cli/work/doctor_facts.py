@@ -20,6 +20,7 @@ from facerf_cli.network.files import SHIPPED, serving_files
 from facerf_cli.network.stored_graph import ASSET
 from facerf_cli.network.stored_graph import LICENCE as MEDIAPIPE_LICENCE
 from facerf_cli.relighting.models import described_file
+from facerf_cli.run.machine import memory_bytes
 from facerf_cli.work.installed import MISSING
 
 
@@ -48,11 +49,10 @@ def _device(settings: Settings) -> dict[str, Any]:
     device = torch_device(settings)
     built = f"built for CUDA {torch.version.cuda}" if torch.version.cuda else "built without CUDA"
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else f"this torch is {built}"
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     return {
         "uses": f"{device} ({name})",
         "threads": torch.get_num_threads(),
-        "memory": f"{memory:.0f} GiB",
+        "memory": f"{memory_bytes() / 2**30:.0f} GiB",
         "seed": settings.seed,
     }
 

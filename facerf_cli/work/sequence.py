@@ -213,7 +213,7 @@ def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
     states = [os.stat(path) for path in dict.fromkeys(item.input_path for item in shot.frames)]
     return {
         "frames": len(shot.frames),
-        "files": [[state.st_size, state.st_mtime_ns] for state in states],
+        "files": [[state.st_size, state.st_mtime_ns, state.st_ctime_ns] for state in states],
         "cuts": shot.cuts,
         "face": options.face,
         "landmarks": options.landmarks,

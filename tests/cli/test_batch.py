@@ -208,6 +208,18 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
     assert made(capsys) == []
 
 
+def test_another_photo_of_the_same_size_and_time_is_processed(
+    two: Path, tmp_path: Path, capsys: Said
+) -> None:
+    run([two], tmp_path / "out")
+    before = (two / "a.png").stat()
+    (two / "a.png").write_bytes(b"z")
+    os.utime(two / "a.png", ns=(before.st_atime_ns, before.st_mtime_ns))
+    capsys.readouterr()
+    run([two], tmp_path / "out")
+    assert made(capsys) == ["a"]
+
+
 def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, capsys: Said) -> None:
     run([two], tmp_path / "out", recipe={"lights": 150})
     (two / "a.png").write_bytes(b"A")

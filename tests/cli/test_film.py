@@ -1,6 +1,7 @@
 """Films and sequences from the command line, by the face's field with a network that is Lambert's law."""
 
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from fractions import Fraction
@@ -21,6 +22,7 @@ from facerf_cli.main import main
 from facerf_cli.work import light_of_picture
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.sequence import OpenShot, ShotFrames
+from facerf_cli.work.sequence import _made_from as made_from
 from facerf_cli.work.shots import ShotOptions, collect_frames
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Folders, Log, Patch, Said
@@ -268,6 +270,17 @@ def test_alpha_that_is_0_in_every_frame_is_none(tmp_path: Path, name: str, caplo
             assert alphas == [None] * 3
         assert (caplog.text.count("is transparent in every frame; its alpha is left out") == 1) == (not shown)
         caplog.clear()
+
+
+def test_a_film_of_the_same_size_and_time_has_another_track(tmp_path: Path) -> None:
+    film, options = tmp_path / "me.mov", PhotoOptions(Settings())
+    write_qtrle(film, [np.dstack([frame_of(0), np.full((192, 224), 255, np.uint8)])] * 2)
+    (shot,) = collect_frames([str(film)], ShotOptions(), BatchOptions(tmp_path / "out"), options)[1]
+    head, before = made_from(shot, options), film.stat()
+    assert made_from(shot, options) == head
+    film.write_bytes(film.read_bytes())
+    os.utime(film, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert made_from(shot, options) != head
 
 
 @pytest.mark.slow

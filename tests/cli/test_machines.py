@@ -86,7 +86,7 @@ def test_processes_start_unasked_where_they_pay(
     settings: Settings,
     jobs: int,
 ) -> None:
-    monkeypatch.setattr("os.cpu_count", lambda: processors)
+    monkeypatch.setattr("facerf_cli.batch.run.processors", lambda: processors)
     monkeypatch.setattr("facerf_cli.run.memory.default_limit", lambda jobs=1: gigabytes << 30)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
     assert jobs_that_pay(items, a_process, settings) == jobs

@@ -75,13 +75,13 @@ def test_killed_at_any_moment_the_same_line_ends_in_the_same_tree(
     killed = Path(shutil.copytree(small, tmp_path / "killed"))
     command = [sys.executable, "-m", "facerf_cli", *line(killed, images=images)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=ENVIRONMENT, start_new_session=True)
-    fifth = killed / "relit" / "0000" / "00004.exr"  # no glob: folders that it looks into come and go
+    early = killed / "relit" / "0000" / "00004.exr"  # no glob: folders that it looks into come and go
     try:
-        wait_until(fifth.exists, process)
+        wait_until(early.exists, process)
     finally:
         os.killpg(process.pid, signal.SIGKILL)
         process.wait()
-    assert 5 <= len(list((killed / "relit").glob("*/*.exr"))) < 3 * images
+    assert 0 < len(list((killed / "relit").glob("*/*.exr"))) < 3 * images  # a camera's come together
     assert main(line(killed, images=images)) == 0
     assert tree(killed / "relit") == tree(dataset / "relit")
 

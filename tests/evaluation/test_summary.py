@@ -99,7 +99,8 @@ def test_text_breaks_the_tables_down_and_numbers_do_not() -> None:
     assert summary.groups[1].cells["si_mse"]["ours"].interval.mean == pytest.approx(0.25)
     assert summary.groups[2].cells["si_mse"]["theirs"].interval.mean == pytest.approx(0.5)
     assert "psnr" in summary.groups[0].cells and "psnr" not in summary.groups[1].cells
-    assert summarise(Layout("Toy"), rows()).groups == summary.groups  # by all text, where none is named
+    by_all_text = summarise(Layout("Toy"), rows())
+    assert repr(by_all_text.groups) == repr(summary.groups)  # NaN is equal to NaN only up to Python 3.12
     many = [replace(row, facts={"map": f"{row.case}.{n}"}) for n, row in enumerate(3 * rows())]
     keyed = [replace(row, case=f"{n}") for n, row in enumerate(many)]
     assert len(summarise(Layout("Toy"), keyed).groups) == 1  # but by none of many values

@@ -1,3 +1,4 @@
+import errno
 import logging
 import os
 import signal
@@ -200,6 +201,32 @@ def test_a_killed_process_holds_nothing(tmp_path: Path, caplog: Log) -> None:
     with alone_in(tmp_path / "out", ".lock"):
         pass
     assert not caplog.text and not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("error", [errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_system_without_locks_costs_a_warning(
+    error: int, tmp_path: Path, caplog: Log, monkeypatch: Patch
+) -> None:
+    monkeypatch.setattr("fcntl.flock", refuse := Refusal(error))
+    logging.getLogger("facerf").propagate = True
+    for out in (tmp_path / "there", tmp_path / "new" / "out"):
+        with alone_in(out, ".lock"), alone_in(out, ".lock"):  # nobody waits
+            (out / "a.png").touch()
+        assert [path.name for path in out.iterdir()] == ["a.png"]
+        assert str(out) in caplog.text and os.strerror(error) in caplog.text
+    refuse.error = errno.EIO
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)), alone_in(tmp_path, ".lock"):
+        pass
+
+
+class Refusal:
+    """A lock that fails."""
+
+    def __init__(self, error: int) -> None:
+        self.error = error
+
+    def __call__(self, *_: int) -> None:
+        raise OSError(self.error, os.strerror(self.error))
 
 
 def test_a_link_at_the_locks_name_is_refused_and_an_output_folder_may_be_one(tmp_path: Path) -> None:
