@@ -161,7 +161,7 @@ def relight(
         return
     code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
     if film is not None:
-        code = film.joined(images, taken, key, code)
+        code = film.joined(items, images, taken, key, code)
     elif options.ball and not batch.dry_run and batch.shard.number == 1:
         _write_balls(plan, batch)
     raise typer.Exit(code)

@@ -128,6 +128,9 @@ def _begun(
     coded.colorspace = coded.color_primaries = coded.color_trc = BT709
     coded.color_range = _LIMITED
     stream.height, stream.width = (side + side % 2 for side in size_px)
+    if timing.timecode:  # FFmpeg leaves out drop-frame ones at other rates than multiples of 30
+        drops = round(timing.rate) % 30 == 0
+        stream.metadata["timecode"] = timing.timecode if drops else timing.timecode.replace(";", ":")
     return stream, _Sounds(av, container, timing.sound, form.copied) if timing.sound else None
 
 

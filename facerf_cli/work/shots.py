@@ -4,6 +4,7 @@ import hashlib
 import logging
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -18,6 +19,7 @@ from facerf_cli.batch.inputs import (
     NamePattern,
     collect_items,
     fields_of,
+    refuse_gaps,
 )
 from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf, key_of
 from facerf_cli.batch.run import BatchOptions, folder_not_file
@@ -34,6 +36,7 @@ FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
 _FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames of each kind of film
 _RATE = Fraction(24)
 _MOST_RATE = 1000
+_DROP_FRAME = 0x40  # flag of a timecode
 _DIGITS = 4  # of a film's frame numbers, or more
 _NUMBERED = re.compile(r"(.*?)(\d{2,})(\D*\.\w+)", re.DOTALL)
 _FEWEST_FRAMES = 3  # that look like a shot
@@ -131,15 +134,24 @@ def _of_film(item: Item, pattern: NamePattern | None) -> Shot:
 
 
 def _of_images(photos: Sequence[Item]) -> list[Shot]:
-    """Images grouped by folder and name without number; each group is a shot, by number."""
+    """Group images by folder and name without number; each group is a shot, by number.
+
+    Raises InputError for a file that does not exist, and for a gap in the numbers of a shot.
+    """
     groups: dict[PurePosixPath, list[tuple[int, str, Item]]] = {}
     for item in photos:
+        if not item.input_path.is_file():
+            raise InputError(f"{item.input_path}: no such file; a shot needs all of its frames")
         place = item.mirrored or PurePosixPath(item.input_path.name)
         match = DOTTED.fullmatch(place.stem)
         stem, number = match.groups() if match else (place.stem, "0")
-        groups.setdefault(place.with_name(stem), []).append((int(number), item.name, item))
-    shots = ((stem.name, [item for *_, item in sorted(group)]) for stem, group in groups.items())
-    return [Shot(frames[0].output_base.with_name(name), tuple(frames)) for name, frames in shots]
+        groups.setdefault(place.with_name(stem), []).append((int(number), number, item))
+    shots = []
+    for stem, group in groups.items():
+        frames = [(number, item) for _, number, item in sorted(group)]
+        refuse_gaps([(number, item.input_path) for number, item in frames])
+        shots.append(Shot(frames[0][1].output_base.with_name(stem.name), tuple(item for _, item in frames)))
+    return shots
 
 
 def _consecutive(photos: Sequence[Item]) -> tuple[Path, str] | None:
@@ -241,13 +253,20 @@ class FilmOutput:
         from facerf_cli.files.film_writer import check_writable
 
         digest_of = cache(file_sha256)
-        made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
+        made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items], str(self.rate)
         key = key_of(made_from)
         if self._is_finished(key, batch.overwrite):
             log.info("%s: already finished", self.path)
             return ""
         if shots and shots[0].film:
             check_writable(self.path, shots[0].film)
+        elif not self.rate and len(rates := {_stated(item)[0] for item in items}) > 1:
+            log.warning(
+                "%s: its frames state %d frame rates; that of the first one, %s, is used (--fps: another)",
+                self.path,
+                len(rates),
+                _stated(items[0])[0],
+            )
         return key
 
     def _is_finished(self, key: str, overwrite: Overwrite) -> bool:
@@ -258,7 +277,9 @@ class FilmOutput:
             return False
         return overwrite == "never" or key in comment_of(self.path)
 
-    def joined(self, images: Sequence[Path], shots: Sequence[Shot], key: str, code: int) -> int:
+    def joined(
+        self, items: Sequence[Item], images: Sequence[Path], shots: Sequence[Shot], key: str, code: int
+    ) -> int:
         """Write the film from its frames, in order, and remove them, unless some failed; the exit code."""
         if code or not all(path.exists() for path in images):
             log.error("%s: not written, since frames failed; the others stay in %s", self.path, self.folder)
@@ -268,7 +289,8 @@ class FilmOutput:
         from facerf_cli.run.logs import Provenance
 
         source = shots[0].film if shots else None
-        timing = film_timing(source) if source else Timing.steady(len(images), self.rate or _RATE)
+        rate, timecode = _stated(items[0])
+        timing = film_timing(source) if source else Timing.steady(len(images), self.rate or rate, timecode)
         facts = Provenance(source.name if source else "").attributes()
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
         write_film(self.path, images, timing, f"Synthetic: relit by a trained model; {said}; made from {key}")
@@ -279,6 +301,23 @@ class FilmOutput:
             self.folder.rmdir()
         print(self.path)
         return 0
+
+
+def _stated(item: Item) -> tuple[Fraction, str]:
+    """Read the frame rate and the timecode in the header of an image; 24 and "" if it has no valid ones."""
+    from facerf_cli.files.image_metadata import read_header
+
+    header = read_header(item.input_path)
+    metadata = header.metadata if header else {}
+    rate, timecode, stated = _RATE, "", metadata.get("framesPerSecond")
+    if isinstance(stated, tuple):
+        with suppress(UsageError):
+            rate = film_rate("/".join(map(str, stated)))
+    with suppress(LookupError, TypeError):  # of another type than a timecode
+        packed = metadata["smpte:TimeCode"][0]  # SMPTE 12M: BCD digits, between them flags
+        timecode = (packed & 0x3F7F7F3F).to_bytes(4, "big").hex(":")
+        timecode = f"{timecode[:8]};{timecode[9:]}" if packed & _DROP_FRAME else timecode
+    return rate, timecode
 
 
 def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
