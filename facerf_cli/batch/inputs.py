@@ -359,7 +359,7 @@ def refuse_gaps(frames: Sequence[tuple[str, str | Path]]) -> None:
         if found > step:
             missing = f"{int(number) + step:0{len(number)}}"
             raise InputError(
-                f"{path}: frame {missing} after it is missing; add it, or choose frames of a constant step"
+                f"{path}: the next frame, {missing}, is missing; add it, or choose frames of a constant step"
             )
 
 

@@ -21,7 +21,7 @@ from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
 _LIMITED = 1  # range (ITU-T H.273)
-_CLOCK = 90_000  # ticks a second, in which the times of frames are written
+_CLOCK = 90_000  # ticks per second, at least, in which the times of frames are written
 
 
 @dataclass(frozen=True)
@@ -103,13 +103,14 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
         with av.open(str(temporary), "w", options=options) as container:
             container.metadata["comment"] = comment
             stream, sounds = _begun(av, container, form, _pixels(images[0], form).shape[:2], timing)
+            clock = _clock(timing)
             for ticks, lasts, image in _timed(images, timing):
                 frame = av.VideoFrame.from_ndarray(_even(_pixels(image, form)), format=form.source)
                 frame = frame.reformat(format=form.pixels, dst_colorspace=BT709, interpolation=exact(av))
-                frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, _CLOCK), lasts
+                frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, clock), lasts
                 container.mux(stream.encode(frame))
                 if sounds:
-                    sounds.write_until(Fraction(ticks, _CLOCK))
+                    sounds.write_until(Fraction(ticks, clock))
             container.mux(stream.encode(None))
             if sounds:
                 sounds.write_until(None)
@@ -123,7 +124,7 @@ def _begun(
     stream = container.add_stream(form.codec, rate=timing.rate)
     stream.options = dict(form.options)
     stream.pix_fmt = form.pixels
-    stream.time_base = stream.codec_context.time_base = Fraction(1, _CLOCK)
+    stream.time_base = stream.codec_context.time_base = Fraction(1, _clock(timing))
     coded = stream.codec_context
     coded.colorspace = coded.color_primaries = coded.color_trc = BT709
     coded.color_range = _LIMITED
@@ -144,10 +145,17 @@ def comment_of(path: Path) -> str:
         return ""
 
 
+def _clock(timing: Timing) -> int:
+    """Return the ticks per second, whose number makes each frame at the usual rates whole ticks long."""
+    per_second = timing.rate.numerator
+    return per_second * -(-_CLOCK // per_second) if per_second < 2 * _CLOCK else _CLOCK
+
+
 def _timed(images: Sequence[Path], timing: Timing) -> Iterator[tuple[int, int, Path]]:
     """Start and length of each frame, in ticks."""
-    starts = [round(time_s * _CLOCK) for time_s in timing.times_s]
-    ends = [*starts[1:], starts[-1] + round(_CLOCK / timing.rate)]
+    clock = _clock(timing)
+    starts = [round(time_s * clock) for time_s in timing.times_s]
+    ends = [*starts[1:], starts[-1] + round(clock / timing.rate)]
     assert all(first < last for first, last in pairwise([*starts, ends[-1]]))
     for start, end, image in zip(starts, ends, images, strict=True):
         yield start, end - start, image

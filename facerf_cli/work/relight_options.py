@@ -141,7 +141,7 @@ class RelightOptions:
         identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
             (an extra).
         ball: Write a mirror ball and a diffuse ball under each map, too.
-        fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too).
+        fps: Set the frames per second of -o FILE.mp4, such as 25 or 24000/1001.
         name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
     """
 
@@ -195,7 +195,12 @@ class RelightOptions:
     white: White = white_option()
     normals_from: Path | None = normals_option()
     fps: Fraction | None = option(
-        None, metavar="RATE", in_recipe=False, shown_default="24", parse=film_rate, panel=IMAGE
+        None,
+        metavar="RATE",
+        in_recipe=False,
+        shown_default="that of the EXR header, else 24",
+        parse=film_rate,
+        panel=IMAGE,
     )
     name: NamePattern | None = option(
         None,

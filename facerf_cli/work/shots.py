@@ -35,7 +35,7 @@ log = logging.getLogger(LOGGER_NAME)
 FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
 _FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames of each kind of film
 _RATE = Fraction(24)
-_MOST_RATE = 1000
+_MOST_RATE, _FINEST_RATE = 1000, 1001  # numerators and denominators must fit FFmpeg's
 _DROP_FRAME = 0x40  # flag of a timecode
 _DIGITS = 4  # of a film's frame numbers, or more
 _NUMBERED = re.compile(r"(.*?)(\d{2,})(\D*\.\w+)", re.DOTALL)
@@ -339,7 +339,7 @@ def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
 def film_rate(text: str) -> Fraction:
     """Parse `--fps`, frames a second."""
     try:
-        rate = Fraction(text)
+        rate = Fraction(text).limit_denominator(_FINEST_RATE)
     except (ValueError, ZeroDivisionError):
         rate = Fraction(0)
     if not 0 < rate <= _MOST_RATE:
