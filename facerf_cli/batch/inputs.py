@@ -11,7 +11,7 @@ import re
 import sys
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -341,26 +341,26 @@ def _numbered(entry: str, before: str, digits: int, after: str) -> list[str]:
     matches = (
         form.fullmatch(name) for name in (os.listdir(folder or ".") if os.path.isdir(folder or ".") else ())
     )
-    frames = {os.path.join(folder, match[0]): match[1] for match in matches if match}
+    frames = {Path(folder, match[0]): match[1] for match in matches if match}
     if not frames:
         raise UsageError(f"{entry}: no such files; check the pattern")
-    paths = sorted(frames, key=lambda path: (int(frames[path]), path))
-    refuse_gaps([(frames[path], path) for path in paths])
-    return paths
+    return list(map(str, in_order(frames)))
 
 
-def refuse_gaps(frames: Sequence[tuple[str, str | Path]]) -> None:
-    """Raise InputError unless frames, each a number and a path, are in order with a constant step."""
-    steps = [int(later) - int(number) for (number, _), (later, _) in pairwise(frames)]
+def in_order(numbers: Mapping[Path, str]) -> list[Path]:
+    """Sort frames by their numbers; raise InputError unless these have a constant step."""
+    paths = sorted(numbers, key=lambda path: (int(numbers[path]), path))
+    steps = [int(numbers[after]) - int(numbers[before]) for before, after in pairwise(paths)]
     step = math.gcd(*steps)
-    for (number, path), (_, following), found in zip(frames, frames[1:], steps, strict=False):
+    for (before, after), found in zip(pairwise(paths), steps, strict=True):
         if found == 0:
-            raise InputError(f"{path} and {following}: have the same frame number; remove one of them")
+            raise InputError(f"{before} and {after}: have the same frame number; remove one of them")
         if found > step:
-            missing = f"{int(number) + step:0{len(number)}}"
+            missing = f"{int(numbers[before]) + step:0{len(numbers[before])}}"
             raise InputError(
-                f"{path}: the next frame, {missing}, is missing; add it, or choose frames of a constant step"
+                f"{before}: the next frame, {missing}, is missing; add it, or choose frames of one step"
             )
+    return paths
 
 
 def _walk(folder: Path, output_real: str, suffixes: frozenset[str]) -> Iterator[Path]:

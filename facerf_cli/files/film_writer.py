@@ -98,19 +98,19 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
     av, form = require_av(path), _FORMS[path.suffix.lower()]
     if path.suffix.lower() == ".mov" and decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
         form = _ALPHA_FORM
+    base = Fraction(1, _clock(timing))
     with atomic_path(path) as temporary:
         options = {"movflags": "+faststart"}
         with av.open(str(temporary), "w", options=options) as container:
             container.metadata["comment"] = comment
             stream, sounds = _begun(av, container, form, _pixels(images[0], form).shape[:2], timing)
-            clock = _clock(timing)
             for ticks, lasts, image in _timed(images, timing):
                 frame = av.VideoFrame.from_ndarray(_even(_pixels(image, form)), format=form.source)
                 frame = frame.reformat(format=form.pixels, dst_colorspace=BT709, interpolation=exact(av))
-                frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, clock), lasts
+                frame.pts, frame.time_base, frame.duration = ticks, base, lasts
                 container.mux(stream.encode(frame))
                 if sounds:
-                    sounds.write_until(Fraction(ticks, clock))
+                    sounds.write_until(ticks * base)
             container.mux(stream.encode(None))
             if sounds:
                 sounds.write_until(None)
@@ -146,7 +146,7 @@ def comment_of(path: Path) -> str:
 
 
 def _clock(timing: Timing) -> int:
-    """Return the ticks per second, whose number makes each frame at the usual rates whole ticks long."""
+    """Return the ticks per second; a frame at a usual rate lasts a whole number of them."""
     per_second = timing.rate.numerator
     return per_second * -(-_CLOCK // per_second) if per_second < 2 * _CLOCK else _CLOCK
 

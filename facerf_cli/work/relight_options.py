@@ -195,12 +195,7 @@ class RelightOptions:
     white: White = white_option()
     normals_from: Path | None = normals_option()
     fps: Fraction | None = option(
-        None,
-        metavar="RATE",
-        in_recipe=False,
-        shown_default="that of the EXR header, else 24",
-        parse=film_rate,
-        panel=IMAGE,
+        None, metavar="RATE", in_recipe=False, shown_default="the EXR's, or 24", parse=film_rate, panel=IMAGE
     )
     name: NamePattern | None = option(
         None,

@@ -19,7 +19,7 @@ from facerf_cli.batch.inputs import (
     NamePattern,
     collect_items,
     fields_of,
-    refuse_gaps,
+    in_order,
 )
 from facerf_cli.batch.made_from import DigestOf, Recipe, RecipesOf, key_of
 from facerf_cli.batch.run import BatchOptions, folder_not_file
@@ -138,20 +138,17 @@ def _of_images(photos: Sequence[Item]) -> list[Shot]:
 
     Raises InputError for a file that does not exist, and for a gap in the numbers of a shot.
     """
-    groups: dict[PurePosixPath, list[tuple[int, str, Item]]] = {}
+    groups: dict[PurePosixPath, dict[Path, str]] = {}
     for item in photos:
         if not item.input_path.is_file():
             raise InputError(f"{item.input_path}: no such file; a shot needs all of its frames")
         place = item.mirrored or PurePosixPath(item.input_path.name)
         match = DOTTED.fullmatch(place.stem)
         stem, number = match.groups() if match else (place.stem, "0")
-        groups.setdefault(place.with_name(stem), []).append((int(number), number, item))
-    shots = []
-    for stem, group in groups.items():
-        frames = [(number, item) for _, number, item in sorted(group)]
-        refuse_gaps([(number, item.input_path) for number, item in frames])
-        shots.append(Shot(frames[0][1].output_base.with_name(stem.name), tuple(item for _, item in frames)))
-    return shots
+        groups.setdefault(place.with_name(stem), {})[item.input_path] = number
+    items = {item.input_path: item for item in photos}
+    shots = ((stem.name, [items[path] for path in in_order(group)]) for stem, group in groups.items())
+    return [Shot(frames[0].output_base.with_name(name), tuple(frames)) for name, frames in shots]
 
 
 def _consecutive(photos: Sequence[Item]) -> tuple[Path, str] | None:
@@ -260,13 +257,8 @@ class FilmOutput:
             return ""
         if shots and shots[0].film:
             check_writable(self.path, shots[0].film)
-        elif not self.rate and len(rates := {_stated(item)[0] for item in items}) > 1:
-            log.warning(
-                "%s: its frames state %d frame rates; that of the first one, %s, is used (--fps: another)",
-                self.path,
-                len(rates),
-                _stated(items[0])[0],
-            )
+        elif len({_stated(item, self.rate)[0] for item in items}) > 1:
+            log.warning("%s: its frames state several rates; the first one's is used (--fps)", self.path)
         return key
 
     def _is_finished(self, key: str, overwrite: Overwrite) -> bool:
@@ -289,8 +281,7 @@ class FilmOutput:
         from facerf_cli.run.logs import Provenance
 
         source = shots[0].film if shots else None
-        rate, timecode = _stated(items[0])
-        timing = film_timing(source) if source else Timing.steady(len(images), self.rate or rate, timecode)
+        timing = film_timing(source) if source else Timing.steady(len(images), *_stated(items[0], self.rate))
         facts = Provenance(source.name if source else "").attributes()
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
         write_film(self.path, images, timing, f"Synthetic: relit by a trained model; {said}; made from {key}")
@@ -303,21 +294,21 @@ class FilmOutput:
         return 0
 
 
-def _stated(item: Item) -> tuple[Fraction, str]:
-    """Read the frame rate and the timecode in the header of an image; 24 and "" if it has no valid ones."""
+def _stated(item: Item, rate: Fraction | None) -> tuple[Fraction, str]:
+    """Read the frame rate, unless given, and the timecode in an image's header; 24 and "" by default."""
     from facerf_cli.files.image_metadata import read_header
 
     header = read_header(item.input_path)
     metadata = header.metadata if header else {}
-    rate, timecode, stated = _RATE, "", metadata.get("framesPerSecond")
-    if isinstance(stated, tuple):
+    timecode, stated = "", metadata.get("framesPerSecond")
+    if rate is None and isinstance(stated, tuple):
         with suppress(UsageError):
             rate = film_rate("/".join(map(str, stated)))
     with suppress(LookupError, TypeError):  # of another type than a timecode
         packed = metadata["smpte:TimeCode"][0]  # SMPTE 12M: BCD digits, between them flags
         timecode = (packed & 0x3F7F7F3F).to_bytes(4, "big").hex(":")
         timecode = f"{timecode[:8]};{timecode[9:]}" if packed & _DROP_FRAME else timecode
-    return rate, timecode
+    return rate or _RATE, timecode
 
 
 def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:

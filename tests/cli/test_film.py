@@ -269,7 +269,7 @@ def test_rates_that_headers_state(
     film = FilmOutput(tmp_path / "me.mp4", film_rate(given_rate) if given_rate else None)
     film.folder.mkdir()
     key = film.key_of_new(items, shots, images, lambda digest_of: [], batch)
-    assert ("2 frame rates" in caplog.text) == (len(set(stated)) > 1)
+    assert ("me.mp4: its frames state several rates" in caplog.text) == (len(set(stated)) > 1)
     slow = FilmOutput(film.path, Fraction(12))
     assert slow.key_of_new(items, shots, images, lambda digest_of: [], batch) != key  # it is made again
     assert film.joined(items, images, shots, key, 0) == 0
