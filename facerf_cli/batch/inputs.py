@@ -5,18 +5,20 @@ Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an
 
 import glob
 import logging
+import math
 import os
 import re
 import sys
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any
 
-from facerf_cli.errors import UsageError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.option import flag
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 
@@ -351,24 +353,43 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
 
 
 def _range(entry: str, before: str, first: str, last: str, after: str) -> list[str]:
-    """The frames of `plate.1001-1050.exr`."""
+    """List the frames of `plate.1001-1050.exr`; raise InputError if a file does not exist."""
     if not int(first) <= int(last) < int(first) + _MOST_FRAMES:
         raise UsageError(f"{entry}: not a range of frames; give FIRST-LAST, at most {_MOST_FRAMES}")
-    return [f"{before}{number:0{len(first)}}{after}" for number in range(int(first), int(last) + 1)]
+    paths = [f"{before}{number:0{len(first)}}{after}" for number in range(int(first), int(last) + 1)]
+    if missing := [path for path in paths if not os.path.exists(path)]:
+        raise InputError(f"{missing[0]}: no such file; add it, or choose another range than {entry}")
+    return paths
 
 
 def _numbered(entry: str, before: str, digits: int, after: str) -> list[str]:
-    """The files of `plate.%04d.exr`, by number; numbers of more digits begin with none of 0."""
+    """List the files of `plate.%04d.exr` by number; numbers of more digits begin with none of 0."""
     folder, begin = os.path.split(before)
     number = rf"(\d{{{digits}}}|[1-9]\d{{{digits},}})" if digits > 1 else r"(\d+)"
     form = re.compile(re.escape(begin) + number + re.escape(after))
     matches = (
         form.fullmatch(name) for name in (os.listdir(folder or ".") if os.path.isdir(folder or ".") else ())
     )
-    found = sorted((int(match[1]), os.path.join(folder, match[0])) for match in matches if match)
-    if not found:
+    frames = {Path(folder, match[0]): match[1] for match in matches if match}
+    if not frames:
         raise UsageError(f"{entry}: no such files; check the pattern")
-    return [path for _, path in found]
+    return list(map(str, in_order(frames)))
+
+
+def in_order(numbers: Mapping[Path, str]) -> list[Path]:
+    """Sort frames by their numbers; raise InputError unless these have a constant step."""
+    paths = sorted(numbers, key=lambda path: (int(numbers[path]), path))
+    steps = [int(numbers[after]) - int(numbers[before]) for before, after in pairwise(paths)]
+    step = math.gcd(*steps)
+    for (before, after), found in zip(pairwise(paths), steps, strict=True):
+        if found == 0:
+            raise InputError(f"{before} and {after}: have the same frame number; remove one of them")
+        if found > step:
+            missing = f"{int(numbers[before]) + step:0{len(numbers[before])}}"
+            raise InputError(
+                f"{before}: the next frame, {missing}, is missing; add it, or choose frames of one step"
+            )
+    return paths
 
 
 def _walk(folder: Path, output_real: str, suffixes: frozenset[str]) -> Iterator[Path]:

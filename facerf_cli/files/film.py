@@ -35,16 +35,20 @@ _Stamped = Iterator[tuple[int, Any]]  # frames, each after its time stamp
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of a film's frames in seconds, and the film whose sound it has."""
+    """Times of a film's frames in seconds, the film whose sound it has, and its first frame's timecode.
+
+    The timecode is 01:02:03:04, or 01:02:03;04 for drop-frame; empty for none.
+    """
 
     times_s: tuple[Fraction, ...]
     rate: Fraction
     sound: Path | None = None
+    timecode: str = ""
 
     @staticmethod
-    def steady(count: int, rate: Fraction) -> "Timing":
-        """Frames at a constant rate, without sound."""
-        return Timing(tuple(number / rate for number in range(count)), rate)
+    def steady(count: int, rate: Fraction, timecode: str = "") -> "Timing":
+        """Return the timing of frames at a constant rate, without sound."""
+        return Timing(tuple(number / rate for number in range(count)), rate, timecode=timecode)
 
 
 def require_av(path: Path) -> Any:
@@ -112,14 +116,17 @@ class Film:
         return sorted(pts)
 
     def timing(self) -> Timing:
-        """The times of the frames in order, the mean frame rate, and the film where it has sound."""
+        """Return the frame times in order, the mean rate, the timecode, and the film if it has sound."""
         base, begins_s = Fraction(self._stream.time_base), start_s(self._container)
         times_s = tuple(pts * base - begins_s for pts in self._pts)
         rate = Fraction(self._stream.average_rate or 0)
         if rate <= 0:
             length_s = times_s[-1] - times_s[0]
             rate = (len(times_s) - 1) / length_s if length_s else Fraction(24)
-        return Timing(times_s, rate, self._path if any(self.sounds) else None)
+        parts = (self._container, *self._container.streams, self._stream)
+        said = {key.lower(): value for part in parts for key, value in part.metadata.items()}
+        sound = self._path if any(self.sounds) else None
+        return Timing(times_s, rate, sound, said.get("timecode", ""))
 
     @property
     def sounds(self) -> list[Any]:

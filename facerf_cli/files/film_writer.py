@@ -21,7 +21,7 @@ from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
 _LIMITED = 1  # range (ITU-T H.273)
-_CLOCK = 90_000  # ticks a second, in which the times of frames are written
+_CLOCK = 90_000  # ticks per second, at least, in which the times of frames are written
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,7 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
     av, form = require_av(path), _FORMS[path.suffix.lower()]
     if path.suffix.lower() == ".mov" and decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
         form = _ALPHA_FORM
+    base = Fraction(1, _clock(timing))
     with atomic_path(path) as temporary:
         options = {"movflags": "+faststart"}
         with av.open(str(temporary), "w", options=options) as container:
@@ -106,10 +107,10 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
             for ticks, lasts, image in _timed(images, timing):
                 frame = av.VideoFrame.from_ndarray(_even(_pixels(image, form)), format=form.source)
                 frame = frame.reformat(format=form.pixels, dst_colorspace=BT709, interpolation=exact(av))
-                frame.pts, frame.time_base, frame.duration = ticks, Fraction(1, _CLOCK), lasts
+                frame.pts, frame.time_base, frame.duration = ticks, base, lasts
                 container.mux(stream.encode(frame))
                 if sounds:
-                    sounds.write_until(Fraction(ticks, _CLOCK))
+                    sounds.write_until(ticks * base)
             container.mux(stream.encode(None))
             if sounds:
                 sounds.write_until(None)
@@ -123,18 +124,28 @@ def _begun(
     stream = container.add_stream(form.codec, rate=timing.rate)
     stream.options = dict(form.options)
     stream.pix_fmt = form.pixels
-    stream.time_base = stream.codec_context.time_base = Fraction(1, _CLOCK)
+    stream.time_base = stream.codec_context.time_base = Fraction(1, _clock(timing))
     coded = stream.codec_context
     coded.colorspace = coded.color_primaries = coded.color_trc = BT709
     coded.color_range = _LIMITED
     stream.height, stream.width = (side + side % 2 for side in size_px)
+    if timing.timecode:  # FFmpeg leaves out drop-frame ones at other rates than multiples of 30
+        drops = round(timing.rate) % 30 == 0
+        stream.metadata["timecode"] = timing.timecode if drops else timing.timecode.replace(";", ":")
     return stream, _Sounds(av, container, timing.sound, form.copied) if timing.sound else None
+
+
+def _clock(timing: Timing) -> int:
+    """Return the ticks per second; a frame at a usual rate lasts a whole number of them."""
+    per_second = timing.rate.numerator
+    return per_second * -(-_CLOCK // per_second) if per_second < 2 * _CLOCK else _CLOCK
 
 
 def _timed(images: Sequence[Path], timing: Timing) -> Iterator[tuple[int, int, Path]]:
     """Start and length of each frame, in ticks."""
-    starts = [round(time_s * _CLOCK) for time_s in timing.times_s]
-    ends = [*starts[1:], starts[-1] + round(_CLOCK / timing.rate)]
+    clock = _clock(timing)
+    starts = [round(time_s * clock) for time_s in timing.times_s]
+    ends = [*starts[1:], starts[-1] + round(clock / timing.rate)]
     assert all(first < last for first, last in pairwise([*starts, ends[-1]]))
     for start, end, image in zip(starts, ends, images, strict=True):
         yield start, end - start, image

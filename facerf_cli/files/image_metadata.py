@@ -40,10 +40,11 @@ _XMP_PROPERTIES = {"IPTC:DigitalSourceType": "Iptc4xmpExt:DigitalSourceType", "S
 
 _OF_PLATE = re.compile(
     r"(?!.*(GPS|Note|Comment|Owner|Serial|Unique|Uuid|Photographer|Editor))"
-    r"(smpte:TimeCode|FramesPerSecond|DateTime|Make|Model|ExposureTime|FNumber|reelName|Exif:\w+"
-    r"|(camera|lens)\w*|(nominal|effective|entrancePupil|pinhole)\w*|focus|aperture|expTime|isoSpeed|shutterAngle)"
+    r"(smpte:(Time|Key)Code|[Ff]ramesPerSecond|DateTime|Make|Model|ExposureTime|FNumber|reelName|Exif:\w+"
+    r"|(camera|lens|sensor)\w*|(nominal|effective|entrancePupil|pinhole)\w*|focalLength|focus|aperture|tStop"
+    r"|expTime|isoSpeed|shutterAngle|captureRate|imageCounter)"
 )
-_TUPLES = {"smpte:TimeCode": "timecode", "FramesPerSecond": "rational"}
+_TUPLES = {"smpte:TimeCode": "timecode", "smpte:KeyCode": "keycode"}
 
 
 @dataclass(frozen=True)
@@ -87,9 +88,10 @@ def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def set_attribute(spec: oiio.ImageSpec, name: str, value: Any) -> None:
-    """Set an attribute of an image; a tuple has the type of its name."""
+    """Set an attribute of an image; a tuple has the type of its name, or of its numbers."""
     if isinstance(value, tuple):
-        spec.attribute(name, oiio.TypeDesc(_TUPLES.get(name, "rational")), value)
+        of_numbers = f"float[{len(value)}]" if any(isinstance(one, float) for one in value) else "rational"
+        spec.attribute(name, oiio.TypeDesc(_TUPLES.get(name, of_numbers)), value)
     else:
         spec.attribute(name, value)
 

@@ -140,7 +140,7 @@ class RelightOptions:
         photo_of_stack: Put an OLAT stack back on its photo, at the photo's resolution.
         identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
             (an extra).
-        fps: Show so many frames a second in -o FILE.mp4 (24000/1001, too).
+        fps: Set the frames per second of -o FILE.mp4, such as 25 or 24000/1001.
         name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
     """
 
@@ -193,7 +193,7 @@ class RelightOptions:
     white: White = white_option()
     normals_from: Path | None = normals_option()
     fps: Fraction | None = option(
-        None, metavar="RATE", in_recipe=False, shown_default="24", parse=film_rate, panel=IMAGE
+        None, metavar="RATE", in_recipe=False, shown_default="the EXR's, or 24", parse=film_rate, panel=IMAGE
     )
     name: NamePattern | None = option(
         None,

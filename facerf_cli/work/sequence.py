@@ -180,8 +180,6 @@ def follow_all(shots: Sequence[Shot], options: PhotoOptions) -> None:
     After a cut the face is chosen as in a new film.
     """
     for shot in shots:
-        if missing := [item for item in shot.frames if not item.input_path.is_file()]:
-            raise InputError(f"{missing[0].input_path}: no such file; a shot needs all of its frames")
         track = ShotTrack(shot.track)
         track.begin(_made_from(shot, options))
         if len(track.sightings) < len(shot.frames):

@@ -4,6 +4,7 @@ import hashlib
 import logging
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache
@@ -18,6 +19,7 @@ from facerf_cli.batch.inputs import (
     NamePattern,
     collect_items,
     fields_of,
+    in_order,
 )
 from facerf_cli.batch.made_from import (
     DigestOf,
@@ -42,7 +44,8 @@ log = logging.getLogger(LOGGER_NAME)
 FRAMES_IN_A_ROW = 8  # that a process takes, since neighbours share work
 _FORMATS: dict[str, Format] = {".mp4": "png", ".mov": "png16"}  # of the frames of each kind of film
 _RATE = Fraction(24)
-_MOST_RATE = 1000
+_MOST_RATE, _FINEST_RATE = 1000, 1001  # numerators and denominators must fit FFmpeg's
+_DROP_FRAME = 0x40  # flag of a timecode
 _DIGITS = 4  # of a film's frame numbers, or more
 _NUMBERED = re.compile(r"(.*?)(\d{2,})(\D*\.\w+)", re.DOTALL)
 _FEWEST_FRAMES = 3  # that look like a shot
@@ -140,14 +143,20 @@ def _of_film(item: Item, pattern: NamePattern | None) -> Shot:
 
 
 def _of_images(photos: Sequence[Item]) -> list[Shot]:
-    """Images grouped by folder and name without number; each group is a shot, by number."""
-    groups: dict[PurePosixPath, list[tuple[int, str, Item]]] = {}
+    """Group images by folder and name without number; each group is a shot, by number.
+
+    Raises InputError for a file that does not exist, and for a gap in the numbers of a shot.
+    """
+    groups: dict[PurePosixPath, dict[Path, str]] = {}
     for item in photos:
+        if not item.input_path.is_file():
+            raise InputError(f"{item.input_path}: no such file; a shot needs all of its frames")
         place = item.mirrored or PurePosixPath(item.input_path.name)
         match = DOTTED.fullmatch(place.stem)
         stem, number = match.groups() if match else (place.stem, "0")
-        groups.setdefault(place.with_name(stem), []).append((int(number), item.name, item))
-    shots = ((stem.name, [item for *_, item in sorted(group)]) for stem, group in groups.items())
+        groups.setdefault(place.with_name(stem), {})[item.input_path] = number
+    items = {item.input_path: item for item in photos}
+    shots = ((stem.name, [items[path] for path in in_order(group)]) for stem, group in groups.items())
     return [Shot(frames[0].output_base.with_name(name), tuple(frames)) for name, frames in shots]
 
 
@@ -250,7 +259,7 @@ class FilmOutput:
         if self.rate and shots and shots[0].film:
             raise UsageError("--fps: a film keeps its own times; leave it out")
         digest_of = cache(file_sha256)
-        made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items]
+        made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items], str(self.rate)
         recipes = keyed([{"film": key_of(made_from)}])
         read, index = items[0].input_path, self._index
         if not index.to_make(read, [self.path], recipes, batch.overwrite):
@@ -265,6 +274,8 @@ class FilmOutput:
             from facerf_cli.files.film_writer import check_writable
 
             check_writable(self.path, shots[0].film)
+        elif len({_stated(item, self.rate)[0] for item in items}) > 1:
+            log.warning("%s: its frames state several rates; the first one's is used (--fps)", self.path)
         return recipes
 
     def joined(
@@ -279,7 +290,7 @@ class FilmOutput:
         from facerf_cli.run.logs import Provenance
 
         source = shots[0].film if shots else None
-        timing = film_timing(source) if source else Timing.steady(len(images), self.rate or _RATE)
+        timing = film_timing(source) if source else Timing.steady(len(images), *_stated(items[0], self.rate))
         facts = Provenance(source.name if source else "").attributes()
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
         read, index = items[0].input_path, self._index
@@ -297,6 +308,23 @@ class FilmOutput:
             self.folder.rmdir()
         print(self.path)
         return 0
+
+
+def _stated(item: Item, rate: Fraction | None) -> tuple[Fraction, str]:
+    """Read the frame rate, unless given, and the timecode in an image's header; 24 and "" by default."""
+    from facerf_cli.files.image_metadata import read_header
+
+    header = read_header(item.input_path)
+    metadata = header.metadata if header else {}
+    timecode, stated = "", metadata.get("framesPerSecond")
+    if rate is None and isinstance(stated, tuple):
+        with suppress(UsageError):
+            rate = film_rate("/".join(map(str, stated)))
+    with suppress(LookupError, TypeError):  # of another type than a timecode
+        packed = metadata["smpte:TimeCode"][0]  # SMPTE 12M: BCD digits, between them flags
+        timecode = (packed & 0x3F7F7F3F).to_bytes(4, "big").hex(":")
+        timecode = f"{timecode[:8]};{timecode[9:]}" if packed & _DROP_FRAME else timecode
+    return rate or _RATE, timecode
 
 
 def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
@@ -318,7 +346,7 @@ def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
 def film_rate(text: str) -> Fraction:
     """Parse `--fps`, frames a second."""
     try:
-        rate = Fraction(text)
+        rate = Fraction(text).limit_denominator(_FINEST_RATE)
     except (ValueError, ZeroDivisionError):
         rate = Fraction(0)
     if not 0 < rate <= _MOST_RATE:

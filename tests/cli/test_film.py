@@ -23,7 +23,7 @@ from facerf_cli.work import light_of_picture
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
-from facerf_cli.work.shots import ShotOptions, collect_frames
+from facerf_cli.work.shots import FilmOutput, ShotOptions, collect_frames, film_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Folders, Log, Patch, Said
 
@@ -31,6 +31,7 @@ av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[v
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 FRAMES = 3
 CHEAP = ("--reflectance", "field", "--lights", "12")
+PHOTO_OPTIONS = PhotoOptions(Settings())
 
 
 def frame_of(number: int) -> np.ndarray:
@@ -219,12 +220,82 @@ def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
     assert [row["landmarks"] is None for row in track] == [False, True, False]
 
 
-def test_a_sequence_with_a_hole_is_said(given: Path, tmp_path: Path, capsys: Said) -> None:
-    for number in (1, 3):
+@pytest.mark.parametrize("more", [(), ("--dry-run",)])
+@pytest.mark.parametrize("frames", [("plate.1-4.exr",), ("plate.%d.exr",), ("plate.3.exr", "plate.4.exr")])
+def test_a_sequence_with_a_hole_is_said(
+    given: Path, tmp_path: Path, capsys: Said, frames: tuple[str, ...], more: tuple[str, ...]
+) -> None:
+    """Before anything is made."""
+    for number in (1, 2, 4):
         write_exr(tmp_path / f"plate.{number}.exr", frame_of(number) / np.float32(255))
-    line = (tmp_path / "plate.1-3.exr", "--sequence", "--light", "0,0", "-o", tmp_path / "out")
-    assert facerf(given, "relight", *line, *CHEAP) == 1
-    assert "plate.2.exr: no such file; a shot needs all of its frames" in capsys.readouterr().err
+    line = (*(tmp_path / name for name in frames), "--sequence", "--light", "0,0")
+    for out in ("out", "out.mp4"):
+        assert facerf(given, "relight", *line, "-o", tmp_path / out, *CHEAP, *more) == 1
+        said = capsys.readouterr()
+        assert "plate.3.exr: no such file" in said.err or "frame, 3, is missing" in said.err
+        assert said.out == "" and len(names(tmp_path)) == 3
+
+
+def test_a_film_of_a_sequence_has_the_rate_and_the_timecode_of_its_headers(
+    given: Path, tmp_path: Path
+) -> None:
+    for number in range(2):
+        stated: dict[str, Any] = {
+            "framesPerSecond": (24000, 1001),
+            "smpte:TimeCode": (0x01020304 + number, 0),
+        }
+        path = tmp_path / f"plates/me_{number}.exr"
+        path.parent.mkdir(exist_ok=True)
+        write_exr(path, (frame_of(number) / np.float32(255)) ** np.float32(2.2), metadata=stated)
+    line = (tmp_path / "plates", "--sequence", "--light", "70,20", *CHEAP)
+    assert facerf(given, "relight", *line, "-o", tmp_path / "me.mov") == 0
+    assert facerf(given, "relight", tmp_path / "me.mov", *line[2:], "-o", tmp_path / "again.mp4") == 0
+    for name in ("me.mov", "again.mp4"):
+        with av.open(str(tmp_path / name)) as container:
+            stream = container.streams.video[0]
+            assert stream.average_rate == Fraction(24000, 1001)
+            assert stream.metadata["timecode"] == "01:02:03:04"
+
+
+@pytest.mark.parametrize(
+    ("stated", "given_rate", "timecode", "expected"),
+    [
+        ([(30000, 1001)] * 2, None, 0x01020344, (Fraction(30000, 1001), "01:02:03;04")),
+        ([(30000, 1001)] * 2, "25", 0x01020344, (25, "01:02:03:04")),  # 25 has no drop-frame
+        ([(25, 1), (24, 1)], None, None, (25, None)),
+        ([(48, 1), None], None, None, (48, None)),
+        ([None, None], None, None, (24, None)),
+        *(([bad, bad], None, None, (24, None)) for bad in ((0, 0), (-24, 1), (2**31 - 1, 1), (24, 0))),
+        ([(2**31 - 1, 89478485)] * 2, None, None, (24, None)),  # almost
+    ],
+)
+def test_rates_that_headers_state(
+    tmp_path: Path,
+    stated: list[tuple[int, int] | None],
+    given_rate: str | None,
+    timecode: int | None,
+    expected: tuple[Any, str | None],
+    caplog: Log,
+) -> None:
+    images = []
+    for number, rate in enumerate(stated):
+        of_rate: dict[str, Any] = {"framesPerSecond": rate} if rate else {}
+        header = of_rate | ({} if timecode is None else {"smpte:TimeCode": (timecode, 0)})
+        write_exr(tmp_path / f"me_{number}.exr", np.zeros((16, 16, 3), np.float32), metadata=header)
+        images.append(tmp_path / f"lit_{number}.png")
+        Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(images[-1])
+    batch = BatchOptions(output=tmp_path / "me.mp4.frames")
+    items, shots = collect_frames([str(tmp_path / "me_%d.exr")], ShotOptions(True), batch, PHOTO_OPTIONS)
+    film = FilmOutput(tmp_path / "me.mp4", film_rate(given_rate) if given_rate else None)
+    film.folder.mkdir()
+    key = film.key_of_new(items, shots, images, lambda digest_of: [], batch)
+    assert ("me.mp4: its frames state several rates" in caplog.text) == (len(set(stated)) > 1)
+    slow = FilmOutput(film.path, Fraction(12))
+    assert slow.key_of_new(items, shots, images, lambda digest_of: [], batch) != key  # it is made again
+    assert film.joined(items, images, shots, key, 0) == 0
+    with av.open(str(film.path)) as container:
+        (stream, *_) = container.streams
+        assert (stream.average_rate, stream.metadata.get("timecode")) == expected
 
 
 @pytest.mark.slow
@@ -396,6 +467,7 @@ def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
         (("{film}", "--light", "0,0", "-o", "{out}.webm"), "give one of these"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--fps", "25"), "is for -o FILE.mp4"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "0"), "not a rate"),
+        (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "1/9999999"), "not a rate"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4"), "is one film"),
         (("{film}", "--light", "0,0", "-o", "{out}", "--face", "all"), "--face INDEX"),
         (("{film}", "--light", "20,0;face=0", "-o", "{out}"), "add --face 0"),

@@ -69,7 +69,7 @@ def test_colours_and_order_come_back(tmp_path: Path, suffix: str, kind: type, mo
     with closing(Film(path)) as film:
         timing = film.timing()
         assert film.read(0).shape == (36, 50, 3) and len(timing.times_s) == 5 and timing.sound is None
-        assert timing.rate == pytest.approx(30000 / 1001, rel=1e-4)
+        assert timing.rate == Fraction(30000, 1001)
         for number in (3, 0, 4, 1, 2, 2):  # in any order
             frame = film.read(number)
             assert frame.dtype == kind
@@ -86,6 +86,39 @@ def test_an_odd_size_is_made_even_and_uneven_times_are_kept(tmp_path: Path) -> N
     times_s = tuple(map(Fraction, ("0", "1/30", "1/10", "1/5", "1/2")))
     write_film(path, images_of(tmp_path), Timing(times_s, Fraction(20)), "")
     assert [float(time_s) for time_s in film_timing(path).times_s] == pytest.approx(list(map(float, times_s)))
+
+
+@pytest.mark.parametrize("rate", ["24000/1001", "60000/1001", "120000/1001", "25/2", "2997/125", "1/1000"])
+def test_a_rate_is_exact(tmp_path: Path, rate: str) -> None:
+    write_film(tmp_path / "film.mov", images_of(tmp_path)[:3], Timing.steady(3, Fraction(rate)), "")
+    assert film_timing(tmp_path / "film.mov").rate == Fraction(rate)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "rate", "timecode", "on_container"),
+    [
+        ("a.mov", "libx264", "24000/1001", "01:02:03:04", True),
+        ("a.mp4", "libx264", "60000/1001", "01:02:03;04", False),
+        ("a.mxf", "mpeg2video", "25", "10:00:00:24", True),
+        ("a.mkv", "libx264", "25", "10:00:00:24", True),
+        ("a.mkv", "libx264", "25", "no timecode", False),
+    ],
+)
+@pytest.mark.parametrize("made", ["b.mov", "b.mp4"])
+def test_timecode_is_kept(
+    tmp_path: Path, name: str, codec: str, rate: str, timecode: str, on_container: bool, made: str
+) -> None:
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream(codec, rate=Fraction(rate))
+        stream.width, stream.height, stream.pix_fmt = 48, 32, "yuv420p"
+        (container if on_container else stream).metadata["timecode"] = timecode
+        for _ in range(2):
+            frame = av.VideoFrame.from_ndarray(np.zeros((32, 48, 3), np.uint8))
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    write_film(tmp_path / made, images_of(tmp_path)[:2], film_timing(tmp_path / name), "")
+    found = film_timing(tmp_path / made)
+    assert (found.timecode, found.rate) == ("" if timecode[0] == "n" else timecode, Fraction(rate))
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import math
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,3 +118,23 @@ def test_results_keep_how_a_photo_was_made_and_no_names_or_numbers_of_people_and
     assert plate_metadata({"cameraSerialNumber": "1", "cameraUuid": "2", "lensModel": "x"}) == {
         "lensModel": "x"
     }
+
+
+def test_results_keep_what_an_exr_says_of_its_shot(tmp_path: Path) -> None:
+    """In its own types, since another program reads them by their types."""
+    said: dict[str, Any] = {
+        "focalLength": 50.0,
+        "framesPerSecond": (24000, 1001),
+        "smpte:TimeCode": (0x01020344, 7),
+        "smpte:KeyCode": (1, 2, 3, 4, 5, 6, 7),
+        "cameraColorBalance": (1.5, 2.0),
+        "tStop": 2.5,
+        "reelName": "A001",
+    }
+    write_exr(tmp_path / "a.exr", np.zeros((4, 6, 3), np.float32), metadata=said)
+    for name, copy in (("a.exr", "b.exr"), ("b.exr", "c.exr")):
+        header = read_header(tmp_path / name)
+        assert header is not None
+        kept = plate_metadata(header.metadata)
+        assert kept.items() >= said.items()
+        write_exr(tmp_path / copy, np.zeros((4, 6, 3), np.float32), metadata=kept)
