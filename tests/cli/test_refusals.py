@@ -59,7 +59,6 @@ WRONG: dict[str, dict[str, str]] = {
         "doctor extra": "unexpected extra argument(s) (extra)",
         "config relighting": "no such verb",
         "config --config none.toml": "no such file",
-        "check one": "no index",
     },
     "relight a.jpg": {
         "": "no light given; add --envmap, --light",
