@@ -88,6 +88,7 @@ def test_outputs_beside_what_is_read_are_made(folder: Path, capsys: Said) -> Non
     """A rerun finds its own results in the folder of the mattes, and another matte there; none is read."""
     Path("mattes/other_person.png").write_bytes(b"")
     for name in ("me_segment.exr", "me_person.png"):
-        (folder / "mattes" / name).touch()
-    assert main(["segment", "me.png", "--person", "mattes", "-o", "mattes", "--dry-run"]) == 0
+        (folder / "mattes" / name).write_bytes(b"made")
+    line = ["segment", "me.png", "--person", "mattes", "-o", "mattes", "--dry-run", "--overwrite", "always"]
+    assert main(line) == 0
     assert "me.png -> mattes/me_person.png" in capsys.readouterr().out
