@@ -288,11 +288,11 @@ def test_rates_that_headers_state(
     items, shots = collect_frames([str(tmp_path / "me_%d.exr")], ShotOptions(True), batch, PHOTO_OPTIONS)
     film = FilmOutput(tmp_path / "me.mp4", film_rate(given_rate) if given_rate else None)
     film.folder.mkdir()
-    key = film.key_of_new(items, shots, images, lambda digest_of: [], batch)
+    recipes = film.recipes_of_new(items, shots, images, lambda digest_of: [], batch)
     assert ("me.mp4: its frames state several rates" in caplog.text) == (len(set(stated)) > 1)
     slow = FilmOutput(film.path, Fraction(12))
-    assert slow.key_of_new(items, shots, images, lambda digest_of: [], batch) != key  # it is made again
-    assert film.joined(items, images, shots, key, 0) == 0
+    assert slow.recipes_of_new(items, shots, images, lambda digest_of: [], batch) != recipes
+    assert film.joined(items, images, shots, recipes, 0) == 0
     with av.open(str(film.path)) as container:
         (stream, *_) = container.streams
         assert (stream.average_rate, stream.metadata.get("timecode")) == expected
