@@ -40,7 +40,7 @@ from facerf_cli.light.light import (
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.find import FaceBox, face_at
+from facerf_cli.portrait.find import FaceBox, face_with
 from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
@@ -163,7 +163,8 @@ def fit(
         normals = unit_normals(linear_pixels("normals", normals).detach().numpy(), pixels.shape[:2])
     if head is None:
         if landmarks_px is not None:
-            face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
+            landmarks_px = check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2])
+            face = face_with(models.networks.people, to_display(pixels), landmarks_px)
         elif face is None:
             (face,) = find_faces(models, pixels, "largest", geometry)
         head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)

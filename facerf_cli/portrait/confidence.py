@@ -67,6 +67,9 @@ SCALES = {
     "disputed": Scale(0.8, 0.9, "unclear outline"),
     "crowded": Scale(0.6, 0.25, "others close by"),
     "severed": Scale(0.5, 0.2, "parts apart from the face"),
+    # Given matte: share of the face that it shows; gain of its overlap if it were inverted or turned.
+    "masked": Scale(0.1, 0.5, "the matte covers the face"),
+    "misplaced": Scale(0.12, 0.03, "the matte fits another place"),
 }
 
 
@@ -154,13 +157,14 @@ def matte_facts(
     around = beyond & ~next_to
     pairs = combinations((shares.anybody[near], parsed[near], matte[near]), 2)
     return {
-        "disputed": min(_overlap(*pair) for pair in pairs),
+        "disputed": min(overlap(*pair) for pair in pairs),
         "crowded": float((shares.anybody[around] > 0.5).sum() / max(around.sum(), 1)),
         "severed": float(lost.sum() / max(person.sum(), 1)),
     }
 
 
-def _overlap(one: np.ndarray, other: np.ndarray) -> float:
+def overlap(one: np.ndarray, other: np.ndarray) -> float:
+    """Divide what two shares [...] have in common by what either has."""
     return float(np.minimum(one, other).sum() / max(float(np.maximum(one, other).sum()), 1e-6))
 
 
