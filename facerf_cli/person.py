@@ -15,7 +15,7 @@ from facerf_cli import pipeline
 from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import check_in_photo, check_landmarks
+from facerf_cli.face.crop import check_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays, fit_to_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.landmarks import to_display
@@ -163,8 +163,7 @@ def fit(
         normals = unit_normals(linear_pixels("normals", normals).detach().numpy(), pixels.shape[:2])
     if head is None:
         if landmarks_px is not None:
-            landmarks_px = check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2])
-            face = face_with(models.networks.people, to_display(pixels), landmarks_px)
+            face = face_with(models.networks.people, to_display(pixels), check_landmarks(landmarks_px))
         elif face is None:
             (face,) = find_faces(models, pixels, "largest", geometry)
         head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)

@@ -27,7 +27,6 @@ _ON_LINE = 1e-12  # of what is rounded, in sides of the square squared
 _WHITE = 0.95  # of the brightest value of a photo, from which on a channel is clipped
 _AROUND_PX = (2, 6)  # of a small image: how far from a person its neighbours are looked for
 _NEAR = 1.5  # heights of the head from its middle, where all networks know a person well
-SUPPORTED_YAW_DEG = 45.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ SCALES = {
     "small": Scale(20.0, 44.0),
     "blurred": Scale(0.1, 0.18),
     "profile": Scale(0.15, 0.4),
-    "turned": Scale(75.0, SUPPORTED_YAW_DEG, "turned away"),
+    "turned": Scale(75.0, 45.0, "turned away"),
     # Share of the face that something covers, that lies beyond the frame, that is clipped in two channels;
     # number of its levels of green.
     "covered": Scale(0.4, 0.1),

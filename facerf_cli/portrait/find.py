@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
+from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, check_in_photo, from_landmarks
 from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
@@ -153,6 +153,7 @@ def face_with(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.n
 
     Raises InputError, with the likely cause, for landmarks that clearly lie off the face.
     """
+    check_in_photo(landmarks_px, *image_srgb.shape[:2])
     image = _brightened(image_srgb)
     mesh = mesh_near(people, image, _around(landmarks_px))
     face, view = _looked_at(people, image, landmarks_px, mesh)

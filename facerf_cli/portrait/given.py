@@ -21,7 +21,7 @@ _MASKED = 0.1  # share of the face that a matte of its person shows at least
 _GAIN, _GAIN_OVER_WHITE, _FITS = 0.17, 0.04, 0.77
 _CHANGES = list(product((False, True), repeat=3))  # x and y swapped, then x and y reversed
 _CAUSES: dict[tuple[bool, ...], str] = {
-    (False, False, False): "they are of the photo at another size",
+    (False, False, False): "the photo had another size",
     (True, False, False): "x and y are swapped",
     (False, True, False): "x counts from the right",
     (False, False, True): "y counts from the bottom",
@@ -37,26 +37,21 @@ def check_on_face(view: SquareView, faces: Sequence[np.ndarray], size_px: tuple[
         faces: Landmarks [68, 2] of the faces that are detected in the photo.
         size_px: The photo's height and width.
     """
-    given_px, causes = view.landmarks_px[:68], []
-    for face_px in faces:
-        extent_px = np.ptp(face_px, axis=0).max()
-        if _apart(given_px, face_px) < _SAME * extent_px:
-            return
-        for swapped, *reverse in _CHANGES:
-            sign, start = 1 - 2 * np.array(reverse), np.array(reverse) * (size_px[1], size_px[0])
-            points = given_px[:, :: -1 if swapped else 1] * sign
-            cause = _CAUSES.get((swapped, *reverse), _EXIF)
-            named = [(cause, points)]
-            if sum([swapped, *reverse]) % 2:  # a detector names left and right as the stored pixels show them
-                named.append((_EXIF, points[MIRROR_68]))
-            for cause, points in named:
-                scale = ((face_px - start) * points).sum() / (points**2).sum()
-                if abs(scale - 1) > _OWN_SIZE:
-                    size = f"they are of the photo at {1 / scale:.2f} of its size"
-                    cause = f"{cause}, and {size}" if swapped or any(reverse) else size
-                causes.append((_apart(scale * points + start, face_px) / extent_px, cause))
+    given_px, causes = view.landmarks_px[:68], [(1.0, "")]
+    if any(_apart(given_px, face_px) < _SAME for face_px in faces):
+        return
+    for face_px, (swapped, *reverse) in product(faces, _CHANGES):
+        start = np.array(reverse) * (size_px[1], size_px[0])
+        points = given_px[:, :: -1 if swapped else 1] * (1 - 2 * np.array(reverse))
+        named = [(_CAUSES.get((swapped, *reverse), _EXIF), points)]
+        if sum([swapped, *reverse]) % 2:  # a detector names left and right as they lie in the stored pixels
+            named.append((_EXIF, points[MIRROR_68]))
+        for cause, ordered in named:
+            scale = ((face_px - start) * ordered).sum() / (ordered**2).sum()
+            said = f" (they fit {1 / scale:.2f} of the photo's size)" if abs(scale - 1) > _OWN_SIZE else ""
+            causes.append((_apart(scale * ordered + start, face_px), cause + said))
     advice = "use landmarks of the upright photo, [x, y] in its pixels from the top left"
-    misfit, cause = min(causes, default=(1.0, ""))
+    misfit, cause = min(causes)
     if misfit < _SAME:
         raise InputError(f"landmarks: they lie off the face; the likely cause: {cause}; {advice}")
     classes = view.classes.numpy()
@@ -66,8 +61,9 @@ def check_on_face(view: SquareView, faces: Sequence[np.ndarray], size_px: tuple[
         raise InputError(f"landmarks: they lie on background or clothes, where no face is seen; {advice}")
 
 
-def _apart(points_px: np.ndarray, others_px: np.ndarray) -> float:
-    return float(np.median(np.linalg.norm(points_px - others_px, axis=-1)))
+def _apart(points_px: np.ndarray, face_px: np.ndarray) -> float:
+    """Median distance of points [68, 2] from those of a face, in its extent."""
+    return float(np.median(np.linalg.norm(points_px - face_px, axis=-1)) / np.ptp(face_px, axis=0).max())
 
 
 def given_matte_facts(view: SquareView, matte: np.ndarray) -> dict[str, float]:

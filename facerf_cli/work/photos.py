@@ -15,7 +15,7 @@ import torch
 from facerf_cli.batch.inputs import Item, companions
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import check_in_photo, from_landmarks
+from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks, to_display
@@ -29,7 +29,6 @@ from facerf_cli.person import find_faces
 from facerf_cli.pipeline import head_of
 from facerf_cli.portrait.confidence import (
     SCALES,
-    SUPPORTED_YAW_DEG,
     confidence_of,
     face_facts,
     touched_sides,
@@ -37,7 +36,6 @@ from facerf_cli.portrait.confidence import (
 from facerf_cli.portrait.find import FaceBox, face_with
 from facerf_cli.portrait.given import given_matte_facts
 from facerf_cli.portrait.given_normals import unit_normals
-from facerf_cli.portrait.parse import SquareView
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
@@ -71,7 +69,7 @@ log = logging.getLogger(LOGGER_NAME)
 class PhotoFace:
     """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'.
 
-    `name` is for messages. `facts` say how far it can be relied on; a frame of a shot has none.
+    `name` is for messages. `facts` say how far it can be relied on; a frame of a shot has those of its take.
     """
 
     tag: str
@@ -87,14 +85,17 @@ class PhotoFace:
             self.facts.update(segmentation.facts)
             self.touches.update(touched_sides(segmentation.matte))
 
-    def rated(self) -> dict[str, Any]:
-        """The confidence for the report, said in a line, too."""
+    def rated(self, quiet: bool = False) -> dict[str, Any]:
+        """Rate the face for the report, and unless `quiet` in a line."""
         if not self.facts:
             return {}
         confidence = confidence_of(self.facts)
         touches = [f"touches the frame: {', '.join(self.touches)}"] if self.touches else []
         why = ", ".join([*(SCALES[name].said or name for name in confidence.reasons), *touches])
-        log.info("%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else "")
+        if not quiet:
+            log.info(
+                "%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else ""
+            )
         factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
         rated = {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
         return rated | ({"touches_frame": self.touches} if self.touches else {})
@@ -114,9 +115,9 @@ class FittedFace(PhotoFace):
         return self.head.fit
 
     def described(self) -> dict[str, Any]:
-        """The face's entries in the report; its confidence is said in a line, too."""
+        """Describe the face for the report, and unless it is of a shot in a line."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
-        return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated()}
+        return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated(quiet=self.steady is not None)}
 
 
 @step("load")
@@ -213,11 +214,6 @@ def write_each(
     return [tag for tag, _ in made], facts_of([facts for _, facts in made], options)
 
 
-def facts_of_found(faces: Sequence[PhotoFace], options: PhotoOptions) -> dict[str, Any]:
-    """The report's entries of a photo whose faces were only found."""
-    return facts_of([face.rated() for face in faces], options)
-
-
 def find_people(
     item: Item, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None, to_fit: bool = False
 ) -> list[PhotoFace]:
@@ -231,7 +227,6 @@ def find_people(
         path = companion(item, options.landmarks, "--landmarks")
         landmarks_px = read_landmarks(path)
         with naming(path):
-            check_in_photo(landmarks_px, *image.pixels.shape[:2])
             faces = [face_with(models.networks.people, to_display(image.pixels), landmarks_px)]
     else:
         geometry = options.geometry if to_fit else "landmarks"
@@ -242,22 +237,29 @@ def find_people(
         if len(faces) > 1:
             x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
             name += f": face {number} from the left, at x {x_px}, y {y_px} px"
-        facts = {} if face.view is None else _facts_of(face.view, image.pixels, models)
-        if face.view is not None and matte is not None:
-            with naming(matte_path(item, options)):
-                facts |= given_matte_facts(face.view, matte)
+        facts = facts_of_face(item, face, image.pixels, options, matte)
         found.append(
             PhotoFace(f"_face{number}" if options.face == "all" else "", name, face, facts, number=number)
         )
     return found
 
 
-def _facts_of(view: SquareView, photo: np.ndarray, models: Models) -> dict[str, float]:
-    """Facts of a face in a photo [H, W, 3], with its turn by the face model."""
-    crop = from_landmarks(view.landmarks_px[:68], models.sides().crop_px)
+def facts_of_face(
+    item: Item, face: FaceBox, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
+) -> dict[str, float]:
+    """Measure a face in a photo [H, W, 3], its turn by the face model, and its matte [H, W] if that is given.
+
+    Raises InputError for a matte that does not show it.
+    """
+    if (view := face.view) is None:
+        return {}
+    crop = from_landmarks(view.landmarks_px[:68], load_models_once(options).sides().crop_px)
     in_crop = crop.to_crop(view.landmarks_px[:68])
-    fit = fit_landmarks(models.face, in_crop, crop, trust=trust_inside(in_crop, crop, *photo.shape[:2]))
-    return face_facts(view, photo) | {"turned": abs(rotation_to_pose(fit.rotation)[0])}
+    trust = trust_inside(in_crop, crop, *photo.shape[:2])
+    fit = fit_landmarks(face_model(options), in_crop, crop, trust=trust)
+    facts = face_facts(view, photo) | {"turned": abs(rotation_to_pose(fit.rotation)[0])}
+    with naming(matte_path(item, options)):
+        return facts if matte is None else facts | given_matte_facts(view, matte)
 
 
 def fit_facts(fit: FaceFit) -> dict[str, Any]:
@@ -304,15 +306,6 @@ def fitted_face(face: PhotoFace, head: Head, matte: np.ndarray | None) -> Fitted
             "with `facerf fit-geometry`, or give the face's points by --landmarks",
             face.name,
             100 * head.fit.error_iod,
-        )
-    yaw_deg = rotation_to_pose(head.fit.rotation)[0]
-    if abs(yaw_deg) > SUPPORTED_YAW_DEG:
-        log.warning(
-            "%s: the head is turned by %.0f degrees; beyond %.0f it may fail: look at it with "
-            "`facerf fit-geometry`",
-            face.name,
-            abs(yaw_deg),
-            SUPPORTED_YAW_DEG,
         )
     return FittedFace(face.tag, face.name, face.found, face.facts, number=face.number, head=head, matte=matte)
 

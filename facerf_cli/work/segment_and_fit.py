@@ -29,8 +29,7 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
-    facts_of_found,
-    facts_of_networks,
+    facts_of,
     find_people,
     load_models_once,
     person_matte,
@@ -58,9 +57,10 @@ def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[lis
     """
     if place := open_at(shots, item, options):
         shot, number = place
-        image, face, found = shot.segmented(number)
-        _write_segment(item, "", image, to_display(image.pixels), face, found)
-        return [""], facts_of_networks(options)
+        image, person, found = shot.segmented(number)
+        assert isinstance(person.found, Face)
+        _write_segment(item, "", image, to_display(image.pixels), person.found, found)
+        return [""], facts_of([person.rated(quiet=True)], options)
     image = read_photo(item, options, KEPT_PX + 4)  # a class, too
     display = to_display(image.pixels)
     networks, matte = load_models_once(options).networks.people, person_matte(item, image.pixels, options)
@@ -72,7 +72,7 @@ def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[lis
         if not (found.cut(image.alpha).matte > _SHOWS_PERSON).any():
             raise InputError(f"{person.name}: no person is cut out; pass a matte by --person")
         _write_segment(item, person.tag, image, display, person.found, found)
-    return [person.tag for person in people], facts_of_found(people, options)
+    return [person.tag for person in people], facts_of([face.rated() for face in people], options)
 
 
 def _write_segment(

@@ -19,7 +19,7 @@ from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.read import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709, unit_floats
-from facerf_cli.portrait.find import Face, face_at
+from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import described_file
@@ -28,8 +28,11 @@ from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
+    PhotoFace,
     companion,
+    facts_of_face,
     load_models_once,
+    naming,
     person_matte,
     read_photo,
 )
@@ -204,7 +207,8 @@ def _follow(shot: Shot, track: ShotTrack, options: PhotoOptions) -> None:
             seen = follower.see(image)
         else:
             path = companion(shot.frames[number], options.landmarks, "--landmarks")
-            seen = Sighting(read_landmarks(path), 0.0)
+            with naming(path):
+                seen = Sighting(face_with(networks, image, read_landmarks(path)).landmarks_px, 0.0)
         track.add(seen, cut)
 
 
@@ -262,7 +266,7 @@ class OpenShot:
     def __init__(self, shot: Shot, options: PhotoOptions, white: White | None = None) -> None:
         self.shot, self.track, self.frames = shot, ShotTrack(shot.track), ShotFrames(shot, options)
         self._options, self._white = options, white
-        self._take = range(0)
+        self._take, self._facts = range(0), dict[str, float]()
         self._steady: SteadyShot | None = None
 
     def take_of(self, number: int) -> SteadyShot:
@@ -274,24 +278,41 @@ class OpenShot:
             mattes = ShotMattes(self.shot, take, self.frames, options) if options.has_given_person else None
             sides = models.sides(options.texture_side)
             self._steady = SteadyShot(models, self.frames, sightings, sides, mattes, self._white)
+            self._facts = {}
         return self._steady
 
-    def segmented(self, number: int) -> tuple[LinearImage, Face, Segmentation]:
+    def _facts_of(self, take: SteadyShot) -> dict[str, float]:
+        """Measure the face, and a given matte, in the middle frame of a take; see `facts_of_face`."""
+        if not self._facts:
+            item, pixels, options = self.shot.frames[take.middle], self.frames[take.middle], self._options
+            people, landmarks_px = load_models_once(options).networks.people, take.landmarks_px(take.middle)
+            face = face_with(people, to_display(pixels), landmarks_px)
+            matte = person_matte(item, pixels, options, in_shot=True)
+            shown = None if matte is None or not matte.any() else matte
+            self._facts = facts_of_face(item, face, pixels, options, shown)
+        return self._facts
+
+    def segmented(self, number: int) -> tuple[LinearImage, PhotoFace, Segmentation]:
         """A frame, its face, and its person, steadied by the frames around it."""
         take = self.take_of(number)
         with self._naming(number):
-            face, found = face_at(take.landmarks_px(number)), take.segmentation(number)
-        return self.frames.image(number), face, found
+            face, found, facts = (
+                face_at(take.landmarks_px(number)),
+                take.segmentation(number),
+                self._facts_of(take),
+            )
+        person = PhotoFace("", str(self.shot.frames[number].input_path), face, facts)
+        return self.frames.image(number), person, found
 
     def fitted(self, number: int, portrait: bool = True) -> tuple[LinearImage, FittedFace]:
         """A frame, and its head with what is steadied by the frames around it; see `SteadyShot.window`."""
         take = self.take_of(number)
         with self._naming(number):
-            steady = take.window(number, portrait)
+            steady, facts = take.window(number, portrait), self._facts_of(take)
         head, matte = steady.head, steady.segmentation.matte
         found = face_at(head.fit.crop.to_photo(head.landmarks_px))
         face = FittedFace(
-            "", str(self.shot.frames[number].input_path), found, head=head, steady=steady, matte=matte
+            "", str(self.shot.frames[number].input_path), found, facts, head=head, steady=steady, matte=matte
         )
         return self.frames.image(number), face
 
