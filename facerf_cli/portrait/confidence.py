@@ -67,7 +67,7 @@ SCALES = {
     "crowded": Scale(0.6, 0.25, "others close by"),
     "severed": Scale(0.5, 0.2, "parts apart from the face"),
     # Given matte: share of the face that it shows; gain of its overlap if it were inverted or turned.
-    "masked": Scale(0.1, 0.5, "the matte covers the face"),
+    "masked": Scale(0.2, 0.7, "the matte covers the face"),
     "misplaced": Scale(0.12, 0.03, "the matte fits another place"),
 }
 

@@ -17,7 +17,7 @@ from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.given import check_on_face
+from facerf_cli.portrait.given import check_seen, lie_on_one
 from facerf_cli.portrait.mesh import (
     FaceMesh,
     distinct,
@@ -153,13 +153,19 @@ def face_with(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.n
 
     Raises InputError, with the likely cause, for landmarks that clearly lie off the face.
     """
-    check_in_photo(landmarks_px, *image_srgb.shape[:2])
-    image = _brightened(image_srgb)
-    mesh = mesh_near(people, image, _around(landmarks_px))
-    face, view = _looked_at(people, image, landmarks_px, mesh)
-    if view.relative_error > _UNCLEAR:
-        others = detect_faces(people, image_srgb, everyone=True)
-        check_on_face(view, [other.landmarks_px for other in others], image.shape)
+    image, size_px = _brightened(image_srgb), image_srgb.shape[:2]
+
+    def detected() -> list[np.ndarray]:
+        return [face.landmarks_px for face in detect_faces(people, image_srgb, everyone=True)]
+
+    try:
+        check_in_photo(landmarks_px, *size_px)
+    except InputError:
+        lie_on_one(landmarks_px, detected(), size_px)  # raises one that names the cause
+        raise
+    face, view = _looked_at(people, image, landmarks_px, mesh_near(people, image, _around(landmarks_px)))
+    if view.relative_error > _UNCLEAR and not lie_on_one(landmarks_px, detected(), size_px):
+        check_seen(view)
     return face
 
 

@@ -27,19 +27,17 @@ _CAUSES: dict[tuple[bool, ...], str] = {
     (False, False, True): "y counts from the bottom",
 }
 _EXIF = "the photo's EXIF orientation was not applied"
+_ADVICE = "use landmarks of the upright photo, [x, y] in its pixels from the top left"
 
 
-def check_on_face(view: SquareView, faces: Sequence[np.ndarray], size_px: tuple[int, ...]) -> None:
-    """Raise InputError, with the likely cause, for landmarks that clearly lie off the face.
+def lie_on_one(given_px: np.ndarray, faces: Sequence[np.ndarray], size_px: tuple[int, ...]) -> bool:
+    """Tell if landmarks [68, 2] lie on one of the faces [68, 2] that are detected in a photo [H, W].
 
-    Args:
-        view: What the Parsing Network sees around them, with the landmarks themselves.
-        faces: Landmarks [68, 2] of the faces that are detected in the photo.
-        size_px: The photo's height and width.
+    Raises InputError, with the likely cause, where they would after a change of axes or size.
     """
-    given_px, causes = view.landmarks_px[:68], [(1.0, "")]
     if any(_apart(given_px, face_px) < _SAME for face_px in faces):
-        return
+        return True
+    causes = [(1.0, "")]
     for face_px, (swapped, *reverse) in product(faces, _CHANGES):
         start = np.array(reverse) * (size_px[1], size_px[0])
         points = given_px[:, :: -1 if swapped else 1] * (1 - 2 * np.array(reverse))
@@ -50,15 +48,19 @@ def check_on_face(view: SquareView, faces: Sequence[np.ndarray], size_px: tuple[
             scale = ((face_px - start) * ordered).sum() / (ordered**2).sum()
             said = f" (they fit {1 / scale:.2f} of the photo's size)" if abs(scale - 1) > _OWN_SIZE else ""
             causes.append((_apart(scale * ordered + start, face_px), cause + said))
-    advice = "use landmarks of the upright photo, [x, y] in its pixels from the top left"
     misfit, cause = min(causes)
     if misfit < _SAME:
-        raise InputError(f"landmarks: they lie off the face; the likely cause: {cause}; {advice}")
+        raise InputError(f"landmarks: they lie off the face; the likely cause: {cause}; {_ADVICE}")
+    return False
+
+
+def check_seen(view: SquareView) -> None:
+    """Raise InputError for landmarks of a view that clearly lie where no face is."""
     classes = view.classes.numpy()
     side = classes.shape[-1]
-    x, y = (view.square.to_share(given_px[17:]) * side).astype(int).clip(0, side - 1).T
+    x, y = (view.square.to_share(view.landmarks_px[17:68]) * side).astype(int).clip(0, side - 1).T
     if classes[[0, class_index("garment")]][:, y, x].sum(0).mean() > _ELSEWHERE:
-        raise InputError(f"landmarks: they lie on background or clothes, where no face is seen; {advice}")
+        raise InputError(f"landmarks: they lie on background or clothes, where no face is seen; {_ADVICE}")
 
 
 def _apart(points_px: np.ndarray, face_px: np.ndarray) -> float:

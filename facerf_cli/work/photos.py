@@ -69,7 +69,7 @@ log = logging.getLogger(LOGGER_NAME)
 class PhotoFace:
     """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'.
 
-    `name` is for messages. `facts` say how far it can be relied on; a frame of a shot has those of its take.
+    `name` is for messages. `facts` say how far it can be relied on; those of a frame leave out its own matte.
     """
 
     tag: str
@@ -189,7 +189,7 @@ def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[
     So the first one's files are written last, and mark the photo as finished.
     """
     matte = person_matte(item, image.pixels, options)
-    found = find_people(item, image, options, matte, to_fit=True)
+    found = find_people(item, image, options, matte, True)
     return (_fitted(found.pop(), image, options, matte) for _ in range(len(found)))
 
 

@@ -38,6 +38,7 @@ from facerf_cli.work.photos import (
 )
 from facerf_cli.work.shots import Shot, Shots
 
+_WHOLE = 0.9  # largest value of a matte from which on the person is all there
 _DECODED = 12  # frames of a film that are kept as they were decoded
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
@@ -266,7 +267,7 @@ class OpenShot:
     def __init__(self, shot: Shot, options: PhotoOptions, white: White | None = None) -> None:
         self.shot, self.track, self.frames = shot, ShotTrack(shot.track), ShotFrames(shot, options)
         self._options, self._white = options, white
-        self._take, self._facts = range(0), dict[str, float]()
+        self._take = range(0)
         self._steady: SteadyShot | None = None
 
     def take_of(self, number: int) -> SteadyShot:
@@ -278,29 +279,24 @@ class OpenShot:
             mattes = ShotMattes(self.shot, take, self.frames, options) if options.has_given_person else None
             sides = models.sides(options.texture_side)
             self._steady = SteadyShot(models, self.frames, sightings, sides, mattes, self._white)
-            self._facts = {}
         return self._steady
 
-    def _facts_of(self, take: SteadyShot) -> dict[str, float]:
-        """Measure the face, and a given matte, in the middle frame of a take; see `facts_of_face`."""
-        if not self._facts:
-            item, pixels, options = self.shot.frames[take.middle], self.frames[take.middle], self._options
-            people, landmarks_px = load_models_once(options).networks.people, take.landmarks_px(take.middle)
-            face = face_with(people, to_display(pixels), landmarks_px)
-            matte = person_matte(item, pixels, options, in_shot=True)
-            shown = None if matte is None or not matte.any() else matte
-            self._facts = facts_of_face(item, face, pixels, options, shown)
-        return self._facts
+    def _facts_of(self, number: int, landmarks_px: np.ndarray) -> dict[str, float]:
+        """Measure the face of a frame, and a given matte unless it is faint; see `facts_of_face`."""
+        if self.track.sightings[number] is None:
+            return {"unclear": 1.0}  # filled in
+        item, pixels, options = self.shot.frames[number], self.frames[number], self._options
+        face = face_with(load_models_once(options).networks.people, to_display(pixels), landmarks_px)
+        matte = person_matte(item, pixels, options, in_shot=True)
+        shown = matte is not None and matte.max() > _WHOLE
+        return facts_of_face(item, face, pixels, options, matte if shown else None)
 
     def segmented(self, number: int) -> tuple[LinearImage, PhotoFace, Segmentation]:
         """A frame, its face, and its person, steadied by the frames around it."""
         take = self.take_of(number)
         with self._naming(number):
-            face, found, facts = (
-                face_at(take.landmarks_px(number)),
-                take.segmentation(number),
-                self._facts_of(take),
-            )
+            face, found = face_at(take.landmarks_px(number)), take.segmentation(number)
+            facts = self._facts_of(number, face.landmarks_px)
         person = PhotoFace("", str(self.shot.frames[number].input_path), face, facts)
         return self.frames.image(number), person, found
 
@@ -308,9 +304,10 @@ class OpenShot:
         """A frame, and its head with what is steadied by the frames around it; see `SteadyShot.window`."""
         take = self.take_of(number)
         with self._naming(number):
-            steady, facts = take.window(number, portrait), self._facts_of(take)
-        head, matte = steady.head, steady.segmentation.matte
-        found = face_at(head.fit.crop.to_photo(head.landmarks_px))
+            steady = take.window(number, portrait)
+            head, matte = steady.head, steady.segmentation.matte
+            found = face_at(head.fit.crop.to_photo(head.landmarks_px))
+            facts = self._facts_of(number, found.landmarks_px)
         face = FittedFace(
             "", str(self.shot.frames[number].input_path), found, facts, head=head, steady=steady, matte=matte
         )

@@ -109,6 +109,17 @@ def test_a_relit_person_is_that_of_the_matte_and_another_matte_multiplies_it(
     assert (layers["A"] == layers["person.A"]).all()
 
 
+def test_an_inverted_matte_fails_in_photos_and_shots(given: Path, tmp_path: Path, capsys: Said) -> None:
+    photo = given / "plates/me.0000.png"
+    for number in range(2):
+        save(tmp_path / f"inverted/me.{number:04d}.png", 1 - ellipse(0.02 * number))
+    for line in ((photo,), (given / "plates", "--sequence")):
+        assert facerf("segment", *line, "--person", tmp_path / "inverted", "-o", tmp_path / "out") == 1
+        said = " ".join(capsys.readouterr().err.split())
+        assert "inverted" in said and "me.0000.png" in said
+    assert not list((tmp_path / "out").glob("*_person.png"))
+
+
 def test_the_portrait_field_is_of_the_given_person() -> None:
     options = PhotoOptions(Settings(device="cpu"))
     models, photo = load_models_once(options), head_photo()
