@@ -164,7 +164,8 @@ def face_with(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.n
         lie_on_one(landmarks_px, detected(), size_px)  # raises one that names the cause
         raise
     face, view = _looked_at(people, image, landmarks_px, mesh_near(people, image, _around(landmarks_px)))
-    if view.relative_error > _UNCLEAR and not lie_on_one(landmarks_px, detected(), size_px):
+    unclear = view.relative_error > _UNCLEAR and image.any()  # in a black photo nothing is seen anywhere
+    if unclear and not lie_on_one(landmarks_px, detected(), size_px):
         check_seen(view)
     return face
 
