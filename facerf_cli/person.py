@@ -130,7 +130,7 @@ def fit(
             there are none.
 
     Of a list of photos landmarks, mattes and normals are lists, too. Raises InputError where no face is
-    found, the fit fails, or normals are not those of the face.
+    found, landmarks clearly lie off the face, the fit fails, or normals are not those of the face.
     """
     one_of(RelightKind, "reflectance", reflectance)
     if white is not None:

@@ -16,6 +16,7 @@ from skimage.data import astronaut as photograph
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display
@@ -118,6 +119,21 @@ def test_an_inverted_matte_fails_in_photos_and_shots(given: Path, tmp_path: Path
         said = " ".join(capsys.readouterr().err.split())
         assert "inverted" in said and "me.0000.png" in said
     assert not list((tmp_path / "out").glob("*_person.png"))
+
+
+def test_frames_of_a_sequence_are_rated_and_landmarks_off_the_face_fail_it(
+    given: Path, tmp_path: Path, capsys: Said
+) -> None:
+    line = ("segment", given / "plates", "--sequence")
+    assert facerf(*line, "-o", tmp_path / "out") == 0
+    rows = [json.loads(row) for row in (tmp_path / "out/report.jsonl").read_text().splitlines()]
+    assert [row["certainty"] for row in rows] == ["sure", "sure"]
+    points = read_landmarks(tmp_path / "out/me.0000_landmarks.json")
+    (tmp_path / "half.json").write_text(json.dumps((points / 2).tolist()))
+    capsys.readouterr()
+    assert facerf(*line, "--landmarks", tmp_path / "half.json", "-o", tmp_path / "half") != 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "half.json" in said and "0.50" in said
 
 
 def test_the_portrait_field_is_of_the_given_person() -> None:
