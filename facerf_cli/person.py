@@ -15,7 +15,7 @@ from facerf_cli import pipeline
 from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import check_in_photo, check_landmarks
+from facerf_cli.face.crop import check_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays, fit_to_arrays
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.landmarks import to_display
@@ -40,7 +40,7 @@ from facerf_cli.light.light import (
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.find import FaceBox, face_at
+from facerf_cli.portrait.find import FaceBox, face_with
 from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
@@ -130,7 +130,7 @@ def fit(
             there are none.
 
     Of a list of photos landmarks, mattes and normals are lists, too. Raises InputError where no face is
-    found, the fit fails, or normals are not those of the face.
+    found, landmarks clearly lie off the face, the fit fails, or normals are not those of the face.
     """
     one_of(RelightKind, "reflectance", reflectance)
     if white is not None:
@@ -163,7 +163,7 @@ def fit(
         normals = unit_normals(linear_pixels("normals", normals).detach().numpy(), pixels.shape[:2])
     if head is None:
         if landmarks_px is not None:
-            face = face_at(check_in_photo(check_landmarks(landmarks_px), *pixels.shape[:2]))
+            face = face_with(models.networks.people, to_display(pixels), check_landmarks(landmarks_px))
         elif face is None:
             (face,) = find_faces(models, pixels, "largest", geometry)
         head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)

@@ -27,7 +27,6 @@ _ON_LINE = 1e-12  # of what is rounded, in sides of the square squared
 _WHITE = 0.95  # of the brightest value of a photo, from which on a channel is clipped
 _AROUND_PX = (2, 6)  # of a small image: how far from a person its neighbours are looked for
 _NEAR = 1.5  # heights of the head from its middle, where all networks know a person well
-SUPPORTED_YAW_DEG = 45.0
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ SCALES = {
     "small": Scale(20.0, 44.0),
     "blurred": Scale(0.1, 0.18),
     "profile": Scale(0.15, 0.4),
-    "turned": Scale(75.0, SUPPORTED_YAW_DEG, "turned away"),
+    "turned": Scale(75.0, 45.0, "turned away"),
     # Share of the face that something covers, that lies beyond the frame, that is clipped in two channels;
     # number of its levels of green.
     "covered": Scale(0.4, 0.1),
@@ -67,6 +66,9 @@ SCALES = {
     "disputed": Scale(0.8, 0.9, "unclear outline"),
     "crowded": Scale(0.6, 0.25, "others close by"),
     "severed": Scale(0.5, 0.2, "parts apart from the face"),
+    # Given matte: share of the face that it shows; gain of its overlap if it were inverted or turned.
+    "masked": Scale(0.2, 0.7, "the matte covers the face"),
+    "misplaced": Scale(0.12, 0.03, "the matte fits another place"),
 }
 
 
@@ -154,13 +156,14 @@ def matte_facts(
     around = beyond & ~next_to
     pairs = combinations((shares.anybody[near], parsed[near], matte[near]), 2)
     return {
-        "disputed": min(_overlap(*pair) for pair in pairs),
+        "disputed": min(overlap(*pair) for pair in pairs),
         "crowded": float((shares.anybody[around] > 0.5).sum() / max(around.sum(), 1)),
         "severed": float(lost.sum() / max(person.sum(), 1)),
     }
 
 
-def _overlap(one: np.ndarray, other: np.ndarray) -> float:
+def overlap(one: np.ndarray, other: np.ndarray) -> float:
+    """Divide what two shares [...] have in common by what either has."""
     return float(np.minimum(one, other).sum() / max(float(np.maximum(one, other).sum()), 1e-6))
 
 

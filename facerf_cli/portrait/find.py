@@ -12,11 +12,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, from_landmarks
+from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, check_in_photo, from_landmarks
 from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks
+from facerf_cli.portrait.given import check_seen, lie_on_one
 from facerf_cli.portrait.mesh import (
     FaceMesh,
     distinct,
@@ -35,6 +36,7 @@ _NO_FACE = "no face found; try a larger or brighter image that shows the whole f
 _FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
 _DARK = 100  # of 255: brightest percentile of a photo that is brightened before it is searched
+_UNCLEAR = 0.05  # relative error of given landmarks from which on they may lie off the face
 _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
 
 
@@ -135,7 +137,7 @@ def detect_faces(
         meshes = distinct([*meshes, *find_meshes(people, image_srgb, squares)])
         if meshes and not everyone:
             break
-    faces = [face for mesh in meshes if (face := _as_face(people, image_srgb, mesh))]
+    faces = [face for mesh in meshes if (face := _face_of(people, image_srgb, mesh))]
     faces.sort(key=lambda face: face.box_px[0])
     heads = [OtherHead(face.landmarks_px) for face in faces]
     return [replace(one, others=heads[:n] + heads[n + 1 :], number=n) for n, one in enumerate(faces)]
@@ -145,7 +147,29 @@ def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.n
     """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
     check_display(image_srgb)
     mesh = mesh_near(people, image_srgb, _around(landmarks_px))
-    return _as_face(people, image_srgb, mesh) if mesh else None
+    return _face_of(people, image_srgb, mesh) if mesh else None
+
+
+def face_with(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face:
+    """Look at the face of given landmarks [68, 2] in an sRGB uint8 image [H, W, 3].
+
+    Raises InputError, with the likely cause, for landmarks that clearly lie off the face.
+    """
+    image, size_px = _brightened(image_srgb), image_srgb.shape[:2]
+
+    def detected() -> list[np.ndarray]:
+        return [face.landmarks_px for face in detect_faces(people, image_srgb, everyone=True)]
+
+    try:
+        check_in_photo(landmarks_px, *size_px)
+    except InputError:
+        lie_on_one(landmarks_px, detected(), size_px)  # raises one that names the cause
+        raise
+    face, view = _looked_at(people, image, landmarks_px, mesh_near(people, image, _around(landmarks_px)))
+    unclear = view.relative_error > _UNCLEAR and image.any()  # in a black photo nothing is seen anywhere
+    if unclear and not lie_on_one(landmarks_px, detected(), size_px):
+        check_seen(view)
+    return face
 
 
 def _brightened(image: np.ndarray) -> np.ndarray:
@@ -168,20 +192,25 @@ def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
         yield parts_of(image, _FINEST_PX)
 
 
-def _as_face(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face | None:
+def _face_of(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face | None:
     """The face of a mesh; None where the Parsing Network sees no head there."""
-    landmarks_px = mesh.landmarks_px.astype(np.float64)
+    face, view = _looked_at(people, image, mesh.landmarks_px.astype(np.float64), mesh)
+    return None if view.presence < LEAST_PRESENCE else replace(face, score=mesh.score)
+
+
+def _looked_at(
+    people: PeopleNetworks, image: np.ndarray, landmarks_px: np.ndarray, mesh: FaceMesh | None
+) -> tuple[Face, SquareView]:
+    """The face with landmarks [68, 2], and what is seen there; its mesh says how steady it is."""
     (view,) = look(people.parsing, image, [_around(landmarks_px)])
-    if view.presence < LEAST_PRESENCE:
-        return None
     apart_px = np.linalg.norm(view.landmarks_px[:68] - landmarks_px, axis=-1)
     view = replace(
         view,
         landmarks_px=np.concatenate([landmarks_px, view.landmarks_px[68:]]),
         error_px=np.concatenate([np.maximum(view.error_px[:68], apart_px / 2), view.error_px[68:]]),
-        unsteadiness=unsteadiness(people.face_mesh, image, mesh),
+        unsteadiness=unsteadiness(people.face_mesh, image, mesh) if mesh else 0.0,
     )
-    return Face(box_of(from_landmarks(landmarks_px, 1)), mesh.score, landmarks_px, view=view)
+    return Face(box_of(from_landmarks(landmarks_px, 1)), math.inf, landmarks_px, view=view), view
 
 
 def _around(face: np.ndarray) -> Square:

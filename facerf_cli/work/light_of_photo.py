@@ -116,7 +116,7 @@ def write_shot_light(
         face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
         found = _write(item, image, face, options, width_px, sh_order, take.other_heads)
         tags.append(face.tag)
-        facts.append(found | {"frames": take.key_frames})
+        facts.append(face.described() | found | {"frames": take.key_frames})
     return tags, (facts[0] if len(facts) == 1 else {"takes": facts}) | facts_of_networks(options.photo)
 
 
@@ -125,7 +125,7 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
     image = read_photo(item, options.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        _require_light_on(face)
+        _require_light_on(face, options)
         return {"light_from": "face"} | _write(item, image, face, options, width_px, sh_order)
 
     try:
@@ -142,7 +142,7 @@ def map_of_photo(path: Path, options: LightOptions, height: int) -> Tensor:
     image = read_photo(item, options.photo)
     try:
         face = fit_faces(item, image, options.photo)[0]
-        _require_light_on(face)
+        _require_light_on(face, options)
     except NoFaceError:
         from facerf_cli.work.light_of_picture import guessed_light
 
@@ -150,9 +150,9 @@ def map_of_photo(path: Path, options: LightOptions, height: int) -> Tensor:
     return rig_to_latlong(_estimate(item, image, face.head, options)[0].light, height)
 
 
-def _require_light_on(face: FittedFace) -> None:
-    """Raise NoFaceError for a face that is too small, dark or doubtful to read light from."""
-    if confidence_of(face.facts).word == "doubtful":
+def _require_light_on(face: FittedFace, options: LightOptions) -> None:
+    """Raise NoFaceError for a detected face that is too small, dark or doubtful to read light from."""
+    if options.photo.landmarks is None and confidence_of(face.facts).word == "doubtful":
         raise NoFaceError(f"{face.name}: its face is doubtful")
 
 
@@ -263,4 +263,4 @@ def _write(
     write_light(base.with_name(base.name + ".json"), record)
     shown = draw_estimate(face.head, models.face, estimate.explained, envmap)
     write_display(base.with_name(base.name + ".png"), shown, metadata=metadata)
-    return face.described() | facts
+    return facts

@@ -15,8 +15,8 @@ import torch
 from facerf_cli.batch.inputs import Item, companions
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import check_in_photo
-from facerf_cli.face.fit import FaceFit
+from facerf_cli.face.crop import from_landmarks
+from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.face.morphable import MorphableModel, load_face_model
@@ -29,14 +29,14 @@ from facerf_cli.person import find_faces
 from facerf_cli.pipeline import head_of
 from facerf_cli.portrait.confidence import (
     SCALES,
-    SUPPORTED_YAW_DEG,
     confidence_of,
     face_facts,
     touched_sides,
 )
-from facerf_cli.portrait.find import Face, FaceBox, face_at
+from facerf_cli.portrait.find import FaceBox, face_with
+from facerf_cli.portrait.given import given_matte_facts
 from facerf_cli.portrait.given_normals import unit_normals
-from facerf_cli.portrait.segment import Segmentation
+from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
@@ -69,7 +69,7 @@ log = logging.getLogger(LOGGER_NAME)
 class PhotoFace:
     """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'.
 
-    `name` is for messages. `facts` say how far it can be relied on; there are none of a face that was given.
+    `name` is for messages. `facts` say how far it can be relied on; those of a frame leave out its own matte.
     """
 
     tag: str
@@ -80,19 +80,22 @@ class PhotoFace:
     number: int = 0  # from the left
 
     def see(self, segmentation: Segmentation) -> None:
-        """Learn the facts of its person's matte, and where that touches the frame."""
+        """Add the facts of its person's matte, and where that touches the frame."""
         if self.facts:
             self.facts.update(segmentation.facts)
             self.touches.update(touched_sides(segmentation.matte))
 
-    def rated(self) -> dict[str, Any]:
-        """The confidence for the report, said in a line, too."""
+    def rated(self, quiet: bool = False) -> dict[str, Any]:
+        """Rate the face for the report, and unless `quiet` in a line."""
         if not self.facts:
             return {}
         confidence = confidence_of(self.facts)
         touches = [f"touches the frame: {', '.join(self.touches)}"] if self.touches else []
         why = ", ".join([*(SCALES[name].said or name for name in confidence.reasons), *touches])
-        log.info("%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else "")
+        if not quiet:
+            log.info(
+                "%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else ""
+            )
         factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
         rated = {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
         return rated | ({"touches_frame": self.touches} if self.touches else {})
@@ -112,9 +115,9 @@ class FittedFace(PhotoFace):
         return self.head.fit
 
     def described(self) -> dict[str, Any]:
-        """The face's entries in the report; its confidence is said in a line, too."""
+        """Describe the face for the report, and unless it is of a shot in a line."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
-        return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated()}
+        return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated(quiet=self.steady is not None)}
 
 
 @step("load")
@@ -185,7 +188,8 @@ def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[
 
     So the first one's files are written last, and mark the photo as finished.
     """
-    matte, found = person_matte(item, image.pixels, options), find_people(item, image, options, True)
+    matte = person_matte(item, image.pixels, options)
+    found = find_people(item, image, options, matte, True)
     return (_fitted(found.pop(), image, options, matte) for _ in range(len(found)))
 
 
@@ -197,38 +201,65 @@ def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[Fit
 def write_each(
     item: Item, image: LinearImage, options: PhotoOptions, write: Callable[[FittedFace], dict[str, Any]]
 ) -> tuple[list[str], dict[str, Any]]:
-    """Fit and write one face after the other; return their tags, and the entries that `write` gives."""
-    made = [(face.tag, write(face)) for face in fit_each(item, image, options)][::-1]
+    """Fit, write and rate one face after the other.
+
+    Return their tags and their entries in the report, to which `write` may add.
+    """
+    made: list[tuple[str, dict[str, Any]]] = []
+    people = load_models_once(options).networks.people
+    for face in fit_each(item, image, options):
+        added, landmarks_px = write(face), face.fit.crop.to_photo(face.head.landmarks_px)
+        face.see(segment(people, to_display(image.pixels), landmarks_px, face.matte, face.head.others))
+        made.insert(0, (face.tag, face.described() | added))
     return [tag for tag, _ in made], facts_of([facts for _, facts in made], options)
 
 
-def facts_of_found(faces: Sequence[PhotoFace], options: PhotoOptions) -> dict[str, Any]:
-    """The report's entries of a photo whose faces were only found."""
-    return facts_of([face.rated() for face in faces], options)
-
-
 def find_people(
-    item: Item, image: LinearImage, options: PhotoOptions, to_fit: bool = False
+    item: Item, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None, to_fit: bool = False
 ) -> list[PhotoFace]:
-    """Find the faces that the options choose, from left to right, with landmarks or what a fit needs."""
+    """Find the faces that the options choose, from left to right, with landmarks or what a fit needs.
+
+    Raises InputError for given landmarks, or a given matte [H, W], that do not show the face.
+    """
+    models = load_models_once(options)
     faces: Sequence[FaceBox]
     if options.landmarks is not None:
-        faces = [_given(item, image, options.landmarks)]
+        path = companion(item, options.landmarks, "--landmarks")
+        landmarks_px = read_landmarks(path)
+        with naming(path):
+            faces = [face_with(models.networks.people, to_display(image.pixels), landmarks_px)]
     else:
         geometry = options.geometry if to_fit else "landmarks"
-        path = str(item.input_path)
-        faces = find_faces(load_models_once(options), image.pixels, options.face, geometry, path)
+        faces = find_faces(models, image.pixels, options.face, geometry, str(item.input_path))
     found = []
     for face in faces:
         name, number, (left, top, right, bottom) = str(item.input_path), face.number, face.box_px
         if len(faces) > 1:
             x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
             name += f": face {number} from the left, at x {x_px}, y {y_px} px"
-        facts = {} if face.view is None else face_facts(face.view, image.pixels)
+        facts = facts_of_face(item, face, image.pixels, options, matte)
         found.append(
             PhotoFace(f"_face{number}" if options.face == "all" else "", name, face, facts, number=number)
         )
     return found
+
+
+def facts_of_face(
+    item: Item, face: FaceBox, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
+) -> dict[str, float]:
+    """Measure a face in a photo [H, W, 3], its turn by the face model, and its matte [H, W] if that is given.
+
+    Raises InputError for a matte that does not show it.
+    """
+    if (view := face.view) is None:
+        return {}
+    crop = from_landmarks(view.landmarks_px[:68], load_models_once(options).sides().crop_px)
+    in_crop = crop.to_crop(view.landmarks_px[:68])
+    trust = trust_inside(in_crop, crop, *photo.shape[:2])
+    fit = fit_landmarks(face_model(options), in_crop, crop, trust=trust)
+    facts = face_facts(view, photo) | {"turned": abs(rotation_to_pose(fit.rotation)[0])}
+    with naming(matte_path(item, options)):
+        return facts if matte is None else facts | given_matte_facts(view, matte)
 
 
 def fit_facts(fit: FaceFit) -> dict[str, Any]:
@@ -259,14 +290,6 @@ def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> 
     return Provenance(item.input_path.name, checkpoint_name, **stamp_of_model, key=item.key).attributes()
 
 
-def _given(item: Item, image: LinearImage, landmarks: Path) -> Face:
-    """The face whose landmarks a file holds, or a folder for this photo."""
-    path = companion(item, landmarks, "--landmarks")
-    landmarks_px = read_landmarks(path)
-    with naming(path):
-        return face_at(check_in_photo(landmarks_px, *image.pixels.shape[:2]))
-
-
 def _fitted(
     face: PhotoFace, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
 ) -> FittedFace:
@@ -285,17 +308,7 @@ def fitted_face(face: PhotoFace, head: Head, matte: np.ndarray | None) -> Fitted
             face.name,
             100 * head.fit.error_iod,
         )
-    yaw_deg = rotation_to_pose(head.fit.rotation)[0]
-    if abs(yaw_deg) > SUPPORTED_YAW_DEG:
-        log.warning(
-            "%s: the head is turned by %.0f degrees; beyond %.0f it may fail: look at it with "
-            "`facerf fit-geometry`",
-            face.name,
-            abs(yaw_deg),
-            SUPPORTED_YAW_DEG,
-        )
-    facts = face.facts | ({"turned": abs(yaw_deg)} if face.facts else {})
-    return FittedFace(face.tag, face.name, face.found, facts, number=face.number, head=head, matte=matte)
+    return FittedFace(face.tag, face.name, face.found, face.facts, number=face.number, head=head, matte=matte)
 
 
 def read_matte(item: Item, given: Path, size_px: tuple[int, ...], in_shot: bool = False) -> np.ndarray:
@@ -327,6 +340,11 @@ def read_normals(item: Item, given: Path | None, size_px: tuple[int, ...]) -> np
         return unit_normals(normals, (size_px[0], size_px[1]))
 
 
+def matte_path(item: Item, options: PhotoOptions) -> Path:
+    """The file of a photo's `--person`; of a model's matte, and where none is given, the photo."""
+    return item.input_path if options.person is None else companion(item, options.person, "--person")
+
+
 def person_matte(
     item: Item, pixels: np.ndarray, options: PhotoOptions, in_shot: bool = False
 ) -> np.ndarray | None:
@@ -335,11 +353,11 @@ def person_matte(
     Raises InputError where that of a photo alone is black, or that of `--person` nowhere white.
     """
     height, width = pixels.shape[:2]
+    path = matte_path(item, options)
     if options.person is not None:
-        path = companion(item, options.person, "--person")
         matte = _grey_or_alpha(path, (height, width), _WHITE)
     elif options.matte_from is not None:
-        path, matte = item.input_path, matte_by_rembg(to_display(pixels), options.matte_from)
+        matte = matte_by_rembg(to_display(pixels), options.matte_from)
     else:
         return None
     scale = height / len(matte)

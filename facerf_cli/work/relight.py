@@ -92,7 +92,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
     else:
         image = read_photo(item, plan.photo)
         matte = person_matte(item, image.pixels, plan.photo)
-        faces = find_people(item, image, plan.photo, to_fit=True)
+        faces = find_people(item, image, plan.photo, matte, to_fit=True)
     photo, background = image.pixels, options.background.kind
     normals = read_normals(item, options.normals_from, photo.shape[:2])
     check_faces(item, [face.number for face in faces], plan)
@@ -159,14 +159,13 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
 def _described(
     face: PhotoFace, person: Person, matte: np.ndarray | None, options: RelightOptions
 ) -> FittedFace:
-    """The face of a person, with what is known of its fit and its matte, if that was not given."""
+    """The face of a person, with what is known of its fit and its matte."""
     if isinstance(face, FittedFace):
         return face
     found = fitted_face(face, person.head, matte)
     if person.balance is not None and person.balance.is_far and options.white == "photo":
         log.info("%s: its light has a strong colour (--white scene takes it out)", face.name)
-    if options.composite == "photo" and matte is None:
-        found.see(person.segmentation)
+    found.see(person.segmentation)
     return found
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
+from facerf_cli.errors import InputError
 from facerf_cli.face.fit import save_fit
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
@@ -28,8 +29,7 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
-    facts_of_found,
-    facts_of_networks,
+    facts_of,
     find_people,
     load_models_once,
     person_matte,
@@ -42,6 +42,7 @@ from facerf_cli.work.plan import KEPT_PX, canvas
 from facerf_cli.work.sequence import open_at
 from facerf_cli.work.shots import Shots
 
+_SHOWS_PERSON = 0.5  # share of a pixel from which on a cut-out is not empty
 _SHOWN = 0.55  # share of the class's colour in the overlay
 _OVERLAY_PX = 1600  # largest side of the overlay
 _DOT = 0.004  # side of a landmark in the overlay, in sides of the photo
@@ -56,19 +57,22 @@ def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[lis
     """
     if place := open_at(shots, item, options):
         shot, number = place
-        image, face, found = shot.segmented(number)
-        _write_segment(item, "", image, to_display(image.pixels), face, found)
-        return [""], facts_of_networks(options)
+        image, person, found = shot.segmented(number)
+        assert isinstance(person.found, Face)
+        _write_segment(item, "", image, to_display(image.pixels), person.found, found)
+        return [""], facts_of([person.rated(quiet=True)], options)
     image = read_photo(item, options, KEPT_PX + 4)  # a class, too
     display = to_display(image.pixels)
-    people = find_people(item, image, options)
     networks, matte = load_models_once(options).networks.people, person_matte(item, image.pixels, options)
+    people = find_people(item, image, options, matte)
     for person in reversed(people):
         assert isinstance(person.found, Face)
-        found = segment(networks, display, person.found.landmarks_px, matte)
+        found = segment(networks, display, person.found.landmarks_px, matte, person.found.others)
         person.see(found)
+        if not (found.cut(image.alpha).matte > _SHOWS_PERSON).any():
+            raise InputError(f"{person.name}: no person is cut out; pass a matte by --person")
         _write_segment(item, person.tag, image, display, person.found, found)
-    return [person.tag for person in people], facts_of_found(people, options)
+    return [person.tag for person in people], facts_of([face.rated() for face in people], options)
 
 
 def _write_segment(
@@ -125,7 +129,7 @@ def write_fits(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, 
 
     def write(face: FittedFace) -> dict[str, Any]:
         _write_fit(item, image, face, options)
-        return face.described()
+        return {}
 
     return write_each(item, image, options, write)
 

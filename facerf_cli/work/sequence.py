@@ -19,7 +19,7 @@ from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.film import Film
 from facerf_cli.files.read import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709, unit_floats
-from facerf_cli.portrait.find import Face, face_at
+from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import described_file
@@ -28,13 +28,17 @@ from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
     FittedFace,
+    PhotoFace,
     companion,
+    facts_of_face,
     load_models_once,
+    naming,
     person_matte,
     read_photo,
 )
 from facerf_cli.work.shots import Shot, Shots
 
+_WHOLE = 0.9  # largest value of a matte from which on the person is all there
 _DECODED = 12  # frames of a film that are kept as they were decoded
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
@@ -202,7 +206,8 @@ def _follow(shot: Shot, track: ShotTrack, options: PhotoOptions) -> None:
             seen = follower.see(image)
         else:
             path = companion(shot.frames[number], options.landmarks, "--landmarks")
-            seen = Sighting(read_landmarks(path), 0.0)
+            with naming(path):
+                seen = Sighting(face_with(networks, image, read_landmarks(path)).landmarks_px, 0.0)
         track.add(seen, cut)
 
 
@@ -274,23 +279,36 @@ class OpenShot:
             self._steady = SteadyShot(models, self.frames, sightings, sides, mattes, self._white)
         return self._steady
 
-    def segmented(self, number: int) -> tuple[LinearImage, Face, Segmentation]:
+    def _facts_of(self, number: int, landmarks_px: np.ndarray) -> dict[str, float]:
+        """Measure the face of a frame, and a given matte unless it is faint; see `facts_of_face`."""
+        if self.track.sightings[number] is None:
+            return {"unclear": 1.0}  # filled in
+        item, pixels, options = self.shot.frames[number], self.frames[number], self._options
+        face = face_with(load_models_once(options).networks.people, to_display(pixels), landmarks_px)
+        matte = person_matte(item, pixels, options, in_shot=True)
+        shown = matte is not None and matte.max() > _WHOLE
+        return facts_of_face(item, face, pixels, options, matte if shown else None)
+
+    def segmented(self, number: int) -> tuple[LinearImage, PhotoFace, Segmentation]:
         """A frame, its face, and its person, steadied by the frames around it."""
         take = self.take_of(number)
         with self._naming(number):
             face, found = face_at(take.landmarks_px(number)), take.segmentation(number)
-        return self.frames.image(number), face, found
+            facts = self._facts_of(number, face.landmarks_px)
+        person = PhotoFace("", str(self.shot.frames[number].input_path), face, facts)
+        return self.frames.image(number), person, found
 
     def fitted(self, number: int, portrait: bool = True) -> tuple[LinearImage, FittedFace]:
         """A frame, and its head with what is steadied by the frames around it; see `SteadyShot.window`."""
         take = self.take_of(number)
         with self._naming(number):
             steady = take.window(number, portrait)
-        head, matte = steady.head, steady.segmentation.matte
-        found = face_at(head.fit.crop.to_photo(head.landmarks_px))
+            head, matte = steady.head, steady.segmentation.matte
+            found = face_at(head.fit.crop.to_photo(head.landmarks_px))
+            facts = self._facts_of(number, found.landmarks_px)
         which, name = self._options.face, str(self.shot.frames[number].input_path)
         left = int(which) if which.isdecimal() else 0
-        face = FittedFace("", name, found, number=left, head=head, steady=steady, matte=matte)
+        face = FittedFace("", name, found, facts, number=left, head=head, steady=steady, matte=matte)
         return self.frames.image(number), face
 
     @contextmanager

@@ -62,7 +62,7 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             write_page(
                 page, item, work.photo, image.pixels, face, work.size_px, work.white, work.normals_from
             )
-        return face.described()
+        return {}
 
     tags, facts = write_each(item, image, work.photo, write)
     return tags, facts | {"lights": len(directions)}

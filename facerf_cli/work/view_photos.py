@@ -58,7 +58,7 @@ def write_pages(
     def write(face: FittedFace) -> dict[str, Any]:
         path = item.output(face.tag + ".html")
         write_page(path, item, options, image.pixels, face, size_px, white, normals_from)
-        return face.described()
+        return {}
 
     return write_each(item, image, options, write)
 

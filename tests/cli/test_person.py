@@ -16,6 +16,7 @@ from skimage.data import astronaut as photograph
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display
@@ -107,6 +108,32 @@ def test_a_relit_person_is_that_of_the_matte_and_another_matte_multiplies_it(
     layers = exr_layers(tmp_path / "out/me_light_70_20.0000.exr")
     assert np.abs(layers["A"] - part * ellipse()).max() < 2 * EIGHT_BITS
     assert (layers["A"] == layers["person.A"]).all()
+
+
+def test_an_inverted_matte_fails_in_photos_and_shots(given: Path, tmp_path: Path, capsys: Said) -> None:
+    photo = given / "plates/me.0000.png"
+    for number in range(2):
+        save(tmp_path / f"inverted/me.{number:04d}.png", 1 - ellipse(0.02 * number))
+    for line in ((photo,), (given / "plates", "--sequence")):
+        assert facerf("segment", *line, "--person", tmp_path / "inverted", "-o", tmp_path / "out") == 1
+        said = " ".join(capsys.readouterr().err.split())
+        assert "inverted" in said and "me.0000.png" in said
+    assert not list((tmp_path / "out").glob("*_person.png"))
+
+
+def test_frames_of_a_sequence_are_rated_and_landmarks_off_the_face_fail_it(
+    given: Path, tmp_path: Path, capsys: Said
+) -> None:
+    line = ("segment", given / "plates", "--sequence")
+    assert facerf(*line, "-o", tmp_path / "out") == 0
+    rows = [json.loads(row) for row in (tmp_path / "out/report.jsonl").read_text().splitlines()]
+    assert [row["certainty"] for row in rows] == ["sure", "sure"]
+    points = read_landmarks(tmp_path / "out/me.0000_landmarks.json")
+    (tmp_path / "half.json").write_text(json.dumps((points / 2).tolist()))
+    capsys.readouterr()
+    assert facerf(*line, "--landmarks", tmp_path / "half.json", "-o", tmp_path / "half") != 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "half.json" in said and "0.50" in said
 
 
 def test_the_portrait_field_is_of_the_given_person() -> None:

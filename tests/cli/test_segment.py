@@ -39,15 +39,64 @@ def test_every_file_is_there_and_its_landmarks_serve_as_input(cut: Path, tmp_pat
     assert row["outputs"] == [f"astronaut{ending}" for ending in ENDINGS]
     assert all((cut / name).is_file() for name in row["outputs"])
     assert 0 < row["confidence"] <= 1 and row["certainty"] in ("sure", "unsure", "doubtful")
-    assert set(row["factors"]) == set(SCALES) - {"turned"}  # no head was fitted
+    of_given_matte = {"masked", "misplaced"}
+    assert set(row["factors"]) == set(SCALES) - of_given_matte
     assert set(row["touches_frame"]) == {"bottom"}
     document = json.loads((cut / "astronaut_landmarks.json").read_text())
     assert len(document["landmarks"]) == len(document["expected_error_px"]) == 68
     assert "left iris" in document["more"]
     given = str(cut / "astronaut_landmarks.json")
     assert main(["segment", str(PHOTO), "-o", str(tmp_path), "--landmarks", given]) == 0
-    row = json.loads((tmp_path / "report.jsonl").read_text())
-    assert "confidence" not in row  # they are the user's
+    again = json.loads((tmp_path / "report.jsonl").read_text())
+    assert again["certainty"] == row["certainty"]
+    assert again["confidence"] == pytest.approx(row["confidence"], abs=0.02)
+
+
+def test_landmarks_of_the_photo_at_half_size_fail_and_the_cause_is_named(
+    cut: Path, tmp_path: Path, capsys: Said
+) -> None:
+    points = read_landmarks(cut / "astronaut_landmarks.json")
+    for name, wrong, cause in (
+        ("half", points / 2, "0.50"),
+        ("swapped", points[:, ::-1], "x and y"),
+        ("outside", 3 * points, "3.00"),
+    ):
+        (tmp_path / f"{name}.json").write_text(json.dumps(wrong.tolist()))
+        line = ["segment", str(PHOTO), "--landmarks", str(tmp_path / f"{name}.json")]
+        assert main([*line, "-o", str(tmp_path / "out")]) == 1
+        said = " ".join(capsys.readouterr().err.split())
+        assert f"{name}.json" in said and cause in said
+    assert not list((tmp_path / "out").glob("*.png"))
+
+
+def test_no_empty_cut_out_is_written(tmp_path: Path, capsys: Said) -> None:
+    """The photo's own alpha hides the person."""
+    photo = read_image(PHOTO).pixels
+    alpha = np.zeros(photo.shape[:2], np.float32)
+    alpha[:20, -20:] = 1
+    write_display(tmp_path / "hidden.png", photo, 0.0, alpha)
+    assert main(["segment", str(tmp_path / "hidden.png"), "-o", str(tmp_path / "out")]) == 1
+    assert "hidden.png" in (said := capsys.readouterr().err) and "--person" in said
+    assert not list((tmp_path / "out").glob("*.png"))
+
+
+@pytest.mark.slow
+def test_all_commands_rate_a_person_alike(two_people: Path, tmp_path: Path) -> None:
+    rows = {}
+    for verb, *line in (
+        ("segment",),
+        ("fit-geometry",),
+        ("view",),
+        ("predict-olat", "--lights", "4", "--frame", "uv"),
+        ("relight", "--light", "40,10", "--composite", "face", "--reflectance", "field"),
+    ):
+        output = tmp_path / verb
+        assert main([verb, str(two_people), "--face", "1", *line, "-o", str(output)]) == 0
+        rows[verb] = json.loads((output / "report.jsonl").read_text())
+    for verb, row in rows.items():
+        assert row["certainty"] == rows["segment"]["certainty"], verb
+        for name, factor in rows["segment"]["factors"].items():
+            assert row["factors"][name] == pytest.approx(factor, abs=0.02), (verb, name)
 
 
 def test_one_file_is_that_of_the_folder(cut: Path, tmp_path: Path, capsys: Said) -> None:
@@ -119,13 +168,19 @@ def test_classes_sum_to_the_matte_and_lie_where_face_hair_and_garment_are(
     assert layers["person.A"][5, -5] < 0.5  # the flag behind her is no part of her
 
 
-def test_a_person_before_another_is_not_sure_and_the_line_says_why(tmp_path: Path, capsys: Said) -> None:
+@pytest.fixture
+def two_people(tmp_path: Path) -> Path:
     """The same photo twice, one over the other: the second head touches the first's."""
     photo = read_image(PHOTO).pixels
     right = np.roll(photo, 80, 1)
-    both = np.where(np.arange(photo.shape[1])[:, None] < 225, photo, right)
-    write_display(tmp_path / "both.png", both)
-    assert main(["segment", str(tmp_path / "both.png"), "-o", str(tmp_path), "--face", "0"]) == 0
+    write_display(tmp_path / "both.png", np.where(np.arange(photo.shape[1])[:, None] < 225, photo, right))
+    return tmp_path / "both.png"
+
+
+def test_a_person_before_another_is_not_sure_and_the_line_says_why(
+    two_people: Path, tmp_path: Path, capsys: Said
+) -> None:
+    assert main(["segment", str(two_people), "-o", str(tmp_path), "--face", "0"]) == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert row["certainty"] != "sure" and row["factors"]["disputed"] < 0.6
     line = capsys.readouterr().err
