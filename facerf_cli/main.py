@@ -28,7 +28,6 @@ from facerf_cli.cli.brief import Verb, Verbs
 from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, UsageError
-from facerf_cli.files.atomic import remove_own
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals
@@ -323,7 +322,6 @@ def main(arguments: Sequence[str]) -> int:
         try:
             code = app(args=line, prog_name="facerf", standalone_mode=False)
         finally:
-            remove_own()
             end_again()
         sys.stdout.flush()
         if code == 130:  # typer turns Ctrl-C into this exit code

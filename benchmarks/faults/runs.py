@@ -169,7 +169,7 @@ def start(line: Sequence[str], before: Callable[[], None], notes: Path | None) -
     except BaseException:
         traceback.print_exc()
     finally:
-        atomic.remove_own()  # as at the exit of a process that is no fork
+        atomic._remove_own()  # as at the exit of a process that is no fork
         os._exit(code)
 
 

@@ -3,24 +3,28 @@
 Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an input fills.
 """
 
+import atexit
 import glob
 import logging
 import os
 import re
+import shutil
 import sys
+import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.atomic import folder_of_run
 from facerf_cli.files.texts import LIMIT_BYTES
 from facerf_cli.option import flag
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
+from facerf_cli.run.stopping import clean_by
 
 OF_PHOTOS = ("dir", "parent", "stem", "ext")
 OF_FILES = (*OF_PHOTOS, "frame")
@@ -342,16 +346,34 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
             yield from sorted(glob.glob(entry)) or [entry]
 
 
-def _from_stdin(null_separated: bool) -> list[str]:
-    """List the names on standard input, or the file that an image there is copied to: its first bytes decide.
+def is_pattern(text: str) -> bool:
+    """True for the names of several files: `plate.%04d.exr`, `plate.####.exr`, `plate.1-9.exr`, `plate.*`."""
+    return any(form.fullmatch(text) for form in (_FRAMES, _NUMBERED)) or glob.has_magic(text)
 
-    The file is temporary. Raises UsageError for other data, such as a video.
+
+def numbered_images(text: str, output: Path) -> tuple[Path, ...]:
+    """List the images of a folder or pattern by the numbers in their names; UsageError if one is missing."""
+    found = [item.input_path for item in collect_items([text], output)]
+    if missing := [path for path in found if not path.is_file()]:
+        raise UsageError(f"{missing[0]}: no such file; check {text}")
+    return tuple(sorted(found, key=lambda path: _DIGITS.sub(lambda digits: digits[0].zfill(20), str(path))))
+
+
+def _from_stdin(null_separated: bool) -> list[str]:
+    """List the names on standard input; or copy an image from there to a file, which goes with the process.
+
+    The first bytes decide. Raises UsageError for other data, such as a video.
     """
     stream = sys.stdin.buffer
     content = stream.read(LIMIT_BYTES + 1)
     for suffix, start in _STARTS.items():
         if re.match(start, content[:_START_BYTES], re.DOTALL):
-            path = folder_of_run("stdin") / f"stdin{suffix}"
+            folder = tempfile.mkdtemp(prefix="facerf-stdin-")
+            remove = partial(shutil.rmtree, folder, ignore_errors=True)
+            atexit.register(remove)
+            clean_by(remove)
+            path = Path(folder, "stdin", f"stdin{suffix}")  # {parent} is stdin
+            path.parent.mkdir()
             with path.open("wb") as file:
                 while content:
                     file.write(content)
@@ -359,17 +381,16 @@ def _from_stdin(null_separated: bool) -> list[str]:
                         raise UsageError("-: an image of more than 1 GiB; pass the file by its name")
                     content = stream.read(LIMIT_BYTES)
             return [str(path)]
-    names = [""]
     is_utf16 = re.match(rb"\xff\xfe.\0|\xfe\xff\0.", content, re.DOTALL)
-    if len(content) <= LIMIT_BYTES and not is_utf16 and (null_separated or b"\0" not in content):
-        text = os.fsdecode(content).removeprefix("\ufeff")
-        lines = text.split("\0") if null_separated else [one.rstrip("\r") for one in text.split("\n")]
-        names = list(filter(None, lines))
-    if sum(map(os.path.lexists, names)) < _LEAST_FOUND * len(names):
+    is_text = len(content) <= LIMIT_BYTES and not is_utf16 and (null_separated or b"\0" not in content)
+    text = os.fsdecode(content).removeprefix("\ufeff") if is_text else "\0"
+    names = text.split("\0") if null_separated else [one.rstrip("\r") for one in text.split("\n")]
+    names = list(filter(None, names))
+    if not is_text or sum(map(os.path.lexists, names)) < _LEAST_FOUND * len(names):
+        start = f"it begins with {content[:_SHOWN_BYTES]!r}"
         raise UsageError(
-            f"-: standard input is neither an image nor a list of existing files in UTF-8 (it begins with "
-            f"{content[:_SHOWN_BYTES]!r}); pass other files, such as videos, by name, and a list of names "
-            "that end in NUL with -0"
+            f"-: standard input is neither an image nor a list of existing files in UTF-8 ({start}); pass "
+            "videos by name, and names that end in NUL with -0"
         )
     return names
 

@@ -36,15 +36,7 @@ from facerf_cli.files.atomic import all_or_none, alone_in, atomic_path, sweep_le
 from facerf_cli.files.texts import is_regular, require_regular
 from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
-from facerf_cli.run.logs import (
-    LOGGER_NAME,
-    STDERR,
-    as_named,
-    escaped,
-    printable_line,
-    progress_bar,
-    unexpected,
-)
+from facerf_cli.run.logs import LOGGER_NAME, STDERR, escaped, named, printable_line, progress_bar, unexpected
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, ending, process_died, spread
 
@@ -169,7 +161,7 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
     row = {
         "verb": verb,
         "item": result.item.name,
-        "input": as_named(result.item.input_path.as_posix()),
+        "input": named(result.item.input_path.as_posix()),
         "status": "failed" if result.error else "done",
         "seconds": result.seconds,
         "error": printable_line(result.error) or None,
@@ -439,7 +431,7 @@ def _log_to_make_again(reasons: Counter[str]) -> None:
 def _list_what_would_be_done(todo: Sequence[Item], finished: Sequence[Item], job: Job) -> int:
     for item in todo:
         for path in job.outputs_of(item):
-            print_path(as_named(f"{item.input_path} -> {path}"))
+            print_path(named(f"{item.input_path} -> {path}"))
     log.info("dry run: %d to do, %d already finished", len(todo), len(finished))
     missing = [item for item in (*todo, *finished) if item.is_file and not os.path.exists(item.input_path)]
     for item in missing:

@@ -17,7 +17,6 @@ import os
 import platform
 import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -75,30 +74,18 @@ def atomic_path(path: Path) -> Iterator[Path]:
 def hidden_folder(path: Path) -> Iterator[Path]:
     """Yield a hidden folder next to an output, of this process alone, which goes with the block."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    room = _new_room(path)
+    if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # for each file it would be quadratic
+        _swept.add(absolute)
+        sweep_leftovers(path.parent)
+    name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
+    room = path.parent / name
+    _open.add(room)
     try:  # before it is there: an interrupt may come at any time
         room.mkdir(mode=0o700)
         yield room
     finally:
         shutil.rmtree(room, ignore_errors=True)
         _open.discard(room)
-
-
-def folder_of_run(name: str) -> Path:
-    """Create a folder of some name in a hidden, temporary one, which `remove_own` removes as the run ends."""
-    folder = _new_room(Path(tempfile.gettempdir(), name)) / name
-    folder.mkdir(mode=0o700, parents=True)
-    return folder
-
-
-def _new_room(path: Path) -> Path:
-    """Choose the hidden folder next to an output; remove what killed processes left there."""
-    if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # for each file it would be quadratic
-        _swept.add(absolute)
-        sweep_leftovers(path.parent)
-    name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
-    _open.add(room := path.parent / name)
-    return room
 
 
 @contextmanager
@@ -124,14 +111,14 @@ def sweep_leftovers(folder: Path) -> None:
                 _remove(Path(entry.path))
 
 
-def remove_own() -> None:
-    """Remove what this process is writing, and its temporary folders."""
+def _remove_own() -> None:
+    """Remove what this process is writing."""
     for room in list(_open):
         shutil.rmtree(room, ignore_errors=True)
 
 
-clean_by(remove_own)
-atexit.register(remove_own)  # what a Ctrl-C in the midst of removing it has left
+clean_by(_remove_own)
+atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
 
 
 def _machine() -> str:

@@ -25,7 +25,7 @@ from facerf_cli.batch.settings import Overwrite
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import BATCH, option
-from facerf_cli.run.logs import LOGGER_NAME, as_named
+from facerf_cli.run.logs import LOGGER_NAME, named
 from facerf_cli.work.output_options import Format
 from facerf_cli.work.photo_options import PhotoOptions
 
@@ -236,7 +236,7 @@ class FilmOutput:
         if self.rate and shots and shots[0].film:
             raise UsageError("--fps: a film keeps its own times; leave it out")
         if batch.dry_run:
-            print(as_named(f"{items[0].input_path} -> {self.path}"))
+            print(named(f"{items[0].input_path} -> {self.path}"))
             return ""
         from facerf_cli.files.film_writer import check_writable
 

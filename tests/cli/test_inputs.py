@@ -4,9 +4,11 @@ import io
 import json
 import logging
 import os
+import subprocess
 import sys
 import unicodedata
 from pathlib import Path, PurePosixPath
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -25,7 +27,6 @@ from facerf_cli.batch.inputs import (
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.atomic import remove_own
 from facerf_cli.main import main
 from facerf_cli.work.photo_options import PhotoOptions, check_companion
 from facerf_cli.work.photos import companion
@@ -128,7 +129,7 @@ def test_outputs_and_contact_sheets_are_no_inputs(photos: Path, tmp_path: Path) 
 
 
 def pipe(monkeypatch: Patch, content: bytes) -> None:
-    """Let standard input hold some bytes."""
+    """Let standard input hold some bytes; temporary files are not removed before the tests end."""
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
 
 
@@ -177,8 +178,6 @@ def test_the_first_bytes_tell_an_image_on_stdin(start: bytes, suffix: str, monke
     pipe(monkeypatch, start + bytes(5000))
     (path,) = map(Path, expand_inputs(["-"]))
     assert path.name == f"stdin{suffix}" and path.read_bytes() == start + bytes(5000)
-    remove_own()
-    assert not path.parents[1].exists()
 
 
 @pytest.mark.parametrize(
@@ -211,7 +210,6 @@ def test_what_stdin_may_hold_is_bounded(monkeypatch: Patch) -> None:
         pipe(monkeypatch, content)
         with pytest.raises(UsageError, match=said):
             list(expand_inputs(["-"]))
-    remove_own()
 
 
 def test_an_image_on_stdin_is_not_named_by_its_temporary_file(
@@ -227,18 +225,41 @@ def test_an_image_on_stdin_is_not_named_by_its_temporary_file(
         streams = capsys.readouterr()
         lines = streams.out + streams.err
         assert said in lines and str(temporary) not in lines
-        assert not list(temporary.iterdir())
     for _ in range(2):
         pipe(monkeypatch, b"\x89PNG of toys")
         assert toy_batch.run(Path("-"), out) == 0
         assert (tmp_path / "written").read_text() == "stdin\n"
-        remove_own()
     assert "already finished" in capsys.readouterr().err
     (row,) = map(json.loads, (out / "report.jsonl").read_text().splitlines())
     assert (row["item"], row["input"]) == ("stdin", "-")
     pipe(monkeypatch, b"\x89PNG")
     assert names(tmp_path, Path("-"), pattern="{parent}-{stem}-{ext}") == ["stdin-stdin-png"]
-    remove_own()
+
+
+@pytest.mark.parametrize("unwinds", [True, False])
+def test_an_image_on_stdin_goes_with_its_process(tmp_path: Path, unwinds: bool) -> None:
+    code = """if True:
+        import sys, time
+        from facerf_cli.batch.inputs import expand_inputs
+        from facerf_cli.run.stopping import end_on_signals
+        end_on_signals(0.1)
+        print(*expand_inputs(["-"]), flush=True)
+        try:
+            time.sleep(60)
+        except SystemExit:
+            if sys.argv[1] == "True":
+                raise
+            time.sleep(60)
+    """
+    command = [sys.executable, "-c", code, str(unwinds)]
+    settings = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, env=settings, stdin=PIPE, stdout=PIPE) as process:
+        assert process.stdin and process.stdout
+        process.stdin.write(b"\x89PNG")
+        process.stdin.close()
+        assert Path(process.stdout.readline().decode().strip()).read_bytes() == b"\x89PNG"
+        process.terminate()
+    assert process.returncode == 143 and not list(tmp_path.iterdir())
 
 
 def test_frames(tmp_path: Path) -> None:
