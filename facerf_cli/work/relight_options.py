@@ -141,16 +141,16 @@ class RelightOptions:
     """The options that images share.
 
     Attributes:
-        rig: Approximate maps by a rig of N lights, or by a file of directions.
+        rig: Approximate maps by a rig of N lights, or by a file of directions (az,el or x y z; .lp).
         pose: Turn the head to a pose, in degrees; shows the face alone.
         reflectance: Relight the whole portrait, or the face by the paper's field; or by a baseline:
             diffuse-sh, specular-sh, prt.
         exposure: Expose PNG and JPEG by EV, or the face as in the photo (auto) or well lit (face).
         exposure_group: Share an exposure: of each photo, or the first one's by folder or sequence of frames.
         composite: Show the photo with its face relit, or the rendered face alone, with alpha.
-        background: Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which
-            keep their look; the envmap; or none (alpha). A folder or pattern (bg/{stem}.png) has an image for
-            each photo; a folder or numbers (bg/b.%04d.png) for each frame of a shot, in order.
+        background: Show behind the person the photo, an image, images by frame (bg/b.%04d.png) or name
+            (bg/{stem}.png), a folder of either, or a colour (#RRGGBB or linear R,G,B), which keep their look;
+            the envmap; or none (alpha).
         background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
         light_wrap: Let so much of the background's light run over the matte's edge; the EXR's layer wrap.
         match_tones: Keep a person in PNG and JPEG within the haze of the picture behind it.
