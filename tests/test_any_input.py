@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from facerf_cli.batch.inputs import NamePattern
 from facerf_cli.batch.settings import Shard
-from facerf_cli.capture.draft import read_light_list
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.light_files import (
@@ -22,7 +21,7 @@ from facerf_cli.files.light_files import (
     write_light,
 )
 from facerf_cli.files.spaces import space_of_profile
-from facerf_cli.files.texts import read_rig
+from facerf_cli.files.texts import read_light_list, read_rig
 from facerf_cli.light.entries import lit_images, parse_lights
 from facerf_cli.run.logs import escaped, json_line, printable_line
 from facerf_cli.work.output_options import parse_exposure

@@ -66,7 +66,8 @@ def _landmarks(path: Path) -> None:
 
 
 def _light_list(path: Path) -> None:
-    from facerf_cli.capture.draft import match_lights, read_light_list
+    from facerf_cli.capture.light_lists import match_lights
+    from facerf_cli.files.texts import read_light_list
 
     match_lights(read_light_list(path), ["a", "b"], {"image_00": "a"})
 

@@ -3,24 +3,30 @@
 Names of outputs may be patterns such as `{dir}/{stem}_{light}`, whose fields an input fills.
 """
 
+import atexit
 import glob
 import logging
 import math
 import os
 import re
+import shutil
 import sys
+import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from string import Formatter
 from typing import Any
 
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.texts import LIMIT_BYTES
 from facerf_cli.option import flag
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
+from facerf_cli.run.stopping import clean_by
 
 OF_PHOTOS = ("dir", "parent", "stem", "ext")
 OF_FILES = (*OF_PHOTOS, "frame")
@@ -44,6 +50,27 @@ _DIGITS = re.compile(r"(\d+)")
 _MOST_FRAMES = 100_000
 _MOST_NAMED = 8  # kinds of files, or folders, that a line names
 _LONGEST_PATH = 4096  # characters
+_START_BYTES, _SHOWN_BYTES = 4096, 40  # of standard input: what tells images, what a message shows
+_LEAST_FOUND = 0.1  # share of a list's names; data that is no list may name the folders . and /
+_MOST_IMAGE_BYTES = 1 << 30  # on standard input: the most pixels that are read, of four floats
+_STARTS = {  # the first bytes of images, by suffix
+    ".exr": rb"\x76\x2f\x31\x01",
+    ".hdr": rb"#\?(RADIANCE|RGBE)",
+    ".png": rb"\x89PNG",
+    ".jpg": rb"\xff\xd8\xff",
+    ".tif": rb"II[*+]\0|MM\0[*+]",
+    ".webp": rb"RIFF.{4}WEBP",
+    ".jxl": rb"\xff\x0a|\0\0\0\x0cJXL ",
+    ".heic": rb".{4}ftyp(hei[cmsx]|hevc|mif1|msf1)",
+    ".avif": rb".{4}ftypavi[fs]",
+    ".jp2": rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51",
+    ".psd": rb"8BPS\0",
+    ".bmp": rb"BM.{4}\0{4}",
+    ".gif": rb"GIF8[79]a",
+    ".dpx": rb"SDPX\0\0|XPDS..\0\0",
+    ".cin": rb"\x80\x2a\x5f\xd7|\xd7\x5f\x2a\x80",
+    ".ppm": rb"P[2356Ff](\s+(#[^\n]*\n\s*)*-?[\d.]+){3}\s",
+}
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -165,7 +192,7 @@ def collect_items(
 
     Folders are walked recursively for `suffixes`, and a file keeps the path that it has in its folder; a file
     that is named alone has its name only. So an item's place depends on no other input, and two that meet in
-    one place are refused. `-` reads paths from stdin. Hidden files and folders are left out, and so is an
+    one place are refused. `-` reads standard input. Hidden files and folders are left out, and so is an
     output folder inside an input folder. In a `sequence` images are named as frames: `shot_0001.png` as
     `shot.0001.png`.
     """
@@ -335,12 +362,10 @@ def _forms(name: str) -> list[str]:
 
 
 def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterator[str]:
-    """Yield the inputs, with the names on standard input in place of `-`, and files in place of frames."""
+    """Yield the inputs, with what standard input holds in place of `-`, and files in place of frames."""
     for entry in inputs:
         if entry == "-":
-            text = sys.stdin.read().removeprefix("\ufeff")
-            lines = text.split("\0") if null_separated else [one.rstrip("\r") for one in text.split("\n")]
-            yield from filter(None, lines)
+            yield from _from_stdin(null_separated)
         elif os.path.exists(entry) or len(entry) > _LONGEST_PATH:
             yield entry
         elif frames := _FRAMES.fullmatch(entry):
@@ -350,6 +375,54 @@ def expand_inputs(inputs: Sequence[str], null_separated: bool = False) -> Iterat
             yield from _numbered(entry, before, int(digits or len(marks or "")), after)
         else:
             yield from sorted(glob.glob(entry)) or [entry]
+
+
+def is_pattern(text: str) -> bool:
+    """True for the names of several files: `plate.%04d.exr`, `plate.####.exr`, `plate.1-9.exr`, `plate.*`."""
+    return any(form.fullmatch(text) for form in (_FRAMES, _NUMBERED)) or glob.has_magic(text)
+
+
+def numbered_images(text: str, output: Path) -> tuple[Path, ...]:
+    """List the images of a folder or pattern by the numbers in their names; UsageError if one is missing."""
+    found = [item.input_path for item in collect_items([text], output)]
+    if missing := [path for path in found if not path.is_file()]:
+        raise UsageError(f"{missing[0]}: no such file; check {text}")
+    return tuple(sorted(found, key=lambda path: _DIGITS.sub(lambda digits: digits[0].zfill(20), str(path))))
+
+
+def _from_stdin(null_separated: bool) -> list[str]:
+    """List the names on standard input; or copy an image from there to a file, which goes with the process.
+
+    The first bytes decide. Raises UsageError for other data, such as a video.
+    """
+    stream = sys.stdin.buffer
+    content = stream.read(LIMIT_BYTES + 1)
+    for suffix, start in _STARTS.items():
+        if re.match(start, content[:_START_BYTES], re.DOTALL):
+            folder = tempfile.mkdtemp(prefix="facerf-stdin-")
+            remove = partial(shutil.rmtree, folder, ignore_errors=True)
+            atexit.register(remove)
+            clean_by(remove)
+            path = Path(folder, "stdin", f"stdin{suffix}")  # {parent} is stdin
+            path.parent.mkdir()
+            with path.open("wb") as file:
+                while content:
+                    file.write(content)
+                    if file.tell() > _MOST_IMAGE_BYTES:
+                        raise UsageError("-: an image of more than 1 GiB; pass the file by its name")
+                    content = stream.read(LIMIT_BYTES)
+            return [str(path)]
+    is_utf16 = re.match(rb"\xff\xfe.\0|\xfe\xff\0.", content, re.DOTALL)
+    is_text = len(content) <= LIMIT_BYTES and not is_utf16 and (null_separated or b"\0" not in content)
+    text = os.fsdecode(content).removeprefix("\ufeff") if is_text else "\0"
+    names = text.split("\0") if null_separated else [one.rstrip("\r") for one in text.split("\n")]
+    names = list(filter(None, names))
+    if not is_text or sum(map(os.path.lexists, names)) < _LEAST_FOUND * len(names):
+        raise UsageError(
+            "-: standard input is neither an image nor a list of existing files in UTF-8 (it begins with "
+            f"{content[:_SHOWN_BYTES]!r}); pass videos by name, and names that end in NUL with -0"
+        )
+    return names
 
 
 def _range(entry: str, before: str, first: str, last: str, after: str) -> list[str]:

@@ -42,6 +42,7 @@ _OPTIONS = {
     "config": "--ocio",
     "data": "the data",
     "dataset_format": "facerf's version of datasets",
+    "frames": "the images of --background",
     "kind": "--background",
     "leaders": "the first photo of --exposure-group",
     "matte_model": "the model of --matte-from",

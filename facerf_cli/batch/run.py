@@ -50,6 +50,7 @@ from facerf_cli.run.logs import (
     STDERR,
     counted,
     escaped,
+    named,
     printable_line,
     progress_bar,
     unexpected,
@@ -182,7 +183,7 @@ def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
     row = {
         "verb": verb,
         "item": result.item.name,
-        "input": result.item.input_path,
+        "input": named(result.item.input_path.as_posix()),
         "status": "failed" if result.error else "done",
         "seconds": result.seconds,
         "error": printable_line(result.error) or None,
@@ -511,7 +512,7 @@ def _log_to_make_again(reasons: Counter[str]) -> None:
 def _list_what_would_be_done(stale: Mapping[Item, Mapping[Path, str]]) -> int:
     for item, paths in stale.items():
         for path in paths:
-            print_path(f"{item.input_path} -> {path}")
+            print_path(named(f"{item.input_path} -> {path}"))
     log.info("dry run: %s would be made", counted(sum(map(len, stale.values())), "result"))
     missing = [item for item in stale if item.is_file and not os.path.exists(item.input_path)]
     for item in missing:

@@ -18,13 +18,14 @@ from typing import Any
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.capture.capture import FIELDS, compile_pattern, require_pattern, unlisted_kind
-from facerf_cli.capture.light_lists import DraftLights, draft_lights, match_lights, read_light_list
+from facerf_cli.capture.light_lists import DraftLights, draft_lights, match_lights
 from facerf_cli.capture.metashape import read_metashape
 from facerf_cli.capture.stage_json import FACING, STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.image_metadata import Header, read_header
+from facerf_cli.files.texts import read_light_list
 from facerf_cli.image.colour import LINEAR, find_space
 from facerf_cli.run.logs import LOGGER_NAME, counted
 

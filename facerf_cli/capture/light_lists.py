@@ -1,31 +1,21 @@
 """Lists of a stage's lights beside its images, for drafts of `stage.json`.
 
-A text has lines `name x y z` or `x y z`, as LP files of reflectance transformation imaging, whose first line
-is the number of lines that follow. A JSON file holds a list of [x, y, z], or {name: [x, y, z]}, either of
-them maybe under "light_positions". Vectors are directions, or positions relative to the object. Where they
-lie on a sphere about another place, they are positions in the axes of the stage: in metres or, if that would
-be too large a stage, in millimetres.
+Vectors of a list (`files.texts.read_light_list`) are directions, or positions relative to the object. Where
+they lie on a sphere about another place, they are positions in the axes of the stage: in metres or, if that
+would be too large a stage, in millimetres.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from facerf_cli.errors import InputError
-from facerf_cli.files.texts import parse_json, read_text
+from facerf_cli.files.texts import ListedLight, Vector
 
-_LIMIT_BYTES = 4 << 20
 _DIGITS = 6
 _LARGEST_STAGE = 20.0  # radius in metres: larger ones are in millimetres
 _ASIDE, _OFF = 0.05, 0.1  # of the radius: a middle farther away is a place; lights are so near to the sphere
 _FEWEST = 8  # lights that determine a sphere
-
-Vector = list[float]
-ListedLight = tuple[str, Vector]  # name of an image, empty in a list without names
 
 
 @dataclass(frozen=True)
@@ -61,48 +51,6 @@ def sphere_middle(points: np.ndarray) -> np.ndarray:
     """The middle [3] of the sphere nearest to points [N, 3], by linear least squares."""
     terms = np.column_stack([2 * points, np.ones(len(points))])
     return np.asarray(np.linalg.lstsq(terms, (points**2).sum(1), rcond=None)[0][:3])
-
-
-def read_light_list(path: Path) -> list[ListedLight]:
-    """Read a list of lights; InputError names the first wrong line or entry."""
-    text = read_text(path, _LIMIT_BYTES, "give lines `name x y z`")
-    try:
-        rows = _rows_of_json(text) if path.suffix.lower() == ".json" else _rows_of_text(text)
-    except ValueError as error:
-        raise InputError(f"{path}: is no list of lights ({error}); give [[x, y, z], ...]") from None
-    lights: list[ListedLight] = []
-    for place, name, values in rows:
-        try:
-            x, y, z = values
-            vector = [float(x), float(y), float(z)]
-        except (ValueError, TypeError):
-            raise InputError(f"{path}: {place} is wrong; give `name x y z`") from None
-        if not 0 < math.hypot(*vector) < math.inf:
-            raise InputError(f"{path}: {place} has no direction; give a finite vector other than 0")
-        lights.append((name, vector))
-    return lights
-
-
-def _rows_of_text(text: str) -> list[tuple[str, str, Any]]:
-    """The place of each light, its name and its values."""
-    rows: list[tuple[str, str, Any]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        fields = line.split("#")[0].replace(",", " ").rsplit(maxsplit=3)
-        if not fields or (not rows and len(fields) == 1 and fields[0].isdecimal()):
-            continue  # empty, or the number of lines
-        rows.append((f"line {number}", "".join(fields[:-3]).strip(), fields[-3:]))
-    return rows
-
-
-def _rows_of_json(text: str) -> list[tuple[str, str, Any]]:
-    content = parse_json(text)
-    if isinstance(content, dict):
-        content = content.get("light_positions", content)
-    if isinstance(content, dict):
-        return [(name, name, values) for name, values in content.items()]
-    if not isinstance(content, list):
-        raise ValueError("neither a list nor an object")
-    return [(f"light {number}", "", values) for number, values in enumerate(content)]
 
 
 def match_lights(

@@ -51,7 +51,8 @@ class ConvertLight(Job):
         from_axes: Read input maps in the orientation of this program.
         width_px: Write maps of this width; the height is half of it.
         order: Write spherical harmonics of this order in json and sh.
-        lights: Write json over this rig: a number, 'az,el;az,el;...', or a file of such lines.
+        lights: Write json over this rig: a number, 'az,el;az,el;...', or a file of such lines or vectors
+            (.lp).
         signed: Keep the plain series of spherical harmonics, negative in places (default: the nearest
             non-negative light).
     """
@@ -102,8 +103,8 @@ def convert_light(
         list[str],
         typer.Argument(
             metavar="LIGHT...",
-            help="Lat-long maps (.exr, .hdr), lights of estimate-light (.json); folders of them, or - for a "
-            "list.",
+            help="Lat-long maps (.exr, .hdr), lights of estimate-light (.json); folders of them, or - to "
+            "read a map, or a list of paths.",
             show_default=False,
         ),
     ],

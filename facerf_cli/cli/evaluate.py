@@ -38,7 +38,7 @@ PhotosOrDatasetArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="PHOTO...|DATASET",
-        help="Images, folders, - for a list on standard input; or a folder of `facerf prepare-dataset`.",
+        help="Images, folders, - for standard input; or a folder of `facerf prepare-dataset`.",
         show_default=False,
     ),
 ]

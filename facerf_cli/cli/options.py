@@ -53,8 +53,8 @@ InputsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="PHOTO...",
-        help="Images, folders (walked recursively), frames (plate.1001-1050.exr, plate.%04d.exr), or - to "
-        "read a list of paths from standard input.",
+        help="Images, folders (walked recursively), frames (plate.1001-1050.exr, plate.%04d.exr), or - for "
+        "an image or a list on standard input.",
         show_default=False,
     ),
 ]
@@ -63,7 +63,7 @@ FramesArgument = Annotated[
     typer.Argument(
         metavar="PHOTO|FILM...",
         help="Images, films (.mp4, .mov, .mkv and more), folders of images (walked recursively), frames "
-        "(plate.%04d.exr), or - to read a list of paths.",
+        "(plate.%04d.exr), or - for an image or a list.",
         show_default=False,
     ),
 ]

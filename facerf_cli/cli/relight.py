@@ -49,11 +49,16 @@ class RelightJob(Job):
 
         A dry run loads no networks, and so estimates no light of a photo.
         """
+        from facerf_cli.files.image_metadata import read_header
         from facerf_cli.work.lights import readable
         from facerf_cli.work.outputs import check_output
         from facerf_cli.work.photos import prepare_photos
 
         check_output(self.plan.options.output)
+        background = self.plan.options.background
+        for picture in (*background.frames[:1], background.path):
+            if picture and picture.is_file() and read_header(picture) is None:
+                raise UsageError(f"--background {picture}: not a readable image; pass an image")
         maps = [setup.envmap.envmap for setup in self.plan.setups if setup.envmap]
         lights = [envmap.options for envmap in maps if isinstance(envmap, PhotoLight)]
         uses = networks_of([self.plan.options.reflectance]).union(*(light.networks for light in lights))
@@ -151,7 +156,7 @@ def relight(
 
         if not any(is_olat_stack(item.input_path) for item in items):
             raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
-    plan = plan.of_items(items, Shots(taken))
+    plan = plan.of_items(items, Shots(taken), output)
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
     refuse_read([film.path] if film else images, files_read((items, plan, sources), items))
@@ -170,6 +175,7 @@ def _write_to_stdout(inputs: Sequence[str], plan: RelightPlan) -> None:
         items = collect_items(inputs, Path(folder), PHOTO_SUFFIXES)
         images = len(items) * len(plan.setups)
         check_stdout(images if plan.photo.face != "all" else 2 * images, plan.options.output.formats)
+        plan = plan.of_items(items, Shots(), output=Path(folder))
         (path,) = RelightJob(plan).ready(dry_run=False).process(items[0]).outputs
         sys.stdout.buffer.write(path.read_bytes())
         sys.stdout.buffer.flush()

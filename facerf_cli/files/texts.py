@@ -1,4 +1,4 @@
-"""Files that other people wrote, read within limits: text, JSON, TOML and the rigs of lights in it.
+"""Files that other people wrote, read within limits: text, JSON, TOML, and lists and rigs of lights.
 
 Only regular files are opened: a pipe or a device could be waited for without end. In JSON a key that occurs
 twice and a number that is not finite are errors. The module imports nothing heavy, since the index of a
@@ -10,6 +10,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import stat
 import tomllib
 from collections import Counter
@@ -24,9 +25,12 @@ _MOST_DEPTH = 64
 _LARGEST = 1 << 63  # magnitude of an integer; a longer one overflows where it meets an array
 _OPENING = (",", "[", "{")  # there are at most as many values as these, and one
 MOST_RIG_LIGHTS = 32
-_RIG_LIMIT_BYTES = 1 << 16
+_RIG_LIMIT_BYTES, _LIST_LIMIT_BYTES = 1 << 16, 4 << 20
+_ENDS_IN_NUMBER = re.compile(r"(.*\s)?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
 Settings = dict[str, str]
+Vector = list[float]
+ListedLight = tuple[str, Vector]  # name of an image, empty in a list without names
 
 
 def is_regular(path: Path) -> bool:
@@ -180,3 +184,58 @@ def _text(value: Any, where: str) -> str:
     except OverflowError:
         pass
     raise InputError(f"{where}: not a number; give numbers, lists of them, or text such as '0:360:24'")
+
+
+def read_light_list(path: Path) -> list[ListedLight]:
+    """Read a list of lights; raise an InputError that names the first wrong line or entry.
+
+    A text has lines `name x y z` or `x y z`, like LP files of reflectance transformation imaging, which begin
+    with the number of lights. A JSON file holds a list of [x, y, z], or {name: [x, y, z]}, either of them
+    maybe under "light_positions".
+    """
+    text = read_text(path, _LIST_LIMIT_BYTES, "write lines `name x y z`")
+    try:
+        rows = _rows_of_json(text) if path.suffix.lower() == ".json" else _rows_of_text(text)
+    except ValueError as error:
+        raise InputError(
+            f"{path}: is no list of lights ({error}); correct it, or write [[x, y, z], ...]"
+        ) from None
+    lights: list[ListedLight] = []
+    for place, name, values in rows:
+        try:
+            x, y, z = values
+            vector = [float(x), float(y), float(z)]
+        except (ValueError, TypeError):
+            raise InputError(f"{path}: {place} is wrong; give `name x y z`") from None
+        if not 0 < math.hypot(*vector) < math.inf:
+            raise InputError(f"{path}: {place} has no direction; give a finite vector other than 0")
+        lights.append((name, vector))
+    return lights
+
+
+def _rows_of_text(text: str) -> list[tuple[str, str, Any]]:
+    """The place of each light, its name and its values."""
+    rows: list[tuple[str, str, Any]] = []
+    count = None
+    for number, line in enumerate(text.splitlines(), 1):
+        fields = re.split(r"(?:^|\s)#", line)[0].replace(",", " ").rsplit(maxsplit=3)
+        if not rows and len(fields) == 1 and fields[0].isdecimal():
+            count = int(fields[0])
+        elif fields:
+            name = "".join(fields[:-3]).strip()
+            too_many = _ENDS_IN_NUMBER.fullmatch(name) and not name.isdecimal()
+            rows.append((f"line {number}", name, [] if too_many else fields[-3:]))
+    if count not in (None, len(rows)):
+        raise ValueError(f"it states {count} lights and has {len(rows)}")
+    return rows
+
+
+def _rows_of_json(text: str) -> list[tuple[str, str, Any]]:
+    content = parse_json(text)
+    if isinstance(content, dict):
+        content = content.get("light_positions", content)
+    if isinstance(content, dict):
+        return [(name, name, values) for name, values in content.items()]
+    if not isinstance(content, list):
+        raise ValueError("neither a list nor an object")
+    return [(f"light {number}", "", values) for number, values in enumerate(content)]

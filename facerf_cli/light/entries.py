@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.texts import read_bytes, read_rig, text_of
+from facerf_cli.files.texts import read_light_list, read_rig, read_text
 
 MOST_LIGHTS = 4096
 MOST_FRAMES = 9999
 _LIGHTS_FILE_LIMIT_BYTES = 1 << 20
-_DIRECTIONS_HELP = "give a number, 'az,el;az,el;...' in degrees, or a text file with az,el on each line"
+_DIRECTIONS_HELP = (
+    "pass a number, 'az,el;az,el;...' in degrees, or a file with az,el, x y z or name x y z on each line"
+)
 _MOST_DIGITS = 9  # of a count; Python refuses to read thousands
 _FORMS = ("AZ,EL", "AZ,EL,STRENGTH", "AZ,EL,R,G,B")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
@@ -139,16 +141,20 @@ def sweep(text: str, option: str) -> list[float]:
 def parse_lights(text: str) -> int | list[tuple[float, float]]:
     """Parse `--lights`: the number of a uniform rig, or (azimuth, elevation) in degrees of each light.
 
-    The text is a number, 'az,el;az,el', or a file of such lines.
+    The text is a number, 'az,el;az,el', or a file of such lines or of vectors (`read_light_list`).
     """
     if text.isdecimal():
         if not (len(text) <= _MOST_DIGITS and 1 <= int(text) <= MOST_LIGHTS):
             raise UsageError(f"--lights {text}: not a number of lights; give 1 to {MOST_LIGHTS}")
         return int(text)
     is_file = os.path.isfile(text)  # Path's own raises where a long list is no possible name
-    pairs = _lines(Path(text)) if is_file else [part for part in text.split(";") if part.strip()]
+    try:
+        pairs = _lines(Path(text)) if is_file else [part for part in text.split(";") if part.strip()]
+    except InputError as error:
+        raise UsageError(f"--lights {error}") from None
     if not pairs or "," not in pairs[0]:
-        raise UsageError(f"--lights {text!r}: {_DIRECTIONS_HELP}")
+        missing = "" if is_file or "," in text else "no such file; "
+        raise UsageError(f"--lights {text!r}: {missing}{_DIRECTIONS_HELP}")
     if len(pairs) > MOST_LIGHTS:
         raise UsageError(f"--lights: {len(pairs)} lights; give {MOST_LIGHTS} at most")
     option = f"--lights {text}:" if is_file else "--lights"
@@ -156,15 +162,18 @@ def parse_lights(text: str) -> int | list[tuple[float, float]]:
 
 
 def _lines(path: Path) -> list[str]:
-    """Read the lines of a text file that are neither empty nor comments."""
-    try:
-        text = text_of(read_bytes(path, _LIGHTS_FILE_LIMIT_BYTES, "give a text file"))
-    except InputError as error:
-        raise UsageError(f"--lights {error}") from None
-    except UnicodeDecodeError as error:
-        raise UsageError(f"--lights {path}: cannot be read as text ({error}); give a text file") from None
-    lines = (line.partition("#")[0].strip() for line in text.splitlines())
-    return [",".join(line.replace(",", " ").split()) for line in lines if line]
+    """Read az,el in degrees from the lines of a file that are neither empty nor comments, or its vectors."""
+    text = read_text(path, _LIGHTS_FILE_LIMIT_BYTES, "pass a text file")
+    lines = (line.partition("#")[0].replace(",", " ").split() for line in text.splitlines())
+    pairs = [fields for fields in lines if fields]
+    if pairs and (len(pairs[0]) != 2 or path.suffix.lower() in (".lp", ".json")):
+        pairs = [list(map(repr, _azel_of(*vector))) for _, vector in read_light_list(path)]
+    return [",".join(fields) for fields in pairs]
+
+
+def _azel_of(x: float, y: float, z: float) -> tuple[float, float]:
+    """The azimuth and elevation of a vector, in degrees."""
+    return math.degrees(math.atan2(x, z)), math.degrees(math.atan2(y, math.hypot(x, z)))
 
 
 @dataclass(frozen=True)

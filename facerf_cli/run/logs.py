@@ -3,6 +3,7 @@
 import json
 import logging
 import math
+import re
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -31,6 +32,7 @@ _CAPTURES_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/composit
 # Shared by the log and the progress bars, so that they do not overwrite each other.
 STDERR = Console(stderr=True)
 LOGGER_NAME = "facerf"
+_FROM_STDIN = re.compile(r"\S*/facerf-stdin-\w+/stdin/stdin\.\w+")  # see `batch.inputs`
 _LONGEST_LINE = 2000  # characters of a message; those of damaged files may be of any length
 
 
@@ -224,9 +226,14 @@ def escaped(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def named(text: str) -> str:
+    """Return the text with `-` in place of the temporary file of an image on standard input."""
+    return _FROM_STDIN.sub("-", text)
+
+
 def printable_line(text: str) -> str:
     """The text as one printable line of limited length, for a log or a report."""
-    line = escaped(one_line(text[: 4 * _LONGEST_LINE]))
+    line = escaped(one_line(named(text[: 4 * _LONGEST_LINE])))
     return line if len(line) <= _LONGEST_LINE else line[: _LONGEST_LINE - 3] + "..."
 
 

@@ -281,7 +281,8 @@ class _PhotoLights:
                 "--light-from background: no picture is behind the person; add --background FILE, or give "
                 "./background for a file of that name"
             )
-        return PhotoLight(f"{self.background.stem}_light", self.background, self.options, is_background=True)
+        name = f"{split_frame(self.background.stem)[0]}_light"
+        return PhotoLight(name, self.background, self.options, is_background=True)
 
     def each(self, entries: Sequence[str], output: Path) -> list[PhotoLight]:
         """The lights of photos (files, folders, quoted patterns)."""

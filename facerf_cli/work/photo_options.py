@@ -191,7 +191,7 @@ class LightOptions(SolveOptions):
 
     Attributes:
         reflectance: Choose the reflectance model; each baseline estimates its own light.
-        rig: Solve for the light of a rig of N lights, or of a file of directions.
+        rig: Solve for the light of a rig of N lights, or of a file of directions (az,el or x y z; .lp).
         vgg_weights: Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.
         keep_eyes: Use the eyes, too (the paper leaves them out).
         fov_deg: The angle of view of a picture without face.

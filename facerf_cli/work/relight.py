@@ -46,7 +46,7 @@ from facerf_cli.work.photos import (
 )
 from facerf_cli.work.plan import beside_people, canvas, require_face, require_people
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan
-from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces
+from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces, with_background
 
 log = logging.getLogger(LOGGER_NAME)
 _digest_once = lru_cache(maxsize=256)(file_sha256)
@@ -59,6 +59,7 @@ def relight_item(plan: RelightPlan, item: Item) -> Outcome:
     facts: Mapping[str, Any] = {}
     plan = replace(plan, setups=plan.setups_of(item))
     shared_ev = _shared_exposures(item, plan)
+    plan = with_background(plan, item)
     for scene in scenes_of(item, plan, together=plan.options.composite == "photo"):
         with beside_people(len(scene.faces), scene.subject.size_px):
             written |= _write_setups(item, scene, plan, shared_ev)
@@ -207,7 +208,7 @@ def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
     if not {setup.name for setup in plan.setups} <= set(known):
         if isinstance(rule := plan.exposure_rule, float):
             return dict.fromkeys((setup.name for setup in plan.setups), rule)
-        scene = next(scenes_of(leader, plan, together=True))
+        scene = next(scenes_of(leader, with_background(plan, leader), together=True))
         known |= _exposures_ev(scene, scene.relit, plan)
     return known
 

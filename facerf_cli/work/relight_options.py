@@ -10,8 +10,11 @@ from typing import Literal, Self
 from facerf_cli.baselines import Kind, RelightKind
 from facerf_cli.batch.inputs import (
     COMPANION,
+    FILM_SUFFIXES,
     Item,
     NamePattern,
+    is_pattern,
+    numbered_images,
     only_item,
     split_frame,
 )
@@ -22,6 +25,7 @@ from facerf_cli.light.entries import EVEN, OWN, is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
+    BACKGROUND,
     LightSetup,
     LightSources,
     Sampling,
@@ -56,16 +60,25 @@ _FIELDS = ("field", "portrait")
 _OF_EVERY_IMAGE = ("person", "class", "rgb", "rgba")  # names of layers
 _LAYERS = ("matte", "albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
 _LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
-_FORMS = "photo, envmap, none, an image file, black or another name, #RRGGBB or R,G,B"
+_FORMS = "photo, envmap, none, an image file, a folder, black or another name, #RRGGBB or R,G,B"
 
 
 @dataclass(frozen=True)
 class BackgroundChoice:
-    """A choice of background; `colour` is scene-linear Rec.709."""
+    """A choice of background; `colour` is scene-linear Rec.709.
+
+    `path` is an image, or a folder or pattern with one for each photo. `frames` are the images behind the
+    frames of a shot, in place of it.
+    """
 
     kind: BackgroundKind
-    path: Path | None = None
+    path: Path | None = option(None, metavar=COMPANION)
     colour: tuple[float, float, float] | None = None
+    frames: tuple[Path, ...] = ()
+
+    def listed(self, output: Path) -> Self:
+        """This choice with the frames of a folder or pattern, which is not searched in the output folder."""
+        return replace(self, path=None, frames=numbered_images(str(self.path), output))
 
     def is_dark(self, setup: LightSetup) -> bool:
         """True where nothing bright is behind the person: nothing, black, or a dark colour."""
@@ -79,10 +92,17 @@ def parse_background(text: str) -> BackgroundChoice:
     """Parse `--background`; raises UsageError where it names none."""
     if text in ("photo", "envmap", "none"):
         return BackgroundChoice(text)  # type: ignore[arg-type]
-    if Path(text).is_file():
-        return BackgroundChoice("file", Path(text))
+    path = Path(text)
+    if path.suffix.lower() in FILM_SUFFIXES:
+        advice = f"convert it to images (ffmpeg -i {path.name} bg/%04d.png), and pass their folder"
+        raise UsageError(f"--background {path}: a video is not read; {advice}")
+    if path.is_file():
+        return BackgroundChoice("file", path)
     if (colour := _named(text)) is not None:
         return BackgroundChoice("colour", colour=colour)
+    if path.is_dir() or "{" in text or is_pattern(text):
+        check_companion(None if is_pattern(text) else path, "--background")
+        return BackgroundChoice("file", path)
     if "," in text:
         red, green, blue = numbers(text, ("R,G,B",), "--background")
         if min(red, green, blue) < 0:
@@ -121,15 +141,16 @@ class RelightOptions:
     """The options that images share.
 
     Attributes:
-        rig: Approximate maps by a rig of N lights, or by a file of directions.
+        rig: Approximate maps by a rig of N lights, or by a file of directions (az,el or x y z; .lp).
         pose: Turn the head to a pose, in degrees; shows the face alone.
         reflectance: Relight the whole portrait, or the face by the paper's field; or by a baseline:
             diffuse-sh, specular-sh, prt.
         exposure: Expose PNG and JPEG by EV, or the face as in the photo (auto) or well lit (face).
         exposure_group: Share an exposure: of each photo, or the first one's by folder or sequence of frames.
         composite: Show the photo with its face relit, or the rendered face alone, with alpha.
-        background: Show behind the person the photo, an image or a colour (#RRGGBB or linear R,G,B), which
-            keep their look; the envmap; or none (alpha).
+        background: Show behind the person the photo, an image, images by frame (bg/b.%04d.png) or name
+            (bg/{stem}.png), a folder of either, or a colour (#RRGGBB or linear R,G,B), which keep their look;
+            the envmap; or none (alpha).
         background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
         light_wrap: Let so much of the background's light run over the matte's edge; the EXR's layer wrap.
         match_tones: Keep a person in PNG and JPEG within the haze of the picture behind it.
@@ -266,8 +287,24 @@ class RelightPlan:
         stale = {setup.name for setup in self.setups if not item.stale.isdisjoint(self._images(item, setup))}
         return tuple(setup for setup in self.setups if not item.stale or setup.name in stale)
 
-    def of_items(self, items: Sequence[Item], shots: Shots) -> Self:
-        """This plan for some photos, and frames of shots; UsageError where two images have one path."""
+    def of_items(self, items: Sequence[Item], shots: Shots, output: Path) -> Self:
+        """This plan for some photos, and frames of shots.
+
+        Raises UsageError where two images have one path, and where frames lack an image of `--background`.
+        """
+        behind = self.options.background
+        if shots.all and behind.path is not None and behind.path.is_dir():
+            behind = behind.listed(output)
+        for item in items if behind.frames else ():
+            where = f"--background {behind.frames[0].parent}: {len(behind.frames)} images"
+            if item.output_base not in shots.places:
+                advice = "add --sequence, or pass one image, or a folder of images with the photos' names"
+                raise UsageError(f"{where}, but {item.input_path} is not a frame of a shot; {advice}")
+            frames = shots.places[item.output_base][0].frames
+            if len(frames) > len(behind.frames):
+                raise UsageError(
+                    f"{where}, but the shot has {len(frames)} frames; add images or remove frames"
+                )
         for path in self.outputs_of(items[0]) if self.options.output.file_suffix else ():
             if len(self.setups) > 1:
                 raise UsageError(
@@ -290,7 +327,8 @@ class RelightPlan:
             paths.add(path)
         grouped = self.options.exposure_group != "photo"
         groups = {self._group(item): item for item in reversed(items)} if grouped else {}
-        return replace(self, leaders=tuple(groups.values()), shots=shots)
+        options = replace(self.options, background=behind)
+        return replace(self, options=options, leaders=tuple(groups.values()), shots=shots)
 
     def leader_of(self, item: Item) -> Item | None:
         """The photo whose exposure an item shares; None without groups."""
@@ -343,7 +381,14 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
         )
     of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
     how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
-    setups = collect_setups(sources, output, photo.settings.seed, how, options.background.path)
+    background = options.background
+    if background.path is not None and not background.path.is_file():
+        from_behind = any(entry.rpartition("=")[2] == BACKGROUND for entry in sources.light_from or ())
+        if from_behind or is_pattern(str(background.path)):
+            background = background.listed(output)
+    setups = collect_setups(
+        sources, output, photo.settings.seed, how, (*background.frames, background.path)[0]
+    )
     layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
     for name in (name for setup in setups for name in setup.names):
         if name in layers:
@@ -363,6 +408,7 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     filled = replace(
         options,
         photo=photo,
+        background=background,
         composite="face" if alone else "photo",
         exposure="auto" if options.exposure is None else options.exposure,
         reflectance="field" if alone and options.reflectance == "portrait" else options.reflectance,

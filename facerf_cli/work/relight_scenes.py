@@ -1,7 +1,7 @@
 """The scenes of `facerf relight`: people of a photo, or an OLAT stack, and what is behind them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import accumulate, islice, pairwise
 from typing import Any
@@ -21,7 +21,7 @@ from facerf_cli.run.logs import step
 from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import as_in_photo, each_alone, on_face, read_map, with_room
-from facerf_cli.work.photos import FittedFace
+from facerf_cli.work.photos import FittedFace, companion
 from facerf_cli.work.plan import beside
 from facerf_cli.work.relight_options import BackgroundChoice, RelightPlan
 
@@ -96,6 +96,15 @@ def as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[
     """
     lit = [with_room(as_in_photo(on_face(setup, face), even)) for setup in setups]
     return tuple(one for setup in lit for one in (setup, *(each_alone(setup) if setup.names else ())))
+
+
+def with_background(plan: RelightPlan, item: Item) -> RelightPlan:
+    """Choose the image of `--background` that goes with an item: by its place in its shot, or by its name."""
+    choice = plan.options.background
+    path = choice.path and companion(item, choice.path, "--background")
+    if choice.frames:
+        path = choice.frames[plan.shots.places[item.output_base][1]]
+    return replace(plan, options=replace(plan.options, background=replace(choice, path=path, frames=())))
 
 
 def backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:

@@ -36,7 +36,7 @@ from facerf_cli.batch.run import BatchOptions, folder_not_file, keep, warn_of_ed
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import BATCH, option
-from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME, named
 from facerf_cli.work.output_options import Format
 from facerf_cli.work.photo_options import PhotoOptions
 
@@ -268,7 +268,7 @@ class FilmOutput:
                 warn_of_edited(keep(index, [self.path], [item.input_path for item in items]))
             return []
         if batch.dry_run:
-            print(f"{read} -> {self.path}")
+            print(named(f"{read} -> {self.path}"))
             return []
         if shots and shots[0].film:
             from facerf_cli.files.film_writer import check_writable

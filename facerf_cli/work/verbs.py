@@ -168,7 +168,8 @@ class PredictOlat(PhotoWork):
     """`facerf predict-olat`.
 
     Attributes:
-        lights: Predict a uniform rig of N lights, or directions in degrees: a text file, or a list.
+        lights: Predict a uniform rig of N lights, or directions: a list in degrees, or a file (az,el or
+            x y z; .lp).
         pose: Turn the head to a pose, in degrees.
         frame: Predict the whole person in the photo's frame; the face alone in that of its crop; or UV
             textures, which other poses can be rendered from.

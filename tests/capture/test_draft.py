@@ -11,9 +11,10 @@ import pytest
 
 from facerf_cli.capture.draft import as_text, draft_stage, frames_by_pattern
 from facerf_cli.capture.layouts import read_capture
-from facerf_cli.capture.light_lists import match_lights, read_light_list
+from facerf_cli.capture.light_lists import match_lights
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.files.texts import read_light_list
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import ACESCG
 from tests.capture.stages import LENS
@@ -329,6 +330,11 @@ def given_stage(tmp_path: Path) -> Path:
     [
         ("1\nL1 0 0", "line 2 is wrong"),
         ("L1 0 0 1\nL2 a b c", "line 2 is wrong"),
+        ("3\nL1 0 0 1\nL2 0 1 0", "states 3 lights and has 2"),
+        ("1\nL1 0 0 1\nL2 0 1 0", "states 1 lights and has 2"),
+        ("a.jpg 0.1 0.2 0.9 1.0", "line 1 is wrong"),
+        ("0.1 0.2 0.9 1.0", "line 1 is wrong"),
+        ("0,5 0,3 0,8", "line 1 is wrong"),
         ("L1 0 0 0", "line 1 has no direction"),
         ("L1 nan 0 0", "no direction"),
         ("L1 inf 0 0", "no direction"),

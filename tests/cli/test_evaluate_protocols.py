@@ -96,7 +96,8 @@ def test_a_checkpoint_of_another_layout_is_said_once(tmp_path: Path, capsys: Sai
 def test_couples_are_read_from_a_list(tmp_path: Path, capsys: Said, monkeypatch: Patch) -> None:
     for name in ("a.jpg", "b.jpg"):
         shutil.copy(PHOTO, tmp_path / name)
-    monkeypatch.setattr("sys.stdin", io.StringIO(f"{tmp_path / 'a.jpg'}\n{tmp_path / 'b.jpg'}\n"))
+    text = f"{tmp_path / 'a.jpg'}\n{tmp_path / 'b.jpg'}\n"
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
     assert run("transfer", "--photos", "-", "-o", tmp_path / "out", "--dry-run") == 0
     assert "a--b" in capsys.readouterr().out
 

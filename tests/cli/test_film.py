@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterator
 from fractions import Fraction
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -14,16 +14,20 @@ import pytest
 from PIL import Image
 from skimage.data import astronaut
 
+from facerf_cli.batch.inputs import Item, files_read
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Settings
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from facerf_cli.work import light_of_picture
+from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
+from facerf_cli.work.relight_scenes import with_background
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
-from facerf_cli.work.shots import FilmOutput, ShotOptions, collect_frames, film_rate
+from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Folders, Log, Patch, Said
 
@@ -119,9 +123,85 @@ def test_all_frames_have_the_one_light_of_the_picture_behind_them(
     rows = [json.loads(row) for row in (out / "report.jsonl").read_text().splitlines()]
     assert all(list(row["exposure_ev"].values()) == [0] for row in rows)
     capsys.readouterr()
-    film = ("--background", given / "me.mp4", "--light-from", "background")
-    assert facerf(given, "relight", given / "small.png", *film, "-o", tmp_path / "no", *CHEAP) == 1
-    assert "me.mp4" in capsys.readouterr().err
+    film = ("--background", given / "me.mp4", "--light-from", "background", "--dry-run")
+    assert facerf(given, "relight", given / "small.png", *film, "-o", tmp_path / "no", *CHEAP) == 2
+    assert "me.mp4: a video is not read" in capsys.readouterr().err
+
+
+def test_each_frame_has_its_image_of_a_moving_background(given: Path, tmp_path: Path, capsys: Said) -> None:
+    """The first frame has the first image by its number; the light of the background is that image's."""
+    greys = {"b.8.png": 40, "b.9.png": 120, "b.10.png": 200, "b.11.png": 250}
+    for folder in ("plates", "bg"):
+        (tmp_path / folder).mkdir()
+    for name, grey in greys.items():
+        Image.new("RGB", (60, 40), (grey,) * 3).save(tmp_path / "bg" / name)
+    for number in range(FRAMES):
+        Image.fromarray(frame_of(number)).save(tmp_path / f"plates/me.{1001 + number}.png")
+    plates, more = (tmp_path / "plates", "--sequence"), ("--format", "png", *CHEAP)
+
+    def made(background: str, *line: object) -> int:
+        return facerf(given, "relight", *line, "--background", tmp_path / background, *more)
+
+    out = ("--light", "60,20", "-o", tmp_path / "out")
+    assert made("bg", *plates, *out) == 0
+    shown = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "out").glob("*.png"))]
+    assert [int(image[0, 0, 0]) for image in shown] == [40, 120, 200]
+    assert made("bg/b.%d.png", *plates, *out) == 0 and "already finished" in capsys.readouterr().err
+    from_behind = ("--light-from", "background", "-o", tmp_path / "light", "--dry-run")
+    assert made("bg/b.####.png", *plates, *from_behind) == 2  # four digits
+    assert made("bg/b.8-10.png", *plates, *from_behind) == 0
+    assert "me_b_light.1003.png" in capsys.readouterr().out
+    shutil.copy(tmp_path / "bg/b.8.png", tmp_path / "bg/b.9.png")
+    assert made("bg/b.%d.png", *plates, *out, "--dry-run") == 0
+    assert "the images of --background" in capsys.readouterr().err
+    into = ("--light", "60,20", "--name", "b.{frame:1}", "-o", tmp_path / "bg")
+    line = [tmp_path / f"plates/me.{number}.png" for number in (8, 9, 10)]
+    for path in line:
+        shutil.copy(tmp_path / "plates/me.1001.png", path)
+    assert made("bg/b.%d.png", *line, "--sequence", *into) == 2
+    assert "b.8.png: is the input" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("background", "inputs", "said"),
+    [
+        ("bg/b.1-2.png", ["me.mp4"], "2 images, but the shot has 3 frames"),
+        ("bg/b.%d.png", ["small.png"], "small.png is not a frame of a shot"),
+        ("bg/c.%d.png", ["me.mp4"], "c.%d.png"),
+        ("empty", ["me.mp4"], "no inputs found"),
+        ("bg/{frames}.png", ["small.png"], "no field"),
+        ("bg/{stem}.mov", ["small.png"], "a video is not read"),
+        ("film", ["me.mp4"], "film: not a readable image"),
+        ("text.png", ["small.png"], "text.png: not a readable image"),
+    ],
+)
+def test_a_background_that_does_not_fit_is_refused_before_the_first_frame(
+    given: Path, tmp_path: Path, background: str, inputs: list[str], said: str, capsys: Said
+) -> None:
+    for name in ("bg", "empty"):
+        (tmp_path / name).mkdir()
+    for number in (1, 2):
+        Image.new("RGB", (6, 4)).save(tmp_path / f"bg/b.{number}.png")
+    shutil.copy(given / "me.mp4", tmp_path / "film")
+    (tmp_path / "text.png").write_text("not an image")
+    line = ("--background", tmp_path / background, "--light", "60,20", "-o", tmp_path / "out", "--dry-run")
+    assert facerf(given, "relight", *(given / name for name in inputs), *line, *CHEAP) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert said in error
+
+
+def test_photos_have_backgrounds_by_their_names(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.png", "c_sky.png"):
+        Image.new("RGB", (6, 4)).save(tmp_path / name)
+    photo, sources = PhotoOptions(Settings(device="cpu")), LightSources(light=["60,20"])
+    shown = {}
+    for background, stem in ((tmp_path, "a"), (tmp_path, "b"), (tmp_path / "{stem}_sky.png", "c")):
+        item = Item(Path(f"photos/{stem}.jpg"), tmp_path / "out" / stem, stem, PurePosixPath(f"{stem}.jpg"))
+        options = RelightOptions(photo, background=parse_background(str(background)))
+        plan = plan_relight(options, sources, tmp_path / "out").of_items([item], Shots(), tmp_path / "out")
+        shown[stem] = with_background(plan, item).options.background.path
+        assert list(files_read(plan, [item])) == [shown[stem]]
+    assert shown == {"a": tmp_path / "a.jpg", "b": tmp_path / "b.png", "c": tmp_path / "c_sky.png"}
 
 
 @pytest.mark.slow

@@ -1,16 +1,21 @@
 """The items of a command line: which files, under which names."""
 
 import io
+import json
 import logging
+import os
+import subprocess
 import sys
 import unicodedata
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
+from subprocess import PIPE
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from facerf_cli.batch import inputs as inputs_module
 from facerf_cli.batch.inputs import (
     PHOTO_SUFFIXES,
     Item,
@@ -27,6 +32,7 @@ from facerf_cli.main import main
 from facerf_cli.work.photo_options import PhotoOptions, check_companion
 from facerf_cli.work.photos import companion
 from facerf_cli.work.shots import ShotOptions, collect_frames
+from tests.cli import toy_batch
 from tests.kinds import Log, Patch, Said
 
 
@@ -122,14 +128,138 @@ def test_outputs_and_contact_sheets_are_no_inputs(photos: Path, tmp_path: Path) 
     assert names == ["a_olat", "b_olat"]
 
 
+def pipe(monkeypatch: Patch, content: bytes) -> None:
+    """Let standard input hold some bytes; temporary files are not removed before the tests end."""
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+
+
 def test_lists_on_stdin_end_in_lines_or_nul(photos: Path, tmp_path: Path, monkeypatch: Patch) -> None:
-    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n"))
+    pipe(monkeypatch, f"{photos / 'b.jpg'}\n\n{photos / 'x'}\r\n".encode())
     names = [item.name for item in collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES)]
     assert names == ["b", "a", "c"]
-    (photos / "two\nlines.png").touch()
-    monkeypatch.setattr(sys, "stdin", io.StringIO(f"{photos / 'b.jpg'}\0{photos}/two\nlines.png\0"))
+    (photos / "two\r\nlines.png").touch()
+    pipe(monkeypatch, f"{photos / 'b.jpg'}\0{photos}/two\r\nlines.png\0".encode())
     items = collect_items(["-"], tmp_path / "out", PHOTO_SUFFIXES, null_separated=True)
-    assert [item.name for item in items] == ["b", "two\nlines"]
+    assert [item.name for item in items] == ["b", "two\r\nlines"]
+    pipe(monkeypatch, b"\xef\xbb\xbfodd\xff.jpg\n")
+    monkeypatch.chdir(photos)
+    Path(os.fsdecode(b"odd\xff.jpg")).touch()
+    assert list(expand_inputs(["-"])) == [os.fsdecode(b"odd\xff.jpg")]
+
+
+@pytest.mark.parametrize(
+    ("start", "suffix"),
+    [
+        (b"\x89PNG\r\n\x1a\n", ".png"),
+        (b"\xff\xd8\xff\xe1", ".jpg"),
+        (b"II*\0\x08\0\0\0", ".tif"),
+        (b"MM\0*\0\0\0\x08", ".tif"),
+        (b"MM\0+\0\x08\0\0", ".tif"),
+        (b"v/1\x01\x02\0\0\0", ".exr"),
+        (b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n", ".hdr"),
+        (b"RIFF\x24\n\0\0WEBPVP8 ", ".webp"),
+        (b"\xff\x0a\xfa\x1f", ".jxl"),
+        (b"\0\0\0\x0cJXL \r\n\x87\n", ".jxl"),
+        (b"\0\0\0\x24ftypheic\0\0\0\0mif1", ".heic"),
+        (b"\0\0\0\x0aftypmif1\0\0\0\0mif1", ".heic"),
+        (b"\0\0\0\x20ftypavif\0\0\0\0avif", ".avif"),
+        (b"\0\0\0\x0cjP  \r\n\x87\n", ".jp2"),
+        (b"8BPS\0\x01\0\0\0\0\0\0\0\x03", ".psd"),
+        (b"SDPX\0\0\x20\0V1.0", ".dpx"),
+        (b"XPDS\0\x20\0\0V1.0", ".dpx"),
+        (b"\x80*_\xd7\0\0\x08\0", ".cin"),
+        (b"BM\x36\x0a\0\0\0\0\0\0\x36", ".bmp"),
+        (b"GIF89a\x2c\x01", ".gif"),
+        (b"P6\n# by hand\n# twice 2\n4 3\n255\n\0", ".ppm"),
+        (b"P5 4 3 65535 \0", ".ppm"),
+    ],
+)
+def test_the_first_bytes_tell_an_image_on_stdin(start: bytes, suffix: str, monkeypatch: Patch) -> None:
+    pipe(monkeypatch, start + bytes(5000))
+    (path,) = map(Path, expand_inputs(["-"]))
+    assert path.name == f"stdin{suffix}" and path.read_bytes() == start + bytes(5000)
+
+
+@pytest.mark.parametrize(
+    ("content", "null_separated"),
+    [
+        (b"\0\0\0\x20ftypisom" + bytes(range(256)) * 40, False),  # a video
+        (b"\x1aE\xdf\xa3\x01" + bytes(range(256)) * 40, True),
+        (b"".join(bytes([n, n + 1, 10]) for n in range(128, 250)), False),
+        (b"# Title\n\nSome text\n.\n" + b"- more\n" * 20, False),
+        ("a.png\nb.jpg\n".encode("utf-16"), False),
+        ("a.png\n.\n".encode("utf-16"), True),
+        (b"b.jpg\0Z.EXR\0", False),
+    ],
+)
+def test_what_is_neither_an_image_nor_a_list_costs_a_line(
+    photos: Path, content: bytes, null_separated: bool, monkeypatch: Patch, capsys: Said
+) -> None:
+    monkeypatch.chdir(photos)
+    pipe(monkeypatch, content)
+    more = ["-0"] if null_separated else []
+    assert main([*more, "segment", "-", "-o", str(photos.parent / "out"), "--dry-run"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "standard input is neither an image nor a list" in line and len(line) < 500
+
+
+def test_what_stdin_may_hold_is_bounded(monkeypatch: Patch) -> None:
+    monkeypatch.setattr(inputs_module, "LIMIT_BYTES", 5000)
+    monkeypatch.setattr(inputs_module, "_MOST_IMAGE_BYTES", 12000)
+    for content, said in ((b"\x89PNG" + bytes(20000), "more than 1 GiB"), (b"x" * 5001, "neither")):
+        pipe(monkeypatch, content)
+        with pytest.raises(UsageError, match=said):
+            list(expand_inputs(["-"]))
+
+
+def test_an_image_on_stdin_is_not_named_by_its_temporary_file(
+    tmp_path: Path, monkeypatch: Patch, capsys: Said
+) -> None:
+    """In any line, in the report, and in what makes a finished result fit; the file goes with the run."""
+    temporary, out = tmp_path / "temporary", tmp_path / "out"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    for code, said in ((0, "- -> "), (1, "-: damaged")):
+        pipe(monkeypatch, b"\x89PNG\r\n\x1a\n cut short")
+        assert main(["segment", "-", "-o", str(out), *["--dry-run"][code:]]) == code
+        streams = capsys.readouterr()
+        lines = streams.out + streams.err
+        assert said in lines and str(temporary) not in lines
+    for _ in range(2):
+        pipe(monkeypatch, b"\x89PNG of toys")
+        assert toy_batch.run(Path("-"), out) == 0
+        assert (tmp_path / "written").read_text() == "stdin\n"
+    assert "already finished" in capsys.readouterr().err
+    (row,) = map(json.loads, (out / "report.jsonl").read_text().splitlines())
+    assert (row["item"], row["input"]) == ("stdin", "-")
+    pipe(monkeypatch, b"\x89PNG")
+    assert names(tmp_path, Path("-"), pattern="{parent}-{stem}-{ext}") == ["stdin-stdin-png"]
+
+
+@pytest.mark.parametrize("unwinds", [True, False])
+def test_an_image_on_stdin_goes_with_its_process(tmp_path: Path, unwinds: bool) -> None:
+    code = """if True:
+        import sys, time
+        from facerf_cli.batch.inputs import expand_inputs
+        from facerf_cli.run.stopping import end_on_signals
+        end_on_signals(0.1)
+        print(*expand_inputs(["-"]), flush=True)
+        try:
+            time.sleep(60)
+        except SystemExit:
+            if sys.argv[1] == "True":
+                raise
+            time.sleep(60)
+    """
+    command = [sys.executable, "-c", code, str(unwinds)]
+    settings = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, env=settings, stdin=PIPE, stdout=PIPE) as process:
+        assert process.stdin and process.stdout
+        process.stdin.write(b"\x89PNG")
+        process.stdin.close()
+        assert Path(process.stdout.readline().decode().strip()).read_bytes() == b"\x89PNG"
+        process.terminate()
+    assert process.returncode == 143 and not list(tmp_path.iterdir())
 
 
 def test_frames(tmp_path: Path) -> None:

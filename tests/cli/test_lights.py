@@ -16,6 +16,7 @@ from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
 from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
+from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.main import main, repeat_options
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
 from facerf_cli.work.lights import (
@@ -123,6 +124,44 @@ def test_a_wrong_value_says_what_is_wanted_and_no_light_comes_twice(tmp_path: Pa
         collect_setups(LightSources(), Path("out"))
     with pytest.raises(UsageError, match="once"):
         collect_setups(LightSources(light=["1,2", "1.0,2"]), Path("out"))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("dome.lp", "3\r\nimg 1.jpg 0.0 0.0 2.5\r\nimg#2.jpg 1 0 0\r\nimg_3.jpg\t0\t.6\t.8\r\n"),
+        ("dome.txt", "# x y z\n0 0 1\n\n4e1, 0, 0  # right\n0, 3, 4\n"),
+        ("dome.txt", "3\n0 0 1\n+1.5 0 0\n0 3 4\n"),
+        ("dome.lp", "\ufeff3\n1 0 0 1\n2 1 0 0\n3 0 3 4\n"),
+        ("dome.json", '{"light_positions": [[0, 0, 1], [2, 0, 0], [0, 3, 4]]}'),
+    ],
+)
+def test_a_rig_of_vectors_has_their_directions(tmp_path: Path, name: str, text: str) -> None:
+    """As the LP files of RTI have them: x to the image's right, y up, z toward the camera."""
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    elevation = np.degrees(np.arctan2(3, 4))
+    np.testing.assert_allclose(parse_lights(str(path)), [(0, 0), (90, 0), (0, elevation)], atol=1e-9)
+    expected = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 0.6, 0.8]])
+    torch.testing.assert_close(rig_by_text(str(path)), expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("2\na.jpg 0 0 1\n", "states 2"),
+        ("a.jpg 0 0 1\nb.jpg 0 0\n", "line 2"),
+        ("a.jpg 0 0 1\nb.jpg 0 0 0\n", "line 2"),
+        ("a.jpg nan 0 1\n", "line 1"),
+        ("", "x y z on each line"),
+    ],
+)
+def test_a_wrong_rig_of_vectors_costs_a_line_that_names_file_and_line(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    (tmp_path / "dome.lp").write_text(text)
+    with pytest.raises(UsageError, match=rf"--lights .*dome\.lp.*{said}"):
+        parse_lights(str(tmp_path / "dome.lp"))
 
 
 def test_frame_numbers_stay_at_the_end() -> None:

@@ -107,7 +107,7 @@ def test_a_background_colour_keeps_its_look_and_a_map_does_not(given: Path, tmp_
 
 
 def test_one_image_on_standard_output(
-    given: Path, tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes]
+    given: Path, tmp_path: Path, capsysbinary: pytest.CaptureFixture[bytes], monkeypatch: Patch
 ) -> None:
     assert relight(given, Path("-"), *LIGHT) == 0
     said = capsysbinary.readouterr()
@@ -118,6 +118,13 @@ def test_one_image_on_standard_output(
     )
     with Image.open(io.BytesIO(said.out)) as image:
         assert image.format == "PNG" and image.size == (SIDE, SIDE)
+    with (given / "astronaut.png").open("rb") as photo:
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(photo))
+        assert relight(given, Path("-"), *LIGHT, photo=Path("-")) == 0
+    piped = capsysbinary.readouterr()
+    assert piped.err.startswith(b"- under light_")
+    first, second = (Image.open(io.BytesIO(image)) for image in (said.out, piped.out))
+    assert first.tobytes() == second.tobytes()
     assert relight(given, Path("-"), *LIGHT, "--format", "exr", "--composite", "face") == 0
     (tmp_path / "piped.exr").write_bytes(capsysbinary.readouterr().out)
     assert read_image(tmp_path / "piped.exr").alpha is not None

@@ -136,7 +136,7 @@ WRONG: dict[str, dict[str, str]] = {
     "predict-olat a.jpg": {
         "--lights 0": "give 1 to 4096",
         "--lights 99999": "give 1 to 4096",
-        "--lights few": "give a number",
+        "--lights few": "no such file; pass a number",
         "--lights '1,2;3'": "numbers separated by commas",
         "--lights 1,nan": "numbers separated by commas",
         "--lights -3": "give a number",
