@@ -1,10 +1,9 @@
-"""Light of a background over a matte's edge, and the haze of a picture, as PNG shows them."""
+"""Light of a background over a matte's edge."""
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from facerf_cli.image.haze import Haze, haze_of
 from facerf_cli.image.light_wrap import LightWrap
 from facerf_cli.image.strips import STRIP_PX
 
@@ -35,28 +34,3 @@ def test_a_large_background_is_read_in_strips() -> None:
     matte = np.broadcast_to(np.float32(0.5), (2000, 3000))
     np.testing.assert_allclose(LightWrap(Wall(), matte, 1.0)[slice(1990, 2000)], 0.25, rtol=1e-5)
     assert most <= STRIP_PX
-
-
-def test_a_person_is_kept_within_the_tones_of_a_picture() -> None:
-    ramp = np.linspace(0.05, 0.6, 400, dtype=np.float32)
-    grey = np.broadcast_to(ramp[None, :, None], (300, 400, 3))
-    haze = haze_of(grey, (300, 400))
-    assert haze.black == pytest.approx(0.0555, abs=2e-3) and haze.white == pytest.approx(0.5945, abs=2e-3)
-    person = np.array([0, 0.1, 0.5, 1, 8], np.float32)[None, :, None].repeat(3, -1)
-    shown = haze.over(person, np.ones((1, 5), np.float32))[0, :, 0]
-    assert shown[0] == pytest.approx(haze.black) and shown[-1] == pytest.approx(haze.white)
-    assert (np.diff(shown) > 0).all()
-    assert shown[1] == pytest.approx(haze.black + 0.1 * (1 - haze.black))
-    np.testing.assert_array_equal(haze.over(person, np.zeros((1, 5), np.float32)), person)
-    half = haze.over(person, np.full((1, 5), 0.5, np.float32))[0, :, 0]
-    np.testing.assert_allclose(half, (shown + person[0, :, 0]) / 2, rtol=1e-6)
-
-
-def test_grass_is_no_haze_and_a_wall_veils_little() -> None:
-    grass = np.broadcast_to(np.float32((0.2, 0.4, 0.0)), (30, 40, 3))
-    assert haze_of(grass, (30, 40)) == Haze(0.0, pytest.approx(0.4))
-    night = np.zeros((30, 40, 3), np.float32)
-    assert haze_of(night, (30, 40)) == Haze(0.0, 0.4)
-    assert haze_of(night + 1.5, (30, 40)) == Haze(0.1, 1.5)
-    bright = np.full((1, 2, 3), 0.9, np.float32)
-    np.testing.assert_array_equal(Haze(0.0, 1.5).over(bright, np.ones((1, 2), np.float32)), bright)

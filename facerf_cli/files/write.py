@@ -36,7 +36,6 @@ from facerf_cli.image.colour import (
     from_linear_rec709,
     rgb_to_xyz,
 )
-from facerf_cli.image.haze import Haze
 from facerf_cli.image.strips import Rows, rows_of, strips
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
@@ -257,14 +256,12 @@ def write_display(
     added: Rows | None = None,
     bits: Literal[8, 16] = 8,
     quality: int = JPEG_QUALITY,
-    haze: Haze | None = None,
 ) -> float:
     """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
 
     "auto" is `colour.auto_exposure_ev` where alpha [H, W] exceeds one half. PNG keeps alpha, with colour that
     is not premultiplied; JPEG has no alpha and shows the image over black. `view`, `share` and `added`, not
-    exposed, are those of `colour.encode_display`; `bits` are of a PNG, `quality` (1 to 100) of a JPEG. What
-    `share` says is brought within the tones of a `haze`.
+    exposed, are those of `colour.encode_display`; `bits` are of a PNG, `quality` (1 to 100) of a JPEG.
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
@@ -285,10 +282,7 @@ def write_display(
                 seen = seen * opaque[..., None]
             more = None if added is None else added[rows] * gain
             kept = None if share is None else rows_of(share, rows)
-            exposed = np.nan_to_num(seen * gain)
-            if haze is not None and kept is not None:
-                exposed = haze.over(exposed, kept)
-            data = encode_display(exposed, view, kept, more)
+            data = encode_display(np.nan_to_num(seen * gain), view, kept, more)
             if opaque is not None and not jpeg:
                 data = np.dstack([data, opaque.astype(np.float32)])
             file.write(rows, data)

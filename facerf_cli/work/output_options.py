@@ -25,7 +25,6 @@ NEEDS: dict[str, tuple[Format, ...]] = {
     "aov": ("exr",),
     "compression": ("exr",),
     "exr": ("exr",),
-    "match_tones": _DISPLAYED,
     "quality": ("jpg",),
     "output_colourspace": ("exr", "tiff"),
     "view": _DISPLAYED,

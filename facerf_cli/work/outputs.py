@@ -12,7 +12,6 @@ import numpy as np
 from facerf_cli.errors import UsageError
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image.colour import LINEAR, ColourSpace, View, named_space, named_view
-from facerf_cli.image.haze import Haze
 from facerf_cli.image.strips import Rows
 from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.work.output_options import Format, OutputOptions
@@ -26,8 +25,8 @@ class OutputImage:
     """An image to write: linear Rec.709 [H, W, 3], not multiplied by alpha [H, W], and its layers.
 
     `share` [H, W] is how far a soft view applies to each pixel, or `added` [H, W, 3], by rows, what was
-    not photographed (`colour.encode_display`); without both it applies to all. `header` is further metadata
-    of the EXR alone; `haze`, of PNG and JPEG, is that of the picture behind the share.
+    not photographed (`colour.encode_display`); without both it applies to all. `header` is metadata that only
+    the EXR has.
     """
 
     pixels: np.ndarray
@@ -36,7 +35,6 @@ class OutputImage:
     share: np.ndarray | None = None
     added: Rows | None = None
     header: Mapping[str, Any] = field(default_factory=dict)
-    haze: Haze | None = None
 
 
 def check_output(options: OutputOptions) -> None:
@@ -80,7 +78,6 @@ def write_output(
                 *kept,
                 bits,
                 options.quality,
-                image.haze,
             )
 
     at_once = len(options.formats) if not isinstance(image.pixels, np.memmap) else 1

@@ -362,7 +362,9 @@ def person_matte(
         return None
     scale = height / len(matte)
     if abs(width - scale * matte.shape[1]) > 2 * max(1.0, scale):  # sides were rounded
-        raise InputError(f"{path}: {_sizes(matte, (height, width))}; give one of the photo's aspect")
+        sizes, turned = _sizes(matte, (height, width)), abs(height - width * matte.shape[1] / len(matte)) <= 2
+        cause = "; the likely cause: the photo's EXIF orientation was not applied" if turned else ""
+        raise InputError(f"{path}: {sizes}{cause}; use a matte of the upright photo")
     if not in_shot and not matte.any():
         raise InputError(f"{path}: the matte is black and shows nobody; make it white where the person is")
     if options.person is not None and not in_shot and (most := matte.max()) < _WHITE:

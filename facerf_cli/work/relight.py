@@ -18,9 +18,8 @@ from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
-from facerf_cli.image.haze import haze_of
 from facerf_cli.image.light_wrap import LightWrap
-from facerf_cli.image.strips import Empty, Scaled, rows_of
+from facerf_cli.image.strips import Empty, rows_of
 from facerf_cli.person import Group, Person, Target, fit
 from facerf_cli.relighting.people_in_photo import Background
 from facerf_cli.relighting.relightable import RenderRequest
@@ -308,10 +307,8 @@ def _rendered(
         others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
         others += [layers["wrap"]] if wrap is not None else []
         added = SumOf(others, subject.size_px[1], alpha)
-    share, haze = matte if keeps else None, None
-    if behind is not None and plan.options.match_tones:
-        haze = haze_of(Scaled(behind, np.float32(2.0**ev)), subject.size_px)
-    return OutputImage(pixels, scene.alpha if alpha is None else alpha, layers, share, added, haze=haze)
+    shown_alpha = scene.alpha if alpha is None else alpha
+    return OutputImage(pixels, shown_alpha, layers, matte if keeps else None, added)
 
 
 @dataclass(frozen=True, eq=False)

@@ -153,7 +153,6 @@ class RelightOptions:
             the envmap; or none (alpha).
         background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
         light_wrap: Let so much of the background's light run over the matte's edge; the EXR's layer wrap.
-        match_tones: Keep a person in PNG and JPEG within the haze of the picture behind it.
         aov: Add layers to the EXR besides its matte: albedo, normal, position, depth, shadow, specular,
             classes, face, uv.
         matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
@@ -201,7 +200,6 @@ class RelightOptions:
         panel=IMAGE,
     )
     light_wrap: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=IMAGE)
-    match_tones: bool = option(False, panel=IMAGE)
     aov: tuple[str, ...] = option(
         (), metavar="NAME,...", shown_default="none", default_text="", parse=parse_aov, panel=IMAGE
     )
@@ -368,8 +366,6 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     behind = options.background.kind
     if options.light_wrap and behind in ("photo", "none"):
         raise UsageError("--light-wrap: is of another background; add --background FILE, COLOUR or envmap")
-    if options.match_tones and behind != "file":
-        raise UsageError("--match-tones: is of a picture behind the person; add --background FILE")
     if options.identity and alone:
         raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
     check_companion(options.matte, "--matte")

@@ -1,4 +1,4 @@
-"""`facerf relight` before another picture: --light-wrap and --match-tones."""
+"""`facerf relight` before another picture: --light-wrap."""
 
 from pathlib import Path
 
@@ -50,18 +50,3 @@ def test_the_wrap_is_a_layer_that_adds_up(given: Path, tmp_path: Path, hazy: Pat
         added = sum(layer for name, layer in layers.items() if name != "own")
         shown = linear_to_srgb(read_image(path.with_suffix(".png")).pixels)
         np.testing.assert_allclose(shown, encode_display(image, SOFT_VIEW, added=added), atol=1.5 / 255)
-
-
-def test_tones_are_matched_in_png_alone(given: Path, tmp_path: Path, hazy: Path) -> None:
-    line = ["--background", hazy, "--light", "60,20", "--exposure", "1"]
-    plain = relit(given, tmp_path / "plain", *line)
-    matched = relit(given, tmp_path / "matched", *line, "--match-tones")
-    one, two = (read_image(path).pixels for path in (plain, matched))
-    np.testing.assert_array_equal(one, two)
-    matte = exr_layers(plain)["person.A"]
-    before, after = (read_image(path.with_suffix(".png")).pixels for path in (plain, matched))
-    np.testing.assert_array_equal(before[matte == 0], after[matte == 0])
-    sure = matte == 1
-    whites = before[sure].max(), after[sure].max()
-    assert before[sure].min() < 0.01 and after[sure].min() == pytest.approx(0.1, abs=0.01)
-    assert 0.5 < whites[1] < 0.7 < whites[0]
