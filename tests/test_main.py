@@ -215,7 +215,7 @@ def test_threads_wait_asleep_unless_the_user_says_otherwise(given: dict[str, str
         ("bash", "facerf do", "doctor"),
         ("zsh", "facerf do", "doctor"),
         ("fish", "facerf do", "doctor"),
-        ("bash", "facerf relight --exposure-group ", "photo\nfolder\nsequence"),
+        ("bash", "facerf relight --composite ", "photo\nface"),
     ],
 )
 def test_shell_completion(shell: str, words: str, offered: str) -> None:

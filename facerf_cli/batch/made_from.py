@@ -44,8 +44,6 @@ _OPTIONS = {
     "dataset_format": "facerf's version of datasets",
     "frames": "the images of --background",
     "kind": "--background",
-    "leaders": "the first photo of --exposure-group",
-    "matte_model": "the model of --matte-from",
     "lights": "the lights",
     "name": "the lights",
     "names": "the layers of --light",

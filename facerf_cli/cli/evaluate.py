@@ -70,7 +70,7 @@ def reconstruction(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
     *,
-    photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
+    photo: Annotated[PhotoOptions, Without("texture_side", "person")],
     solve: SolveOptions,
     options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS, "facts")],
 ) -> None:
@@ -97,7 +97,7 @@ def transfer(
         ),
     ],
     *,
-    photo: Annotated[PhotoOptions, Without("texture_side", "face", "person", "matte_from")],
+    photo: Annotated[PhotoOptions, Without("texture_side", "face", "person")],
     solve: SolveOptions,
     options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS, "photos", "held_to_photo")],
 ) -> None:
@@ -118,7 +118,7 @@ def geometry(
     context: typer.Context,
     inputs: PhotosOrDatasetArgument,
     *,
-    photo: Annotated[PhotoOptions, Without("texture_side", "person", "matte_from")],
+    photo: Annotated[PhotoOptions, Without("texture_side", "person")],
     options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS[:2], *_METHODS, "facts", "mean_checkpoint")],
 ) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).

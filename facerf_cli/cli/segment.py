@@ -19,7 +19,7 @@ class Segment(PhotoWork):
 
     photo: Annotated[
         PhotoOptions,
-        Only("colourspace", "layer", "face", "landmarks", "person", "matte_from"),
+        Only("colourspace", "layer", "face", "landmarks", "person"),
     ]
     verb = "segment"
     endings = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")

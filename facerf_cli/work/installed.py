@@ -15,7 +15,6 @@ EXTRAS = {
     "ray": "`--ray`, on clusters",
     "heic": "HEIC photos of phones",
     "video": "films in and out; its wheel holds GPL codecs",
-    "rembg": "`--matte-from rembg:NAME`; its models have licences of their own",
     "dlib": "`--identity`, and Face dis of `evaluate`",
 }
 Facts = dict[str, Any]

@@ -14,7 +14,6 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
 from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
-from facerf_cli.work.matte_models import MatteModel, parse_matte_from
 
 MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
 _TURNED_AWAY_DEG, _MOST_ROLL_DEG = 90.0, 180.0
@@ -86,8 +85,6 @@ class PhotoOptions:
         form: Class of a Reflectance Network of your own.
         person: Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies
             it.
-        matte_from: Replace it by that of a model in rembg's folder (an extra); the model's licence is
-            reported.
     """
 
     settings: Settings
@@ -108,9 +105,6 @@ class PhotoOptions:
     )
     form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
     person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
-    matte_from: MatteModel | None = option(
-        None, metavar="rembg:NAME", shown_default=False, parse=parse_matte_from, panel=FACE
-    )
     ocio_config: str = ""  # that knows the colour space; '' is $OCIO, or the built-in one
 
     def check(self) -> None:
@@ -125,16 +119,9 @@ class PhotoOptions:
         if self.landmarks is not None and self.geometry == "network":
             raise UsageError("--landmarks: --geometry network uses none; leave one out")
         check_companion(self.landmarks, "--landmarks")
-        if self.person is not None and self.matte_from is not None:
-            raise UsageError("--matte-from: --person gives the matte; leave one out")
-        if self.face == "all" and self.has_given_person:
-            raise UsageError("--face all: --person and --matte-from show one person; give --face INDEX")
+        if self.face == "all" and self.person is not None:
+            raise UsageError("--face all: --person shows one person; pass --face INDEX")
         check_companion(self.person, "--person")
-
-    @property
-    def has_given_person(self) -> bool:
-        """True if the person's matte is not facerf's own."""
-        return self.person is not None or self.matte_from is not None
 
     @property
     def first_tag(self) -> str:
@@ -152,7 +139,7 @@ def photo_words(options: PhotoOptions, number: int = 0) -> list[str]:
     for one in fields(options):
         value, about = getattr(options, one.name), one.metadata.get("option")
         if about and value != one.default:
-            text = number if value == "all" else getattr(value, "matte_from", value)
+            text = number if value == "all" else value
             words += [about.flags[0] if about.flags else flag(one.name), str(text)]
     checkpoints = () if settings.checkpoints_by_default else settings.checkpoints
     return words + [word for path in checkpoints for word in ("--checkpoint", str(path))]
@@ -240,7 +227,7 @@ class LightOptions(SolveOptions):
 def for_other_photos(photo: PhotoOptions) -> PhotoOptions:
     """Options for photos of which only the light is used: those of the inputs that describe one file go."""
     folder = photo.landmarks if photo.landmarks is not None and not photo.landmarks.is_file() else None
-    alone = replace(photo, colourspace=None, layer=None, person=None, matte_from=None)
+    alone = replace(photo, colourspace=None, layer=None, person=None)
     return replace(alone, face="largest", landmarks=folder)
 
 

@@ -42,7 +42,6 @@ from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.run.threads import compute_apart
-from facerf_cli.work.matte_models import matte_by_rembg, require_rembg
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
 from facerf_cli.work.plan import KEPT_PX, beside
 
@@ -129,9 +128,6 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
     if options.colourspace is not None:
         named_space(options.colourspace, options.ocio_config)
     face_model(options)
-    if (model := options.matte_from) is not None:
-        require_rembg(model)
-        log.info("mattes by %s: licence %s", model.matte_from, model.licence)
     settings = options.settings
     if not settings.checkpoints_by_default:
         serving_files(settings.checkpoints, uses, "this line")
@@ -274,9 +270,8 @@ def facts_of(faces: list[dict[str, Any]], options: PhotoOptions) -> dict[str, An
 
 
 def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
-    """The report's entries of the networks that were used: file and digest of each, and rembg's model."""
-    facts: dict[str, Any] = {"networks": load_models_once(options).networks.served()}
-    return facts if options.matte_from is None else facts | {"matte_from": options.matte_from.facts()}
+    """Return the report's entries of the networks that were used: file and digest of each."""
+    return {"networks": load_models_once(options).networks.served()}
 
 
 def stamp(item: Item) -> dict[str, str | int]:
@@ -341,7 +336,7 @@ def read_normals(item: Item, given: Path | None, size_px: tuple[int, ...]) -> np
 
 
 def matte_path(item: Item, options: PhotoOptions) -> Path:
-    """The file of a photo's `--person`; of a model's matte, and where none is given, the photo."""
+    """Return the file of a photo's `--person`; without it, the photo."""
     return item.input_path if options.person is None else companion(item, options.person, "--person")
 
 
@@ -353,13 +348,10 @@ def person_matte(
     Raises InputError where that of a photo alone is black, or that of `--person` nowhere white.
     """
     height, width = pixels.shape[:2]
-    path = matte_path(item, options)
-    if options.person is not None:
-        matte = _grey_or_alpha(path, (height, width), _WHITE)
-    elif options.matte_from is not None:
-        matte = matte_by_rembg(to_display(pixels), options.matte_from)
-    else:
+    if options.person is None:
         return None
+    path = matte_path(item, options)
+    matte = _grey_or_alpha(path, (height, width), _WHITE)
     scale = height / len(matte)
     if abs(width - scale * matte.shape[1]) > 2 * max(1.0, scale):  # sides were rounded
         sizes, turned = _sizes(matte, (height, width)), abs(height - width * matte.shape[1] / len(matte)) <= 2
@@ -367,7 +359,7 @@ def person_matte(
         raise InputError(f"{path}: {sizes}{cause}; use a matte of the upright photo")
     if not in_shot and not matte.any():
         raise InputError(f"{path}: the matte is black and shows nobody; make it white where the person is")
-    if options.person is not None and not in_shot and (most := matte.max()) < _WHITE:
+    if not in_shot and (most := matte.max()) < _WHITE:
         at_most = f"nowhere white, {255 * most:.0f} of 255 at most"
         raise InputError(f"{path}: the matte is {at_most}; make it white where the person is")
     return matte if matte.shape == (height, width) else resized(matte, height, width).clip(0, 1)

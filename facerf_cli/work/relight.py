@@ -193,15 +193,12 @@ def _metadata(item: Item, plan: RelightPlan) -> dict[str, str | int]:
 
 
 def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
-    """The exposures of an item's group; None where it has none, or is the one that it has them of.
-
-    Frames of a shot share that of one of its middle.
-    """
-    leader = plan.leader_of(item)
-    if place := _in_shot(item, plan):
-        shot, number = place
-        leader = shot.shot.frames[shot.take_of(number).middle]
-    if leader is None or leader == item:
+    """Return the exposures of the middle frame of an item's take; None for a photo and that frame itself."""
+    if not (place := _in_shot(item, plan)):
+        return None
+    shot, number = place
+    leader = shot.shot.frames[shot.take_of(number).middle]
+    if leader == item:
         return None
     known = plan.exposures.setdefault(leader.output_base, {})
     if not {setup.name for setup in plan.setups} <= set(known):
@@ -254,11 +251,10 @@ def _write_setups(
                 if scene.identity is not None:
                     written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
                 del image
-            group = " as its group" if shared_ev else ""
-            said = [f"exposed by {ev:+.2f} EV{group}"]
+            said = [f"exposed by {ev:+.2f} EV"]
             if setup.room:
                 said.append(f"with {100 * setup.room:g} % of the light bounced by the room (--room)")
-            if not (shared_ev and plan.shots.all):
+            if not shared_ev:
                 log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
             del relit, each  # of all of its part, beside the next
     return written

@@ -16,7 +16,6 @@ from facerf_cli.batch.inputs import (
     is_pattern,
     numbered_images,
     only_item,
-    split_frame,
 )
 from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.settings import NOT_IN_RECIPE
@@ -54,7 +53,6 @@ from facerf_cli.work.shots import (
 )
 
 Composite = Literal["photo", "face"]
-ExposureGroup = Literal["photo", "folder", "sequence"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
 _FIELDS = ("field", "portrait")
 _OF_EVERY_IMAGE = ("person", "class", "rgb", "rgba")  # names of layers
@@ -146,7 +144,6 @@ class RelightOptions:
         reflectance: Relight the whole portrait, or the face by the paper's field; or by a baseline:
             diffuse-sh, specular-sh, prt.
         exposure: Expose PNG and JPEG by EV, or the face as in the photo (auto) or well lit (face).
-        exposure_group: Share an exposure: of each photo, or the first one's by folder or sequence of frames.
         composite: Show the photo with its face relit, or the rendered face alone, with alpha.
         background: Show behind the person the photo, an image, images by frame (bg/b.%04d.png) or name
             (bg/{stem}.png), a folder of either, or a colour (#RRGGBB or linear R,G,B), which keep their look;
@@ -178,7 +175,6 @@ class RelightOptions:
         panel=IMAGE,
         everyday=True,
     )
-    exposure_group: ExposureGroup = option("photo", metavar="KIND", panel=IMAGE)
     output: OutputOptions = field(default_factory=OutputOptions)
     composite: Composite | None = option(None, shown_default="photo; face with --pose", panel=IMAGE)
     background: BackgroundChoice = option(
@@ -234,9 +230,8 @@ class RelightPlan:
         sampling: How maps give a rig's lights their weights.
         keeps_photo: True by --composite photo, which no stack can have.
         has_room: True by --room; a stack has none else.
-        leaders: The first photo of each group that shares an exposure.
         shots: The films and sequences among the inputs.
-        exposures: Of leaders by setup, by their place, as far as this process knows them.
+        exposures: Exposure by setup of the middle frame of each take that this process knows.
     """
 
     options: RelightOptions
@@ -244,7 +239,6 @@ class RelightPlan:
     sampling: Sampling
     keeps_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)
     has_room: bool = field(default=False, metadata=NOT_IN_RECIPE)
-    leaders: tuple[Item, ...] = field(default=(), metadata=NOT_IN_RECIPE)
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     exposures: dict[Path, dict[str, float]] = field(
         default_factory=dict, metadata=NOT_IN_RECIPE, compare=False
@@ -323,26 +317,12 @@ class RelightPlan:
                     f"{item.input_path}: {path} would be the name of two images; give --name more fields"
                 )
             paths.add(path)
-        grouped = self.options.exposure_group != "photo"
-        groups = {self._group(item): item for item in reversed(items)} if grouped else {}
         options = replace(self.options, background=behind)
-        return replace(self, options=options, leaders=tuple(groups.values()), shots=shots)
-
-    def leader_of(self, item: Item) -> Item | None:
-        """The photo whose exposure an item shares; None without groups."""
-        group = self._group(item)
-        return next((leader for leader in self.leaders if self._group(leader) == group), None)
-
-    def _group(self, item: Item) -> Path:
-        if self.options.exposure_group == "folder":
-            return item.output_base.parent
-        return item.output_base.with_name(split_frame(item.output_base.name)[0])
+        return replace(self, options=options, shots=shots)
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         """The recipe of every output, which holds the light of its own setup alone."""
         shared = recipe_of(self, digest_of)
-        if self.leaders:
-            shared["leaders"] = [digest_of(leader.input_path) for leader in self.leaders]
         shared |= recipe_of_shots(self.shots.all, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.options.output.formats]

@@ -274,7 +274,7 @@ class OpenShot:
             self._take = take = next(take for take in self.track.takes if number in take)
             models, options = load_models_once(self._options), self._options
             sightings = [seen if one in take else None for one, seen in enumerate(self.track.sightings)]
-            mattes = ShotMattes(self.shot, take, self.frames, options) if options.has_given_person else None
+            mattes = ShotMattes(self.shot, take, self.frames, options) if options.person else None
             sides = models.sides(options.texture_side)
             self._steady = SteadyShot(models, self.frames, sightings, sides, mattes, self._white)
         return self._steady

@@ -231,7 +231,7 @@ def _check_stack(item: Item, plan: RelightPlan) -> None:
         wrong = "a stack holds the field as predicted; give its photo"
     elif options.normals_from is not None:
         wrong = "a stack holds the normals with which it was predicted; give its photo"
-    elif plan.photo.has_given_person:
+    elif plan.photo.person is not None:
         wrong = "a stack holds its person's matte; give its photo"
     elif options.photo_of_stack is None and any(setup.has_own for setup in plan.setups):
         wrong = "the photo's own light (own) needs its photo; give that with --photo"

@@ -1,8 +1,6 @@
-"""A person's matte that is given, by a file or by a model of rembg: it is the matte from end to end."""
+"""A person's matte from a file: it is the matte from end to end."""
 
 import json
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ from skimage.data import astronaut as photograph
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.read import LinearImage
@@ -26,29 +24,14 @@ from facerf_cli.main import main
 from facerf_cli.pipeline import fit_photo, reflectance_of
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.work.matte_models import UNKNOWN, parse_matte_from
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import fit_faces, load_models_once, person_matte, read_matte, read_photo
 from tests.exr_layers import exr_layers
-from tests.kinds import Folders, Log, Patch, Said
+from tests.kinds import Folders, Log, Said
 
 HEIGHT, WIDTH = 192, 224
 CHEAP = ("--reflectance", "field", "--lights", "12", "--light", "70,20", "--format", "exr")
 EIGHT_BITS = 0.5 / 255 + 1e-3  # with the step of half floats
-MODEL = "u2net_human_seg"
-STAND_IN = """
-import numpy as np
-
-def new_session(model_name, *args, **kwargs):
-    return ("session of", model_name)
-
-def remove(data, session=None, only_mask=False, **kwargs):
-    assert only_mask and session == ("session of", "{model}")
-    assert data.dtype == np.uint8 and data.ndim == 3
-    mask = np.zeros(data.shape[:2], np.uint8)
-    mask[:, 20:-30] = 255
-    return mask
-"""
 
 
 def ellipse(shift: float = 0.0, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
@@ -281,6 +264,9 @@ def test_a_matte_of_the_same_aspect_is_resampled_and_alpha_that_varies_is_one(
     options = PhotoOptions(Settings(), person=save(tmp_path / "wide.png", ellipse(0, 60, 120)))
     with pytest.raises(InputError, match=r"wide\.png: the matte has 120 x 60 pixels, the photo 224 x 192"):
         person_matte(item, photo, options)
+    options = PhotoOptions(Settings(), person=save(tmp_path / "turned.png", ellipse(0, WIDTH, HEIGHT)))
+    with pytest.raises(InputError, match=r"turned\.png: .*EXIF orientation"):
+        person_matte(item, photo, options)
     options = PhotoOptions(Settings(), person=save(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH))))
     with pytest.raises(InputError, match=r"black\.png: the matte is black"):
         person_matte(item, photo, options)
@@ -291,70 +277,7 @@ def test_a_matte_of_the_same_aspect_is_resampled_and_alpha_that_varies_is_one(
         assert found is not None and np.abs(found - ellipse()).max() < EIGHT_BITS
 
 
-@pytest.fixture
-def rembg(tmp_path: Path, monkeypatch: Patch) -> Iterator[Path]:
-    """A stand-in of rembg's interface, and its folder with one model; the path of that."""
-    (tmp_path / "python").mkdir()
-    (tmp_path / "python/rembg.py").write_text(STAND_IN.replace("{model}", MODEL))
-    monkeypatch.syspath_prepend(str(tmp_path / "python"))
-    for name in ("U2NET_HOME", "XDG_DATA_HOME"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("REMBG_HOME", str(tmp_path / "home"))
-    monkeypatch.setenv("MODEL_CHECKSUM_DISABLED", "")
-    path = tmp_path / f"home/models/{MODEL}/{MODEL}.onnx"
-    path.parent.mkdir(parents=True)
-    path.write_bytes(b"weights")
-    yield path
-    sys.modules.pop("rembg", None)
-
-
-def test_a_model_of_rembg_gives_the_matte_and_its_licence_is_said(
-    rembg: Path, given: Path, tmp_path: Path, capsys: Said
-) -> None:
-    line = (given / "plates/me.0000.png", "--matte-from", f"rembg:{MODEL}", "-o", tmp_path / "out")
-    assert facerf("segment", *line) == 0
-    assert f"mattes by rembg:{MODEL}: licence Apache-2.0" in " ".join(capsys.readouterr().err.split())
-    matte = exr_layers(tmp_path / "out/me.0000_segment.exr")["person.A"]
-    assert (matte[:, 20:-30] == 1).all() and matte[:, :20].max() == 0
-    row = json.loads((tmp_path / "out/report.jsonl").read_text())
-    expected = {"model": f"rembg:{MODEL}", "licence": "Apache-2.0", "file": str(rembg)}
-    assert row["matte_from"] == expected
-    rembg.write_bytes(b"other weights")
-    assert facerf("segment", *line, "--dry-run") == 0
-    assert "made from other options: the model of --matte-from" in capsys.readouterr().err
-
-
-def test_models_that_are_not_there_are_refused_with_the_command_that_fetches_them(
-    rembg: Path, given: Path, tmp_path: Path, capsys: Said
-) -> None:
-    with pytest.raises(UsageError, match="facerf downloads no model; fetch it with `rembg d bria-rmbg`"):
-        parse_matte_from("rembg:bria-rmbg")
-    for wrong in ("rembg", "rembg:", "u2net", "rembg:../u2net"):
-        with pytest.raises(UsageError, match="give rembg:NAME"):
-            parse_matte_from(wrong)
-    (tmp_path / "python/rembg.py").unlink()
-    line = ("--matte-from", f"rembg:{MODEL}", "-o", tmp_path / "out")
+def test_a_matte_of_one_person_is_not_for_all_faces(given: Path, tmp_path: Path, capsys: Said) -> None:
+    line = ("--person", given / "mattes", "--face", "all", "-o", tmp_path / "out")
     assert facerf("segment", given / "plates", *line) == 2
-    assert "pip install 'facerf[rembg]'" in " ".join(capsys.readouterr().err.split())
-
-
-def test_models_of_older_versions_lie_in_one_folder(rembg: Path, tmp_path: Path, monkeypatch: Patch) -> None:
-    monkeypatch.setenv("U2NET_HOME", str(tmp_path / "old"))
-    (tmp_path / "old").mkdir()
-    licences = {
-        "u2net": "Apache-2.0",
-        "birefnet-portrait": "MIT",
-        "bria-rmbg": "CC BY-NC 4.0, not for commercial use",
-        "isnet-general-use": UNKNOWN,
-    }
-    for name, licence in licences.items():
-        (tmp_path / f"old/{name}.onnx").touch()
-        model = parse_matte_from(f"rembg:{name}")
-        assert model.matte_model == tmp_path / f"old/{name}.onnx" and model.licence == licence
-
-
-def test_options_that_do_not_go_together(rembg: Path, given: Path, tmp_path: Path, capsys: Said) -> None:
-    person, model = ("--person", given / "mattes"), ("--matte-from", f"rembg:{MODEL}")
-    for more, said in (((*person, *model), "leave one out"), ((*person, "--face", "all"), "show one person")):
-        assert facerf("segment", given / "plates", *more, "-o", tmp_path / "out") == 2
-        assert said in " ".join(capsys.readouterr().err.split())
+    assert "shows one person" in " ".join(capsys.readouterr().err.split())

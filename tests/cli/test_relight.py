@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.olat_stack import read_olat_header, write_olat_stack
+from facerf_cli.files.olat_stack import read_olat_header
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
@@ -26,7 +26,6 @@ from facerf_cli.work.relight_options import RelightOptions, parse_aov
 from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
 from tests.kinds import Patch, Said
-from tests.stacks import read_olat_stack
 
 
 def relight(given: Path, output: Path, *line: str, photo: Path = PHOTO) -> int:
@@ -367,43 +366,3 @@ def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -
     assert relight(given, tmp_path, *lights, "--format", "png") == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image
-
-
-@pytest.mark.slow
-def test_a_group_shares_the_exposure_of_its_first_photo(given: Path, tmp_path: Path) -> None:
-    """A darker frame, which by itself would be made as bright as the first."""
-    photo = read_image(PHOTO).pixels
-    frames = tmp_path / "plate"
-    for number, pixels in enumerate((photo, 0.4 * photo)):
-        write_exr(frames / f"shot.{number:04d}.exr", pixels)
-    line = ["relight", str(frames), "--light", "60,10", "--landmarks", str(given / "astronaut.json")]
-    fixed = ["--reflectance", "field", "--composite", "face", "--format", "png", "--exposure", "face"]
-    exposures = {}
-    for group in ("photo", "sequence"):
-        output = tmp_path / group
-        assert main([*line, *fixed, "--exposure-group", group, "-o", str(output)]) == 0
-        rows = map(json.loads, (output / "report.jsonl").read_text().splitlines())
-        exposures[group] = {row["item"]: next(iter(row["exposure_ev"].values())) for row in rows}
-    first, second = "shot.0000", "shot.0001"
-    assert exposures["photo"][second] > exposures["photo"][first] + 1
-    assert exposures["sequence"][first] == exposures["sequence"][second] == exposures["photo"][first]
-
-
-def test_a_group_of_stacks_shares_the_exposure_of_the_first(given: Path, tmp_path: Path) -> None:
-    """The same stack twice, the second at 0.4 of its light."""
-    fixed = ["--checkpoint", str(given / "lambert.safetensors"), "--landmarks", str(given / "astronaut.json")]
-    olat = ["predict-olat", str(PHOTO), "--lights", "4", "--frame", "face", "-o", str(tmp_path / "olat")]
-    assert main([*fixed[:2], *olat, *fixed[2:]]) == 0
-    stack = read_olat_stack(tmp_path / "olat/astronaut_olat.exr")
-    stacks = tmp_path / "stacks"
-    stacks.mkdir()
-    for number, share in enumerate((1.0, 0.4)):
-        write_olat_stack(stacks / f"a.{number:04d}.exr", stack.header, [stack.olats.float() * share])
-    exposures = {}
-    for group in ("photo", "sequence"):
-        line = ["--light", "20,10", "--format", "png", "--exposure", "face", "--exposure-group", group]
-        assert main([*fixed[:2], "relight", str(stacks), *line, "-o", str(tmp_path / group)]) == 0
-        rows = map(json.loads, (tmp_path / group / "report.jsonl").read_text().splitlines())
-        exposures[group] = [next(iter(row["exposure_ev"].values())) for row in rows]
-    assert exposures["photo"][1] > exposures["photo"][0] + 1
-    assert exposures["sequence"] == [exposures["photo"][0]] * 2

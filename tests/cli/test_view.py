@@ -14,7 +14,6 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.files.olat_stack import write_olat_stack
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
-from facerf_cli.work.matte_models import MatteModel
 from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
 from facerf_cli.work.view_photos import write_index
@@ -78,9 +77,8 @@ def test_the_command_of_a_page_has_the_options_that_it_was_made_with() -> None:
     )
     line = "--input-colourspace ACEScg --face 2 --landmarks points --checkpoint"
     assert photo_words(options, 2) == [*line.split(), "my net.safetensors"]
-    rembg = MatteModel("rembg:u2net", Path("models/u2net.onnx"))
-    alone = PhotoOptions(Settings(), face="1", person=Path("mattes"), matte_from=rembg)
-    assert photo_words(alone) == ["--face", "1", "--person", "mattes", "--matte-from", "rembg:u2net"]
+    alone = PhotoOptions(Settings(), face="1", person=Path("mattes"))
+    assert photo_words(alone) == ["--face", "1", "--person", "mattes"]
     shipped = Settings(checkpoints=(Path("shipped"),), checkpoints_by_default=True)
     assert photo_words(PhotoOptions(shipped)) == []
 
