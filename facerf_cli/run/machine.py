@@ -1,4 +1,4 @@
-"""What this process may use of the machine: processors and memory, as Slurm or a container limits them."""
+"""Processors and memory that this process may use, as Slurm or a container limits them."""
 
 import os
 from collections.abc import Iterator
