@@ -146,7 +146,7 @@ def test_each_frame_has_its_image_of_a_moving_background(given: Path, tmp_path: 
     assert made("bg", *plates, *out) == 0
     shown = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "out").glob("*.png"))]
     assert [int(image[0, 0, 0]) for image in shown] == [40, 120, 200]
-    assert made("bg/b.%d.png", *plates, *out) == 0 and "already finished" in capsys.readouterr().err
+    assert made("bg/b.%d.png", *plates, *out) == 0 and "finished and kept" in capsys.readouterr().err
     from_behind = ("--light-from", "background", "-o", tmp_path / "light", "--dry-run")
     assert made("bg/b.####.png", *plates, *from_behind) == 2  # four digits
     assert made("bg/b.8-10.png", *plates, *from_behind) == 0

@@ -229,9 +229,9 @@ def test_an_image_on_stdin_is_not_named_by_its_temporary_file(
         pipe(monkeypatch, b"\x89PNG of toys")
         assert toy_batch.run(Path("-"), out) == 0
         assert (tmp_path / "written").read_text() == "stdin\n"
-    assert "already finished" in capsys.readouterr().err
-    (row,) = map(json.loads, (out / "report.jsonl").read_text().splitlines())
-    assert (row["item"], row["input"]) == ("stdin", "-")
+    assert "finished and kept" in capsys.readouterr().err
+    rows = map(json.loads, (out / "report.jsonl").read_text().splitlines())
+    assert {(row["item"], row["input"]) for row in rows} == {("stdin", "-")}
     pipe(monkeypatch, b"\x89PNG")
     assert names(tmp_path, Path("-"), pattern="{parent}-{stem}-{ext}") == ["stdin-stdin-png"]
 
