@@ -133,7 +133,7 @@ def test_a_chosen_face_keeps_its_number_from_the_left(
     monkeypatch.setattr(photos, "load_models_once", lambda *_: None)
     monkeypatch.setattr(photos, "find_faces", lambda models, photo, which, *_: choose_face(faces, which, "a"))
     item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
-    people = photos.find_people(item, image, PhotoOptions(Settings(), face=which))
+    people = photos.find_people(item, image, PhotoOptions(Settings(), face=which), matte=None)
     assert [face.number for face in people] == numbers
 
 
@@ -148,6 +148,7 @@ def test_the_face_of_a_shot_has_the_number_by_which_it_was_chosen() -> None:
         frames=SimpleNamespace(image=lambda _: None),
         _naming=lambda _: nullcontext(),
         _options=PhotoOptions(Settings(), face="2"),
+        _facts_of=lambda *_: {},
     )
     assert OpenShot.fitted(shot, 0)[1].number == 2
 

@@ -140,4 +140,4 @@ def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
         assert main([*line, str(marks)]) == 1
         err = capsys.readouterr().err
         assert "astronaut" in err and message in err and "Traceback" not in err and "unexpected" not in err
-    assert not (tmp_path / "o").exists()
+    assert [path.name for path in (tmp_path / "o").glob("[!.]*")] == ["report.jsonl"]

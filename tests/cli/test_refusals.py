@@ -136,7 +136,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--lights few": "no such file; pass a number",
         "--lights '1,2;3'": "numbers separated by commas",
         "--lights 1,nan": "numbers separated by commas",
-        "--lights -3": "give a number",
+        "--lights -3": "pass a number",
         "--pose 10,20": "--pose",
         "--pose a,b,c": "--pose",
         "--pose inf,0,0": "--pose",

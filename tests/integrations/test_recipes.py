@@ -30,7 +30,7 @@ from tests.integrations.test_nuke_and_blender import ROOT
 PROGRAMS = ("oiiotool", "ffmpeg", "ffprobe", "exiftool", "magick", "convert", "find", "jq", "parallel")
 # They download, install, start a service, submit a job, or need a screen.
 NOT_RUN = ("rembg", "pip", "pipx", "uvx", "apt", "docker", "blender", "git", "make", "man", "python3", "ray")
-NOT_RUN += ("sbatch", "srun", "tensorboard")
+NOT_RUN += ("cat", "rm", "sbatch", "srun", "tensorboard")
 OURS = ("facerf", "torchrun", "python", ".venv/bin/python", ".", "export")
 PAGES = sorted({*ROOT.glob("docs/*.md"), *ROOT.glob("*.md")} - {ROOT / "CHANGELOG.md"})
 PATH = os.pathsep.join(
