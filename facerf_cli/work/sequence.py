@@ -1,5 +1,6 @@
 """Frames of a shot: its face followed once, in a file, and the view of it that each frame needs."""
 
+import hashlib
 import json
 import logging
 import os
@@ -39,6 +40,7 @@ from facerf_cli.work.photos import (
 from facerf_cli.work.shots import Shot, Shots
 
 _WHOLE = 0.9  # largest value of a matte from which on the person is all there
+_SEAL = '{"sha256": '  # begins the last row of a track
 _DECODED = 12  # frames of a film that are kept as they were decoded
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
@@ -116,9 +118,10 @@ class ShotMattes:
 
 
 class ShotTrack:
-    """The face and the cuts of a shot, as the file beside its outputs holds them: a head, and a row a frame.
+    """The face and the cuts of a shot, as the file beside its outputs has them: a head, and a row per frame.
 
-    A run that was killed may leave half a row, which is cut off.
+    The last row is the SHA-256 of all before it, which tells whether the user has edited the file. A run that
+    was killed may leave half a row, which is cut off.
     """
 
     def __init__(self, path: Path) -> None:
@@ -127,15 +130,18 @@ class ShotTrack:
         self.sightings: list[Sighting | None] = []
         self.cuts: list[int] = []  # first frames of takes, but for that of the first take
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        self._is_facerfs = not text
         whole = text[: text.rfind("\n") + 1]
+        content, _, seal = whole.partition(_SEAL)
         try:
-            rows = list(map(json.loads, whole.splitlines()))
-        except ValueError:
+            self.head, *rows = map(json.loads, content.splitlines())
+            for row in rows:
+                self._take(row)
+        except (ValueError, TypeError, KeyError, AttributeError):  # not a track
             return
-        for row in rows[1:]:
-            self._take(row)
-        self.head = rows[0] if rows else None
-        if whole != text:
+        self._is_facerfs = isinstance(self.head, dict) and "parsing" in self.head
+        self._is_facerfs &= seal in ("", self._seal(content))
+        if whole != text and self._is_facerfs:
             path.write_text(whole, encoding="utf-8")
 
     @property
@@ -149,9 +155,17 @@ class ShotTrack:
         return [take for take in self.takes if any(self.sightings[take.start : take.stop])]
 
     def begin(self, head: Any) -> None:
-        """Forget all frames, unless they were made from what the head says."""
+        """Forget all frames, unless they were made from what the head says.
+
+        Raises InputError for a file that facerf did not write, or that was changed since.
+        """
         head = json.loads(json_line(head))
         if self.head != head:
+            if not self._is_facerfs:
+                raise InputError(
+                    f"{self._path}: was not written by facerf, or was changed since; move it, or choose "
+                    "another -o"
+                )
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._path.write_text(json_line(head) + "\n", encoding="utf-8")
             self.head, self.sightings, self.cuts = head, [], []
@@ -169,6 +183,13 @@ class ShotTrack:
         with self._path.open("a", encoding="utf-8") as stream:
             stream.write(line + "\n")
         self._take(json.loads(line))
+        if len(self.sightings) == self.head["frames"]:
+            content = self._path.read_text(encoding="utf-8")
+            self._path.write_text(content + _SEAL + self._seal(content), encoding="utf-8")
+
+    @staticmethod
+    def _seal(content: str) -> str:
+        return f'"{hashlib.sha256(content.encode()).hexdigest()}"}}\n'
 
     def _take(self, row: dict[str, Any]) -> None:
         if row.get("cut"):

@@ -98,7 +98,7 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     rows = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
     assert [row["item"] for row in rows] == [f"me.{number:04d}" for number in range(FRAMES)]
     assert len({tuple(row["exposure_ev"].values()) for row in rows}) == 1
-    track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:]
+    track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:-1]
     left = [np.mean(row["landmarks"], 0)[0] for row in track]
     assert np.diff(left) == pytest.approx([-2] * (FRAMES - 1), abs=0.5)  # pixels: as the film moves
     capsys.readouterr()
@@ -296,7 +296,7 @@ def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
     assert [name for name in names(out) if name.endswith(".png")] == [
         f"plate_light_70_20.{number}.png" for number in (1001, 1002, 1003)
     ]
-    track = [json.loads(line) for line in (out / "plate_track.jsonl").read_text().splitlines()][1:]
+    track = [json.loads(line) for line in (out / "plate_track.jsonl").read_text().splitlines()][1:-1]
     assert [row["landmarks"] is None for row in track] == [False, True, False]
 
 
@@ -486,6 +486,22 @@ def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("edited", [True, False])
+def test_a_track_of_the_user_is_not_replaced(given: Path, tmp_path: Path, capsys: Said, edited: bool) -> None:
+    path, line = tmp_path / "me_track.jsonl", (given / "me.mp4", "--light", "70,20", *CHEAP, "-o", tmp_path)
+    if edited:
+        assert facerf(given, "relight", *line) == 0
+        path.write_text(path.read_text().replace('"expected_error": 0.0', '"expected_error": 0.5', 1))
+    else:
+        path.write_text('{"mine": true}\nand half a line')
+    before = path.read_bytes()
+    assert facerf(given, "relight", *line, "--no-cuts") == 1
+    assert f"{path}: was not written by facerf, or was changed" in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert not edited or facerf(given, "relight", *line) == 0, "its edits count"
+    assert path.read_bytes() == before
+
+
 def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> None:
     """The second take is dark and mirrored; the film is stopped in it, and goes on."""
     takes = [frame_of(0)] * 2 + [(frame_of(0)[:, ::-1] * 0.5).astype(np.uint8)] * 2
@@ -494,7 +510,7 @@ def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> Non
 
     def made(folder: str, *more: str) -> tuple[list[dict[str, Any]], list[float]]:
         assert facerf(given, "relight", *line, "-o", tmp_path / folder, *more) == 0
-        track = (tmp_path / folder / "cut_track.jsonl").read_text().splitlines()[1:]
+        track = (tmp_path / folder / "cut_track.jsonl").read_text().splitlines()[1:-1]
         report = (tmp_path / folder / "report.jsonl").read_text().splitlines()
         exposures = [next(iter(json.loads(row)["exposure_ev"].values())) for row in report]
         return [json.loads(row) for row in track], exposures
