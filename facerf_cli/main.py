@@ -59,12 +59,11 @@ _LINES = {
     },
     "Look after facerf": {
         "doctor": "Show what is installed, and what is missing.",
-        "config": "Show the defaults in force.",
         "face-model": "Import, fetch, list and show face models.",
     },
 }
 VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}
-_FILES = dict.fromkeys(("doctor", "config"), "installation")  # of verbs whose file has another name
+_FILES = {"doctor": "installation"}  # of commands whose file has another name
 
 # The networks that verbs use; with some options they use fewer.
 _ALL = networks_of(NETWORKS) | {"light_features"}
@@ -224,7 +223,7 @@ def _global_options(
             callback=_take_defaults,
             is_eager=True,
             metavar="FILE",
-            help="Take defaults of options from this TOML file (see `facerf config`).",
+            help="Take defaults of options from this TOML file (docs/batch.md).",
             show_default=False,
         ),
     ] = None,
@@ -272,7 +271,7 @@ def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, .
 
     files, verb = tuple(map(checkpoint_file, given)), context.invoked_subcommand or ""
     if was_given(context, "checkpoint"):
-        if verb not in ("doctor", "config"):  # which show what is wrong
+        if verb != "doctor":  # which shows what is wrong
             serving_files(files, USES.get(verb, ()), f"facerf {verb}")
         return files
     return files if verb in USES else ()

@@ -144,7 +144,7 @@ def test_a_relight_imports_what_it_needs(tmp_path: Path) -> None:
 def test_a_reader_that_goes_away_is_no_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "facerf_cli", "config", "relight"]
+    command = [sys.executable, "-m", "facerf_cli", "doctor"]
     result = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     os.close(writer)
     assert (result.returncode, result.stderr) == (141, "")

@@ -43,9 +43,6 @@ facerf train -o run/ --resume
 facerf doctor
 facerf doctor --json
 facerf doctor --checkpoint run/
-facerf config
-facerf config relight
-facerf config evaluate.compare --config facerf.toml
 facerf evaluate olat dataset/ -o report/
 facerf evaluate olat dataset/ --checkpoint run/ -o report/
 facerf evaluate olat dataset/ --against other.safetensors -o report/

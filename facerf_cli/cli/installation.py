@@ -1,4 +1,4 @@
-"""The installation (`doctor`) and defaults of options (`config`)."""
+"""The installation (`doctor`), and defaults of options from a file (`--config`)."""
 
 import logging
 import textwrap
@@ -155,50 +155,3 @@ def _checked(path: Path, verb: str, table: Any, command: Any) -> dict[str, Any]:
 
 def _options(command: Any) -> Iterator[Any]:
     return (parameter for parameter in command.params if parameter.param_type_name == "option")
-
-
-def config(
-    context: typer.Context,
-    verb: Annotated[
-        str | None,
-        typer.Argument(metavar="[VERB]", help="Show all options of this verb.", show_default=False),
-    ] = None,
-) -> None:
-    """Show the defaults in force, and where each comes from: a configuration file, or facerf itself.
-
-    Without VERB: those that the file of --config (or FACERF_CONFIG) sets. With VERB the others follow, each
-    after a #. The file is TOML with a table for each verb ([relight], [evaluate.yale-b]) and one for global
-    options ([global]); options have the names of the command line, without dashes in front. What the command
-    line gives comes first.
-    """
-    root = context.find_root()
-    given, source = root.default_map or {}, root.params.get("config")
-    if verb is None:
-        if source is None:
-            print("no configuration file; give one with --config FILE or FACERF_CONFIG")
-        _print_given(given, str(source), "")
-        return
-    command: Any = root.command
-    for name in verb.split("."):
-        command, given = getattr(command, "commands", {}).get(name), given.get(name, {})
-        if command is None:
-            raise UsageError(f"config {verb}: no such verb; see `facerf --help`")
-    defaults = []
-    for parameter in _options(command):
-        if parameter.name in given:
-            print(f"{parameter.opts[0]} = {_as_text(given[parameter.name])}  ({source})")
-        elif not parameter.required:
-            defaults.append(f"# {parameter.opts[0]} = {_as_text(parameter.get_default(context))}")
-    print("\n".join(["# not set, and so by default:", *defaults]))
-
-
-def _print_given(tables: Mapping[str, Any], source: str, above: str) -> None:
-    for name, value in tables.items():
-        if isinstance(value, Mapping):
-            _print_given(value, source, f"{above}{name} ")
-        else:
-            print(f"{above}--{name.strip('_').replace('_', '-')} = {_as_text(value)}  ({source})")
-
-
-def _as_text(value: Any) -> str:
-    return "not set" if value is None or value == () else str(value)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.main import main
-from tests.kinds import Patch, Said
+from tests.kinds import Said
 
 CONFIG = """
 [global]
@@ -37,19 +37,3 @@ def test_the_file_gives_defaults_and_the_command_line_comes_first(
     said = capsys.readouterr().out
     assert "a_light_5_5.png" in said and "40_10" not in said
     assert not (tmp_path / "out").exists()
-
-
-def test_config_shows_what_is_in_force_and_from_where(config: Path, capsys: Said, monkeypatch: Patch) -> None:
-    monkeypatch.setenv("FACERF_CONFIG", str(config))
-    assert main(["config"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert f"--seed = 3  ({config})" in lines and f"evaluate yale-b --overwrite = always  ({config})" in lines
-    assert main(["config", "relight"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert f"--exposure = face  ({config})" in lines and "# --lights = 150" in lines
-    assert lines.index(f"--exposure = face  ({config})") < lines.index("# not set, and so by default:")
-    assert all(line[0] == "#" for line in lines[lines.index("# not set, and so by default:") :])
-    assert main(["config", "relight", "--seed", "5"]) == 0
-    monkeypatch.delenv("FACERF_CONFIG")
-    assert main(["config"]) == 0
-    assert "no configuration file" in capsys.readouterr().out

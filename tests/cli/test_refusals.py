@@ -57,8 +57,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--seed": "'--seed' requires an argument",
         "-v": "Missing command",
         "doctor extra": "unexpected extra argument(s) (extra)",
-        "config relighting": "no such verb",
-        "config --config none.toml": "no such file",
+        "doctor --config none.toml": "no such file",
     },
     "relight a.jpg": {
         "": "no light given; add --envmap, --light",

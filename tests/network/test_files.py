@@ -60,6 +60,5 @@ def test_a_file_of_the_configuration_may_serve_other_verbs(tmp_path: Path) -> No
     path = checkpoint(tmp_path / "a.st", "portrait")
     config = tmp_path / "facerf.toml"
     config.write_text(f'[global]\ncheckpoint = ["{path}"]\n')
-    assert main(["--config", str(config), "config"]) == 0
     line = ["envmap", "--count", "1", "--size", "64", "-o", str(tmp_path / "out")]
     assert main(["--config", str(config), *line]) == 0
