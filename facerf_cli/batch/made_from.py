@@ -370,6 +370,11 @@ class FolderIndex:
             rows.append({"output": name, "verb": self._verb, "item": item, **digest})
         self._append(rows)
 
+    def add_file(self, read: Path, output: Path, recipes: Keyed) -> None:
+        """Add the one output of a run that has no items."""
+        self.open(recipes, has_work=True)
+        self.add(output.name, Made(read_row(read), (read_row(output),)), [output], recipes)
+
     def own(self, path: Path) -> None:
         """Note a file that belongs to no item, such as the list of all pages, as written by facerf."""
         row = {"output": self._name(path), "verb": self._verb, "sha256": read_row(path)["sha256"]}

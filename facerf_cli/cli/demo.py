@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import collect_items
+from facerf_cli.batch.made_from import FolderIndex, keyed, recipe_of
 from facerf_cli.cli.examples import examples_of
 from facerf_cli.cli.options import settings_of
 from facerf_cli.cli.relight import RelightJob
@@ -33,33 +34,40 @@ def demo(
 ) -> None:
     """Relight a photo that facerf brings along, under four maps and four single lights, on one sheet.
 
-    It takes a quarter of a minute, and no file is overwritten. The photo is of Eileen Collins (NASA, public
-    domain).
+    It takes a quarter of a minute. A file that facerf did not write is not replaced. The photo is of Eileen
+    Collins (NASA, public domain).
     """
     if output.suffix.lower() not in (".jpg", ".png"):
         raise UsageError(f"-o {output}: not an image; give a file that ends in .jpg or .png")
-    if output.exists():
-        raise UsageError(f"{output}: the file exists; give another name with -o")
     settings, level = settings_of(context), log.level
+    photo, maps = _DEMO / "astronaut.jpg", sorted(map(str, _DEMO.glob("maps/*.exr")))
+    index = FolderIndex(output.parent, "demo", file=output)
+    recipes = keyed([recipe_of(settings, index.digest_of)])
+    if not index.to_make(photo, [output], recipes, "changed"):
+        log.info("%s: is finished and kept", output)
+        return
     log.setLevel(logging.WARNING if level == logging.INFO else level)  # lines with the photo's long path
     options = RelightOptions(
         PhotoOptions(settings),
         background=BackgroundChoice("envmap"),
         output=OutputOptions(formats=("png",)),
     )
-    photo, maps = _DEMO / "astronaut.jpg", sorted(map(str, _DEMO.glob("maps/*.exr")))
     with tempfile.TemporaryDirectory() as folder:
         plan = plan_relight(options, LightSources(envmap=maps, light=[*_LIGHTS]), Path(folder))
         (item,) = collect_items([str(photo)], Path(folder))
         images = RelightJob(plan).ready(dry_run=False).process(item).outputs
         words = [*(f"--envmap {Path(one).name}" for one in maps), *(f"--light {one}" for one in _LIGHTS)]
-        _write_sheet(output, [photo, *images], ["the photo", *words])
+        key = index.key_of(photo, recipes[0][0])
+        _write_sheet(output, [photo, *images], ["the photo", *words], {"facerf:key": key})
+        index.add_file(photo, output, recipes)
     log.setLevel(level)
     print(output)
     log.info("a photo of yours: %s", examples_of("relight")[0])
 
 
-def _write_sheet(sheet: Path, images: Sequence[Path], words: Sequence[str]) -> None:
+def _write_sheet(
+    sheet: Path, images: Sequence[Path], words: Sequence[str], metadata: dict[str, str | int | float]
+) -> None:
     """Write images, each over its word, in three columns."""
     import numpy as np  # --help does without it
 
@@ -74,4 +82,4 @@ def _write_sheet(sheet: Path, images: Sequence[Path], words: Sequence[str]) -> N
         )
         for path, word in zip(images, words, strict=True)
     ]
-    write_display(sheet, contact_sheet(np.stack(tiles), columns=3))
+    write_display(sheet, contact_sheet(np.stack(tiles), columns=3), metadata=metadata)

@@ -25,12 +25,10 @@ from facerf_cli.batch.made_from import (
     DigestOf,
     FolderIndex,
     Keyed,
-    Made,
     Recipe,
     RecipesOf,
     key_of,
     keyed,
-    read_row,
 )
 from facerf_cli.batch.run import BatchOptions, folder_not_file, keep, warn_of_edited
 from facerf_cli.errors import InputError, UsageError
@@ -295,12 +293,10 @@ class FilmOutput:
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
         read, index = items[0].input_path, self._index
         key = index.key_of(read, recipes[0][0])
-        index.open(recipes, has_work=True)
         write_film(
             self.path, images, timing, f"Synthetic: relit by a trained model; {said}; facerf:key={key}"
         )
-        made = Made(read_row(read), (read_row(self.path),))
-        index.add(self.path.name, made, [self.path], recipes)
+        index.add_file(read, self.path, recipes)
         records = [*self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")]
         for path in (*images, *(shot.track for shot in shots), *records):
             path.unlink(missing_ok=True)
