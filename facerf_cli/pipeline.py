@@ -9,6 +9,7 @@ scene-linear [H, W, 3], textures [3, T, T]; directions are toward the light, in 
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -118,7 +119,8 @@ def head_of(
         head = regress_photo(models, photo, face.box_px, sides)
     head = replace(head, others=face.others)
     if face.view is not None:
-        head = head.without(models.face, uncovered(face.view, head.fit.crop))
+        with suppress(InputError):  # all of it is covered: then nothing is left out, and its rating is low
+            head = head.without(models.face, uncovered(face.view, head.fit.crop))
     return head if matte is None else head.without(models.face, uncovered_by(matte, head.fit.crop))
 
 

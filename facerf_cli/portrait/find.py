@@ -48,8 +48,8 @@ class NoFaceError(InputError):
 class FaceBox:
     """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
 
-    There is no view of a face that was given. The photo's other heads are there where they were looked for.
-    `number` counts the faces that were found from the left, from 0.
+    `view` is None for a face that no network has looked at. The photo's other heads are there where they were
+    looked for. `number` counts the faces that were found from the left, from 0.
     """
 
     box_px: Box
