@@ -234,7 +234,7 @@ class FolderIndex:
         self._lost: tuple[type[Exception], ...] = (FacerfError, OSError) if file else ()
         self._is_single = file is not None
         self.outputs: dict[str, Row] = {}
-        self._unfinished: list[Row] = []  # outputs of items that a killed run did not finish
+        self._unfinished: dict[tuple[str, str], Row] = {}  # outputs of items that a killed run did not finish
         self._digests: dict[str, set[str]] = {}  # by output: what facerf has written there
         self._of_item: dict[Any, set[str]] = {}  # by command and item: its outputs
         self._files: dict[str, Row] = {}
@@ -253,7 +253,7 @@ class FolderIndex:
                 if "key" in row:
                     self.outputs[name] = row
                 else:
-                    self._unfinished.append(row)
+                    self._unfinished[name, str(row.get("sha256"))] = row
                 self._digests.setdefault(name, set()).add(str(row.get("sha256")))
                 self._of_item.setdefault((row.get("verb"), row.get("item")), set()).add(name)
         elif "sha256" in row:
@@ -307,15 +307,22 @@ class FolderIndex:
                 reason = f"made from {other_options(self._recipes.get(before, {}), recipe)}"
             elif read_before != digest[:_INPUT]:
                 reason = "made from another input"
+            elif self._is_of_ended_run(path, row):
+                reason = "made by a run that was ended"
             else:
                 reason = "" if size else "an output is empty"
             if reason and not (self._is_single and _carries(path, _key(key, digest))):
                 stale[path] = reason
         return stale
 
+    def _is_of_ended_run(self, path: Path, row: Row) -> bool:
+        """True for an output that a run with other options wrote after its row, and did not note."""
+        others = self._digests[self._name(path)] - {row.get("sha256")}
+        return bool(others) and self._digest_or_none(path) in others
+
     def refusal(self, path: Path) -> str:
         """Say why an output must not be replaced; '' if facerf wrote what is there, or nothing is there."""
-        if regular_size(path) == 0 or not os.path.exists(path):
+        if regular_size(path) == 0 or not os.path.lexists(path):
             return ""
         written = self._digests.get(self._name(path))
         if written and self._digest_or_none(path) in written:
@@ -345,13 +352,15 @@ class FolderIndex:
         self._new.clear()
         rows: list[Mapping[str, Any]] = list(self._files.values())
         rows += [{"recipe": key, "of": recipe} for key, recipe in self._recipes.items()]
-        rows += [*self._unfinished, *self.outputs.values()]
+        rows += [*self._unfinished.values(), *self.outputs.values()]
         with suppress(*self._lost), atomic_path(self.path) as temporary:
             temporary.write_text(lines_of(rows), encoding="utf-8")
 
     def close(self) -> None:
-        """Remove the journals at the end of a run, which has added the rows of all its items."""
+        """Remove the journals at the end of a run; rows of items that did not end are kept."""
         for journal in self._journals():
+            rows = ((str(row.get("output")), row) for row in json_rows(journal))
+            self._append([row for name, row in rows if row.get("sha256") not in self._digests.get(name, ())])
             journal.unlink(missing_ok=True)
 
     def _journals(self) -> list[Path]:
@@ -366,6 +375,7 @@ class FolderIndex:
             self._note(row)
             name = self._name(Path(row["file"]))
             key = _key(keys.get(name, ""), made.read["sha256"])
+            self._digests.setdefault(name, set()).add(row["sha256"])
             digest = {"sha256": row["sha256"], "key": key}
             rows.append({"output": name, "verb": self._verb, "item": item, **digest})
         self._append(rows)
@@ -383,6 +393,9 @@ class FolderIndex:
     def _append(self, rows: Iterable[Row]) -> None:
         with suppress(*self._lost), self.path.open("a", encoding="utf-8") as stream:
             stream.write(lines_of([*rows, *self._new]))
+            stream.flush()
+            with suppress(OSError):  # not every file system can
+                os.fsync(stream.fileno())
         self._new.clear()
 
     def _digest_or_none(self, path: Path) -> str:
@@ -406,12 +419,12 @@ class Writes:
     """Decides which files the writes of an item may replace, and journals the digests of what it writes.
 
     Attributes:
-        written: SHA-256 of each file in the output folder that the item has written.
+        written: SHA-256 and state of each file in the output folder that the item has written.
         left: Files that were left as they are.
     """
 
     def __init__(self, item: Item, folder: Path, verb: str, index: Path, overwrite: Overwrite) -> None:
-        self.written: dict[Path, str] = {}
+        self.written: dict[Path, tuple[str, os.stat_result]] = {}
         self.left: set[Path] = set()
         self._item, self._folder, self._overwrite = item, folder, overwrite
         self._row = {"verb": verb, "item": item.name}
@@ -433,11 +446,8 @@ class Writes:
                 f"{path}: was not written by facerf, or was changed since; move it, choose another -o, or "
                 "pass --overwrite always"
             )
-        self._note(path, file_sha256(temporary))
-        return True
-
-    def _note(self, path: Path, digest: str) -> None:
-        self.written[path] = digest
+        digest = file_sha256(temporary)
+        self.written[path] = digest, temporary.stat()
         row = {"output": path.relative_to(self._folder).as_posix(), **self._row, "sha256": digest}
         with suppress(OSError):  # only the next run after a kill needs it
             descriptor = os.open(self._journal, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
@@ -446,20 +456,28 @@ class Writes:
                 os.fsync(descriptor)
             finally:
                 os.close(descriptor)
+        return True
 
     def rows(self, outputs: Iterable[Path]) -> tuple[Row, ...]:
         """Return rows of all that was written, and of outputs that were not written by `atomic_path`."""
-        rows = [
-            {"file": os.path.abspath(path), **_state(path.stat()), "sha256": digest}
-            for path, digest in self.written.items()
-        ]
+        rows: list[Row] = []
+        for path, (digest, before) in self.written.items():
+            with suppress(OSError):  # the user has removed it
+                now = path.stat()
+                same = (now.st_ino, now.st_size, now.st_mtime_ns) == (
+                    before.st_ino,
+                    before.st_size,
+                    before.st_mtime_ns,
+                )
+                state = _state(now) if same else {}  # edited meanwhile: it is read again
+                rows.append({"file": os.path.abspath(path), **state, "sha256": digest})
         rows += [read_row(path) for path in outputs if path not in self.written]
         return tuple(rows)
 
 
 def is_there(path: Path) -> bool:
-    """True for a folder, and for a file that is not empty: a full disk or a copy may leave empty ones."""
-    return path.is_dir() or bool(is_regular(path) and path.stat().st_size)
+    """True for all but an empty file: a full disk or a copy may leave empty ones."""
+    return os.path.lexists(path) and regular_size(path) != 0
 
 
 def _carries(path: Path, key: str) -> bool:

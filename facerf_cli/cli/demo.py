@@ -10,6 +10,7 @@ import typer
 
 from facerf_cli.batch.inputs import collect_items
 from facerf_cli.batch.made_from import FolderIndex, keyed, recipe_of
+from facerf_cli.batch.run import keep, warn_of_edited
 from facerf_cli.cli.examples import examples_of
 from facerf_cli.cli.options import settings_of
 from facerf_cli.cli.relight import RelightJob
@@ -45,6 +46,7 @@ def demo(
     recipes = keyed([recipe_of(settings, index.digest_of)])
     if not index.to_make(photo, [output], recipes, "changed"):
         log.info("%s: is finished and kept", output)
+        warn_of_edited(keep(index, [output], [photo]))
         return
     log.setLevel(logging.WARNING if level == logging.INFO else level)  # lines with the photo's long path
     options = RelightOptions(

@@ -17,6 +17,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks, to_display
+from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.film import Film
 from facerf_cli.files.read import LinearImage
 from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709, unit_floats
@@ -130,9 +131,10 @@ class ShotTrack:
         self.sightings: list[Sighting | None] = []
         self.cuts: list[int] = []  # first frames of takes, but for that of the first take
         text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-        self._is_facerfs = not text
-        whole = text[: text.rfind("\n") + 1]
-        content, _, seal = whole.partition(_SEAL)
+        self._is_facerfs = not text and (path.is_file() or not os.path.lexists(path))
+        content, mark, seal = text.partition(_SEAL)
+        whole = text if mark else text[: text.rfind("\n") + 1]
+        content = content if mark else whole
         try:
             self.head, *rows = map(json.loads, content.splitlines())
             for row in rows:
@@ -140,7 +142,7 @@ class ShotTrack:
         except (ValueError, TypeError, KeyError, AttributeError):  # not a track
             return
         self._is_facerfs = isinstance(self.head, dict) and "parsing" in self.head
-        self._is_facerfs &= seal in ("", self._seal(content))
+        self._is_facerfs &= self._seal(content).startswith(seal)
         if whole != text and self._is_facerfs:
             path.write_text(whole, encoding="utf-8")
 
@@ -166,8 +168,8 @@ class ShotTrack:
                     f"{self._path}: was not written by facerf, or was changed since; move it, or choose "
                     "another -o"
                 )
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._path.write_text(json_line(head) + "\n", encoding="utf-8")
+            with atomic_path(self._path) as temporary:
+                temporary.write_text(json_line(head) + "\n", encoding="utf-8")
             self.head, self.sightings, self.cuts = head, [], []
 
     def add(self, seen: Sighting | None, cut: bool) -> None:
@@ -184,8 +186,9 @@ class ShotTrack:
             stream.write(line + "\n")
         self._take(json.loads(line))
         if len(self.sightings) == self.head["frames"]:
-            content = self._path.read_text(encoding="utf-8")
-            self._path.write_text(content + _SEAL + self._seal(content), encoding="utf-8")
+            seal = self._seal(self._path.read_text(encoding="utf-8"))
+            with self._path.open("a", encoding="utf-8") as stream:
+                stream.write(_SEAL + seal)
 
     @staticmethod
     def _seal(content: str) -> str:

@@ -297,9 +297,12 @@ class FilmOutput:
             self.path, images, timing, f"Synthetic: relit by a trained model; {said}; facerf:key={key}"
         )
         index.add_file(read, self.path, recipes)
+        frames = FolderIndex(self.folder, "relight")
+        edited = {path for path in images if frames.refusal(path)}
         records = [*self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")]
-        for path in (*images, *(shot.track for shot in shots), *records):
-            path.unlink(missing_ok=True)
+        for path in (*images, *(() if edited else (*(shot.track for shot in shots), *records))):
+            if path not in edited:
+                path.unlink(missing_ok=True)
         if not any(self.folder.iterdir()):
             self.folder.rmdir()
         print(self.path)

@@ -333,6 +333,59 @@ def test_outputs_of_a_run_that_was_killed_are_facerfs(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "out").glob(".facerf*")] == [".facerf-index.jsonl"]
 
 
+def test_outputs_of_a_worker_that_died_are_facerfs(two: Path, tmp_path: Path, capsys: Said) -> None:
+    (two / "a.png").write_bytes(b"late")
+    assert run([two], tmp_path / "out", jobs=2) == 1 and "process died" in capsys.readouterr().err
+    assert (tmp_path / "out/a_copy.bin").read_bytes() == b"late"
+    for number in range(3):  # rows of items without an end are not multiplied
+        assert run([two], tmp_path / "out", recipe={"lights": number}, overwrite="never") == 0
+    assert (tmp_path / "out/.facerf-index.jsonl").read_text().count('"output": "a_copy.bin"') == 1
+    assert run([two], tmp_path / "out") == 0
+
+
+def test_a_run_with_other_options_that_was_ended_leaves_nothing_finished(two: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    @dataclass(frozen=True)
+    class Said(Copy):
+        def __call__(self, item: Item) -> Outcome:
+            with atomic_path(item.output("_copy.bin")) as temporary:
+                temporary.write_bytes(str(self.recipe).encode())
+            if self.recipe == {"lights": 2}:
+                raise KeyboardInterrupt
+            return Outcome([item.output("_copy.bin")])
+
+    def call(number: int) -> int:
+        items = collect_items([str(two / "a.png")], out)
+        return run_items(Said(out, {"lights": number}), items, BatchOptions(out), Settings())
+
+    assert call(1) == 0
+    with pytest.raises(KeyboardInterrupt):
+        call(2)
+    assert (out / "a_copy.bin").read_bytes() == b"{'lights': 2}"
+    assert call(1) == 0 and (out / "a_copy.bin").read_bytes() == b"{'lights': 1}"
+
+
+def test_a_result_that_is_edited_while_its_item_runs_is_the_users(two: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    @dataclass(frozen=True)
+    class Slow(Copy):
+        def __call__(self, item: Item) -> Outcome:
+            with atomic_path(item.output("_copy.bin")) as temporary:
+                temporary.write_bytes(b"made")
+            if self.recipe == {"lights": 1}:
+                item.output("_copy.bin").write_bytes(b"mine")
+            return Outcome([item.output("_copy.bin")])
+
+    def call(number: int) -> int:
+        items = collect_items([str(two / "a.png")], out)
+        return run_items(Slow(out, {"lights": number}), items, BatchOptions(out), Settings())
+
+    assert call(1) == 0 and call(2) == 1
+    assert (out / "a_copy.bin").read_bytes() == b"mine"
+
+
 def test_a_report_of_another_program_stays(two: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/report.jsonl").write_text('{"test": "passed"}\n')

@@ -73,7 +73,10 @@ def test_no_file_of_the_user_is_replaced(tmp_path: Path, capsys: Said) -> None:
         for more in ([], ["--dry-run"]):
             assert main([*line, "--seed", "7", *more]) == 1
             assert f"{tmp_path / name}: was changed" in capsys.readouterr().err
+        assert main([*line, "--seed", "7", "--overwrite", "never"]) == 0
         assert (tmp_path / name).read_bytes() == b"mine"
+        if name == "envmaps.png":  # up to date
+            assert main(line) == 0 and (tmp_path / name).read_bytes() == b"mine"
         (tmp_path / name).write_bytes(before)
     assert main([*line, "--seed", "7"]) == 0, "all are facerf's again"
 

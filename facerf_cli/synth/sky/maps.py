@@ -47,8 +47,11 @@ def write_envmaps(
         sweep_leftovers(batch.output)
     new = {path for path in maps if _is_to_be_made(path, maps[path], size_px, batch.overwrite)}
     sheet, index_of = batch.output / SHEET, FolderIndex(batch.output, "envmap")
+    is_shown_anew = bool(new) or _is_older(sheet, maps)
+    if batch.overwrite == "never" and sheet.exists():
+        is_shown_anew = False
     if batch.overwrite == "changed":
-        for path in [*sorted(new), sheet]:
+        for path in [*sorted(new), *([sheet] if is_shown_anew else [])]:
             if refusal := index_of.refusal(path):
                 raise InputError(refusal)
     for index, (path, facts) in enumerate(maps.items()):
@@ -60,7 +63,7 @@ def write_envmaps(
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
             index_of.own(path)
         print(path, flush=True)
-    if new or _is_older(sheet, maps):
+    if is_shown_anew:
         if not batch.dry_run:
             write_sheet(list(maps), sheet)
             index_of.own(sheet)
