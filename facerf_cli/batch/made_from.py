@@ -424,7 +424,7 @@ class Writes:
     """
 
     def __init__(self, item: Item, folder: Path, verb: str, index: Path, overwrite: Overwrite) -> None:
-        self.written: dict[Path, tuple[str, os.stat_result]] = {}
+        self.written: dict[Path, tuple[str, Row]] = {}
         self.left: set[Path] = set()
         self._item, self._folder, self._overwrite = item, folder, overwrite
         self._row = {"verb": verb, "item": item.name}
@@ -447,7 +447,7 @@ class Writes:
                 "pass --overwrite always"
             )
         digest = file_sha256(temporary)
-        self.written[path] = digest, temporary.stat()
+        self.written[path] = digest, {**_state(temporary.stat()), "ctime_ns": 0}  # a rename changes that
         row = {"output": path.relative_to(self._folder).as_posix(), **self._row, "sha256": digest}
         with suppress(OSError):  # only the next run after a kill needs it
             descriptor = os.open(self._journal, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
@@ -464,12 +464,8 @@ class Writes:
         for path, (digest, before) in self.written.items():
             with suppress(OSError):  # the user has removed it
                 now = path.stat()
-                same = (now.st_ino, now.st_size, now.st_mtime_ns) == (
-                    before.st_ino,
-                    before.st_size,
-                    before.st_mtime_ns,
-                )
-                state = _state(now) if same else {}  # edited meanwhile: it is read again
+                same = {**_state(now), "ctime_ns": 0} == before  # else it was edited, and is read again
+                state = _state(now) if same else {}
                 rows.append({"file": os.path.abspath(path), **state, "sha256": digest})
         rows += [read_row(path) for path in outputs if path not in self.written]
         return tuple(rows)

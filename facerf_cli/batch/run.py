@@ -18,14 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
-from facerf_cli.batch.inputs import (
-    Item,
-    NamePattern,
-    check_case,
-    file_pattern,
-    files_read,
-    refuse_read,
-)
+from facerf_cli.batch.inputs import Item, NamePattern, check_case, file_pattern, files_read, refuse_read
 from facerf_cli.batch.made_from import (
     DigestOf,
     FolderIndex,

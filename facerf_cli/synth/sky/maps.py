@@ -47,9 +47,8 @@ def write_envmaps(
         sweep_leftovers(batch.output)
     new = {path for path in maps if _is_to_be_made(path, maps[path], size_px, batch.overwrite)}
     sheet, index_of = batch.output / SHEET, FolderIndex(batch.output, "envmap")
-    is_shown_anew = bool(new) or _is_older(sheet, maps)
-    if batch.overwrite == "never" and sheet.exists():
-        is_shown_anew = False
+    stays = batch.overwrite == "never" and sheet.exists()
+    is_shown_anew = not stays and (bool(new) or _is_older(sheet, maps))
     if batch.overwrite == "changed":
         for path in [*sorted(new), *([sheet] if is_shown_anew else [])]:
             if refusal := index_of.refusal(path):
