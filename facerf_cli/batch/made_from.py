@@ -283,7 +283,7 @@ class FolderIndex:
         if overwrite == "always":
             return dict.fromkeys(outputs, "")
         if overwrite == "never":
-            return {path: "" for path in outputs if not is_there(path)}
+            return {path: "" for path in outputs if not is_occupied(path)}
         stale = self.why_again(read, outputs, recipes)
         for path in stale:
             if refusal := self.refusal(path):
@@ -322,7 +322,7 @@ class FolderIndex:
 
     def refusal(self, path: Path) -> str:
         """Say why an output must not be replaced; '' if facerf wrote what is there, or nothing is there."""
-        if regular_size(path) == 0 or not os.path.lexists(path):
+        if not is_occupied(path):
             return ""
         written = self._digests.get(self._name(path))
         if written and self._digest_or_none(path) in written:
@@ -437,7 +437,7 @@ class Writes:
         """
         if is_temporary(path) or not path.is_relative_to(self._folder):
             return True
-        exists = is_there(path)
+        exists = is_occupied(path)
         if exists and (path in self._item.kept or self._overwrite == "never"):
             self.left.add(path)
             return False
@@ -471,8 +471,8 @@ class Writes:
         return tuple(rows)
 
 
-def is_there(path: Path) -> bool:
-    """True for all but an empty file: a full disk or a copy may leave empty ones."""
+def is_occupied(path: Path) -> bool:
+    """True where anything but an empty file is: a full disk or a copy may leave empty ones."""
     return os.path.lexists(path) and regular_size(path) != 0
 
 

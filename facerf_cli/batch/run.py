@@ -26,7 +26,6 @@ from facerf_cli.batch.made_from import (
     Made,
     Recipe,
     Writes,
-    is_there,
     json_rows,
     keyed,
     lines_of,
@@ -493,7 +492,7 @@ def _broken(item: Item, error: Exception) -> ItemResult:
 
 
 def _exist(outputs: Sequence[Path]) -> bool:
-    return bool(outputs) and all(map(is_there, outputs))
+    return bool(outputs) and all(path.is_dir() or regular_size(path) for path in outputs)
 
 
 def _log_to_make_again(reasons: Counter[str]) -> None:
