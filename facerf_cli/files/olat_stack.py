@@ -43,7 +43,6 @@ _LENGTH_TOLERANCE = 0.01  # a direction's length may differ from 1 by this
 _SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
 _HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
 _OF_STACK = (_HEADER, _DIRECTION, "facerf:light")
-_ARRAYS = ("kind", "directions", "rotation", "source", "seen", "normals", "layout_version")  # of an .npz
 
 
 @dataclass(frozen=True, eq=False)

@@ -255,11 +255,6 @@ class RelightPlan:
         return "auto" if self.options.exposure is None else self.options.exposure
 
     @property
-    def maps(self) -> list[LightSetup]:
-        """The setups that are maps."""
-        return [setup for setup in self.setups if setup.envmap is not None]
-
-    @property
     def lit_faces(self) -> set[int]:
         """The numbers of the faces that have lights of their own."""
         lights = (light for setup in self.setups for light in setup.lights)
