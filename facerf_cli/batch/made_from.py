@@ -69,6 +69,7 @@ DigestOf = Callable[[Path], str]  # SHA-256 of a file
 RecipesOf = Callable[[DigestOf], Sequence[Recipe]]  # of each output of an item, or one for all of them
 Keyed = Sequence[tuple[str, Recipe]]  # recipes with their digests
 _INDEXES = ".facerf-index*.jsonl"
+_ADVICE = "move it, choose another -o, or pass --overwrite always"
 _INPUT = 16  # digits of an input's digest in a key
 
 
@@ -328,7 +329,7 @@ class FolderIndex:
         if written and self._digest_or_none(path) in written:
             return ""
         state = "was changed after facerf wrote it" if written else "was not written by facerf"
-        return f"{path}: {state}; move it, choose another -o, or pass --overwrite always"
+        return f"{path}: {state}; {_ADVICE}"
 
     def is_edited(self, path: Path) -> bool:
         """True if an output is not as it was written."""
@@ -442,10 +443,7 @@ class Writes:
             self.left.add(path)
             return False
         if exists and self._overwrite == "changed" and path not in self._item.stale:
-            raise InputError(
-                f"{path}: was not written by facerf, or was changed since; move it, choose another -o, or "
-                "pass --overwrite always"
-            )
+            raise InputError(f"{path}: was not written by facerf, or was changed since; {_ADVICE}")
         digest = file_sha256(temporary)
         self.written[path] = digest, {**_state(temporary.stat()), "ctime_ns": 0}  # a rename changes that
         row = {"output": path.relative_to(self._folder).as_posix(), **self._row, "sha256": digest}

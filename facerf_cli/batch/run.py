@@ -4,6 +4,7 @@ A verb passes a `Job` to `run_items`. It raises `InputError` for a faulty item (
 other `FacerfError` concerns the whole run and ends it.
 """
 
+import itertools
 import logging
 import os
 import re
@@ -285,7 +286,8 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
 
     Raises UsageError where the output folder cannot be used, or an output is a file to be read.
     """
-    outputs = [path for item in items for path in job.outputs_of(item)]
+    each = {item: job.outputs_of(item) for item in items}
+    outputs = list(itertools.chain.from_iterable(each.values()))
     refuse_read(outputs, files_read((items, job), items))
     items, verb = options.shard.share(items), job.verb
     lock_name = f".facerf-lock{options.shard.suffix}"
@@ -298,16 +300,22 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
         check_case(outputs, options.output)
         index = FolderIndex(options.output, verb, options.shard, options.file)
         recipes = keyed(job.recipes_of(index.digest_of))
-        stale, refused = _planned(job, items, recipes, options, index)
+        each = {item: each[item] for item in items}
+        stale, refused = _planned(each, recipes, options, index)
         lacks = 0
         if any(stale.values()):
             usable = job.ready(options.dry_run)
             if usable is not job:
                 lacks, job, recipes = 1, usable, keyed(usable.recipes_of(index.digest_of))
-                stale, refused = _planned(job, items, recipes, options, index)
-        todo = [_to_make(item, job, paths, index, recipes, options) for item, paths in stale.items() if paths]
+                each = {item: job.outputs_of(item) for item in items}
+                stale, refused = _planned(each, recipes, options, index)
+        todo = [
+            _to_make(item, each[item], paths, index, recipes, options)
+            for item, paths in stale.items()
+            if paths
+        ]
         finished = [item for item, paths in stale.items() if not paths]
-        kept = {item: [path for path in job.outputs_of(item) if path not in stale[item]] for item in stale}
+        kept = {item: [path for path in each[item] if path not in stale[item]] for item in stale}
         again = Counter(next(filter(None, paths.values()), "") for paths in stale.values())
         if count := sum(map(len, kept.values())):
             log.info("%d of %d results are finished and kept", count, count + sum(map(len, stale.values())))
@@ -373,13 +381,12 @@ def _results(
 
 
 def _planned(
-    job: Job, items: Sequence[Item], recipes: Keyed, options: BatchOptions, index: FolderIndex
+    each: Mapping[Item, Sequence[Path]], recipes: Keyed, options: BatchOptions, index: FolderIndex
 ) -> tuple[dict[Item, dict[Path, str]], list[ItemResult]]:
     """Return the outputs of each item that must be made, and why; and items that may not replace a file."""
     stale: dict[Item, dict[Path, str]] = {}
     refused: list[ItemResult] = []
-    for item in items:
-        outputs = job.outputs_of(item)
+    for item, outputs in each.items():
         if not recipes:
             done = options.overwrite != "always" and _exist(outputs)
             stale[item] = {} if done else dict.fromkeys(outputs, "")
@@ -392,13 +399,17 @@ def _planned(
 
 
 def _to_make(
-    item: Item, job: Job, stale: Mapping[Path, str], index: FolderIndex, recipes: Keyed, options: BatchOptions
+    item: Item,
+    outputs: Sequence[Path],
+    stale: Mapping[Path, str],
+    index: FolderIndex,
+    recipes: Keyed,
+    options: BatchOptions,
 ) -> Item:
     """Return an item with the outputs that its work may replace and keeps, and the key of its one file."""
-    outputs = set(job.outputs_of(item))
-    others = index.replaceable(item) - outputs if recipes else set()
+    others = index.replaceable(item).difference(outputs) if recipes else set()
     key = index.key_of(item.input_path, recipes[0][0]) if recipes and options.file else ""
-    return replace(item, stale=frozenset({*stale, *others}), kept=frozenset(outputs - set(stale)), key=key)
+    return replace(item, stale=frozenset({*stale, *others}), kept=frozenset(outputs) - set(stale), key=key)
 
 
 def keep(index: FolderIndex, outputs: Sequence[Path], read: Iterable[Path]) -> int:
