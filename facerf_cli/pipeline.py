@@ -179,6 +179,7 @@ def reflectance_of(
         found = None if network_alone else source_light(models, head.face, steady.light if steady else None)
         quotient = found.quotient if found else None
         field = Field(models, head.face, quotient, even_shade=found is not None)
+        field = field.with_detail(found.even) if found else field
         if steady or white is None:
             return found, replace(field, balance=steady.balance if steady else None)
         even = found.even if found else field.small_under_even_light()

@@ -1,9 +1,8 @@
 """A view of a portrait field at the photo's own resolution.
 
-Its maps are coarse. The gain is enlarged with the photo as a guide, so that the photo without its light keeps
-every pore and hair; bias, shading and highlights are smooth, but for the photo's edges (`edges.py`). Given
-normals have the photo's resolution: what the maps lack of them changes the shading, to first order, over what
-it changes in the photo's own light.
+Its maps are coarse. They are relit at their own resolution, enlarged, sharp at the photo's edges
+(`edges.py`), and multiplied by the photo's detail (`detail.py`). Given normals have the photo's resolution:
+what the maps lack of them changes the shading, to first order, over what it changes in the photo's own light.
 """
 
 from dataclasses import dataclass
@@ -14,22 +13,19 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.face.landmarks import to_display
-from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev, luminance
+from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.matte import local_lines
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
 from facerf_cli.relighting.cast_shadows import CastShadow, change
+from facerf_cli.relighting.detail import finer_detail
 from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
 from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
 from facerf_cli.relighting.rims import Rims
+from facerf_cli.relighting.white import BARE
 
-_REACH_PX, _SMOOTHNESS = 2, 1e-3  # of the guided filter, in pixels of the square, and variance of its guide
-_ALBEDO_MAPS = 15  # slopes and offsets of the gain, and the bias
 _FEATHER = 0.3  # border of the square where a wider one takes over, in halves of its side
 _GLOSS_PX = 0.8  # blur of highlights, which the network draws in pairs of pixels
-_STRAND_RANGE = (0.3, 3.0)  # of an albedo over that of the maps: strands of hair break up its highlights
 _HAIR = ("hair", "beard")
 _SOLID = ("glasses", "headwear", "garment", "hand")  # their edges are kept sharp
 _MOST_CHANGE = 2.0  # of the shading by normals that are finer than the maps
@@ -42,17 +38,16 @@ class ViewRows:
 
     Attributes:
         grid: Places [h, w, 2] in the maps where the pixels find their like, in -1..1.
-        albedo: The photo without its light [3, h, w].
-        strands: What strands of hair do to highlights [h, w].
+        albedo: The albedo with the photo's detail [3, h, w].
+        detail: The photo's detail, a factor of what is relit [3, h, w].
         finer: What given normals have over those of the maps [3, h, w].
     """
 
     rows: slice
     columns: slice
-    pixels: np.ndarray
     grid: Tensor
     albedo: Tensor
-    strands: Tensor
+    detail: Tensor
     finer: Tensor | None = None
 
 
@@ -69,13 +64,10 @@ class ViewLight:
 
 
 class Enlarged:
-    """The person of a view under sums of lights, over the photo [H, W, 3].
+    """The person of a view under sums of lights, over the photo [H, W, 3]."""
 
-    `display_ev` is the exposure at which the photo is shown to the guided filter.
-    """
-
-    def __init__(self, view: PortraitView, size_px: tuple[int, int], display_ev: float) -> None:
-        self._view, self._size_px, self._display_ev = view, size_px, display_ev
+    def __init__(self, view: PortraitView, size_px: tuple[int, int]) -> None:
+        self._view, self._size_px = view, size_px
         classes = view.person.classes
         self.own = (1 - classes[0] > _SURE).float()
         self._colours = colours_of(view.person.image / view.person.exposure)
@@ -85,16 +77,10 @@ class Enlarged:
         self._trust = 1 - self.own * (1 - trust_in(self._colours, solid[0], hair[0]))
         kept = self._trust * (1 - classes[class_index("garment")])
         self._edges = EdgeFill.of(self._colours, self._trust, self.own, kept)
-        self._hair = torch.cat([self._filled(view.maps.albedo[0].mean(0, keepdim=True)), hair])
-        lines = self._gain_lines()
-        self._albedo_maps = torch.cat([lines, self._filled(self._edges.filled(view.maps.bias[0]))])
-        self._gain_maps = torch.cat([lines, self._filled(view.maps.gain[0])])
+        coloured = torch.cat([view.maps.albedo[0], view.person.image / view.person.exposure])
+        coloured = self._filled(self._edges.filled(coloured))
+        self._fixed_maps = torch.cat([coloured, classes[BARE].sum(0, keepdim=True)])
         self._own_light = None if view.own is None else self.ready(view.own)
-
-    @property
-    def pixel_px(self) -> float:
-        """Side of the maps' pixels in those of the photo."""
-        return 1 / self._view.person.square.scale
 
     def weight(self, rows: slice, among: slice) -> tuple[slice, np.ndarray]:
         """Those among columns in which the square is seen in some rows, and its weight [h, w] there."""
@@ -109,11 +95,11 @@ class Enlarged:
         """Read pixels [h, w, 3] of the photo, as far as no light changes them."""
         grid, unit = self._grid(rows, columns), self._view.person.exposure
         grid = places(self._colours, self._trust, grid, torch.from_numpy(pixels), unit)
-        wide = _enlarged(torch.cat([self._albedo_maps, self._hair]), grid)
-        albedo, hair = self._albedo(pixels, wide), wide[_ALBEDO_MAPS:]
-        finer = (albedo.mean(0) / hair[0].clamp_min(1e-4)).clamp(*_STRAND_RANGE)
-        strands = torch.lerp(torch.ones_like(finer), finer, hair[1])
-        return ViewRows(rows, columns, pixels, grid, albedo, strands, self._finer(rows, columns, grid))
+        albedo, source, skin = torch.split(_enlarged(self._fixed_maps, grid), [3, 3, 1])
+        source, skin = (maps.permute(1, 2, 0) for maps in (source, skin))
+        detail = finer_detail(torch.from_numpy(pixels / unit), source, skin, self._view.typical_skin)
+        detail = detail.permute(2, 0, 1)
+        return ViewRows(rows, columns, grid, albedo * detail, detail, self._finer(rows, columns, grid))
 
     @cached_property
     def _normals(self) -> Tensor:
@@ -142,14 +128,13 @@ class Enlarged:
 
         def lit(maps: Tensor, grid: Tensor) -> Tensor:
             shading, highlights = _enlarged(maps, grid).chunk(2)
-            return seen.albedo * shading + highlights * seen.strands
+            return seen.albedo * shading + seen.detail * highlights
 
         parts = [lit(light.front, seen.grid)]
         if rims is not None:
             offsets_px, brightness = rims.at(seen.rows, seen.columns)
             offsets = offsets_px.permute(1, 2, 0) * (2 / self._view.person.square.side_px)
-            # Strands that stand before such a light show one by one.
-            parts.append(lit(light.rear, seen.grid + offsets) * (brightness * seen.strands))
+            parts.append(lit(light.rear, seen.grid + offsets) * brightness)
         return _by_pixel(torch.cat(parts))
 
     def change_by_normals(self, light: ViewLight, seen: ViewRows) -> np.ndarray:
@@ -166,20 +151,10 @@ class Enlarged:
 
         return _by_pixel(change(light, seen.finer) / change(self._own_light, seen.finer))
 
-    def flat(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-        """Luminances [h, w, 2] of the photo without its light, by the guided gain and by the coarse one."""
-        wide = _enlarged(self._gain_maps, self._grid(rows, columns))
-        gains = self._gain(pixels, wide), wide[12:]
-        return np.stack([luminance(_by_pixel(gain) * pixels) for gain in gains], -1)
-
-    def sharpened(self, pixels: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-        """Share [h, w, 1] of the maps' values at the photo's pixels that are sharpened."""
-        return _by_pixel(_enlarged(1 - self._trust[None], self._grid(rows, columns)))
-
     def layer_maps(self, name: str, light: PortraitLight) -> Tensor:
         """Maps [C, S, S] of a layer under a light [3, S, S]; see `PersonInPhoto.layer`."""
         if name == "albedo":
-            return self._albedo_maps
+            return self._fixed_maps[:3]
         if name == "normal":
             return self._normals
         light = light.whole
@@ -209,26 +184,6 @@ class Enlarged:
         skin = view.person.classes[class_index("skin")].numpy()
         image = view.person.image.permute(1, 2, 0).numpy()
         return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())
-
-    def _albedo(self, pixels: np.ndarray, wide: Tensor) -> Tensor:
-        """The photo without its light [3, h, w], from the maps over its pixels [h, w, 3]."""
-        lit = torch.from_numpy(pixels).permute(2, 0, 1) / self._view.person.exposure
-        return lit * self._gain(pixels, wide) + wide[12:_ALBEDO_MAPS]
-
-    def _gain(self, pixels: np.ndarray, wide: Tensor) -> Tensor:
-        """The gain [3, h, w], from the maps over the photo's pixels [h, w, 3]."""
-        guide = torch.from_numpy(to_display(pixels, self._display_ev)).permute(2, 0, 1).float() / 255
-        slopes, offset = torch.split(wide[:12], [9, 3])
-        log_gain = (slopes.view(3, 3, *guide.shape[1:]) * guide).sum(1) + offset
-        return log_gain.clamp(*self._gain_range).exp()
-
-    def _gain_lines(self) -> Tensor:
-        """Log of the gain as a linear function of the photo's colours: slopes and offsets [12, S, S]."""
-        log_gain = self._filled(self._view.maps.gain[0].log())
-        self._gain_range = float(log_gain.min()), float(log_gain.max())
-        guide = to_display(self._view.person.image.permute(1, 2, 0).numpy()).astype(np.float32) / 255
-        lines = local_lines(_by_pixel(log_gain), guide, _REACH_PX, _SMOOTHNESS)
-        return torch.from_numpy(np.concatenate(lines)).float()
 
     def _smooth(self, light: Tensor) -> Tensor:
         """Shading and highlights [6, S, S], continued over the background; highlights are blurred."""

@@ -24,11 +24,12 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
+from facerf_cli.relighting.detail import TINY, DetailRows, FaceDetail
 from facerf_cli.relighting.face_alone import exposure_of_face, face_layer, relit_faces, require_face_layers
 from facerf_cli.relighting.field import Field
-from facerf_cli.relighting.photo_detail import DARK, TINY, DetailRows, PhotoDetail, RelitDetail
 from facerf_cli.relighting.relightable import Relit
 
+_DARK = 0.08  # of the mean source, added before the change of light is taken
 _SURROUND = 3  # crops along each side of the square in which hair and background follow the face's light
 _SURROUND_PX = 64  # pixels along a crop there
 _SPREAD = 0.04  # standard deviation of the blur of the change of light, in crop sides
@@ -42,7 +43,7 @@ class FaceLight:
     """A face under one sum of lights, ready to be rendered by rows."""
 
     change: Tensor
-    detail: RelitDetail
+    face: Tensor
     own: Tensor | None
 
 
@@ -64,7 +65,7 @@ class FaceInPhoto:
         self.vertices_m = head.fit.vertices_camera(model)
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
-        self._detail = PhotoDetail(head.face, self.view, self.own)
+        self._detail = FaceDetail(head.face, self.view, self.own)
         face = reflectance.face if isinstance(reflectance, Field) else head.face
         self.surround = Surround(self.vertices_m, crop, face.texture, self.size_px[1])
 
@@ -102,7 +103,7 @@ class FaceInPhoto:
             inside = self.view.rows_inside(rows)
             part = found[self.view.rows_of(inside, rows), self.view.window[1]]
             share = self.view.mask[inside].numpy()[..., None]
-            part += share * (self._detail.pixels(relit.detail, detail, inside).numpy() - part)
+            part += share * (self._detail.pixels(relit.face, detail, inside).numpy() - part)
         return found
 
     def layer(
@@ -137,7 +138,7 @@ class Surround:
     def changes(self, olats: Tensor) -> Tensor:
         """The change of light [L, 3, s, s] from the source to each of OLAT textures [L, 3, T, T]."""
         mean, around = self._mean_and_blur(olats)
-        floor = DARK * self._mean_source
+        floor = _DARK * self._mean_source
         change = mean / self._mean_source.clamp(min=TINY)
         local = (around + floor * change) / (self._around_source + floor).clamp(min=TINY)
         local = local.minimum(change * _BRIGHTER).maximum(change / _DARKER)

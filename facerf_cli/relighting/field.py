@@ -21,6 +21,7 @@ from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.portrait.correction import Quotient
 from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting import White
+from facerf_cli.relighting.detail import NOISE, contrast, lost_detail
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.shade import without_colour_of_shade
 from facerf_cli.relighting.white import Balance
@@ -30,6 +31,7 @@ from facerf_cli.run.threads import count, in_threads
 _LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
 _LIGHT_SIDE = 128  # texels on which light is estimated
 _AROUND = 32  # lights that shine as even light does
+_DETAIL_PX, _VISIBLE = 4.0, 0.3  # standard deviation of the blur of detail, in texels; least visibility
 SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo's
 
 
@@ -38,7 +40,7 @@ class Field:
     """The field of a face, by the network alone or corrected by a photo's quotient; a `Reflectance`.
 
     With `even_shade` the network sees the face `without_colour_of_shade`, as the quotient's field does. A
-    `balance` holds the gain of its white.
+    `balance` holds the gain of its white; `detail` [3, T, T] is the factor of `with_detail`.
     """
 
     models: Models
@@ -47,6 +49,7 @@ class Field:
     bf16: bool = False
     even_shade: bool = False
     balance: Balance | None = None
+    detail: Tensor | None = None
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
@@ -71,6 +74,7 @@ class Field:
             olats = olats.float().cpu()
             olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
             olats = self.quotient.corrected(olats) if self.quotient else olats
+            olats = olats if self.detail is None else olats * self.detail
             return olats if self.balance is None else olats * self.balance.gain[:, None, None]
 
         yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
@@ -79,6 +83,23 @@ class Field:
         """The face's small texture [3, t, t] under even white light."""
         rig = rig_directions(_AROUND)
         return replace(self, face=shrunk(self.face)).relit(rig, torch.full((1, _AROUND, 3), 1 / _AROUND))[0]
+
+    def with_detail(self, even: Tensor) -> "Field":
+        """Return the field with the detail of the texture that the network loses (`detail.py`).
+
+        `even` [3, t, t] is the small face under even white light. How much of the contrast of its own texture
+        it keeps is the same at all scales, so that it is measured there.
+        """
+        small, sigma = shrunk(self.face), _DETAIL_PX * even.shape[-1] / self.face.texture.shape[-1]
+        sure = (small.visible > SEEN_WELL).float()
+        shown, kept = (
+            contrast(image, sure, sigma, NOISE * float(image.mean())) for image in (small.texture, even)
+        )
+        texture = self.face.texture.detach()
+        weight = (self.face.visible * region_mask("skin", texture.shape[-1]) > _VISIBLE).float()
+        finer = contrast(texture, weight, _DETAIL_PX, NOISE * float(texture.mean()))
+        grey, colour = ((1 - slope(*pair)) * one for one, *pair in zip(finer, shown, kept, strict=True))
+        return replace(self, detail=lost_detail(grey, colour, weight, _DETAIL_PX))
 
     @property
     def has_gradients(self) -> bool:
@@ -112,6 +133,11 @@ class Field:
         texels = self.face.texture.shape[-1] ** 2
         bytes_per_light = self._network.bytes_per_light(texels) * count()
         return max(1, min(most, limit_bytes() // bytes_per_light))
+
+
+def slope(x: Tensor, y: Tensor) -> float:
+    """Return the slope of y as a multiple of x, within 0..1."""
+    return float(((x * y).sum() / (x * x).sum().clamp_min(1e-9)).clamp(0, 1))
 
 
 def shining(weights: Tensor) -> Tensor:

@@ -1,10 +1,10 @@
 """The whole person of a portrait field, relit in its photo at the photo's own resolution.
 
 Of the field's views the narrower lies over the wider one, and fades toward its border. In the face the neural
-field's texture has the photo's detail (`photo_detail.py`); the rest has its grain (`grain.py`).
+field's texture is blended in. Both have the photo's detail (`detail.py`).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, TypeVar
@@ -15,22 +15,19 @@ from torch import Tensor
 
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule
-from facerf_cli.image.strips import in_strips
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.parse import UncoveredRows
 from facerf_cli.raster.texture import smoothstep
 from facerf_cli.relighting.cast_shadows import CastShadow, cast_shadow
+from facerf_cli.relighting.detail import DetailRows, FaceDetail
 from facerf_cli.relighting.enlarged import Enlarged, ViewLight, ViewRows
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.face_alone import FACE_LAYERS, face_layer
 from facerf_cli.relighting.field import near_texture
-from facerf_cli.relighting.grain import Grain, GrainRows, seen_columns
-from facerf_cli.relighting.photo_detail import DetailRows, PhotoDetail, RelitDetail
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.relightable import Relit
 from facerf_cli.relighting.rims import Rims, from_behind
@@ -39,10 +36,7 @@ from facerf_cli.run.threads import both
 
 PERSON_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes")
 T = TypeVar("T")
-Read = Callable[[np.ndarray, slice, slice], np.ndarray]  # of pixels [h, w, 3], their rows and columns
 COLOURS = ("albedo", "specular")  # layers that are radiance
-_NO_GRAIN = ("hair", "eyes", "lips", "mouth")  # its blur would mix their colours with the skin's
-_LEAST_MOUTH = 0.12  # share of lips and mouth in a pixel from which on it has none
 _LIPS = 0.7  # cosine to the face's front from which on lips keep no light from the teeth
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
 
@@ -57,12 +51,13 @@ class _Part(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PersonRows:
-    """Values in some rows of the photo, and in those around them that grain reaches, that no light changes.
+    """Values in some rows of the photo that no light changes.
 
     They are of the columns in which these rows show the person, and of its views there.
     """
 
-    grain: GrainRows
+    rows: slice
+    columns: slice
     parts: list[_Part]
     views: list[ViewRows]
     inside: slice  # of the face's window
@@ -75,7 +70,7 @@ class PersonLight:
     """A person under one sum of lights, ready to be rendered by rows."""
 
     views: list[ViewLight]
-    detail: RelitDetail
+    face: Tensor
     from_behind: bool
     mirrored: list[np.ndarray]
     layers: dict[str, list[Tensor]]
@@ -95,10 +90,9 @@ class PersonInPhoto:
         self.vertices_m = head.fit.vertices_camera(model)
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
-        segmentation, ev = field.person.segmentation, display_ev(self.own.small)
-        self._bare_face = UncoveredRows(segmentation.classes, self.size_px)
-        self._views = [Enlarged(view, self.size_px, ev) for view in field.views]
-        self._detail = PhotoDetail(head.face, self.view, self.own)
+        self._bare_face = UncoveredRows(field.person.segmentation.classes, self.size_px)
+        self._views = [Enlarged(view, self.size_px) for view in field.views]
+        self._detail = FaceDetail(head.face, self.view, self.own)
 
     @property
     def nbytes(self) -> int:
@@ -119,7 +113,7 @@ class PersonInPhoto:
         directions, weights = lights.directions, lights.weights
         middle_m, side = self.vertices_m.mean(0), self._head.face.texture.shape[-1]
         near = lights.around(middle_m)
-        lit, _ = both(lambda: field.lit(directions, weights, near), lambda: self._finish)
+        lit, _ = both(lambda: field.lit(directions, weights, near), lambda: self._eyes)
         forward = self._head.fit.rotation[:, 2]
 
         def arriving(toward: Tensor, weights: Tensor) -> Tensor:
@@ -150,17 +144,8 @@ class PersonInPhoto:
             yield replace(every[number], own=own, keys=tuple(cast))
 
     @cached_property
-    def _finish(self) -> tuple[Grain, Eyes]:
-        """Detail of the photo without its light, and the eyes."""
-        share = in_strips(self._grained, *self.size_px)["share"]
-        grain = Grain(self._flat, share, self._views[0].pixel_px, self._sharpened)
-        return grain, Eyes(self.own, self._field.person.eyes, self.size_px)
-
-    def _grained(self, rows: slice) -> dict[str, np.ndarray]:
-        """Share [h, W] of the person that has grain, in rows of the photo."""
-        hair, eyes, lips, mouth = (self._field.person.segmentation.layer(name, rows) for name in _NO_GRAIN)
-        plain = (1 - hair - eyes).clip(0) * (1 - (lips + mouth) / _LEAST_MOUTH).clip(0)
-        return {"share": (self.matte[rows] > 0) * plain}
+    def _eyes(self) -> Eyes:
+        return Eyes(self.own, self._field.person.eyes, self.size_px)
 
     @cached_property
     def _rims(self) -> Rims:
@@ -179,8 +164,8 @@ class PersonInPhoto:
                 raise UsageError(f"--aov {name}: is no layer; give {', '.join(PERSON_LAYERS)}")
         return PersonLight(
             views=[view.ready(light) for view, light in zip(self._views, relit.views, strict=True)],
-            detail=self._detail.ready(relit.texture, relit.mouth),
-            mirrored=self._finish[1].ready(relit.mirrored),
+            face=self._detail.ready(relit.texture, relit.mouth),
+            mirrored=self._eyes.ready(relit.mirrored),
             from_behind=any(bool(light.behind.any()) for light in relit.views),
             layers=maps,
             keys=[
@@ -192,11 +177,10 @@ class PersonInPhoto:
 
     def observe(self, rows: slice) -> PersonRows:
         """Read rows of the photo, as far as no light changes them."""
-        grain = self._finish[0].observe(rows, self._columns(rows, self._finish[0].margin))
-        wide, inside = grain.wide, self.view.rows_inside(grain.wide)
-        parts, own = self._parts(wide, grain.columns), self.own[wide]
+        columns, inside = seen_columns(self.matte[rows]), self.view.rows_inside(rows)
+        parts, own = self._parts(rows, columns), self.own[rows]
         views = [
-            self._views[part.number].observe(own[:, part.columns].clip(min=0), wide, part.columns)
+            self._views[part.number].observe(own[:, part.columns].clip(min=0), rows, part.columns)
             for part in parts
         ]
         detail, share = None, np.zeros(0, np.float32)
@@ -204,17 +188,17 @@ class PersonInPhoto:
             detail = self._detail.observe(inside)
             bare = self._bare_face[self.view.in_photo(inside)][:, self.view.window[1]]
             share = self.view.mask[inside].numpy() * bare
-        return PersonRows(grain, parts, views, inside, detail, share)
+        return PersonRows(rows, columns, parts, views, inside, detail, share)
 
     def pixels(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
         """Pixels [h, W, 3] of observed rows, without the photo's own light; 0 where nobody is."""
-        rows, among = seen.grain.rows, seen.grain.columns
+        rows, among = seen.rows, seen.columns
         by_maps = self._by_maps(relit, seen)
         pixels = by_maps.copy() if relit.keys else by_maps
         for alone, part, change in self._shadows(relit, rows, among):
             image = by_maps if alone is None else self._by_maps(alone, seen)
             pixels[:, part] += image[:, part] * change
-        return self._finish[1].lit(self._spread(pixels, among), relit.mirrored, rows)
+        return self._eyes.lit(self._spread(pixels, among), relit.mirrored, rows)
 
     def of_face(self, relit: PersonLight, rows: slice) -> Tensor:
         """The part [h, W, 3] of rows of the photo that the face's textures give, with gradients.
@@ -224,14 +208,14 @@ class PersonInPhoto:
         seen, found = self.observe(rows), torch.zeros(rows.stop - rows.start, self.size_px[1], 3)
         if seen.detail is None:
             return found
-        columns = seen.grain.columns
+        columns = seen.columns
         by_maps = self._face_by_maps(relit, seen)
         found[:, columns] = by_maps
         for alone, part, change in self._shadows(relit, rows, columns):
             image = by_maps if alone is None else self._face_by_maps(alone, seen)
             found[:, columns][:, part] += image[:, part] * torch.from_numpy(change)
         ones, nothing = np.ones(found.shape, np.float32), [np.zeros_like(image) for image in relit.mirrored]
-        return found * torch.from_numpy(self._finish[1].lit(ones, nothing, rows))
+        return found * torch.from_numpy(self._eyes.lit(ones, nothing, rows))
 
     def _shadows(
         self, relit: PersonLight, rows: slice, among: slice
@@ -248,24 +232,24 @@ class PersonInPhoto:
 
     def _face_by_maps(self, relit: PersonLight, seen: PersonRows) -> Tensor:
         """The part [h, w, 3] of `_by_maps` that the face's textures give, with gradients."""
-        person = torch.zeros(*seen.grain.inside.shape, 3)
+        person = torch.zeros(seen.rows.stop - seen.rows.start, seen.columns.stop - seen.columns.start, 3)
         at, share, detail = self._face_at(relit, seen)
         person[at] = torch.from_numpy(share) * detail
         if self._field.person.normals is not None:
             person = person * torch.from_numpy(self._change_by_normals(relit, seen))
-        return self._finish[0].given_to(person, seen.grain)
+        return person
 
     def _face_at(
         self, relit: PersonLight, seen: PersonRows
     ) -> tuple[tuple[slice, slice], np.ndarray, Tensor]:
         """Rows and columns of observed pixels that show the face, its share [h, w, 1], its own pixels."""
         assert seen.detail is not None
-        rows, among = self.view.rows_of(seen.inside, seen.grain.wide), seen.grain.columns
+        rows, among = self.view.rows_of(seen.inside, seen.rows), seen.columns
         window = self.view.window[1]
         start = max(window.start, among.start)
         common = slice(start, max(start, min(window.stop, among.stop)))
         own = _within(common, window)
-        detail = self._detail.pixels(relit.detail, seen.detail, seen.inside)[:, own]
+        detail = self._detail.pixels(relit.face, seen.detail, seen.inside)[:, own]
         return (rows, _within(common, among)), seen.face_share[:, own, None], detail
 
     def _by_maps(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
@@ -279,7 +263,7 @@ class PersonInPhoto:
             person[at] += share * (detail.numpy() - person[at])
         if self._field.person.normals is not None:
             person = person * self._change_by_normals(relit, seen)
-        return self._finish[0].given(person + behind if behind.size else person, seen.grain)
+        return person + behind if behind.size else person
 
     def _change_by_normals(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
         """Factor [h, w, 3] of observed pixels by given normals."""
@@ -294,7 +278,7 @@ class PersonInPhoto:
         shares. All are 0 off the person, whose share is the matte: colours are multiplied by it, as layers of
         lights are.
         """
-        rows = seen.grain.rows
+        rows = seen.rows
         if name == "classes":
             return self._field.person.segmentation.layers(rows)
         if name not in PERSON_LAYERS:
@@ -302,7 +286,7 @@ class PersonInPhoto:
         if name in relit.layers:
             used = self._used(relit.layers[name], seen)
             shown = _joined([view.layer(name, maps, one) for view, maps, one in used], seen.parts)
-            values = self._spread(shown[seen.grain.own], seen.grain.columns)
+            values = self._spread(shown, seen.columns)
         else:
             values = {"depth": self._surface.depth_m, "position": self._surface.position_m}[name](rows)
         share = self.matte[rows][..., None]
@@ -325,10 +309,6 @@ class PersonInPhoto:
         for part, view in zip(seen.parts, seen.views, strict=True):
             yield self._views[part.number], values[part.number], view
 
-    def _columns(self, rows: slice, margin: int) -> slice:
-        """Columns of the photo in which rows, and those in a margin, show the person, with that margin."""
-        return seen_columns(self.matte[max(0, rows.start - margin) : rows.stop + margin], margin)
-
     def _parts(self, rows: slice, columns: slice) -> list[_Part]:
         """The views as far as they show in some rows and columns; the last in all of them."""
         parts = []
@@ -347,18 +327,11 @@ class PersonInPhoto:
         found[:, columns] = values
         return found
 
-    def _flat(self, rows: slice) -> np.ndarray:
-        return self._read(rows, [view.flat for view in self._views])
 
-    def _sharpened(self, rows: slice) -> np.ndarray:
-        return self._read(rows, [view.sharpened for view in self._views])
-
-    def _read(self, rows: slice, reads: Sequence[Read]) -> np.ndarray:
-        """Values [h, W, C] of rows of the photo that each view reads, 0 where nobody is."""
-        columns, own = self._columns(rows, 0), self.own[rows]
-        parts = self._parts(rows, columns)
-        shown = [reads[one.number](own[:, one.columns].clip(min=0), rows, one.columns) for one in parts]
-        return self._spread(_joined(shown, parts), columns)
+def seen_columns(shown: np.ndarray) -> slice:
+    """Columns in which a part of an image [h, W] is not 0; at least one."""
+    at = np.flatnonzero(shown.any(0))
+    return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
 
 
 def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:

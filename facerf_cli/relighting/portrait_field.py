@@ -9,6 +9,7 @@ photo back.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -20,8 +21,8 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_uv
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights, PointLights
-from facerf_cli.network.inputs import is_grey
-from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
+from facerf_cli.network.inputs import MEAN_RADIANCE, is_grey
+from facerf_cli.network.portrait import HAIRY, PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
 from facerf_cli.portrait.person import SeenPerson
@@ -30,6 +31,7 @@ from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes, blurred
 from facerf_cli.relighting.baked_in import without_baked_in
+from facerf_cli.relighting.detail import FLOOR, NOISE, contrast, finer_detail, lost_detail, mean_colour
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.rims import from_behind
@@ -45,6 +47,8 @@ _SHARE = 0.4  # of the portrait field in the face, where the other one is finer
 _SKIN = class_index("skin")
 _APART = 0.01  # blur of what is no skin, in sides: skin near to it keeps its make-up and its hair
 _CLOTH = ("garment", "headwear")
+_DETAIL_PX = 2.0  # standard deviation of the blur of detail, in pixels of the maps
+_MOSTLY = 0.5  # least share of the person in a pixel whose detail counts
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
 
@@ -125,7 +129,7 @@ class PortraitView:
     @staticmethod
     def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
         """The view of a person with its maps, corrected by the photo's estimated light."""
-        found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))
+        found = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))._with_detail()
         if source is None:
             return found
         found = found._corrected(source)
@@ -146,8 +150,22 @@ class PortraitView:
 
     def _with_albedo(self, gains: Tensor) -> "PortraitView":
         """The view whose albedo is multiplied by gains [3, S, S]."""
-        colours = {name: getattr(self.maps, name) * gains for name in ("gain", "bias", "albedo")}
-        return replace(self, maps=self.maps._replace(**colours))
+        return replace(self, maps=self.maps._replace(albedo=self.maps.albedo * gains))
+
+    @cached_property
+    def typical_skin(self) -> Tensor:
+        """Mean radiance [3] of the skin, in the units of the network's input."""
+        return mean_colour(self.person.image, self.person.classes[_SKIN]) / self.person.exposure
+
+    def _with_detail(self) -> "PortraitView":
+        """Return the view with the detail of the photo that its albedo has lost (`detail.py`)."""
+        person, hair = self.person, self.person.classes[list(HAIRY)].sum(0)
+        weight = (1 - person.classes[0] > _MOSTLY).float()
+        floor = MEAN_RADIANCE * (NOISE + (FLOOR - NOISE) * hair)
+        images = person.image / person.exposure, self.maps.albedo[0]
+        shown, kept = (contrast(image, weight, _DETAIL_PX, floor) for image in images)
+        grey, colour = (one - other for one, other in zip(shown, kept, strict=True))
+        return self._with_albedo(lost_detail(grey, colour, weight, _DETAIL_PX, hair))
 
     def _corrected(self, source: SourceLight) -> "PortraitView":
         """The view in the units of the photo's light, corrected to give the photo back under it."""
@@ -332,8 +350,10 @@ class PortraitField:
             )
 
         view = self.views[0]
-        texture = self.field.face.texture[None] / view.person.exposure
-        albedo = texture * sampled(view.maps.gain) + sampled(view.maps.bias)
+        texture, source = self.field.face.texture, sampled(view.person.image[None])[0]
+        typical = view.typical_skin * view.person.exposure
+        detail = finer_detail(texture.movedim(0, -1), source.movedim(0, -1), torch.ones(1), typical)
+        albedo = sampled(view.maps.albedo) * detail.movedim(-1, 0)
         own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * view.exposure
         return torch.lerp(textures, own, _SHARE)
 

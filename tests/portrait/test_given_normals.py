@@ -102,7 +102,7 @@ def test_bumps_are_lit_by_their_side_and_the_photos_own_light_gives_the_photo_ba
 def test_bumps_change_nothing_in_the_photos_own_light(person: Person) -> None:
     view, photo = field_of(person).views[0], astronaut.photo()
     assert view.own is not None
-    enlarged, rows, columns = Enlarged(view, photo.shape[:2], 0.0), slice(100, 140), slice(200, 260)
+    enlarged, rows, columns = Enlarged(view, photo.shape[:2]), slice(100, 140), slice(200, 260)
     seen = enlarged.observe(photo[rows, columns], rows, columns)
     assert seen.finer is not None and seen.finer.abs().max() > 0.2
     np.testing.assert_allclose(enlarged.change_by_normals(enlarged.ready(view.own), seen), 1, atol=1e-5)
