@@ -14,6 +14,7 @@ import torch
 import typer
 
 from facerf_cli import pipeline
+from facerf_cli.batch import made_from
 from facerf_cli.face import head
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.resample import resample_model
@@ -35,12 +36,12 @@ LONG = """
 test_paper_script.py test_docs_commands.py
 cli/test_train.py cli/test_film.py cli/test_prepare_dataset.py cli/test_relight.py
 cli/test_output_options.py viewer/test_viewer_agreement.py cli/test_evaluate_protocols.py
-test_ray_workers.py portrait/test_find.py cli/test_prepare_checks.py test_stopping.py
+run/test_ray_workers.py portrait/test_find.py cli/test_prepare_checks.py run/test_stopping.py
 cli/test_predict_olat.py test_python_api.py test_gradients.py test_notebook.py cli/test_synth_stage.py
 cli/test_estimate_light.py training/test_loop.py tools/test_builtin_face.py cli/test_evaluate_yale_b.py
 cli/test_relight_dataset.py
-cli/test_shards_sum_up.py test_foreign_modules.py test_distribution.py test_near_lights.py
-synth/test_path_tracer.py synth/head/test_hair.py test_portrait_field.py
+cli/test_shards_sum_up.py test_foreign_modules.py test_distribution.py relighting/test_near_lights.py
+synth/test_path_tracer.py synth/head/test_hair.py relighting/test_portrait_field.py
 """
 
 
@@ -138,6 +139,15 @@ def _processes_have_torch() -> None:
     multiprocessing.get_context = lambda method=None: context_of(
         "forkserver" if method == "spawn" else method
     )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _cache_of_indexes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the indexes of files that `-o` names out of the user's cache."""
+    folder, in_cache = tmp_path_factory.mktemp("indexes"), made_from._in_cache
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(made_from, "_in_cache", lambda file: folder / in_cache(file).name)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -34,8 +34,8 @@ from facerf_cli.training.portrait import PortraitObjective
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
 from tests import fake_device
 from tests.synth.conftest import bank, bank_folder
-from tests.training import test_diffuse_sh_objective, test_parsing_objective, test_portrait_objective
-from tests.training.test_texture_objective import NETWORK
+from tests.training import test_diffuse_sh, test_parsing, test_portrait
+from tests.training.test_texture import NETWORK
 
 __all__ = ["bank", "bank_folder"]
 ASTRONAUT = Path(__file__).parents[1] / "examples/astronaut.jpg"
@@ -68,23 +68,23 @@ def light_features(bank: Bank) -> Objective:
 
 
 def diffuse_sh(bank: Bank) -> Objective:
-    network = DiffuseNetwork(test_diffuse_sh_objective.NETWORK)
-    return DiffuseObjective(bank, network, test_diffuse_sh_objective.SETTINGS)
+    network = DiffuseNetwork(test_diffuse_sh.NETWORK)
+    return DiffuseObjective(bank, network, test_diffuse_sh.SETTINGS)
 
 
 def parsing(bank: Bank) -> Objective:
     source: Any = SimpleNamespace(
         provenance={"licence": "MIT"},
         people=lambda held_out: ([1], [0]),
-        draw=lambda people, side, generator: test_parsing_objective.truth(side),
+        draw=lambda people, side, generator: test_parsing.truth(side),
     )
-    network = ParsingNetwork(test_parsing_objective.TINY)
-    return ParsingObjective(source, network, test_parsing_objective.SETTINGS)
+    network = ParsingNetwork(test_parsing.TINY)
+    return ParsingObjective(source, network, test_parsing.SETTINGS)
 
 
 def portrait(bank: Bank) -> Objective:
     network = PortraitNetwork(PortraitSettings((8, 8, 8), (0, 1, 1), 14, 32, sees_scale=True))
-    return PortraitObjective(test_portrait_objective.Portraits(), network, test_portrait_objective.SETTINGS)
+    return PortraitObjective(test_portrait.Portraits(), network, test_portrait.SETTINGS)
 
 
 @pytest.mark.parametrize("stage", [reflectance, light_features, diffuse_sh, parsing, portrait])

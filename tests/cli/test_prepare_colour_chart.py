@@ -14,9 +14,9 @@ from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests.capture.chart_image import CAMERA, CORNERS, chart_image
 from tests.capture.test_chart import kept_luminance
-from tests.cli.folders import tree
 from tests.cli.test_prepare_dataset import prepare
 from tests.dataset.capture import BLACK_LEVEL, write_capture
+from tests.folders import tree
 from tests.stacks import read_olat_stack
 
 LIGHTS = 10

@@ -29,8 +29,8 @@ from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
-from tests.cli.folders import tree
 from tests.dataset.capture import Truth, write_capture
+from tests.folders import tree
 from tests.stacks import read_olat_stack
 
 LIGHTS = 12

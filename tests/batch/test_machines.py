@@ -19,8 +19,8 @@ from facerf_cli.errors import UsageError
 from facerf_cli.run import ray_workers
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.workers import Workers, spread
-from tests.cli.folders import rows
-from tests.cli.toy_batch import outputs_of, run
+from tests.batch.toy_batch import outputs_of, run
+from tests.folders import rows
 
 FOLDER_VERBS = {
     "relight", "estimate-light", "convert-light", "predict-olat", "fit-geometry", "synth-stage",

@@ -89,6 +89,6 @@ def run(
 
 
 if __name__ == "__main__":
-    from tests.cli.toy_batch import run as run_importable
+    from tests.batch.toy_batch import run as run_importable
 
     run_importable(Path(sys.argv[1]), Path(sys.argv[2]), ray="local", jobs=2)

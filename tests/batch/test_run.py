@@ -23,8 +23,8 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
-from tests.cli.folders import rows
-from tests.cli.toy_batch import Copy, run
+from tests.batch.toy_batch import Copy, run
+from tests.folders import rows
 from tests.kinds import Patch, Said
 from tests.processes import wait_until
 
@@ -324,7 +324,7 @@ def test_a_file_beside_the_outputs_follows_the_same_rule(two: Path, tmp_path: Pa
 def test_outputs_of_a_run_that_was_killed_are_facerfs(tmp_path: Path) -> None:
     """The process ends after an output has its name, before the run has noted the item."""
     (tmp_path / "a.png").write_bytes(b"late")
-    code = "import sys, pathlib, tests.cli.toy_batch as toy; toy.run(*map(pathlib.Path, sys.argv[1:]))"
+    code = "import sys, pathlib, tests.batch.toy_batch as toy; toy.run(*map(pathlib.Path, sys.argv[1:]))"
     command = [sys.executable, "-c", code, str(tmp_path / "a.png"), str(tmp_path / "out")]
     assert subprocess.run(command, env=ENVIRONMENT, capture_output=True).returncode == -signal.SIGKILL
     assert (tmp_path / "out/a_copy.bin").read_bytes() == b"late"

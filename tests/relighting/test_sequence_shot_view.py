@@ -13,8 +13,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.relighting import sequence as shot_view
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides
 from facerf_cli.relighting.sequence import KEY_FRAMES, LONGEST_GAP, Sighting, SteadyShot
-from tests.film.test_follow import face_of
 from tests.kinds import Patch
+from tests.relighting.test_sequence_follow import face_of
 
 FRAMES = 60
 

@@ -11,7 +11,7 @@ import pytest
 
 from tests.processes import wait_until
 
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 WRITER = """
 import ctypes, sys, time
 from pathlib import Path

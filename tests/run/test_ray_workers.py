@@ -19,14 +19,14 @@ from facerf_cli.batch.settings import Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.ray_workers import _initialise, connect, in_ray
-from tests.cli.toy_batch import run
+from tests.batch.toy_batch import run
 from tests.processes import wait_until
 
 pytestmark = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
 NAMES = tuple(f"{letter}.png" for letter in "abcdefgh")
-# Workers import tests.cli.toy_batch.
-ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+# Workers import tests.batch.toy_batch.
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
 IMPATIENT = {  # Ray waits half a minute by our own settings
     "RAY_NUM_REDIS_GET_RETRIES": "1",
     "RAY_py_gcs_connect_timeout_s": "1",
@@ -177,7 +177,7 @@ def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, two_wor
 @needs_ray
 def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path) -> None:
     (photos / "x" / "a.png").write_bytes(b"wait")
-    command = [sys.executable, "-m", "tests.cli.toy_batch", str(photos), str(tmp_path / "out")]
+    command = [sys.executable, "-m", "tests.batch.toy_batch", str(photos), str(tmp_path / "out")]
     process = subprocess.Popen(
         command, env=ENVIRONMENT, start_new_session=True, stderr=subprocess.PIPE, text=True
     )

@@ -18,8 +18,8 @@ from facerf_cli.files.olat_stack import is_olat_stack
 from facerf_cli.files.read import decode
 from facerf_cli.files.texts import is_regular, read_light_list, read_toml, require_regular
 from facerf_cli.run.logs import json_line, printable_line
-from tests.cli.folders import rows
-from tests.cli.toy_batch import run
+from tests.batch.toy_batch import run
+from tests.folders import rows
 from tests.kinds import Patch, Said
 from tests.stacks import read_olat_stack
 
@@ -103,7 +103,7 @@ def test_a_pipe_in_a_folder_costs_its_own_item(tmp_path: Path) -> None:
 def test_an_output_folder_that_is_a_link_in_a_circle_is_refused(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", "a")
     (tmp_path / "out").symlink_to(tmp_path / "out")
-    command = "from pathlib import Path; from tests.cli.toy_batch import run; import sys\n"
+    command = "from pathlib import Path; from tests.batch.toy_batch import run; import sys\n"
     command += "run(Path(sys.argv[1]), Path(sys.argv[2]))"
     ended = subprocess.run(
         [sys.executable, "-c", command, str(photos), str(tmp_path / "out")],
@@ -116,7 +116,7 @@ def test_an_output_folder_that_is_a_link_in_a_circle_is_refused(tmp_path: Path) 
 
 def test_two_processes_in_a_folder_share_its_report(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", *map(str, range(20)))
-    command = "from pathlib import Path; from tests.cli.toy_batch import run; import sys\n"
+    command = "from pathlib import Path; from tests.batch.toy_batch import run; import sys\n"
     command += "sys.exit(run(Path(sys.argv[1]), Path(sys.argv[2])))"
     line = [sys.executable, "-c", command, str(photos), str(tmp_path / "out")]
     both = [subprocess.Popen(line, env=ENVIRONMENT, stderr=subprocess.DEVNULL) for _ in range(2)]

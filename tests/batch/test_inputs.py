@@ -32,7 +32,7 @@ from facerf_cli.main import main
 from facerf_cli.work.photo_options import PhotoOptions, check_companion
 from facerf_cli.work.photos import companion
 from facerf_cli.work.shots import ShotOptions, collect_frames
-from tests.cli import toy_batch
+from tests.batch import toy_batch
 from tests.kinds import Log, Patch, Said
 
 
