@@ -9,17 +9,11 @@ import pytest
 
 from facerf_cli.capture.chart import GREYS, centres, fit_colours, neutral_matrix, published_colours, sample
 from facerf_cli.image.colour import REC709_CHROMATICITIES, luminance, matrix_to_rec709, rgb_to_xyz
-from tests.capture.chart_image import CAMERA, CORNERS, chart_image
+from tests.capture.chart_image import CAMERA, CORNERS, chart_image, kept_luminance
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # colour-science warns of optional packages that are not there
     import colour as oracle
-
-
-def kept_luminance(camera: np.ndarray) -> np.ndarray:
-    """The inverse [3, 3] of a camera's matrix that leaves the luminance of the chart's greys."""
-    greys = published_colours()[GREYS].sum(0)
-    return np.linalg.inv(camera) * luminance(camera @ greys) / luminance(greys)
 
 
 def test_published_colours_are_those_of_the_chart() -> None:

@@ -22,18 +22,17 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import linear_to_srgb
-from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, chart_image
-from tests.capture.test_chart import kept_luminance
-from tests.capture.test_stage_json import GOOD, capture_at
+from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, chart_image, kept_luminance
+from tests.worlds import FLAT, write_flat_stage
 
-WHITE = [{**light, "intensity": [2, 2, 2]} for light in GOOD["lights"]]
-LEVEL = 0.25  # black, in `GOOD`
-CAMERAS = [GOOD["cameras"][0], {**GOOD["cameras"][0], "id": "C1"}]
+WHITE = [{**light, "intensity": [2, 2, 2]} for light in FLAT["lights"]]
+LEVEL = 0.25  # black, in `FLAT`
+CAMERAS = [FLAT["cameras"][0], {**FLAT["cameras"][0], "id": "C1"}]
 
 
 def capture(folder: Path, **changes: Any) -> Capture:
     folder.mkdir(exist_ok=True)
-    return read_capture(capture_at(folder, **{"lights": WHITE, "cameras": CAMERAS, **changes}))
+    return read_capture(write_flat_stage(folder, **{"lights": WHITE, "cameras": CAMERAS, **changes}))
 
 
 def correction(folder: Path, image: np.ndarray, corners_px: np.ndarray = CORNERS) -> ChartCorrection:
@@ -56,7 +55,7 @@ def test_a_camera_with_noise_is_undone_and_lamps_of_one_colour_change_nothing(tm
     assert chart.record["light_span"] == pytest.approx(1.25, abs=0.05)
     assert chart.record["cameras"] == ["C0", "C1"]
     # A camera that was calibrated by the lamps sees the chart in their colour; frames lose it first.
-    tinted = [{**light, "intensity": [3, 2, 1]} for light in GOOD["lights"]]
+    tinted = [{**light, "intensity": [3, 2, 1]} for light in FLAT["lights"]]
     for name, lights, tint in (("white", WHITE, [1, 1, 1]), ("tinted", tinted, [3, 2, 1])):
         stage = capture(tmp_path / name, lights=lights)
         write_exr(tmp_path / f"{name}.exr", chart_image(matrix=CAMERA, noise=0.0) * np.float32(tint) + LEVEL)

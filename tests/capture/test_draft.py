@@ -17,7 +17,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_light_list
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import ACESCG
-from tests.capture.stages import LENS
+from tests.worlds import LENS
 
 FOLDERS = "{subject}/{camera}/{light}.exr"
 SUFFIXES = frozenset({".exr", ".png", ".pgm"})

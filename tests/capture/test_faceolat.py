@@ -16,9 +16,8 @@ from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.errors import InputError
 from facerf_cli.main import main
-from tests.capture.stages import LENS, write_faceolat
-from tests.dataset.capture import HEAD_WORLD, write_capture
 from tests.stacks import read_olat_stack
+from tests.worlds import HEAD_WORLD, LENS, write_capture, write_faceolat
 
 FAR_M, NEAR_M = 1000.0, 1.6
 Given = tuple[Path, Path, dict[str, str]]

@@ -14,8 +14,8 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.main import main
-from tests.capture.test_stage_json import capture_at
 from tests.capture.yale_fixture import FLASHES, ramp, write_pgm, write_yale_b
+from tests.worlds import write_flat_stage
 
 
 @pytest.fixture
@@ -161,14 +161,14 @@ def test_the_rooms_light_is_subtracted_where_it_was_cropped(tmp_path: Path) -> N
 
 
 def test_a_stage_may_name_its_ambient_images(tmp_path: Path) -> None:
-    capture_at(tmp_path, ambient="{subject}/{camera}/dark.exr")
+    write_flat_stage(tmp_path, ambient="{subject}/{camera}/dark.exr")
     write_exr(tmp_path / "0000/C0/dark.exr", np.full((60, 64, 3), 0.5, np.float32))
     capture = read_capture(tmp_path, ReadSettings(subtract_ambient=True))
     assert capture.frame("0000", "C0", 0)[5, 5] == pytest.approx([1.75, 0.875, 0.4375])  # the black level too
     with pytest.raises(InputError, match=r"names {subject} is needed"):
-        read_capture(capture_at(tmp_path, ambient="dark.exr"))
+        read_capture(write_flat_stage(tmp_path, ambient="dark.exr"))
     with pytest.raises(UsageError, match="names no 'ambient'"):
-        read_capture(capture_at(tmp_path), ReadSettings(subtract_ambient=True))
+        read_capture(write_flat_stage(tmp_path), ReadSettings(subtract_ambient=True))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs ../shared/data/extended_yale_b")

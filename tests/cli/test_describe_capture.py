@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.main import main
-from tests.dataset.capture import write_capture
+from tests.worlds import write_capture
 
 DESCRIBE = ("--describe", "--pattern", "{subject}/{camera}/{light}.exr")
 Said = pytest.CaptureFixture[str]

@@ -20,7 +20,7 @@ from facerf_cli.main import main
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
 from facerf_cli.work.plan import canvas
 from tests.astronaut import PATH
-from tests.cli import test_relight
+from tests.cli import lines
 from tests.exr_layers import exr_layers
 from tests.kinds import Folders, Patch, Said
 
@@ -41,7 +41,7 @@ def given(given: Path, tmp_path_factory: Folders) -> Path:
 
 
 def relight(given: Path, output: Path, *line: str, photo: Path | None = None) -> int:
-    return test_relight.relight(given, output, *line, photo=photo or given / "astronaut.png")
+    return lines.relight(given, output, *line, photo=photo or given / "astronaut.png")
 
 
 def test_formats_of_the_command_line() -> None:

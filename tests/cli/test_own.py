@@ -21,7 +21,7 @@ from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import as_in_photo, lights_over_rig, with_room
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
-from tests.cli.test_relight import relight
+from tests.cli.lines import relight
 from tests.exr_layers import exr_layers
 
 HALF = 2.0**-11  # relative error of half floats

@@ -13,11 +13,11 @@ from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_checkpoint, save_networks
 from facerf_cli.network.files import SHIPPED
 from tests.astronaut import PATH as PHOTO
-from tests.capture.test_stage_json import capture_at
 from tests.capture.yale_fixture import write_yale_b
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Patch, Said
+from tests.worlds import write_flat_stage
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def place(tmp_path_factory: Folders) -> Path:
     write_small_dataset(folder / "data", counts=(1, 0, 1), lights=12, crop_px=32)
     assert main(["relight-dataset", str(folder / "data"), "--envmaps", "procedural:2", "--lazy"]) == 0
     (folder / "stage").mkdir()
-    capture_at(folder / "stage", subjects={"0000": {}, "0001": {}})
+    write_flat_stage(folder / "stage", subjects={"0000": {}, "0001": {}})
     for name in ("a.jpg", "b.jpg", "one/c.jpg", "index/index.jpg"):
         (folder / name).parent.mkdir(exist_ok=True)
         shutil.copy(PHOTO, folder / name)

@@ -24,28 +24,13 @@ from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.synth.sky.skies import kind_of
 from facerf_cli.work.relight_options import RelightOptions, parse_aov
 from tests.astronaut import PATH as PHOTO
+from tests.cli.lines import face_sides, relight
 from tests.exr_layers import exr_layers
 from tests.kinds import Patch, Said
 
 
-def relight(given: Path, output: Path, *line: str, photo: Path = PHOTO) -> int:
-    fixed = ["--checkpoint", str(given / "lambert.safetensors"), "--landmarks", str(given / "astronaut.json")]
-    return main([*fixed[:2], "relight", str(photo), "-o", str(output), "--lights", "12", *fixed[2:], *line])
-
-
 def made(output: Path) -> list[str]:
     return sorted(path.name for path in output.rglob("*") if path.suffix in (".exr", ".png"))
-
-
-def face_sides(path: Path) -> tuple[float, float]:
-    """Mean light on the left and the right half of the face alone."""
-    image = read_image(path)
-    assert image.alpha is not None
-    columns = np.flatnonzero(image.alpha.max(0) > 0.5)
-    middle = (columns[0] + columns[-1]) // 2
-    left, right = (image.alpha.copy() for _ in range(2))
-    left[:, middle:], right[:, :middle] = 0, 0
-    return tuple(float((image.pixels.mean(-1) * side).sum() / side.sum()) for side in (left, right))
 
 
 @pytest.mark.slow

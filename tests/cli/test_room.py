@@ -19,7 +19,7 @@ from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.relight_options import parse_background
 from facerf_cli.work.relight_scenes import as_lit
 from tests.astronaut import PATH as PHOTO
-from tests.cli.test_relight import relight
+from tests.cli.lines import relight
 from tests.exr_layers import exr_layers
 from tests.kinds import Said
 

@@ -27,7 +27,7 @@ from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
 from tests import astronaut
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Patch, Said
-from tests.network.test_installed import FORMS, write_own_package
+from tests.own_package import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset
 from tests.training.synthhuman_folder import write_seen_synthhuman, write_synthhuman
 

@@ -16,7 +16,7 @@ from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.files import read_metadata
 from facerf_cli.network.reflectance_default import DefaultReflectanceNetwork, DefaultReflectanceSettings
 from tests import astronaut
-from tests.dataset.capture import write_capture
+from tests.worlds import write_capture
 
 ROOT = Path(__file__).parents[2]
 FRONT = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8]])

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import pytest
 import torch
@@ -10,41 +10,13 @@ from torch import Tensor, nn
 
 from facerf_cli.dataset.synthhuman import LICENCE, SynthHuman
 from facerf_cli.errors import InputError
-from facerf_cli.network.parsing import Parsing, ParsingNetwork, ParsingSettings
+from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
-from facerf_cli.training.parsing import ParsingObjective, ParsingObjectiveSettings
+from facerf_cli.training.parsing import ParsingObjective
 from tests.training.synthhuman_folder import write_synthhuman
-
-SIDE = 8
-SETTINGS = ParsingObjectiveSettings(held_out_people=1, held_out_draws=1)
-TINY = ParsingSettings((8, 8, 8), (0, 1, 1), 32, len(CLASSES), LANDMARKS)
-
-
-class Portraits:
-    """A bank of one fixed crop."""
-
-    provenance: dict[str, Any] = {"licence": "MIT"}  # noqa: RUF012
-
-    def people(self, held_out: int) -> tuple[list[int], list[int]]:
-        return [1], [0]
-
-    def draw(self, people: list[int], side: int, generator: torch.Generator) -> PortraitCrops:
-        return truth()
-
-
-def truth(side: int = SIDE) -> PortraitCrops:
-    label = torch.full((1, side, side), class_index("skin"))
-    label[:, :2] = class_index("ears")  # a rare class
-    alpha = torch.ones(1, side, side)
-    alpha[:, :, 6:] = 0
-    known = torch.ones(1, LANDMARKS, dtype=torch.bool)
-    known[:, 68:] = False
-    places = torch.rand(1, LANDMARKS, 2, generator=torch.Generator().manual_seed(0)) * 0.5 + 0.25
-    return PortraitCrops(
-        torch.rand(1, 3, side, side), alpha, label, torch.ones(1, side, side), places, known, torch.ones(1)
-    )
+from tests.training.toy_parsing import SETTINGS, SIDE, TINY, Portraits, truth
 
 
 def seen(batch: PortraitCrops, sure: float = 30.0) -> Parsing:
