@@ -287,6 +287,7 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(
     require_served(tmp_path, "portrait", shipped)
 
 
+@pytest.mark.slow
 def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: Patch) -> None:
     # in other processes: tests/dataset/test_portraits.py
     monkeypatch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))
