@@ -27,6 +27,7 @@ from tests.batch.toy_batch import Copy, run
 from tests.folders import rows
 from tests.kinds import Patch, Said
 from tests.processes import wait_until
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -49,8 +50,7 @@ def test_a_name_that_is_not_utf8_is_in_the_report(tmp_path: Path) -> None:
 
 def test_nothing_to_work_on_and_an_output_folder_that_cannot_be(tmp_path: Path, photos: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UsageError, match="no inputs found"):
-        run([tmp_path / "empty"], tmp_path / "out")
+    refused(UsageError, "no inputs found", run, [tmp_path / "empty"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "out"):
@@ -109,8 +109,7 @@ def test_dry_run_writes_nothing(photos: Path, tmp_path: Path, capsys: Said) -> N
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_the_whole_run_ends_it(photos: Path, tmp_path: Path, jobs: int) -> None:
     (photos / "Z.EXR").write_bytes(b"stop")
-    with pytest.raises(FacerfError, match="checkpoint"):
-        run([photos], tmp_path / "out", jobs=jobs)
+    refused(FacerfError, "checkpoint", run, [photos], tmp_path / "out", jobs=jobs)
 
 
 def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: Said) -> None:
@@ -389,8 +388,7 @@ def test_a_result_that_is_edited_while_its_item_runs_is_the_users(two: Path, tmp
 def test_a_report_of_another_program_stays(two: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/report.jsonl").write_text('{"test": "passed"}\n')
-    with pytest.raises(UsageError, match=r"report\.jsonl: was not written by facerf"):
-        run([two], tmp_path / "out")
+    refused(UsageError, "report.jsonl: was not written by facerf", run, [two], tmp_path / "out")
     assert (tmp_path / "out/report.jsonl").read_text() == '{"test": "passed"}\n'
 
 
@@ -403,8 +401,7 @@ def test_outputs_that_differ_only_in_case(
     monkeypatch.setattr("facerf_cli.batch.inputs._ignores_case", lambda folder: ignores)
     photos = [tmp_path / "Me.png", tmp_path / "me.png"]
     if ignores:
-        with pytest.raises(UsageError, match="ignores case"):
-            run(photos, tmp_path / "out")
+        refused(UsageError, "ignores case", run, photos, tmp_path / "out")
         assert not (tmp_path / "out").exists()
     else:
         assert run(photos, tmp_path / "out") == 0

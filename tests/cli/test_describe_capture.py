@@ -98,10 +98,3 @@ def test_options_of_preparing_are_refused(bare: Path, capsys: Said, line: str) -
     assert main(["prepare-dataset", str(bare), *DESCRIBE, *line.split()]) == 2
     assert f"{option} is for preparing; leave it out with --describe" in capsys.readouterr().err
     assert not (bare / "stage.json").exists()
-
-
-def test_a_folder_that_is_no_capture_and_a_line_without_output(tmp_path: Path, capsys: Said) -> None:
-    assert main(["prepare-dataset", str(tmp_path), *DESCRIBE]) == 2
-    assert "no images found" in capsys.readouterr().err
-    assert main(["prepare-dataset", str(tmp_path)]) == 2
-    assert "give -o DATASET" in capsys.readouterr().err

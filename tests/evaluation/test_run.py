@@ -27,6 +27,7 @@ from tests.evaluation.toy_protocol import (
     items,
 )
 from tests.kinds import Patch, Said
+from tests.refusals import refused
 
 OUTPUTS = ("summary.json", "images.csv", "report.html")
 
@@ -85,8 +86,7 @@ def test_items_evaluated_otherwise_are_measured_again(tmp_path: Path, notes: Pat
     out = tmp_path / "out"
     assert evaluate(out) == 0
     for changed in ({"measures": Measures(space="display")}, {"keep_eyes": True}):
-        with pytest.raises(UsageError, match="leave out --overwrite never, or give another folder"):
-            evaluate(out, overwrite="never", **changed)  # type: ignore[arg-type]
+        refused(UsageError, "leave out --overwrite never", evaluate, out, overwrite="never", **changed)
     assert evaluate(out, jobs=1, dry_run=True) == 0 and (out / "summary.json").exists()
     assert evaluate(out, Toy(cases=3, notes=notes), keep_eyes=True) == 0
     assert "made from other options: --keep-eyes" in capsys.readouterr().err and taken(notes) == list(PEOPLE)
@@ -110,8 +110,7 @@ def test_an_item_whose_input_changed_is_measured_again(tmp_path: Path, notes: Pa
 def test_damaged_figures_are_named(tmp_path: Path) -> None:
     assert evaluate(tmp_path) == 0
     (tmp_path / "cases/bea.json").write_text("{}")
-    with pytest.raises(InputError, match="no figures of an evaluation"):
-        evaluate(tmp_path)
+    refused(InputError, "no figures of an evaluation", evaluate, tmp_path)
     assert not (tmp_path / "summary.json").exists()
 
 
@@ -153,8 +152,7 @@ def test_strips_are_few_and_whole_and_the_work_goes_to_other_processes(tmp_path:
         assert len(strips) <= 14 and {f"{person}/19", f"{person}/00"} <= {strip["case"] for strip in strips}
     work = evaluation(tmp_path / "out")
     assert pickle.loads(pickle.dumps(work)) == work
-    with pytest.raises(UsageError, match="nothing to evaluate"):
-        evaluation(tmp_path, inputs=[]).run()
+    refused(UsageError, "nothing to evaluate", evaluation(tmp_path, inputs=[]).run)
 
 
 def test_what_was_kept_and_is_gone_is_made_again(tmp_path: Path, notes: Path) -> None:

@@ -15,6 +15,7 @@ from facerf_cli.image import colour as ours
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # colour-science warns of optional packages that are not there
     import colour as oracle
+from tests.refusals import refused
 
 RGB = np.random.default_rng(3).uniform(-0.2, 3.0, (5, 7, 3)).astype(np.float32)
 ENCODED = np.random.default_rng(4).uniform(0.0, 1.0, (5, 7, 3)).astype(np.float32)
@@ -99,8 +100,7 @@ def test_from_linear_rec709_is_the_way_back(name: str) -> None:
 
 
 def test_a_curve_has_no_way_back_and_srgb_has_one_beyond_the_gamut() -> None:
-    with pytest.raises(ValueError, match="sRGB is not linear"):
-        ours.from_linear_rec709(RGB, ours.SRGB)
+    refused(ValueError, "sRGB is not linear", ours.from_linear_rec709, RGB, ours.SRGB)
     np.testing.assert_allclose(ours.srgb_to_linear(ours.linear_to_srgb(RGB)), RGB, rtol=2e-6, atol=1e-6)
     tall = np.random.default_rng(2).random((700, 500, 3)).astype(np.float32)
     np.testing.assert_array_equal(ours.in_blocks(ours.srgb_to_linear, tall), ours.srgb_to_linear(tall))
@@ -181,8 +181,7 @@ def test_a_configuration_of_a_show(tmp_path: Path, role: str) -> None:
     expected = np.sqrt(ours.from_linear_rec709(RGB.clip(0.01, 0.9), ours.ACESCG))
     np.testing.assert_allclose(shown, expected, atol=1e-4)
     assert not view.is_srgb
-    with pytest.raises(UsageError, match=r"unknown view 'aCES' \(known: none, soft, aces, Show Look"):
-        ours.named_view("aCES", config)
+    refused(UsageError, "unknown view 'aCES' (known: none, soft, aces, Show", ours.named_view, "aCES", config)
 
 
 def test_views_of_another_display(tmp_path: Path) -> None:
@@ -194,18 +193,15 @@ def test_views_of_another_display(tmp_path: Path) -> None:
     half = ours.from_linear_rec709(values, ours.ACESCG) / 2
     np.testing.assert_allclose(ours.encode_display(values, dim), half, atol=1e-4)
     assert ours.named_view("soft", config, "Projector").name == "Raw"  # its default view
-    with pytest.raises(UsageError, match=r"unknown display 'nope' \(known: Monitor, Projector\)"):
-        ours.named_view("soft", config, "nope")
+    refused(UsageError, "unknown display 'nope' (known: Monitor,", ours.named_view, "soft", config, "nope")
     for name in ("Show Look", "aces"):
-        with pytest.raises(UsageError, match=r"unknown view .* \(known: Raw, Dim\)"):
-            ours.named_view(name, config, "Projector")
+        refused(UsageError, "unknown view ... (known: Raw, Dim)", ours.named_view, name, config, "Projector")
 
 
 def test_a_file_that_is_no_configuration(tmp_path: Path) -> None:
     (tmp_path / "bad.ocio").write_text("hello")
     for look_up in (ours.named_view, ours.named_space):
-        with pytest.raises(UsageError, match=r"bad\.ocio: Error"):
-            look_up("Show", str(tmp_path / "bad.ocio"))
+        refused(UsageError, "bad.ocio: Error", look_up, "Show", str(tmp_path / "bad.ocio"))
 
 
 @pytest.mark.parametrize(
@@ -225,15 +221,12 @@ def test_spaces_and_views_are_named_by_their_beginning_in_any_spelling() -> None
     np.testing.assert_allclose(grey, 0.18, rtol=2e-4)
     assert ours.named_space("lin_rec709") is ours.named_space("Linear Rec.709 (sRGB)") is ours.LINEAR
     assert ours.named_space("DISPLAY-P3") is ours.DISPLAY_P3 and ours.named_space("rec 2020") is ours.REC2020
-    with pytest.raises(UsageError, match=r"unknown colour space 'ACEScgg' \(similar names: ACEScg"):
-        ours.named_space("ACEScgg")
+    refused(UsageError, "unknown colour space 'ACEScgg' (similar names: ACEScg", ours.named_space, "ACEScgg")
     with pytest.raises(UsageError, match=r"similar names: linear Rec\.709(, (?!lin_rec709)[^,;]+){2};"):
         ours.named_space("lin_rec709x")  # which has five names
-    with pytest.raises(UsageError, match=r"known: linear Rec\.709, sRGB"):
-        ours.named_space("qqqqq")
+    refused(UsageError, "known: linear Rec.709, sRGB", ours.named_space, "qqqqq")
     assert ours.named_view("un-tone").name == "Un-tone-mapped"
-    with pytest.raises(UsageError, match="unknown view 'Z'"):
-        ours.named_view("Z")
+    refused(UsageError, "unknown view 'Z'", ours.named_view, "Z")
     grey = np.full((2, 3, 3), 0.18, np.float32)
     plain = ours.linear_to_srgb(grey)
     for name in ("none", "soft", "Un-tone-mapped", "un-TONE-mapped"):
@@ -242,8 +235,7 @@ def test_spaces_and_views_are_named_by_their_beginning_in_any_spelling() -> None
     # ACES 2 shows 18 % grey at 10 nits of 100.
     np.testing.assert_allclose(ours.srgb_to_linear(aces), 0.1, atol=0.01)
     assert all(ours.named_view(name).is_srgb for name in ("none", "soft", "aces", "Un-tone-mapped"))
-    with pytest.raises(UsageError, match=r"unknown view 'nope' \(known: none, soft, aces, ACES 2"):
-        ours.named_view("nope")
+    refused(UsageError, "unknown view 'nope' (known: none, soft, aces, ACES 2", ours.named_view, "nope")
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 300.0])

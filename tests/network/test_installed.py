@@ -10,6 +10,7 @@ from facerf_cli.network import checkpoint
 from facerf_cli.network.checkpoint import form_of, load_networks, new_network, save_networks, use_form
 from facerf_cli.network.installed import installed
 from tests.own_package import FORMS, NAME, write_own_package
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -43,16 +44,13 @@ def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
 def test_what_is_not_installed_is_one_line(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.chdir(package)  # nothing comes from the working directory
-        with pytest.raises(UsageError, match="install the package that has it"):
-            installed("my_lab.networks:Darker", "--form")
+        refused(UsageError, "install the package that has it", installed, "my_lab.networks:Darker", "--form")
     for name in ("my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"):
-        with pytest.raises(UsageError, match=f"--objective {name}: "):
-            installed(name, "--objective")
+        refused(UsageError, f"--objective {name}: ", installed, name, "--objective")
 
 
 def test_facerfs_own_forms_import_nothing() -> None:
     use_form("paper")
     use_form(None)
     assert checkpoint._CLASSES == FORMS
-    with pytest.raises(UsageError, match="no such Reflectance Network"):
-        new_network("reflectance", "os:system", {})
+    refused(UsageError, "no such Reflectance Network", new_network, "reflectance", "os:system", {})

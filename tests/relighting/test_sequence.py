@@ -38,6 +38,7 @@ from facerf_cli.relighting.sequence import (
     with_cuts,
 )
 from tests.kinds import Patch
+from tests.refusals import refused
 
 ONE, OTHER = astronaut()[:300, :400], coffee()[:300, :400]
 
@@ -276,8 +277,7 @@ def test_a_frame_is_the_mean_of_both_sides_and_of_none_beyond_a_lost_face(monkey
     assert first_class(view, 10) == pytest.approx(10, abs=1e-3)
     assert first_class(view, 19) < 19 - 0.3  # frames after it are lost
     assert first_class(view, 20 + LONGEST_GAP + 1) > 20 + LONGEST_GAP + 1.3
-    with pytest.raises(InputError, match="frame 25: the face is not seen"):
-        view.segmentation(25)
+    refused(InputError, "frame 25: the face is not seen", view.segmentation, 25)
 
 
 def test_key_frames_are_those_that_show_the_face(monkeypatch: Patch) -> None:

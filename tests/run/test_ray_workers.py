@@ -21,6 +21,7 @@ from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.ray_workers import _initialise, connect, in_ray
 from tests.batch.toy_batch import run
 from tests.processes import wait_until
+from tests.refusals import refused
 
 pytestmark = pytest.mark.slow
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="ray is not installed")
@@ -250,5 +251,4 @@ def test_a_temporary_folder_too_deep_for_sockets_is_one_line() -> None:
         raise OSError("AF_UNIX path length cannot exceed 107 bytes: /deep")
 
     ray = SimpleNamespace(init=init, exceptions=SimpleNamespace(RayError=RuntimeError))
-    with pytest.raises(UsageError, match="--ray local: TMPDIR has too long a name"):
-        _initialise(ray, "local", 1)
+    refused(UsageError, "--ray local: TMPDIR has too long a name", _initialise, ray, "local", 1)

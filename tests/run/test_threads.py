@@ -9,6 +9,7 @@ import torch
 
 from facerf_cli.run import threads as module
 from facerf_cli.run.threads import both, count, in_threads, one_ahead
+from tests.refusals import refused
 
 
 @pytest.fixture(autouse=True)
@@ -67,5 +68,4 @@ def test_one_is_made_ahead_in_order_and_its_error_comes_in_its_place() -> None:
     while len(made) < 2:  # nobody asked for it yet
         time.sleep(0.001)
     assert next(ahead) == 1 and next(ahead) == 2
-    with pytest.raises(ValueError, match="the fourth"):
-        next(ahead)
+    refused(ValueError, "the fourth", next, ahead)

@@ -12,6 +12,7 @@ import pytest
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging
 from facerf_cli.run.workers import Workers, in_order, in_shards, spread
+from tests.refusals import refused
 
 
 def work(item: str) -> str:
@@ -53,8 +54,7 @@ def test_every_one_dies() -> None:
 
 
 def test_what_the_work_raises_is_raised_here() -> None:
-    with pytest.raises(ValueError, match="raise"):
-        list(run("a", "raise", "slow b"))
+    refused(ValueError, "raise", list, run("a", "raise", "slow b"))
 
 
 def test_who_stops_listening_ends_the_workers(tmp_path: Path) -> None:
@@ -72,8 +72,7 @@ def _refuse(pipe: object, level: int, threads: int) -> None:
 
 def test_processes_that_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("facerf_cli.run.workers._serve", _refuse)
-    with pytest.raises(FacerfError, match=r"could not start \(exit code 3\); try --jobs 1"):
-        list(run("a", "b"))
+    refused(FacerfError, "could not start (exit code 3); try --jobs 1", list, run("a", "b"))
 
 
 def test_in_order() -> None:
@@ -116,6 +115,5 @@ def test_every_item_is_worked_on_once(tmp_path: Path) -> None:
 
 
 def test_an_error_ends_the_other_shards(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="no"):
-        in_shards(_fail_or_wait, [tmp_path / "fails", tmp_path / "waits"], 2)
+    refused(ValueError, "no", in_shards, _fail_or_wait, [tmp_path / "fails", tmp_path / "waits"], 2)
     assert not (tmp_path / "waits").exists()

@@ -14,6 +14,7 @@ from facerf_cli.raster.camera import crop_camera
 from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
 from facerf_cli.training.objective import seeded
+from tests.refusals import refused
 
 FEW = GeometryObjectiveSettings(held_out_heads=1, held_out_draws=4)
 
@@ -112,7 +113,5 @@ def test_validation_is_the_same_every_time_and_shows_it(objective):
 
 
 def test_no_images_is_said(tmp_path):
-    with pytest.raises(InputError, match="no images of heads"):
-        RenderedFaces(tmp_path, {})
-    with pytest.raises(InputError, match="no baked heads"):
-        add_head_images(tmp_path, tmp_path / "out", 1, 1, 0)
+    refused(InputError, "no images of heads", RenderedFaces, tmp_path, {})
+    refused(InputError, "no baked heads", add_head_images, tmp_path, tmp_path / "out", 1, 1, 0)

@@ -11,6 +11,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.relighting.relightable import Relit, RenderRequest
 from facerf_cli.work.stack_composers import StackImages
+from tests.refusals import refused
 from tests.stacks import header_of
 
 SIDE = 4
@@ -37,8 +38,7 @@ def test_the_person_alone_has_its_colours_exposure_and_layers_that_add_up() -> N
     composer = StackImages(header(), Path(), header().seen)
     assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
     assert set(composer.rendered(RenderRequest(lit(1.0), layers=("normal",)))) == {"rgb", "normal"}
-    with pytest.raises(UsageError, match="--aov albedo"):
-        composer.rendered(RenderRequest(lit(1.0), layers=("albedo",)))
+    refused(UsageError, "--aov albedo", composer.rendered, RenderRequest(lit(1.0), layers=("albedo",)))
 
 
 def test_on_a_larger_photo_the_change_of_light_is_enlarged_and_the_photo_keeps_its_detail() -> None:
