@@ -273,7 +273,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
     refused(ValueError, "not a list of some of normal", person.relight, KEY, layers=["depht"])
     refused(ValueError, "not one of portrait, field", facerf.fit, models, photo, reflectance="foo")
     refused(ValueError, "matte has shape", facerf.fit, models, photo, matte=np.ones((3, 3)))
-    refused(UsageError, "albedo: is of the portrait", person.albedo.mean)
+    refused(UsageError, "albedo: is of the portrait", lambda: person.albedo)
     refused(UsageError, "device abacus: ... give cpu", facerf.load_models, device="abacus")
     refused(ValueError, "length 1", person.olat, np.ones((2, 3)))
 
