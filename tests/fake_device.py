@@ -1,15 +1,12 @@
-"""A device that computes on the CPU and counts what a GPU would wait for.
+"""A device that computes on the CPU and refuses operators that mix devices, as CUDA does.
 
-Its tensors say that they are on the device `meta`, which code that asks `tensor.device` passes on. Within
-`counted()` an operator that mixes them with tensors of the CPU is refused, as CUDA would, and copies and
-waits are counted by the line of facerf that asks for them.
+Its tensors report the device `meta`, which code that asks `tensor.device` passes on.
 """
 
 import traceback
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 from unittest.mock import patch
 
@@ -19,17 +16,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
 DEVICE = torch.device("meta")
-# Operators whose result the host must know before it goes on.
-_WAITS = ("_local_scalar_dense", "nonzero", "_unique2", "unique_dim", "repeat_interleave")
 
 
 @dataclass
-class Counts:
-    """How often a step calls the device, waits for it and copies to it; by lines of facerf."""
+class Calls:
+    """The number of operators that ran on the device."""
 
-    calls: int = 0
-    waits: Counter[str] = field(default_factory=Counter)
-    copies: Counter[str] = field(default_factory=Counter)
+    count: int = 0
 
 
 class OnDevice(Tensor):
@@ -53,7 +46,7 @@ class OnDevice(Tensor):
 
     @classmethod
     def __torch_dispatch__(cls, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        return _computed(Counts(), function, args, kwargs or {})
+        return _computed(Calls(), function, args, kwargs or {})
 
     def __getitem__(self, key: Any) -> Any:
         return super().__getitem__(_index(key))
@@ -82,16 +75,13 @@ def moved(module: nn.Module) -> nn.Module:
 
 
 @contextmanager
-def counted() -> Iterator[Counts]:
-    """Count what is done on the fake device; new tensors that ask for it are on it."""
-    counts = Counts()
+def in_use() -> Iterator[Calls]:
+    """Refuse operators that mix devices; create new tensors on the fake device where they ask for it."""
+    calls = Calls()
     make, make_like = torch.tensor, Tensor.new_tensor
 
     def sent(made: Tensor, device: Any) -> Tensor:
-        if device is None or torch.device(device) != DEVICE:
-            return made
-        counts.copies[_line()] += 1
-        return OnDevice(made)
+        return made if device is None or torch.device(device) != DEVICE else OnDevice(made)
 
     def tensor(data: Any, *, device: Any = None, **settings: Any) -> Tensor:
         return sent(make(data, **settings), device)
@@ -102,18 +92,18 @@ def counted() -> Iterator[Counts]:
     # autocast does not know the device
     plain = patch("torch.autocast", lambda *arguments, **settings: nullcontext())
     with (
-        _Counting(counts),
+        _Refusing(calls),
         patch("torch.tensor", tensor),
         plain,
         patch("torch.Tensor.new_tensor", new_tensor),
     ):
-        yield counts
+        yield calls
 
 
-class _Counting(TorchDispatchMode):
-    def __init__(self, counts: Counts) -> None:
+class _Refusing(TorchDispatchMode):
+    def __init__(self, calls: Calls) -> None:
         super().__init__()
-        self.counts = counts
+        self.calls = calls
 
     def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -122,10 +112,10 @@ class _Counting(TorchDispatchMode):
                 found = function.decompose(*args, **kwargs)
             if found is not NotImplemented:
                 return found
-        return _computed(self.counts, function, args, kwargs)
+        return _computed(self.calls, function, args, kwargs)
 
 
-def _computed(counts: Counts, function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+def _computed(calls: Calls, function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     given = [value for value in tree_flatten((args, kwargs))[0] if isinstance(value, Tensor)]
     there = [value for value in given if isinstance(value, OnDevice)]
     here = [value for value in given if not isinstance(value, OnDevice)]
@@ -134,19 +124,11 @@ def _computed(counts: Counts, function: Any, args: Any, kwargs: dict[str, Any]) 
     if asked == DEVICE:
         kwargs = kwargs | {"device": torch.device("cpu")}
     copies = "_to_copy" in name or name == "copy_"
-    if copies and here and (asked == DEVICE or (there and name == "copy_")):
-        counts.copies[_line()] += 1
-    elif there:
-        counts.calls += 1
-        if name in _WAITS and (name != "repeat_interleave" or kwargs.get("output_size") is None):
-            counts.waits[_line()] += 1
-        if copies and asked is not None and asked != DEVICE:
-            counts.waits[_line()] += 1
+    if there and not (copies and here and (asked == DEVICE or name == "copy_")):
+        calls.count += 1
         for value in here:
             if value.dim() and not (name.startswith("index") and value.dtype in (torch.int64, torch.bool)):
                 raise RuntimeError(f"{name} mixes devices at {_line()}")
-            if value.dim():
-                counts.copies[_line()] += 1  # of an index
     found = function(*tree_map(_value, args), **tree_map(_value, kwargs))
     if name == "copy_" or (there and name.endswith("_") and not name.endswith("__")):
         return args[0]

@@ -77,7 +77,7 @@ def place(tmp_path: Path) -> Iterator[Path]:
     save_file(VggFeatures().state_dict(), tmp_path / "vgg.safetensors")
     yield tmp_path
     if "ray" in sys.modules:
-        sys.modules["ray"].shutdown()  # tests/test_ray_workers.py connects with settings of its own
+        sys.modules["ray"].shutdown()  # tests/run/test_ray_workers.py connects with settings of its own
 
 
 @pytest.mark.slow

@@ -97,7 +97,6 @@ def test_every_global_option_is_known_to_the_mover_and_none_is_moved_from_behind
     assert names - completion == main.FLAGS | main.VALUED
 
 
-@pytest.mark.usefixtures("fresh_command_line")
 @pytest.mark.parametrize("package", [version("torch"), "2.13.0"])  # PyPI's CUDA build has no +cu130
 def test_version_and_help(package: str, capsys: Said, monkeypatch: Patch) -> None:
     monkeypatch.setattr("importlib.metadata.version", lambda _: package)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.dataset.capture import write_capture
 from tests.shell import run_shell
+from tests.worlds import write_capture
 
 SCRIPT = Path(__file__).parents[1] / "examples/paper/tables.sh"
 

@@ -1,7 +1,7 @@
 """Memory of a photo's work (docs/memory.md): what is refused, and what goes to disk.
 
 One rule: all is counted in images of `IMAGE_PX` bytes a pixel, on top of what a reader decodes. Images are
-made some rows at a time, and a slow test measures the peak (tests/test_memory.py).
+made some rows at a time, and a slow test measures the peak (tests/run/test_memory.py).
 """
 
 import math

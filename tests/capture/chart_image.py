@@ -7,6 +7,7 @@ from skimage.transform import resize
 
 from facerf_cli.capture.chart import (
     COLUMNS,
+    GREYS,
     PATCH_SIDE,
     PATCHES,
     ROWS,
@@ -14,6 +15,7 @@ from facerf_cli.capture.chart import (
     homography,
     published_colours,
 )
+from facerf_cli.image.colour import luminance
 
 SHAPE = (240, 330)
 CORNERS = np.array([[60.0, 50], [270, 62], [262, 188], [52, 180]])  # dark skin's first, clockwise
@@ -66,3 +68,9 @@ def background(draw: np.random.Generator, shape: tuple[int, int], clutter: float
         size = draw.integers(shape[0] // 30, shape[0] // 4, 2)
         scene[top : top + size[0], left : left + size[1]] = draw.uniform(0, 0.9, 3)
     return scene
+
+
+def kept_luminance(camera: np.ndarray) -> np.ndarray:
+    """The inverse [3, 3] of a camera's matrix that leaves the luminance of the chart's greys."""
+    greys = published_colours()[GREYS].sum(0)
+    return np.linalg.inv(camera) * luminance(camera @ greys) / luminance(greys)

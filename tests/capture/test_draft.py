@@ -13,11 +13,12 @@ from facerf_cli.capture.draft import as_text, draft_stage, frames_by_pattern
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.capture.light_lists import match_lights
 from facerf_cli.capture.settings import ReadSettings
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import InputError
 from facerf_cli.files.texts import read_light_list
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import ACESCG
-from tests.capture.stages import LENS
+from tests.refusals import refused
+from tests.worlds import LENS
 
 FOLDERS = "{subject}/{camera}/{light}.exr"
 SUFFIXES = frozenset({".exr", ".png", ".pgm"})
@@ -61,8 +62,7 @@ def test_a_draft_is_refused_until_it_is_filled_in(tmp_path: Path) -> None:
     stage = draft_stage(stage_at(tmp_path), SUFFIXES, FOLDERS)
     assert json.loads(as_text(stage)) == stage and as_text(stage).count('"direction"') == 4
     (tmp_path / "stage.json").write_text(as_text(stage))
-    with pytest.raises(InputError, match=r"lights\[0\]: direction is null; fill it in \(and 5 more\)"):
-        read_capture(tmp_path)
+    refused(InputError, "lights[0]: direction is null; fill it in (and 5 more)", read_capture, tmp_path)
     for light in stage["lights"]:
         light["direction"] = [0, 0, 1]
     for camera in stage["cameras"]:
@@ -170,42 +170,6 @@ def test_faults_of_the_files_are_noted(tmp_path: Path) -> None:
     assert not noted(stage, "all_on")
 
 
-def test_folders_that_are_no_capture(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such folder"):
-        draft_stage(tmp_path / "nowhere", SUFFIXES, FOLDERS)
-    with pytest.raises(UsageError, match="no images found"):
-        draft_stage(tmp_path, SUFFIXES, FOLDERS)
-    image(tmp_path / "anna.png")
-    image(tmp_path / "bob.png")
-    with pytest.raises(UsageError, match="2 lights"):
-        draft_stage(tmp_path, SUFFIXES, "{light}.png")
-    image(tmp_path / "carl.png")
-    for path in tmp_path.glob("*.png"):
-        path.write_bytes(b"torn")
-    with pytest.raises(UsageError, match="cannot be read"):
-        draft_stage(tmp_path, SUFFIXES, "{light}.png")
-
-
-@pytest.mark.parametrize(
-    ("path", "pattern"),
-    [
-        ("L1.png", "{light}.png"),
-        ("anna/L1.exr", "{subject}/{light}.exr"),
-        ("anna/C0/L1.exr", FOLDERS),
-        ("raw/anna/C0/L1.exr", "raw/{subject}/{camera}/{light}.exr"),
-    ],
-)
-def test_without_a_pattern_the_error_has_one_of_the_folders_own_names(
-    tmp_path: Path, path: str, pattern: str
-) -> None:
-    image(tmp_path / path)
-    image(tmp_path / path.replace("1", "2"))
-    image(tmp_path / "a stray/of/0/pictures/chart.exr")
-    with pytest.raises(UsageError) as raised:
-        draft_stage(tmp_path, SUFFIXES, "")
-    assert str(raised.value).endswith(f"say what the parts of a path are, such as '{pattern}' for {path}")
-
-
 def test_links_odd_names_and_pipes(tmp_path: Path) -> None:
     folder = stage_at(tmp_path / "a", 1)
     (folder / "loop").symlink_to(folder)
@@ -255,21 +219,6 @@ def test_a_given_pattern_names_subject_camera_and_light(
     assert tuple(frames.ids(field)[0] for field in ("subject", "camera", "light")) == first
     for (subject, camera, light), path in frames.paths.items():
         assert pattern.format(subject=subject, camera=camera, light=light) == path
-
-
-@pytest.mark.parametrize(
-    ("pattern", "said"),
-    [
-        ("{subject}/{camera}.exr", "names {light} is needed"),
-        ("../{light}.exr", "below the capture"),
-        ("{subject}/{lamp}/{light}.exr", "without '{' '}' elsewhere"),
-        ("{subject}/{light}.exr", r"no image matches, not even 1/1/1\.exr"),
-    ],
-)
-def test_a_wrong_pattern_is_refused(pattern: str, said: str) -> None:
-    with pytest.raises(UsageError, match=said) as raised:
-        frames_by_pattern(crossed("{s}/{c}/{l}.exr"), pattern)
-    assert str(raised.value).startswith("--pattern") and "\n" not in str(raised.value)
 
 
 def listed(folder: Path, text: str) -> Path:
@@ -343,5 +292,4 @@ def given_stage(tmp_path: Path) -> Path:
     ],
 )
 def test_a_wrong_list_is_refused(tmp_path: Path, text: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        read_light_list(listed(tmp_path, text))
+    refused(InputError, said, read_light_list, listed(tmp_path, text))

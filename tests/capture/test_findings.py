@@ -1,15 +1,25 @@
 """Which frames go into stacks: missing, broken, marked ones are left out, and it is said what that costs."""
 
+import io
 import re
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.findings import Finding, Severity, has_new_frames, select_frames
+from facerf_cli.capture.findings import (
+    Finding,
+    Severity,
+    has_new_frames,
+    select_frames,
+    show_findings,
+    summary,
+)
 from facerf_cli.capture.yale_b import Flash, read_yale_capture
 from facerf_cli.errors import InputError
 from tests.capture.yale_fixture import write_yale_b
+from tests.refusals import refused
 
 FLASHES = tuple(Flash(azimuth_deg, 10) for azimuth_deg in range(-60, 61, 10))  # 13
 
@@ -29,8 +39,7 @@ def test_everything_is_there_but_nobody_is_left_without_frames(capture: Capture)
     assert not chosen.in_words() and not chosen.left_out and not chosen.missing
     for light in capture.light_ids[:8]:
         capture.frame_path("yaleB07", "P00", light).unlink()
-    with pytest.raises(InputError, match=r"no camera has enough frames .P00: only 5 of 13"):
-        select_frames(capture, "yaleB07")
+    refused(InputError, "no camera has enough frames (P00: only 5 of 13", select_frames, capture, "yaleB07")
 
 
 def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None:
@@ -51,11 +60,38 @@ def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None
     }
     assert chosen.in_words() == f"2 lights left out ({missing}: P00: missing; {woven}: P00: fields)"
     assert chosen.missing == (f"P00/{missing}", f"P00/{marked}")
-    with pytest.raises(InputError, match=r"yaleB05: 9 of 13 lights .* too few"):
-        select_frames(capture, "yaleB05", [*findings, broken(another)])
+    refused(InputError, "yaleB05: 9 of 13", select_frames, capture, "yaleB05", [*findings, broken(another)])
     with pytest.raises(InputError, match=f"yaleB05/P00/{re.escape(missing)}: missing .*strict"):
         select_frames(capture, "yaleB05", strict=True)
     assert not has_new_frames(capture, "yaleB05", chosen.missing)
     gone.write_bytes(content)
     assert has_new_frames(capture, "yaleB05", chosen.missing)
     select_frames(capture, "yaleB05", strict=True)  # what is marked is known
+
+
+STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
+WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")
+FIELDS = [Finding("error", "fields", "0000", f"has {k} fields", "C0", f"L{k:03d}") for k in range(9)]
+
+
+def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:
+    console = Console(file=io.StringIO(), width=width)
+    show_findings(findings, strict, console)
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_report_counts_what_is_alike_and_begins_with_what_stops_a_subject() -> None:
+    assert shown([]) == ""
+    text = shown([WARNS, *FIELDS, STOPS])
+    assert text.index("subject stopped", text.index("0001/C0")) < text.index("0000/C0/L000")
+    assert text.index("0000/C0/L002") < text.index("the head moves")
+    assert "are mirrored [left] to right" in text  # brackets are no markup
+    assert "the lights are mirrored [left] to right" in shown([STOPS], width=60)
+    assert "warning" not in shown([WARNS, *FIELDS, STOPS], strict=True)
+    assert "left out" not in shown(FIELDS, strict=True)
+    text = shown(FIELDS)
+    assert "0000/C0/L002" in text and "L003" not in text and "(and 6 more like it)" in text
+    assert (
+        summary([WARNS, *FIELDS, STOPS])
+        == "Findings about 2 subjects: 1 x subject stopped, 9 x frame left out, 1 x warning"
+    )

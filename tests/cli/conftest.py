@@ -1,13 +1,11 @@
 """What tests of verbs share: a checkpoint, landmarks, maps and a stack of the example photo."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from facerf_cli.batch import made_from
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
 from tests import astronaut
@@ -15,15 +13,6 @@ from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.synth.conftest import transport_folder
 
 __all__ = ["transport_folder"]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def cache_of_indexes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the indexes of files that `-o` names out of the user's cache."""
-    folder, in_cache = tmp_path_factory.mktemp("indexes"), made_from._in_cache
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(made_from, "_in_cache", lambda file: folder / in_cache(file).name)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -38,8 +38,8 @@ from facerf_cli.work.photos import load_models_once
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import Double
 from tests.kinds import Folders, Patch, Said
-from tests.network.test_own_forms import NAME as OWN_NETWORK
-from tests.network.test_own_forms import write_own_package
+from tests.own_package import NAME as OWN_NETWORK
+from tests.own_package import write_own_package
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 

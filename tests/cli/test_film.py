@@ -503,6 +503,7 @@ def test_a_track_of_the_user_is_not_replaced(given: Path, tmp_path: Path, capsys
     assert path.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> None:
     """The second take is dark and mirrored; the film is stopped in it, and goes on."""
     takes = [frame_of(0)] * 2 + [(frame_of(0)[:, ::-1] * 0.5).astype(np.uint8)] * 2

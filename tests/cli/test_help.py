@@ -131,7 +131,6 @@ def test_what_is_mistyped_gets_the_near_name(line: str, near: str, capsys: Said)
     assert near in capsys.readouterr().err.partition("see '")[0]
 
 
-@pytest.mark.usefixtures("fresh_command_line")
 def test_man_is_in_step_with_the_app() -> None:
     assert {path.name: path.read_text() for path in MAN.glob("*.1")} == manual.pages(), "run `make man`"
 

@@ -21,8 +21,9 @@ from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import as_in_photo, lights_over_rig, with_room
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
-from tests.cli.test_relight import relight
+from tests.cli.lines import relight
 from tests.exr_layers import exr_layers
+from tests.refusals import refused
 
 HALF = 2.0**-11  # relative error of half floats
 
@@ -53,22 +54,6 @@ def test_own_is_a_light_like_others_but_for_the_room() -> None:
     lights = lights_over_rig((alone, both), "12", "cell")
     assert lights.own is not None and lights.own.tolist() == [[1, 1, 1], [1, 1, 1]]
     assert lights.weights.abs().sum((1, 2)).tolist() == [0, 6]
-
-
-@pytest.mark.parametrize(
-    ("entries", "words"),
-    [
-        (["own", "name=day;from=own"], "twice"),
-        (["own;at=0,0,1"], "one of"),
-        (["own;size=1"], "near lights"),
-        (["own;size_deg=5"], "no size"),
-        (["own;spot=20"], "near lights"),
-        (["own;rotate=5"], "of maps"),
-    ],
-)
-def test_what_it_cannot_have_is_refused(entries: list[str], words: str) -> None:
-    with pytest.raises(UsageError, match=words):
-        lit_images(entries)
 
 
 def test_alone_it_gives_the_photo_back(given: Path, tmp_path: Path) -> None:
@@ -141,12 +126,9 @@ def test_python_refuses_what_it_has_not() -> None:
     fitted = astronaut.person()
     person = facerf.Person(fitted.models, fitted.photo, fitted.head, fitted.reflectance)
     own = facerf.Light.own() + facerf.Light.single(0, 0)
-    with pytest.raises(UsageError, match="own light"):
-        own.to_envmap()
-    with pytest.raises(UsageError, match="whole photo"):
-        person.relight(own, pose=(5.0, 0.0, 0.0))
-    with pytest.raises(TypeError, match="directions"):
-        person.olat(own)  # type: ignore[arg-type]
+    refused(UsageError, "own light", own.to_envmap)
+    refused(UsageError, "whole photo", person.relight, own, pose=(5.0, 0.0, 0.0))
+    refused(TypeError, "directions", person.olat, own)
 
 
 @pytest.mark.parametrize("entry", ["even", "from=even", "name=even;from=even", "even;stops=-1"])

@@ -9,8 +9,8 @@ import pytest
 from facerf_cli.capture.findings import LEAST_LIGHTS, Finding
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.main import main
-from tests.dataset.capture import write_capture
 from tests.kinds import Folders, Patch, Said
+from tests.worlds import write_capture
 
 LIGHTS = 12
 Plant = Callable[..., None]

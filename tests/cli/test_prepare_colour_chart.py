@@ -12,12 +12,11 @@ from facerf_cli.capture.layouts import read_capture
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
-from tests.capture.chart_image import CAMERA, CORNERS, chart_image
-from tests.capture.test_chart import kept_luminance
-from tests.cli.folders import tree
-from tests.cli.test_prepare_dataset import prepare
-from tests.dataset.capture import BLACK_LEVEL, write_capture
+from tests.capture.chart_image import CAMERA, CORNERS, chart_image, kept_luminance
+from tests.cli.lines import prepare
+from tests.folders import tree
 from tests.stacks import read_olat_stack
+from tests.worlds import BLACK_LEVEL, write_capture
 
 LIGHTS = 10
 PLACE = ("--chart-corners", " ".join(f"{x:g},{y:g}" for x, y in CORNERS))

@@ -29,9 +29,10 @@ from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
-from tests.cli.folders import tree
-from tests.dataset.capture import Truth, write_capture
+from tests.cli.lines import prepare
+from tests.folders import tree
 from tests.stacks import read_olat_stack
+from tests.worlds import Truth, write_capture
 
 LIGHTS = 12
 Given = tuple[Path, dict[str, Truth]]
@@ -42,13 +43,6 @@ Said = pytest.CaptureFixture[str]
 def given(tmp_path_factory: pytest.TempPathFactory) -> Given:
     folder = tmp_path_factory.mktemp("stage") / "capture"
     return folder, write_capture(folder, subjects=2, lights=LIGHTS)
-
-
-def prepare(capture: Path, output: Path, *line: str) -> int:
-    """Without checks, which have tests of their own; these masks without heads are black from behind."""
-    return main(
-        ["prepare-dataset", str(capture), "-o", str(output), "--crop", "96", "--checks", "off", *line]
-    )
 
 
 @pytest.fixture(scope="module")

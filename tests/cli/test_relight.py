@@ -24,28 +24,14 @@ from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.synth.sky.skies import kind_of
 from facerf_cli.work.relight_options import RelightOptions, parse_aov
 from tests.astronaut import PATH as PHOTO
+from tests.cli.lines import face_sides, relight
 from tests.exr_layers import exr_layers
 from tests.kinds import Patch, Said
-
-
-def relight(given: Path, output: Path, *line: str, photo: Path = PHOTO) -> int:
-    fixed = ["--checkpoint", str(given / "lambert.safetensors"), "--landmarks", str(given / "astronaut.json")]
-    return main([*fixed[:2], "relight", str(photo), "-o", str(output), "--lights", "12", *fixed[2:], *line])
+from tests.refusals import refused
 
 
 def made(output: Path) -> list[str]:
     return sorted(path.name for path in output.rglob("*") if path.suffix in (".exr", ".png"))
-
-
-def face_sides(path: Path) -> tuple[float, float]:
-    """Mean light on the left and the right half of the face alone."""
-    image = read_image(path)
-    assert image.alpha is not None
-    columns = np.flatnonzero(image.alpha.max(0) > 0.5)
-    middle = (columns[0] + columns[-1]) // 2
-    left, right = (image.alpha.copy() for _ in range(2))
-    left[:, middle:], right[:, :middle] = 0, 0
-    return tuple(float((image.pixels.mean(-1) * side).sum() / side.sum()) for side in (left, right))
 
 
 @pytest.mark.slow
@@ -116,9 +102,8 @@ def test_lights_that_are_written_are_given_up_before_others_are_relit(
 def test_layers_have_a_singular_and_a_plural_and_are_listed_as_in_the_help() -> None:
     assert parse_aov("normals,mattes, class,uvs") == ("normal", "classes", "uv")
     assert parse_aov("normal,normals,matte,shadow") == ("normal", "shadow")
-    with pytest.raises(UsageError, match="--aov 'beauty': no such layer") as caught:
-        parse_aov("normal,beauty")
-    listed = str(caught.value).partition("give some of ")[2].split(", ")
+    line = refused(UsageError, "--aov 'beauty': no such layer", parse_aov, "normal,beauty")
+    listed = line.partition("give some of ")[2].split(", ")
     assert {*listed} == {"matte", *FACE_LAYERS, *PERSON_LAYERS}
     text = attributes_of(RelightOptions)["aov"]
     assert listed == [word for word in re.findall(r"\w+", text) if word in listed] and "albedo" in listed
@@ -218,7 +203,8 @@ def test_a_bad_map_harms_no_other(given: Path, tmp_path: Path, capsys: Said) -> 
     (tmp_path / "text.exr").write_text("no picture")
     missing = str(tmp_path / "missing.hdr")
     bad = [str(tmp_path / "square.exr"), str(tmp_path / "text.exr"), missing]
-    assert relight(given, tmp_path / "out", "--envmap", str(given / "maps/grey.exr"), *bad) == 1
+    good = str(given / "maps/grey.exr")
+    assert relight(given, tmp_path / "out", "--reflectance", "field", "--envmap", good, *bad) == 1
     assert made(tmp_path / "out") == ["astronaut_grey.exr", "astronaut_grey.png"]
     errors = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
     assert len(errors) == 3 and "twice as wide" in "".join(errors)

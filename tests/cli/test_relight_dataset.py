@@ -13,8 +13,8 @@ import pytest
 
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
-from tests.cli.folders import rows, tree
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.folders import rows, tree
 from tests.kinds import Folders, Said
 from tests.processes import wait_until
 

@@ -15,7 +15,7 @@ from facerf_cli.main import main
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.files import SHIPPED
-from tests.cli import test_relight as relighting
+from tests.cli.lines import PHOTO, face_sides, relight
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +35,7 @@ def attribute(path: Path, name: str) -> str:
 
 def relight_by_shipped(given: Path, output: Path, *line: str) -> int:
     fixed = ["--landmarks", str(given / "astronaut.json"), "--lights", "12"]
-    return main(["relight", str(relighting.PHOTO), "-o", str(output), *fixed, *line])
+    return main(["relight", str(PHOTO), "-o", str(output), *fixed, *line])
 
 
 @pytest.mark.parametrize("kind", ["diffuse-sh", "specular-sh", "prt"])
@@ -43,9 +43,9 @@ def test_a_face_is_lit_from_where_the_lamp_is(given: Path, tmp_path: Path, kind:
     line = ["--light", "70,0", "--light", "-70,0", "--composite", "face", "--reflectance", kind]
     assert relight_by_shipped(given, tmp_path / "out", *line) == 0
     first = tmp_path / "out/astronaut_light_70_0.exr"
-    left, right = relighting.face_sides(first)
+    left, right = face_sides(first)
     assert right > 1.5 * left
-    left, right = relighting.face_sides(tmp_path / "out/astronaut_light_-70_0.exr")
+    left, right = face_sides(tmp_path / "out/astronaut_light_-70_0.exr")
     assert left > 1.5 * right
     assert attribute(first, "facerf:reflectance") == kind
     assert np.isfinite(read_image(first).pixels).all()
@@ -68,7 +68,7 @@ def test_a_network_of_the_stage_diffuse_sh_is_taken_where_its_model_is_asked_for
     fixed = ["--landmarks", str(given / "astronaut.json"), "--light", "70,0", "--composite", "face"]
 
     def relight(name: str, checkpoint: Path, *more: str) -> int:
-        line = ["relight", str(relighting.PHOTO), "-o", str(tmp_path / name), *fixed, *more]
+        line = ["relight", str(PHOTO), "-o", str(tmp_path / name), *fixed, *more]
         return main(["--checkpoint", str(checkpoint), *line])
 
     for name, checkpoint in (("mine", tmp_path / "mine.safetensors"), ("shipped", SHIPPED["diffuse_sh"])):
@@ -89,7 +89,7 @@ def test_the_portrait_is_the_default(given: Path, tmp_path: Path) -> None:
     images = {}
     for name in ("", "portrait", "field"):
         chosen = ["--reflectance", name] if name else []
-        assert relighting.relight(given, tmp_path / f"_{name}", *line, *chosen) == 0
+        assert relight(given, tmp_path / f"_{name}", *line, *chosen) == 0
         path = tmp_path / f"_{name}/astronaut_light_20_30.exr"
         images[name] = read_image(path).pixels
         assert attribute(path, "facerf:reflectance") == ("field" if name == "field" else "")

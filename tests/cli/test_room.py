@@ -19,9 +19,10 @@ from facerf_cli.work.lights import lights_over_rig, with_room
 from facerf_cli.work.relight_options import parse_background
 from facerf_cli.work.relight_scenes import as_lit
 from tests.astronaut import PATH as PHOTO
-from tests.cli.test_relight import relight
+from tests.cli.lines import relight
 from tests.exr_layers import exr_layers
 from tests.kinds import Said
+from tests.refusals import refused
 
 KEY, RIM = "name=key;az=40;el=20;kelvin=3200", "name=rim;az=160;stops=-1;rgb=0.5,1,1"
 
@@ -73,8 +74,7 @@ def test_a_map_has_no_room_and_a_light_of_a_room_turns_the_default_off(sky: Path
     for entry in ("name=fill;from=around", "room=90,0"):
         (setup,) = setups_of([KEY, entry])
         assert in_room(setup, None, False) == setup
-    with pytest.raises(UsageError, match=r"--room 0\.1: a light has the name room"):
-        in_room(setup, "0.1", False)
+    refused(UsageError, "--room 0.1: a light has the name room", in_room, setup, "0.1", False)
 
 
 def test_none_leaves_the_lights_and_a_rooms_light_is_a_share_of_their_sum() -> None:

@@ -10,11 +10,11 @@ import pytest
 from facerf_cli.batch.settings import Shard
 from facerf_cli.main import main
 from facerf_cli.run.logs import configure_logging
-from tests.cli.folders import tree
-from tests.dataset.capture import write_capture
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.toy_protocol import evaluate
+from tests.folders import tree
 from tests.kinds import Said
+from tests.worlds import write_capture
 
 
 def test_evaluate(tmp_path: Path) -> None:

@@ -22,8 +22,8 @@ from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.stage_settings import Frame
 from facerf_cli.synth.subjects import draw_subject
 from facerf_cli.synth.views import stage_cameras, truth_of
-from tests.cli.folders import tree
 from tests.exr_layers import exr_layers
+from tests.folders import tree
 
 LIGHTS, CAMERAS = 6, 3
 Said = pytest.CaptureFixture[str]

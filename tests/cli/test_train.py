@@ -27,7 +27,7 @@ from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
 from tests import astronaut
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Patch, Said
-from tests.network.test_own_forms import FORMS, write_own_package
+from tests.own_package import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset
 from tests.training.synthhuman_folder import write_seen_synthhuman, write_synthhuman
 
@@ -287,6 +287,7 @@ def test_the_portrait_network_trains_on_a_bank_of_transport(
     require_served(tmp_path, "portrait", shipped)
 
 
+@pytest.mark.slow
 def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: Patch) -> None:
     # in other processes: tests/dataset/test_portraits.py
     monkeypatch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))

@@ -35,6 +35,7 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Log, Patch
+from tests.refusals import refused
 from tests.stacks import read_olat_stack
 
 CROP_PX = 48
@@ -183,8 +184,7 @@ def test_a_stack_gives_the_lazy_sources_of_many_steps(
 
 def test_the_only_person_is_validated_on_and_a_split_without_pairs_is_named(tmp_path: Path) -> None:
     dataset = write_small_dataset(tmp_path, counts=(1, 0, 0), cameras=1, lights=8, crop_px=32)
-    with pytest.raises(InputError, match="in the split train; make them with `facerf relight-"):
-        open_pairs(dataset, "train", 32)
+    refused(InputError, "make them with `facerf relight-", open_pairs, dataset, "train", 32)
     write_pairs(dataset, draw_pairs(dataset, envmap_names(ProceduralMaps(1, 0, 32)), 2, 0), overwrite=False)
     train, validation = (open_pairs(dataset, split, 32).pairs for split in ("train", "validation"))
     assert len(train) == 2 and validation == train

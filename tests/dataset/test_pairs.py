@@ -38,6 +38,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.synth.sky.skies import ProceduralMaps
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Log, Patch
+from tests.refusals import refused
 from tests.stacks import read_olat_stack
 
 MAPS = envmap_names(ProceduralMaps(4, 7, 32))
@@ -225,8 +226,7 @@ def test_parts_of_a_stack_and_a_stack_of_another_rig(dataset: Dataset) -> None:
     np.testing.assert_array_equal(header.normals, stack.header.normals)
     np.testing.assert_array_equal(header.directions, stack.header.directions)
     fewer = replace(dataset, directions_world=dataset.directions_world[:12], light_ids=dataset.light_ids[:12])
-    with pytest.raises(InputError, match="20 lights, the dataset has 12"):
-        world_to_map(fewer)
+    refused(InputError, "20 lights, the dataset has 12", world_to_map, fewer)
     with pytest.raises(InputError, match="20 lights, the dataset has 12"):
         list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))
 
@@ -237,16 +237,14 @@ def test_other_recipes_need_overwrite_and_take_the_old_images_with_them(fresh: D
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     before = weights_path(fresh)
-    with pytest.raises(UsageError, match=r"another seed, other envmaps, .* or move the folder relit"):
-        write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
+    refused(UsageError, "another seed", write_pairs, fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=False)
     assert image_path(fresh, "0000", 1).exists()
     write_pairs(fresh, draw_pairs(fresh, MAPS, 4, 0), overwrite=False)  # more of the same
     assert image_path(fresh, "0000", 1).exists() and not before.exists() and len(read_pairs(fresh)) == 16
     write_pairs(fresh, draw_pairs(fresh, MAPS, 2, 1), overwrite=True)
     assert not image_path(fresh, "0000", 1).exists()
     pairs_path(fresh).write_text("{}\n")
-    with pytest.raises(InputError, match="line 1 is not a pair"):
-        write_pairs(fresh, drawn, overwrite=False)
+    refused(InputError, "line 1 is not a pair", write_pairs, fresh, drawn, overwrite=False)
     assert len(write_pairs(fresh, drawn, overwrite=True)) == 8
 
 
@@ -274,8 +272,7 @@ def test_images_without_their_pairs_are_not_taken_for_finished(fresh: Dataset) -
     path = image_path(fresh, "0000", 0)
     path.parent.mkdir(parents=True)
     path.write_text("of an unknown light")
-    with pytest.raises(UsageError, match="move the folder relit"):
-        write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
+    refused(UsageError, "move the folder", write_pairs, fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=False)
     write_pairs(fresh, draw_pairs(fresh, MAPS, 1, 0), overwrite=True)
     assert not path.exists()
 
@@ -287,12 +284,10 @@ def test_a_map_that_changed_is_another_map(fresh: Dataset, tmp_path: Path) -> No
     rows, weights = load_pairs(fresh)["0000"]
     relight_subject(fresh, rows, weights)
     write_map(tmp_path / "sky.exr", np.full((4, 8, 3), 8.0))
-    with pytest.raises(UsageError, match="other envmaps"):
-        write_pairs(fresh, draw_pairs(fresh, [name], 2, 0), overwrite=False)
+    refused(UsageError, "other envmaps", write_pairs, fresh, draw_pairs(fresh, [name], 2, 0), overwrite=False)
     weights_path(fresh).unlink()
     pairs_path(fresh).touch()
-    with pytest.raises(InputError, match="the envmaps have changed since the pairs were made"):
-        load_pairs(fresh)
+    refused(InputError, "the envmaps have changed since the pairs were made", load_pairs, fresh)
     assert write_pairs(fresh, drawn, overwrite=True)[0].exposure_ev == -3
 
 
@@ -315,14 +310,12 @@ def test_a_row_that_is_no_pair_of_the_dataset(fresh: Dataset, change: dict[str, 
     changed = json.dumps(json.loads(first) | change)
     pairs_path(fresh).write_text("\n".join([changed, *others]))
     number = 2 if change == {"index": 1} else 1  # twice the same pair
-    with pytest.raises(InputError, match=f"line {number} is not a pair"):
-        read_pairs(fresh)
+    refused(InputError, f"line {number} is not a pair", read_pairs, fresh)
 
 
 @pytest.mark.parametrize("name", ["procedural:0:0:99999999", "procedural:0:0:0", "procedural:0"])
 def test_a_row_cannot_ask_for_a_map_of_any_size(name: str) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_envmap(name)
+    refused(InputError, "no such file", read_envmap, name)
 
 
 def test_one_camera_predicts_itself(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.kinds import Folders, Patch
+from tests.refusals import refused
 
 LACKS = 3
 
@@ -80,5 +81,4 @@ def test_a_split_without_a_face_or_anybody_is_refused(tmp_path: Path, monkeypatc
     ):
         folder = tmp_path / str(count)
         write_small_dataset(folder, (count, 0, 0), 1, lights=4, crop_px=192)
-        with pytest.raises(InputError, match=expected):
-            open_dataset_portraits(folder, backgrounds(), SHIPPED_NETWORKS, 1)
+        refused(InputError, expected, open_dataset_portraits, folder, backgrounds(), SHIPPED_NETWORKS, 1)

@@ -31,6 +31,7 @@ from facerf_cli.training.loop import train
 from facerf_cli.training.settings import PRESETS
 from facerf_cli.training.texture import TextureObjective, TextureObjectiveSettings
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.refusals import refused
 from tests.stacks import read_olat_stack
 
 SIDE, LIGHTS = 32, 20
@@ -197,15 +198,12 @@ def test_the_only_person_is_validated_on(tmp_path: Path, caplog: pytest.LogCaptu
 
 
 def test_splits_and_models_that_cannot_be_trained_on(dataset: Dataset, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such face model"):
-        open_dataset_textures(dataset.folder, "nobody.npz", SIDE, 1)
+    refused(InputError, "no such face model", open_dataset_textures, dataset.folder, "nobody.npz", SIDE, 1)
     none = write_small_dataset(tmp_path, counts=(2, 0, 0), cameras=1, lights=4, crop_px=32)
-    with pytest.raises(InputError, match="no subject in the split validation; run prepare-dataset"):
-        open_dataset_textures(none.folder, "builtin", SIDE, 1)
+    refused(InputError, "run prepare-dataset", open_dataset_textures, none.folder, "builtin", SIDE, 1)
     text = (tmp_path / "dataset.json").read_text().replace('"face_model": "builtin"', '"face_model": "other"')
     (tmp_path / "dataset.json").write_text(text)
-    with pytest.raises(InputError, match="fitted with the face model other, not builtin; give --fit-with"):
-        open_dataset_textures(none.folder, "builtin", SIDE, 1)
+    refused(InputError, "give --fit-with", open_dataset_textures, none.folder, "builtin", SIDE, 1)
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,7 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
 from tests.kinds import Folders, Log, Patch
+from tests.refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -301,14 +302,12 @@ def test_a_case_is_the_stacks_image_and_facerf_renders_it_in_its_frame(
     else:
         albedo = person.source(pair(0, "C1", "C1", 0))
         assert si_mse(image, albedo, case.mask) < 0.02 * np.square(albedo[inside]).mean()
-    with pytest.raises(InputError, match="0000/00000: has no source, pose and light"):
-        rendered(case.case, None, ours)
+    refused(InputError, "0000/00000: has no source, pose and light", rendered, case.case, None, ours)
 
 
 def test_joint_fits_of_another_face_model_are_refused(person: DatasetPerson, dataset: Dataset) -> None:
     other = DatasetPerson(replace(dataset, face_model="other"), "0000")
-    with pytest.raises(UsageError, match="joint fits are of other; give it as --face-model"):
-        list(other.compared(compare_olats, bench(person)))
+    refused(UsageError, "give it as --face-model", list, other.compared(compare_olats, bench(person)))
 
 
 def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
@@ -323,8 +322,7 @@ def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> N
 def test_a_photo_of_which_nothing_is_seen_or_that_is_damaged_is_an_error(person: DatasetPerson) -> None:
     lit = person.lit("C0")
     unseen = replace(lit.photo, alpha=0 * person.header("C0").seen)
-    with pytest.raises(InputError, match="0000/C0: nothing of the fitted face"):
-        replace(lit, photo=unseen, _views={}).by(FACE_ONLY)
+    refused(InputError, "0000/C0: nothing of the fitted", replace(lit, photo=unseen, _views={}).by, FACE_ONLY)
 
     def compare(*_: object) -> list[Comparison]:
         raise InputError("damaged")
@@ -388,5 +386,4 @@ def test_traits_are_read_with_the_dataset_and_may_be_missing(dataset: Dataset, t
         assert DatasetPerson(read_dataset(folder), "0000", reading()).facts["tone"] == tone
     content["subjects"]["0000"]["traits"] = ["dark"]
     (folder / "dataset.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="traits"):
-        read_dataset(folder)
+    refused(InputError, "traits", read_dataset, folder)

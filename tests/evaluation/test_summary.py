@@ -17,6 +17,7 @@ from facerf_cli.evaluation.summary import (
     summarise,
 )
 from facerf_cli.image.metrics import Interval
+from tests.refusals import refused
 
 LAYOUT = Layout("Toy", ("si_mse", "psnr"), ("pose",), published("olat"))
 ERRORS = {"ours": (0.1, 0.2, 0.4, 0.3), "theirs": (0.2, 0.1, 0.8, 0.3)}
@@ -107,8 +108,7 @@ def test_text_breaks_the_tables_down_and_numbers_do_not() -> None:
 
 
 def test_bins_sort_as_numbers_do_and_an_image_measured_twice_is_our_bug() -> None:
-    with pytest.raises(ValueError, match="twice"):
-        summarise(LAYOUT, [*rows(), rows()[0]])
+    refused(ValueError, "twice", summarise, LAYOUT, [*rows(), rows()[0]])
     assert sorted(["90 to 180 deg", "5 deg", "30 to 60 deg", "10 deg"], key=natural) == [
         "5 deg", "10 deg", "30 to 60 deg", "90 to 180 deg",
     ]  # fmt: skip

@@ -16,6 +16,7 @@ from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.kinds import Patch
+from tests.refusals import refused
 
 PHOTO = skimage.data.astronaut()[:330, 80:370] / 255.0  # not square
 
@@ -68,11 +69,8 @@ def test_people_are_told_apart(shared_data: Path, descriptor: np.ndarray) -> Non
 
 
 def test_other_shapes_and_a_missing_model_are_refused(landmarks_px: np.ndarray, monkeypatch: Patch) -> None:
-    with pytest.raises(ValueError, match=r"\(330, 290\)"):
-        face_descriptor(PHOTO[..., 0], landmarks_px)
-    with pytest.raises(ValueError, match=r"\(67, 2\)"):
-        face_descriptor(PHOTO, landmarks_px[:67])
+    refused(ValueError, "(330, 290)", face_descriptor, PHOTO[..., 0], landmarks_px)
+    refused(ValueError, "(67, 2)", face_descriptor, PHOTO, landmarks_px[:67])
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     module._recognition.cache_clear()
-    with pytest.raises(FacerfError, match=r"pip install 'facerf\[dlib\]'"):
-        face_descriptor(PHOTO, landmarks_px)
+    refused(FacerfError, "pip install 'facerf[dlib]'", face_descriptor, PHOTO, landmarks_px)

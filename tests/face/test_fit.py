@@ -41,6 +41,7 @@ from facerf_cli.portrait.find import detect_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from tests.refusals import refused
 
 CAMERA = crop_camera(256)
 CROP = Crop(10.0, 20.0, 512.0, 256)
@@ -201,8 +202,7 @@ def test_a_fit_survives_its_file_which_holds_nothing_of_memory(model, tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     np.savez(tmp_path / "endless.npz", **fit_to_arrays(fit) | {"size_px": np.inf})
     for name in ("text.npz", "other.npz", "endless.npz", "missing.npz"):
-        with pytest.raises(InputError, match=name):
-            load_fit(tmp_path / name)
+        refused(InputError, name, load_fit, tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -222,8 +222,7 @@ def test_a_fit_knows_its_model_its_quality_and_the_turn_to_another(model):
     fit = fit_landmarks(model, see(model, *coefficients(model, 0), (0, 0, 0))[0].numpy(), CROP)
     assert fit.quality == "good"
     assert [replace(fit, error_iod=error).quality for error in (0.045, 0.06, 0.2)] == ["good", "fair", "poor"]
-    with pytest.raises(ValueError, match="other"):
-        fit.vertices_camera(replace(model, name="other"))
+    refused(ValueError, "other", fit.vertices_camera, replace(model, name="other"))
     # Vectors in camera space, as normals are: N_t = turn N_s.
     source, target = pose_to_rotation(30.0, 10.0, 5.0), pose_to_rotation(-20.0, 0.0, 15.0)
     fit = replace(

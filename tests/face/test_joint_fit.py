@@ -14,6 +14,7 @@ from facerf_cli.face.fit import IOD_M, fit_landmarks
 from facerf_cli.face.joint_fit import JointFit, PosedCamera, fit_in_crop, fit_views
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.raster.camera import pose_to_rotation, project
+from tests.refusals import refused
 
 YAWS_DEG = (-45.0, -15.0, 15.0, 40.0)
 HEAD_WORLD = (0.3, 1.2, -0.4)  # the world is not the head's
@@ -156,8 +157,7 @@ def test_one_camera_is_a_single_fit_and_a_face_that_is_none_is_left_out(
     joint = fit_views(model, CAMERAS, wrong)
     assert [error is None for error in joint.error_iod] == [False, True, False, False]
     assert error_against(model, joint, world, CAMERAS[1]) < 0.04
-    with pytest.raises(InputError, match="no camera"):
-        fit_views(model, CAMERAS, [None] * len(CAMERAS))
+    refused(InputError, "no camera", fit_views, model, CAMERAS, [None] * len(CAMERAS))
 
 
 @pytest.mark.parametrize(("distance_m", "most_iod"), [(0.8, 0.005), (1.5, 0.008), (10.0, 0.018)])

@@ -9,6 +9,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.portrait import find
 from facerf_cli.portrait.find import Face, choose_face
+from tests.refusals import refused
 
 
 @pytest.fixture
@@ -26,11 +27,9 @@ def test_faces_by_size_sureness_and_number(landmarks_px, caplog, monkeypatch):
     assert choose_face(faces, "largest", "p") == [large] and choose_face(faces, "all", "p") == faces
     assert "p: has 2 faces, of which the largest is taken" in caplog.text
     assert choose_face(faces, "0", "p") == [small]
-    with pytest.raises(InputError, match="2 face"):
-        choose_face(faces, "2", "p")
+    refused(InputError, "2 face", choose_face, faces, "2", "p")
     for which in ("-1", "biggest", ""):
-        with pytest.raises(UsageError, match="largest"):
-            choose_face(faces, which, "p")
+        refused(UsageError, "largest", choose_face, faces, which, "p")
     linear = np.random.default_rng(0).random((300, 70, 3), np.float32)
     assert to_display(linear).dtype == np.uint8
     assert np.abs(to_display(linear).astype(int) - to_display(linear * 1000)).max() <= 1
@@ -51,8 +50,7 @@ def test_files_of_landmarks_are_read_or_named(tmp_path, landmarks_px):
         assert read_landmarks(tmp_path / "a.json") == pytest.approx(landmarks_px)
     (tmp_path / "b.json").write_bytes(bytes(range(256)))
     for name in ("b.json", "missing.pts"):
-        with pytest.raises(InputError, match=name):
-            read_landmarks(tmp_path / name)
+        refused(InputError, name, read_landmarks, tmp_path / name)
 
 
 @pytest.mark.parametrize(
@@ -73,5 +71,4 @@ def test_files_of_landmarks_are_read_or_named(tmp_path, landmarks_px):
 )
 def test_bad_files_are_named(tmp_path, name, text):
     (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=name):
-        read_landmarks(tmp_path / name)
+    refused(InputError, name, read_landmarks, tmp_path / name)

@@ -22,6 +22,7 @@ from facerf_cli.face.topology import (
 )
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
+from tests.refusals import refused
 
 SIDE = 96
 YAWS_DEG = (0.0, 35.0, -35.0)
@@ -43,8 +44,7 @@ def test_masks_are_symmetric_and_bounded(name):
 def test_parts_cover_uv_space_once_and_an_unknown_region_is_named():
     total = sum(region_mask(part, 256) for part in ("skin", "eyes", "brows", "lips", "nostrils", "neck"))
     assert torch.allclose(total, torch.ones(256, 256), atol=1e-6)
-    with pytest.raises(ValueError, match="ears"):
-        region_mask("ears", 8)
+    refused(ValueError, "ears", region_mask, "ears", 8)
 
 
 @pytest.mark.parametrize(

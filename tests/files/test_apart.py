@@ -60,6 +60,6 @@ def test_arrays_come_back_by_name(tmp_path: Path) -> None:
     ],
 )
 def test_what_goes_wrong_there_is_an_error_here(reader: str, says: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=says) as refused:
+    with pytest.raises(ValueError, match=says) as raised:
         arrays_apart(globals()[reader], tmp_path, time_s=2 if reader == "endless" else 60)
-    assert str(refused.value).isprintable()
+    assert str(raised.value).isprintable()

@@ -17,6 +17,7 @@ from facerf_cli.errors import FacerfError
 from facerf_cli.files import downloads
 from facerf_cli.files.downloads import PublishedFile, fetch, opener_of
 from tests.kinds import Patch
+from tests.refusals import refused
 
 CONTENT = bytes(range(256)) * 2000
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
@@ -108,8 +109,7 @@ def test_a_cut_connection_goes_on_where_it_broke(server: Server, tmp_path: Path,
 
 def test_what_a_broken_fetch_got_is_kept_for_the_next(server: Server, tmp_path: Path) -> None:
     server.cuts = [5000, 0]
-    with pytest.raises(FacerfError, match="the connection broke off"):
-        fetch(server.published(), OPTION, tmp_path)
+    refused(FacerfError, "the connection broke off", fetch, server.published(), OPTION, tmp_path)
     assert visible(tmp_path) == []
     assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
     assert server.asked[-1] == "bytes=5000-"
@@ -133,8 +133,7 @@ def test_another_file_than_the_published_one_is_refused(server: Server, tmp_path
 @pytest.mark.parametrize("lengths", [True, False])
 def test_more_than_the_file_can_be_is_not_taken(server: Server, tmp_path: Path, lengths: bool) -> None:
     server.lengths = lengths
-    with pytest.raises(FacerfError, match="larger than the published file can be"):
-        fetch(server.published(size_limit=100_000), OPTION, tmp_path)
+    refused(FacerfError, "larger than", fetch, server.published(size_limit=100_000), OPTION, tmp_path)
     assert visible(tmp_path) == [] and not (tmp_path / ".a file.pth.part").exists()
 
 
@@ -165,14 +164,12 @@ def test_a_silent_server_is_given_up(tmp_path: Path, monkeypatch: Patch) -> None
     monkeypatch.setattr(downloads, "TIMEOUT_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}/a.pth"
-        with pytest.raises(FacerfError, match="no answer within"):
-            fetch(PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
+        refused(FacerfError, "no answer within", fetch, PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
 
 
 @pytest.mark.parametrize("url", ["http://example.org/a.pth", "file:///etc/passwd", "ftp://example.org/a.pth"])
 def test_only_https_is_fetched_from(server: Server, tmp_path: Path, url: str) -> None:
-    with pytest.raises(FacerfError, match="unknown url type"):
-        fetch(PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
+    refused(FacerfError, "unknown url type", fetch, PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
     with pytest.raises(URLError, match="unknown url type"):  # as after a redirection
         opener_of("https://example.org/a.pth").open(url)
     server.location = url.replace("http:", "gopher:")
@@ -204,8 +201,7 @@ def test_a_full_disk_is_named_and_what_came_is_kept(
             return Full(path, mode.replace("b", "")) if full else usual(path, mode, **how)
 
         small.setattr(Path, "open", opened)
-        with pytest.raises(FacerfError, match=r"in the cache \(No space left on device\); make room"):
-            fetch(server.published(), OPTION, tmp_path)
+        refused(FacerfError, "in the cache ... make room", fetch, server.published(), OPTION, tmp_path)
     assert fetch(server.published(), OPTION, tmp_path).read_bytes() == CONTENT
     assert server.asked[:2] == [None, "bytes=5000-"] and server.asked[2] not in server.asked[:2]
 
@@ -223,6 +219,5 @@ def test_a_server_that_drips_is_given_up_and_what_came_is_kept(
     server: Server, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.setattr(downloads, "DEADLINE_S", -1.0)
-    with pytest.raises(FacerfError, match="the next run continues it"):
-        fetch(server.published(), OPTION, tmp_path)
+    refused(FacerfError, "the next run continues it", fetch, server.published(), OPTION, tmp_path)
     assert len(server.asked) == 1 and (tmp_path / ".a file.pth.part").stat().st_size

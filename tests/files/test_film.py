@@ -18,6 +18,7 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_linear_rec709
 from tests.files.made import bt2020_of, write_png
 from tests.kinds import Log, Patch
+from tests.refusals import refused
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PCM = "pcm_s16le"
@@ -156,16 +157,14 @@ def test_a_film_that_cannot_be_finished_is_not_there(tmp_path: Path) -> None:
 
 def test_what_is_no_film_is_said_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("no film at all\n" * 50)
-    with pytest.raises(InputError, match=r"text\.mp4: not a readable film"):
-        film_timing(tmp_path / "text.mp4")
+    refused(InputError, "text.mp4: not a readable film", film_timing, tmp_path / "text.mp4")
     with av.open(str(tmp_path / "tone.mp4"), "w") as container:
         tone = container.add_stream("aac", rate=48000, layout="mono")
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
         frame.sample_rate = 48000
         container.mux(tone.encode(frame))
         container.mux(tone.encode(None))
-    with pytest.raises(InputError, match=r"tone\.mp4: holds no pictures"):
-        film_timing(tmp_path / "tone.mp4")
+    refused(InputError, "tone.mp4: holds no pictures", film_timing, tmp_path / "tone.mp4")
 
 
 def test_a_film_in_hdr_is_refused(tmp_path: Path) -> None:
@@ -177,8 +176,7 @@ def test_a_film_in_hdr_is_refused(tmp_path: Path) -> None:
         frame = av.VideoFrame.from_ndarray(np.zeros((32, 48, 3), np.uint8))
         container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
-    with pytest.raises(InputError, match="is an HDR film"):
-        film_timing(path)
+    refused(InputError, "is an HDR film", film_timing, path)
 
 
 def coded_film(
@@ -495,5 +493,4 @@ def test_sound_that_cannot_be_kept_is_said_before_the_first_frame(tmp_path: Path
 
 def test_without_av_one_line_says_what_to_install(monkeypatch: Patch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UsageError, match=r"pip install 'facerf\[video\]'"):
-        film_timing(tmp_path / "a.mp4")
+    refused(UsageError, "pip install 'facerf[video]'", film_timing, tmp_path / "a.mp4")

@@ -20,6 +20,7 @@ from facerf_cli.run.logs import COMPOSITE_SOURCE_TYPE, Provenance
 from tests.exr_layers import exr_layers
 from tests.files.made import IPTC, MAP, TO_709, H, W, long_runs, properties, write_hdr, write_oiio
 from tests.kinds import Log
+from tests.refusals import refused
 
 VALUES = np.random.default_rng(1).random((23, 34, 4)).astype(np.float32)  # [H, W, RGBA], not square
 
@@ -122,8 +123,7 @@ def test_nan_and_infinity_are_counted(tmp_path: Path, warned: pytest.LogCaptureF
     values = VALUES[..., :3].copy()
     values[3, 5, 1], values[3, 5, 2], values[7, 8, 0] = np.nan, np.inf, -np.inf
     path = write_oiio(tmp_path / "a.exr", values)
-    with pytest.raises(InputError, match="2 of 782 pixels are NaN or infinite"):
-        read_image(path)
+    refused(InputError, "2 of 782 pixels are NaN or infinite", read_image, path)
     replaced = read_image(path, non_finite="zero").pixels
     assert "2 pixels are NaN or infinite" in warned.text
     np.testing.assert_array_equal(replaced, np.where(np.isfinite(values), values, 0))
@@ -191,10 +191,8 @@ def test_display_auto_exposure_is_returned_and_alpha_is_not_premultiplied(tmp_pa
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(FacerfError, match="cannot write"):
-        write_display(tmp_path / "file" / "a.png", VALUES[..., :3])
-    with pytest.raises(UsageError, match="suffix"):
-        write_display(tmp_path / "a.xyz", VALUES[..., :3])
+    refused(FacerfError, "cannot write", write_display, tmp_path / "file" / "a.png", VALUES[..., :3])
+    refused(UsageError, "suffix", write_display, tmp_path / "a.xyz", VALUES[..., :3])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 

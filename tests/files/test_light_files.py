@@ -18,6 +18,7 @@ from facerf_cli.files.light_files import (
     write_light,
 )
 from facerf_cli.files.read import read_image
+from tests.refusals import refused
 
 
 def random_rows(rows: int) -> torch.Tensor:
@@ -49,21 +50,20 @@ def test_a_light_comes_back_from_plain_json_also_of_coefficients_alone(tmp_path:
     after = read_light(tmp_path / "a.json")
     assert len(after.directions) == 0 and after.sh is not None and len(after.sh.coefficients) == 9
     (tmp_path / "a.json").write_text("[1]")
-    with pytest.raises(InputError, match=r"a\.json is \[1\]; an object"):
-        read_light(tmp_path / "a.json")
+    refused(InputError, "a.json is [1]; an object", read_light, tmp_path / "a.json")
 
 
 BAD: dict[str, dict[str, Any]] = {
-    "format is .*facerf-light-1": {"format": "other"},
+    "format is ... facerf-light-1": {"format": "other"},
     "0 directions but 2 weights": {"directions": None},
     "both directions and sh": {"directions": None, "weights": None},
     "2 directions but 1 weights": {"weights": [[1, 1, 1]]},
-    "directions is .*unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
-    "weights is .* rows of 3": {"weights": [[1, 1, 1], [1, 1]]},
+    "directions is ... unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
+    "weights is ... rows of 3": {"weights": [[1, 1, 1], [1, 1]]},
     "NaN is not a finite": {"weights": [[1, 1, 1], [1, 1, float("nan")]]},
     "3 finite numbers": {"weights": [[1, 1, 1], [1, 1, "2"]]},
-    "directions is .*1 to 4096 rows": {"directions": []},
-    "sh: coefficients is .*not 8": {"sh": {"coefficients": [[0, 0, 0]] * 8}},
+    "directions is ... 1 to 4096 rows": {"directions": []},
+    "sh: coefficients is ... not 8": {"sh": {"coefficients": [[0, 0, 0]] * 8}},
     "sh is 5; an object": {"sh": 5},
 }
 
@@ -73,18 +73,14 @@ def test_an_error_is_one_line_that_names_the_fault(complaint: str, tmp_path: Pat
     good = {"format": FORMAT, "directions": [[1, 0, 0], [0, 1, 0]], "weights": [[1, 1, 1], [2, 2, 2]]}
     fields = {name: value for name, value in (good | BAD[complaint]).items() if value is not None}
     (tmp_path / "a.json").write_text(json.dumps(fields))
-    with pytest.raises(InputError, match=complaint) as error:
-        read_light(tmp_path / "a.json")
-    assert "a.json" in str(error.value) and "\n" not in str(error.value)
+    refused(InputError, f"a.json ... {complaint}", read_light, tmp_path / "a.json")
 
 
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b" " * (5 << 20)])
 def test_damaged_files_are_refused(text: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(text)
-    with pytest.raises(InputError, match=r"a\.json: .*give a \.json"):
-        read_light(tmp_path / "a.json")
-    with pytest.raises(InputError, match="no such file"):
-        read_light(tmp_path / "b.json")
+    refused(InputError, "a.json: ... give a .json", read_light, tmp_path / "a.json")
+    refused(InputError, "no such file", read_light, tmp_path / "b.json")
 
 
 def pano(
@@ -127,7 +123,6 @@ def test_a_part_that_lies_outside_its_sphere_is_refused(tmp_path: Path) -> None:
     levels = np.full((16, 32, 3), 200, np.uint8)
     assert read_map_file(pano(tmp_path / "a.jpg", levels, (16, 32), (0, 0))).shape == (16, 32, 3)
     for full, start in (((32, 64), (20, 0)), ((32, 64), (-1, 0)), ((8, 16), (0, 0))):
-        with pytest.raises(InputError, match=r"a\.jpg: its GPano metadata name no part of a sphere"):
-            read_map_file(pano(tmp_path / "a.jpg", levels, full, start))
+        refused(InputError, "a.jpg: its GPano", read_map_file, pano(tmp_path / "a.jpg", levels, full, start))
     with pytest.raises(InputError, match=r"a\.jpg: a part of a sphere .* needs .* GB of memory"):
         read_map_file(pano(tmp_path / "a.jpg", levels, (1 << 20, 1 << 21), (0, 0)))

@@ -11,6 +11,7 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.main import main
 from facerf_cli.network.files import FORMAT, SHIPPED, checkpoint_file, serving_files
 from tests.kinds import Said
+from tests.refusals import refused
 
 
 def checkpoint(path: Path, *networks: str, trained: tuple[str, ...] = ()) -> Path:
@@ -31,15 +32,12 @@ def test_each_file_counts_for_what_its_last_training_trained(tmp_path: Path) -> 
     silent = checkpoint(tmp_path / "d.st", "reflectance", "geometry")  # counts for all it holds
     assert serving_files([silent]) == SHIPPED | {"reflectance": silent, "geometry": silent}
     again = checkpoint(tmp_path / "e.st", "geometry", trained=("geometry",))
-    with pytest.raises(UsageError, match=r"e\.st: holds a Geometry Network, as does .*c\.st"):
-        serving_files([third, again])
-    with pytest.raises(UsageError, match=r"b\.st: .* Portrait Network, but facerf segment uses the Pars"):
-        serving_files([second], ("parsing",), "facerf segment")
+    refused(UsageError, "e.st: holds a Geometry Network, as does ... c.st", serving_files, [third, again])
+    refused(UsageError, "b.st: ... Portrait Network", serving_files, [second], ("parsing",), "facerf segment")
 
 
 def test_a_runs_folder_stands_for_its_best_checkpoint(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no best\.safetensors in this folder"):
-        serving_files([checkpoint_file(tmp_path)])
+    refused(InputError, "no best.safetensors in this folder", serving_files, [checkpoint_file(tmp_path)])
     best = checkpoint(tmp_path / "best.safetensors", "portrait")
     assert serving_files([checkpoint_file(tmp_path)])["portrait"] == best
 

@@ -11,6 +11,7 @@ from facerf_cli.network import parsing
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.parsing import ParsingNetwork, ParsingSettings
 from facerf_cli.relighting.models import load_models
+from tests.refusals import refused
 
 SMALL = ParsingSettings((8, 8, 12, 16), (0, 1, 1, 1), 64, 5, 70)
 
@@ -62,5 +63,4 @@ def test_every_weight_takes_part(network: ParsingNetwork) -> None:
 def test_a_network_of_other_classes_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     save_networks(path, {"parsing": ParsingNetwork(SMALL)}, {"layout_version": LAYOUT_VERSION})
-    with pytest.raises(InputError, match="no Parsing Network of this version"):
-        load_models([path]).networks.load(["parsing"])
+    refused(InputError, "no Parsing Network of this version", load_models([path]).networks.load, ["parsing"])

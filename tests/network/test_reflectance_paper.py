@@ -4,6 +4,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from facerf_cli.network.reflectance_paper import PaperReflectanceNetwork, PaperReflectanceSettings
+from tests.refusals import refused
 
 SMALL = PaperReflectanceSettings(side=32, widths=(8, 8, 12, 16), features=8)
 
@@ -102,8 +103,7 @@ def test_skips_are_convolved_as_if_stacked_and_both_normal_maps_matter(
 
 def test_a_side_that_cannot_be_halved_is_refused() -> None:
     assert PaperReflectanceNetwork(SMALL).as_metadata()["form"] == "paper"
-    with pytest.raises(ValueError, match="halved 4 times"):
-        PaperReflectanceNetwork(PaperReflectanceSettings(40, (8, 8, 8, 8)))
+    refused(ValueError, "halved 4 times", PaperReflectanceNetwork, PaperReflectanceSettings(40, (8, 8, 8, 8)))
 
 
 def test_every_weight_learns() -> None:

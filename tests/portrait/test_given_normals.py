@@ -23,6 +23,7 @@ from facerf_cli.work.photos import read_normals
 from tests import astronaut
 from tests.exr_layers import exr_layers
 from tests.kinds import Said
+from tests.refusals import refused
 
 TILT = 0.5  # of every other pixel's normal toward x, and away from it
 
@@ -117,10 +118,8 @@ def test_a_person_with_normals_is_saved_and_loaded(person: Person, tmp_path: Pat
 def test_what_are_not_the_normals_of_the_face_is_refused(bumpy: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"not those of the face \(mean cosine 0\.\d+\)"):
         fitted(bumpy[..., ::-1].copy())  # as OpenCV writes RGB
-    with pytest.raises(InputError, match="40 x 30 pixels, the photo 512 x 512; give its own"):
-        fitted(bumpy[:30, :40])
-    with pytest.raises(UsageError, match="normals: are for the portrait field"):
-        fitted(bumpy, reflectance="field")
+    refused(InputError, "40 x 30 pixels, the photo 512 x 512; give its own", fitted, bumpy[:30, :40])
+    refused(UsageError, "normals: are for the portrait field", fitted, bumpy, reflectance="field")
 
 
 def test_files_of_each_kind_hold_the_same(bumpy: np.ndarray, tmp_path: Path) -> None:

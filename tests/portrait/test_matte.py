@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from facerf_cli.portrait.matte import PersonColours, lifted, solid
+from facerf_cli.portrait.matte import (
+    PersonColours,
+    lifted,
+    solid,
+    solve_matte,
+    solved_before_plain_background,
+)
 
 SIDE = 96
 
@@ -88,3 +94,71 @@ def test_mixed_pixels_get_the_persons_colour_back(value: float) -> None:
     assert np.abs(found[edge] - own).max() < 0.05 < np.abs(photo[edge] - own).max()
     assert (found[matte == 0] == 0).all()
     assert np.abs(found[matte == 1] - own).max() < 1e-3
+
+
+@pytest.mark.parametrize("colours", [((0.9, 0.9, 0.9), (0.1, 0.1, 0.1)), ((0.2, 0.1, 0.1), (0.3, 0.8, 0.4))])
+def test_shares_of_a_mixture_are_found_without_a_hint(colours: tuple[tuple[float, ...], ...]) -> None:
+    x = np.linspace(-1, 2, 60)
+    truth = np.tile(x.clip(0, 1), (40, 1))
+    own, other = (np.array(colour, np.float32) for colour in colours)
+    image = truth[..., None] * own + (1 - truth[..., None]) * other
+    unknown = np.tile((x > -0.2) & (x < 1.2), (40, 1))
+    expected = np.where(unknown, 0.5, truth)
+    found = solve_matte(image.astype(np.float32), expected, unknown)
+    # the pull toward .5 and the smoothness of windows leave a fourth of what is expected wrongly
+    assert np.abs(found - truth).max() < 0.15 and np.abs(expected - truth).max() > 0.4
+
+
+def test_known_pixels_stay_and_nothing_unknown_is_no_work() -> None:
+    image, expected = np.random.default_rng(0).random((12, 12, 3), np.float32), np.zeros((12, 12))
+    expected[:, 6:] = 1
+    assert (solve_matte(image, expected, np.zeros((12, 12), bool)) == expected).all()
+    unknown = np.zeros((12, 12), bool)
+    unknown[:, 5:7] = True
+    found = solve_matte(image, expected, unknown)
+    assert (found[~unknown] == expected[~unknown]).all() and ((found >= 0) & (found <= 1)).all()
+
+
+PHOTO_SIDE = 200
+PERSON, WALL = np.float32([0.1, 0.06, 0.05]), np.float32([0.9, 0.9, 0.85])
+
+
+def person(radius: float, soft_px: float = 3.0) -> np.ndarray:
+    """A round person [PHOTO_SIDE, PHOTO_SIDE] with a soft outline."""
+    y, x = np.mgrid[:PHOTO_SIDE, :PHOTO_SIDE] - PHOTO_SIDE / 2
+    return np.clip((radius - np.hypot(x, y)) / soft_px + 0.5, 0, 1).astype(np.float32)
+
+
+def before(alpha: np.ndarray, wall: np.ndarray) -> np.ndarray:
+    return np.asarray(alpha[..., None] * PERSON + (1 - alpha[..., None]) * wall, np.float32)
+
+
+def guessed() -> np.ndarray:
+    """A matte that is unsure inside the outline, and hazy outside."""
+    guess, y = person(60), np.arange(PHOTO_SIDE)[:, None]
+    guess[(person(60) == 1) & (person(54) < 1) & (y < PHOTO_SIDE / 2)] = 0.4
+    guess[(person(60) == 0) & (person(66) > 0) & (y > PHOTO_SIDE / 2)] = 0.3
+    return guess
+
+
+def test_before_a_plain_wall_colours_decide_and_what_is_sure_stays() -> None:
+    truth, guess = person(60), guessed()
+    found = solved_before_plain_background(guess, before(truth, WALL))
+    assert np.abs(guess - truth).max() > 0.5
+    np.testing.assert_allclose(found, truth, atol=0.03)
+    # A white button near the outline, too.
+    guess, image = guessed(), before(person(60), WALL)
+    image[120:122, 48:50] = WALL
+    assert (guess[120:122, 48:50] == 1).all()
+    found = solved_before_plain_background(guess, image)
+    sure = (guess == 0) | (guess == 1)
+    np.testing.assert_array_equal(found[sure], guess[sure])
+
+
+@pytest.mark.parametrize("kind", ["varied", "like the person"])
+def test_before_a_background_that_varies_or_is_like_the_person_nothing_changes(kind: str) -> None:
+    blocks = np.random.default_rng(0).random((PHOTO_SIDE // 5, PHOTO_SIDE // 5, 1), np.float32)
+    varied = blocks.repeat(5, 0).repeat(5, 1) * WALL
+    guess = guessed()
+    found = solved_before_plain_background(guess, before(person(60), varied if kind == "varied" else PERSON))
+    np.testing.assert_allclose(found, guess, atol=0.02)

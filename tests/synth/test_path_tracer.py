@@ -19,6 +19,7 @@ from facerf_cli.synth.path_tracer import PathSettings
 from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.shading import Material
 from facerf_cli.synth.views import StageCamera
+from tests.refusals import refused
 from tests.synth.shapes import square
 
 LIGHTS = np.array([[-0.48, 0.36, 0.8], [-0.6, 0.0, 0.8]], np.float32)  # they miss the wall
@@ -33,8 +34,7 @@ def _needs_mitsuba(request: pytest.FixtureRequest) -> None:
 
 def test_without_mitsuba_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(UsageError, match=r"pip install 'facerf\[synth\]'"):
-        path_tracer.load_mitsuba()
+    refused(UsageError, "pip install 'facerf[synth]'", path_tracer.load_mitsuba)
 
 
 def _corner() -> HeadMesh:

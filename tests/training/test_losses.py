@@ -1,7 +1,26 @@
-import torch
+import math
 
+import pytest
+import torch
+from torch import Tensor
+
+from facerf_cli.network.features import VggFeatures, feature_distance, layer_powers
 from facerf_cli.network.inputs import from_root, to_root
-from facerf_cli.training.losses import clipped_si_mse, root_loss, si_mse
+from facerf_cli.training.losses import (
+    Features,
+    MaskedPair,
+    PaperWeights,
+    appearance_loss,
+    clipped_si_mse,
+    closest_points,
+    landmark_loss,
+    light_loss,
+    photometric_loss,
+    regularisation,
+    root_loss,
+    si_mse,
+    slid_contour,
+)
 
 
 def test_si_mse_sees_error_within_the_mask_and_no_scale() -> None:
@@ -35,3 +54,128 @@ def test_roots_are_undone_exactly_and_glints_beyond_white_clipped() -> None:
     target[..., 3, 3], prediction[..., 3, 3] = 30.0, 3.0
     assert clipped_si_mse(prediction, target, weight).item() < 1e-10
     assert si_mse(prediction, target, weight).item() > 1
+
+
+def test_weights_are_the_papers_and_regularisation_their_weighed_mean() -> None:
+    weights = PaperWeights()
+    assert (weights.landmarks, weights.photometric, weights.regularisation, weights.features) == (25, 5, 1, 1)
+    assert (weights.alpha, weights.beta) == (0.4, 0.002)
+    alpha, beta = torch.randn(3, 40), torch.randn(3, 29)
+    for face, value in enumerate(regularisation(alpha, beta).tolist()):
+        by_hand = 0.4 * sum(a * a for a in alpha[face].tolist()) / 40
+        by_hand += 0.002 * sum(b * b for b in beta[face].tolist()) / 29
+        assert value == pytest.approx(by_hand, rel=1e-5)
+
+
+@pytest.mark.parametrize("side_px", [64, 512])
+def test_landmarks_are_in_half_sides(side_px: int) -> None:
+    found, detected = torch.rand(2, 66, 2) * side_px, torch.rand(2, 66, 2) * side_px
+    for face, value in enumerate(landmark_loss(found, detected, side_px).tolist()):
+        total = 0.0
+        for a, b in zip(found[face].tolist(), detected[face].tolist(), strict=True):
+            total += sum(((p - q) / (side_px / 2)) ** 2 for p, q in zip(a, b, strict=True))
+        assert value == pytest.approx(total / 66, rel=1e-4)
+
+
+def test_the_contour_slides_to_the_closest_candidates_and_with_the_mesh() -> None:
+    candidates = (torch.rand(2, 40, 2) * 100).requires_grad_()
+    detected = (torch.rand(2, 17, 2) * 100).requires_grad_()
+    ids = closest_points(candidates, detected)
+    for face in range(2):
+        for number, point in enumerate(detected[face].tolist()):
+            distances = [math.dist(point, other) for other in candidates[face].tolist()]
+            assert int(ids[face, number]) == distances.index(min(distances))
+    slid = slid_contour(candidates, detected)
+    assert torch.equal(slid, torch.stack([c[i] for c, i in zip(candidates, ids, strict=True)]))
+    landmark_loss(slid, detected.detach(), 100).sum().backward()
+    assert detected.grad is None  # which candidate it is has no gradient
+    assert candidates.grad is not None
+    moved = {(face, int(i)) for face, i, _ in candidates.grad.nonzero().tolist()}
+    assert moved == {(face, int(i)) for face in range(2) for i in ids[face]}
+    # A landmark that the mesh passes by finds another vertex, not the one that it had.
+    line = torch.stack([torch.arange(20.0), torch.zeros(20)], -1)[None]
+    landmark = torch.tensor([[[7.2, 1.0]]])
+    assert closest_points(line, landmark).item() == 7
+    assert closest_points(line + torch.tensor([5.0, 0]), landmark).item() == 2
+
+
+def test_photometric_loss_is_a_mean_over_the_mask() -> None:
+    prediction, target = torch.rand(2, 3, 9, 9).requires_grad_(), torch.rand(2, 3, 9, 9)
+    mask = (torch.rand(2, 1, 9, 9) > 0.5).float()
+    loss, shown = photometric_loss(prediction, target, mask), prediction.detach()
+    for face in range(2):
+        inside = [(r, c) for r in range(9) for c in range(9) if mask[face, 0, r, c]]
+        differences = [
+            abs(shown[face, k, r, c] - target[face, k, r, c]).item() for r, c in inside for k in range(3)
+        ]
+        assert loss[face].item() == pytest.approx(sum(differences) / len(differences), rel=1e-4)
+    loss.sum().backward()
+    assert prediction.grad is not None and (prediction.grad[(mask == 0).expand_as(prediction)] == 0).all()
+    assert photometric_loss(prediction, target, mask * 0).sum().item() == 0
+
+
+@pytest.fixture(scope="module")
+def net() -> VggFeatures:
+    torch.manual_seed(0)
+    return VggFeatures(width=0.1).requires_grad_(False)
+
+
+POWERS = torch.tensor([2.0, 3.0, 5.0])  # of the layers
+
+
+def _seen(side: int) -> MaskedPair:
+    mask = torch.zeros(2, 1, side, side)
+    mask[..., 2:-2] = 1
+    return MaskedPair(torch.rand(2, 3, side, side).requires_grad_(), torch.rand(2, 3, side, side), mask)
+
+
+def test_features_are_of_masked_images_and_their_powers_mean_squares(net: VggFeatures) -> None:
+    image, texture = _seen(24), _seen(16)
+    expected: Tensor = torch.zeros(2)
+    for seen in (image, texture):
+        one, other = seen.prediction * seen.mask, seen.target * seen.mask
+        layers = zip(net.layers(one), net.layers(other), POWERS, strict=True)
+        expected = expected + sum(((a - b) ** 2).mean((1, 2, 3)) / power for a, b, power in layers)
+    features = Features(net, POWERS)
+    assert torch.allclose(appearance_loss(features, image, texture), expected, rtol=1e-4)
+    masked = texture.prediction * texture.mask, texture.target * texture.mask
+    assert torch.allclose(light_loss(features, texture), feature_distance(net, *masked, POWERS))
+    ones = torch.ones(3)
+    assert torch.allclose(feature_distance(net, *masked), feature_distance(net, *masked, ones))
+    images = torch.rand(4, 3, 16, 16)
+    wanted = torch.stack([layer.square().mean() for layer in net.layers(images)])
+    torch.testing.assert_close(layer_powers(net, images), wanted)
+
+
+def test_features_pull_the_prediction_within_the_mask_alone(net: VggFeatures) -> None:
+    image, texture = _seen(24), _seen(16)
+    target = texture.target.requires_grad_()
+    appearance_loss(
+        Features(net, POWERS), image, MaskedPair(texture.prediction, target, texture.mask)
+    ).sum().backward()
+    assert target.grad is None
+    for seen in (image, texture):
+        grad = seen.prediction.grad
+        assert grad is not None and grad.abs().sum() > 0
+        assert (grad[(seen.mask == 0).expand_as(grad)] == 0).all()
+
+
+def test_channels_apart_prefer_no_colour_and_stay_finite(net: VggFeatures) -> None:
+    """An error of one channel pulls it alone, and as hard as another, on skin of any colour."""
+    skin = torch.tensor([1.5, 0.9, 0.6])[:, None, None] * (torch.rand(2, 1, 24, 24) + 0.2)
+    pulls = torch.empty(3, 3)
+    for channel in range(3):
+        factor = torch.ones(3, 1, 1)
+        factor[channel] = 0.7
+        wrong = (skin * factor).requires_grad_()
+        pair = MaskedPair(wrong, skin, torch.ones(2, 1, 24, 24))
+        (slope,) = torch.autograd.grad(light_loss(Features(net, POWERS, apart=True), pair).sum(), wrong)
+        pulls[channel] = -slope.sum((0, 2, 3))
+    assert pulls[0, 0] > 0
+    torch.testing.assert_close(pulls, pulls[0, 0] * torch.eye(3), rtol=1e-2, atol=0)
+    for colour in ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]):
+        target = torch.tensor(colour)[:, None, None].expand(1, 3, 24, 24)
+        wrong = torch.rand(1, 3, 24, 24).requires_grad_()
+        pair = MaskedPair(wrong, target, torch.ones(1, 1, 24, 24))
+        light_loss(Features(net, POWERS, apart=True), pair).sum().backward()
+        assert wrong.grad is not None and wrong.grad.isfinite().all()

@@ -10,39 +10,39 @@ from scipy import ndimage
 from facerf_cli.capture.capture import shift_image
 from facerf_cli.capture.checks.motion import align_shifts, head_path, peak, with_alignment
 from facerf_cli.capture.layouts import read_capture
-from tests.capture.checks.egg_stage import CAMERA, IDS, SUBJECT, directions, images, write_stage
+from tests.worlds import EGG, EGG_CAMERA, EGG_LIGHTS, egg_directions, egg_images, write_egg_stage
 
 PLANTED = {2: (3.0, -4.0), 5: (0.0, 1.5), 7: (-2.25, 0.5)}  # frames and how far they moved, down and right
 
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    frames = images(directions())
+    frames = egg_images(egg_directions())
     for row, by in PLANTED.items():
         frames[row] = ndimage.shift(frames[row], by, order=3, mode="nearest")
-    return write_stage(tmp_path_factory.mktemp("moved") / "s", frames)
+    return write_egg_stage(tmp_path_factory.mktemp("moved") / "s", frames)
 
 
 def test_shifts_undo_the_motion_frame_by_frame(stage: Path) -> None:
-    shifts = align_shifts(read_capture(stage), SUBJECT, CAMERA, set())
+    shifts = align_shifts(read_capture(stage), EGG, EGG_CAMERA, set())
     for row, (down, right) in PLANTED.items():
-        assert shifts[IDS[row]] == pytest.approx((-down, -right), abs=0.7)  # of a few lamps, far apart
-    front = [light for light, way in zip(IDS, directions(), strict=True) if way[2] > 0.5]
-    still = set(front) - {IDS[row] for row in PLANTED}
+        assert shifts[EGG_LIGHTS[row]] == pytest.approx((-down, -right), abs=0.7)  # of a few lamps, far apart
+    front = [light for light, way in zip(EGG_LIGHTS, egg_directions(), strict=True) if way[2] > 0.5]
+    still = set(front) - {EGG_LIGHTS[row] for row in PLANTED}
     assert not any(np.hypot(*shifts.get(light, (0, 0))) > 0.7 for light in still)
     capture = read_capture(stage)
-    aligned = with_alignment(capture, SUBJECT, {CAMERA: {IDS[7]}})
-    truth = images(directions())[2]
+    aligned = with_alignment(capture, EGG, {EGG_CAMERA: {EGG_LIGHTS[7]}})
+    truth = egg_images(egg_directions())[2]
     inside = np.s_[12:-12, 12:-12]
     before, after = (
-        np.abs(source.frame(SUBJECT, CAMERA, 2)[..., 0] - truth)[inside].mean()
+        np.abs(source.frame(EGG, EGG_CAMERA, 2)[..., 0] - truth)[inside].mean()
         for source in (capture, aligned)
     )
     assert after < 0.4 * before
-    assert (SUBJECT, CAMERA, IDS[7]) not in aligned.shifts  # a broken frame is not looked at
-    shifted = replace(capture, shifts={(SUBJECT, CAMERA, IDS[1]): (2.0, 0.0)})
-    assert (shifted.frame(SUBJECT, CAMERA, 1)[2:] == capture.frame(SUBJECT, CAMERA, 1)[:-2]).all()
-    assert (shifted.frame(SUBJECT, CAMERA, 0) == capture.frame(SUBJECT, CAMERA, 0)).all()
+    assert (EGG, EGG_CAMERA, EGG_LIGHTS[7]) not in aligned.shifts  # a broken frame is not looked at
+    shifted = replace(capture, shifts={(EGG, EGG_CAMERA, EGG_LIGHTS[1]): (2.0, 0.0)})
+    assert (shifted.frame(EGG, EGG_CAMERA, 1)[2:] == capture.frame(EGG, EGG_CAMERA, 1)[:-2]).all()
+    assert (shifted.frame(EGG, EGG_CAMERA, 0) == capture.frame(EGG, EGG_CAMERA, 0)).all()
 
 
 def test_whole_shifts_move_pixels_and_parts_of_them_share() -> None:
@@ -61,14 +61,14 @@ def test_whole_shifts_move_pixels_and_parts_of_them_share() -> None:
 
 
 def test_a_still_head_is_left_alone(tmp_path: Path) -> None:
-    assert not align_shifts(read_capture(write_stage(tmp_path / "s")), SUBJECT, CAMERA, set())
+    assert not align_shifts(read_capture(write_egg_stage(tmp_path / "s")), EGG, EGG_CAMERA, set())
 
 
 @pytest.mark.filterwarnings("error")
 def test_a_camera_that_sees_no_lamp_in_front_is_left_alone(tmp_path: Path) -> None:
-    capture = read_capture(write_stage(tmp_path / "s"))
+    capture = read_capture(write_egg_stage(tmp_path / "s"))
     behind = replace(capture, directions_world=capture.directions_world * [1, 1, -1])
-    assert not align_shifts(behind, SUBJECT, CAMERA, set(IDS[35:]))
+    assert not align_shifts(behind, EGG, EGG_CAMERA, set(EGG_LIGHTS[35:]))
 
 
 def test_paths_are_told_from_errors_and_jumps_by_sampled_parabolas() -> None:

@@ -11,19 +11,19 @@ from facerf_cli.capture.checks.shading import RigFit, check_rigs
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding, frames_left_out, stopping
 from facerf_cli.capture.layouts import read_capture
-from tests.capture.checks.egg_stage import (
-    CAMERA,
-    HEIGHT,
-    IDS,
-    LIGHTS,
-    SUBJECT,
-    WIDTH,
-    camera_of,
-    directions,
-    images,
-    lights_of,
-    write_frame,
-    write_stage,
+from facerf_cli.files.write import write_exr
+from tests.worlds import (
+    EGG,
+    EGG_CAMERA,
+    EGG_HEIGHT,
+    EGG_LIGHTS,
+    EGG_WIDTH,
+    egg_camera,
+    egg_directions,
+    egg_images,
+    egg_lights,
+    grey,
+    write_egg_stage,
 )
 
 FRONT = 3  # a lamp in front of the egg
@@ -31,13 +31,13 @@ FRONT = 3  # a lamp in front of the egg
 
 @pytest.fixture(scope="module")
 def sound() -> np.ndarray:
-    frames = images(directions())
+    frames = egg_images(egg_directions())
     frames.setflags(write=False)
     return frames
 
 
 def findings(folder: Path) -> list[Finding]:
-    return check_subject(read_capture(folder), SUBJECT)
+    return check_subject(read_capture(folder), EGG)
 
 
 def only(found: list[Finding]) -> Finding:
@@ -56,31 +56,31 @@ def pose(turn: np.ndarray) -> list[list[float]]:
 
 
 def frame(folder: Path, light: int) -> Path:
-    return folder / SUBJECT / CAMERA / f"{IDS[light]}.exr"
+    return folder / EGG / EGG_CAMERA / f"{EGG_LIGHTS[light]}.exr"
 
 
 def test_a_sound_stage_has_no_findings(tmp_path: Path, sound: np.ndarray) -> None:
-    assert not findings(write_stage(tmp_path / "s", sound))
+    assert not findings(write_egg_stage(tmp_path / "s", sound))
 
 
 def test_a_missing_frame_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_stage(tmp_path / "s", sound)
+    folder = write_egg_stage(tmp_path / "s", sound)
     frame(folder, FRONT).unlink()
     found = only(findings(folder))
-    assert (found.check, found.camera, found.light) == ("missing", CAMERA, IDS[FRONT])
-    assert frames_left_out([found]) == {CAMERA: {IDS[FRONT]}} and not stopping([found])
+    assert (found.check, found.camera, found.light) == ("missing", EGG_CAMERA, EGG_LIGHTS[FRONT])
+    assert frames_left_out([found]) == {EGG_CAMERA: {EGG_LIGHTS[FRONT]}} and not stopping([found])
 
 
 def test_a_camera_without_frames_is_one_finding(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_stage(tmp_path / "s", sound, cameras=[camera_of(CAMERA), camera_of("C1")])
+    folder = write_egg_stage(tmp_path / "s", sound, cameras=[egg_camera(EGG_CAMERA), egg_camera("C1")])
     found = only(findings(folder))
     assert (found.check, found.camera, found.light) == ("missing", "C1", "")
 
 
 def test_files_of_no_lamp_are_counted_but_not_the_ambient_one(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_stage(tmp_path / "s", sound)
+    folder = write_egg_stage(tmp_path / "s", sound)
     for name in ("L900", "ambient"):
-        write_frame(frame(folder, 0).with_stem(name), sound[0] * 0.9)
+        write_exr(frame(folder, 0).with_stem(name), grey(sound[0] * 0.9))
     found = only(findings(folder))
     assert found.check == "extra" and found.figures["files"] == 1 and "L900" in found.words
     stage = json.loads((folder / "stage.json").read_text())
@@ -89,19 +89,23 @@ def test_files_of_no_lamp_are_counted_but_not_the_ambient_one(tmp_path: Path, so
 
 
 def test_a_frame_of_another_size_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_stage(tmp_path / "s", sound)
-    write_frame(frame(folder, FRONT), sound[FRONT, ::2, ::2])
+    folder = write_egg_stage(tmp_path / "s", sound)
+    write_exr(frame(folder, FRONT), grey(sound[FRONT, ::2, ::2]))
     found = only(findings(folder))
-    assert found.check == "resolution" and found.leaves_out and f"{WIDTH // 2} x {HEIGHT // 2}" in found.words
+    assert (
+        found.check == "resolution"
+        and found.leaves_out
+        and f"{EGG_WIDTH // 2} x {EGG_HEIGHT // 2}" in found.words
+    )
 
 
 def test_a_camera_of_another_size_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
-    found = findings(write_stage(tmp_path / "s", sound, cameras=[camera_of(CAMERA, WIDTH * 2)]))
+    found = findings(write_egg_stage(tmp_path / "s", sound, cameras=[egg_camera(EGG_CAMERA, EGG_WIDTH * 2)]))
     assert only(found).check == "resolution" and stopping(found)
 
 
 def test_a_damaged_file_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_stage(tmp_path / "s", sound)
+    folder = write_egg_stage(tmp_path / "s", sound)
     path = frame(folder, FRONT)
     path.write_bytes(path.read_bytes()[:400])
     assert only(findings(folder)).check == "unreadable"
@@ -110,7 +114,7 @@ def test_a_damaged_file_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:
 def changed(change: Callable[[np.ndarray], None], sound: np.ndarray, folder: Path) -> list[Finding]:
     frames = sound.copy()
     change(frames)
-    return findings(write_stage(folder, frames))
+    return findings(write_egg_stage(folder, frames))
 
 
 def test_black_and_flat_frames(tmp_path: Path, sound: np.ndarray) -> None:
@@ -118,7 +122,10 @@ def test_black_and_flat_frames(tmp_path: Path, sound: np.ndarray) -> None:
         frames[FRONT], frames[FRONT + 4] = 0, 0.25
 
     found = changed(blacken, sound, tmp_path / "s")
-    assert [(one.check, one.light) for one in found] == [("black", IDS[FRONT]), ("black", IDS[FRONT + 4])]
+    assert [(one.check, one.light) for one in found] == [
+        ("black", EGG_LIGHTS[FRONT]),
+        ("black", EGG_LIGHTS[FRONT + 4]),
+    ]
     assert all(one.leaves_out for one in found)
 
 
@@ -127,14 +134,14 @@ def test_of_the_same_image_twice_the_one_that_fits_its_lamp_stays(tmp_path: Path
         frames[FRONT + 6] = frames[FRONT]
 
     found = only(changed(double, sound, tmp_path / "s"))
-    assert (found.check, found.light, found.leaves_out) == ("duplicate", IDS[FRONT + 6], True)
+    assert (found.check, found.light, found.leaves_out) == ("duplicate", EGG_LIGHTS[FRONT + 6], True)
 
 
 def test_another_cameras_frames_stop_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
-    folder = write_stage(tmp_path / "s", sound, cameras=[camera_of(CAMERA), camera_of("C1")])
-    (folder / SUBJECT / "C1").symlink_to(folder / SUBJECT / CAMERA)
+    folder = write_egg_stage(tmp_path / "s", sound, cameras=[egg_camera(EGG_CAMERA), egg_camera("C1")])
+    (folder / EGG / "C1").symlink_to(folder / EGG / EGG_CAMERA)
     found = only(findings(folder))
-    assert found.check == "duplicate" and found.figures["frames"] == LIGHTS and stopping([found])
+    assert found.check == "duplicate" and found.figures["frames"] == len(EGG_LIGHTS) and stopping([found])
 
 
 def test_clipped_frames_are_counted(tmp_path: Path, sound: np.ndarray) -> None:
@@ -151,7 +158,7 @@ def test_two_fields_under_two_lamps(tmp_path: Path, sound: np.ndarray, strength:
         frames[FRONT, ::2] += strength * (frames[FRONT + 6, ::2] - frames[FRONT, ::2])
 
     found = only(changed(weave, sound, tmp_path / "s"))
-    assert (found.check, found.light, found.leaves_out) == ("fields", IDS[FRONT], True)
+    assert (found.check, found.light, found.leaves_out) == ("fields", EGG_LIGHTS[FRONT], True)
 
 
 def test_a_lamp_that_did_not_fire_leaves_the_light_of_the_room(tmp_path: Path, sound: np.ndarray) -> None:
@@ -162,7 +169,7 @@ def test_a_lamp_that_did_not_fire_leaves_the_light_of_the_room(tmp_path: Path, s
         frames[FRONT] = 0.05 * sound[0]
 
     found = only(changed(put_out, sound, tmp_path / "s"))
-    assert (found.check, found.light, found.leaves_out) == ("order", IDS[FRONT], True)
+    assert (found.check, found.light, found.leaves_out) == ("order", EGG_LIGHTS[FRONT], True)
 
 
 def test_two_frames_under_each_others_names(tmp_path: Path, sound: np.ndarray) -> None:
@@ -170,24 +177,29 @@ def test_two_frames_under_each_others_names(tmp_path: Path, sound: np.ndarray) -
         frames[[FRONT, FRONT + 9]] = frames[[FRONT + 9, FRONT]]
 
     found = changed(swap, sound, tmp_path / "s")
-    assert {(one.check, one.light) for one in found} == {("order", IDS[FRONT]), ("order", IDS[FRONT + 9])}
-    assert all(one.leaves_out for one in found) and IDS[FRONT + 9] in found[0].words
+    assert {(one.check, one.light) for one in found} == {
+        ("order", EGG_LIGHTS[FRONT]),
+        ("order", EGG_LIGHTS[FRONT + 9]),
+    }
+    assert all(one.leaves_out for one in found) and EGG_LIGHTS[FRONT + 9] in found[0].words
 
 
 def test_lights_in_another_order_stop_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
-    order = np.random.default_rng(1).permutation(LIGHTS)
-    found = only(findings(write_stage(tmp_path / "s", sound, lights=lights_of(directions()[order]))))
+    order = np.random.default_rng(1).permutation(len(EGG_LIGHTS))
+    found = only(findings(write_egg_stage(tmp_path / "s", sound, lights=egg_lights(egg_directions()[order]))))
     assert found.check == "order" and stopping([found]) and float(found.figures["median_off_deg"]) > 30
 
 
 def test_a_mirrored_rig_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
-    found = only(findings(write_stage(tmp_path / "s", sound, lights=lights_of(directions() * [-1, 1, 1]))))
+    found = only(
+        findings(write_egg_stage(tmp_path / "s", sound, lights=egg_lights(egg_directions() * [-1, 1, 1])))
+    )
     assert found.check == "rig" and "mirrored" in found.words and stopping([found])
 
 
 def test_a_turned_rig_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> None:
-    turned = directions() @ about_y(np.radians(40)).T
-    found = findings(write_stage(tmp_path / "s", sound, lights=lights_of(turned)))
+    turned = egg_directions() @ about_y(np.radians(40)).T
+    found = findings(write_egg_stage(tmp_path / "s", sound, lights=egg_lights(turned)))
     assert found[0].check == "rig" and float(found[0].figures["right_deg"]) == pytest.approx(40, abs=6)
 
 
@@ -195,13 +207,13 @@ def test_a_turned_rig_stops_the_subject(tmp_path: Path, sound: np.ndarray) -> No
 def test_two_cameras_under_each_others_names(tmp_path: Path, first: str, second: str) -> None:
     """The egg turns with the camera; the lamps do not, and tell one from the other."""
     turn = about_y(0.4)
-    aside = camera_of("C1") | {"world_to_camera": pose(turn)}
-    folder = write_stage(tmp_path / "s", cameras=[camera_of("C0"), aside])
-    (folder / SUBJECT / CAMERA).rename(folder / SUBJECT / "front")
-    (folder / SUBJECT / second).mkdir()
-    for light, image in zip(IDS, images(directions() @ turn.T), strict=True):
-        write_frame(folder / SUBJECT / second / f"{light}.exr", image)
-    (folder / SUBJECT / "front").rename(folder / SUBJECT / first)
+    aside = egg_camera("C1") | {"world_to_camera": pose(turn)}
+    folder = write_egg_stage(tmp_path / "s", cameras=[egg_camera("C0"), aside])
+    (folder / EGG / EGG_CAMERA).rename(folder / EGG / "front")
+    (folder / EGG / second).mkdir()
+    for light, image in zip(EGG_LIGHTS, egg_images(egg_directions() @ turn.T), strict=True):
+        write_exr(folder / EGG / second / f"{light}.exr", grey(image))
+    (folder / EGG / "front").rename(folder / EGG / first)
     found = findings(folder)
     assert [(one.check, one.camera) for one in found] == (
         [] if first == "C0" else [("camera", "C0"), ("camera", "C1")]
@@ -215,7 +227,7 @@ def test_motion_is_measured_in_pixels(tmp_path: Path, sound: np.ndarray) -> None
 
     found = only(changed(move, sound, tmp_path / "s"))
     assert (found.check, found.severity) == ("motion", "warning")
-    assert float(found.figures["worst_px"]) == pytest.approx(5, abs=0.7) and IDS[FRONT] in found.words
+    assert float(found.figures["worst_px"]) == pytest.approx(5, abs=0.7) and EGG_LIGHTS[FRONT] in found.words
 
 
 def rig(camera: str, right_deg: float = 0.0, mirrored: bool = False, up_deg: float = 20.0) -> RigFit:

@@ -21,6 +21,7 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import LANDMARKS_M
 from tests.face.importers.heads import Head, arrays_here, head, off_mm
 from tests.kinds import Patch
+from tests.refusals import refused
 
 h5py = pytest.importorskip("h5py")
 
@@ -145,9 +146,7 @@ def test_a_file_that_crashes_its_reader_is_refused_in_one_line(face: Head, tmp_p
     content = bytearray(path.read_bytes())
     content[43449] = 90
     path.write_bytes(content)
-    with pytest.raises(InputError, match="not a Basel Face Model 2009") as refused:
-        read_basel_2009(path)
-    assert "\n" not in str(refused.value)
+    refused(InputError, "not a Basel Face Model 2009", read_basel_2009, path)
 
 
 def test_the_published_mesh_of_2009_has_its_landmarks(monkeypatch: Patch, tmp_path: Path) -> None:
@@ -228,15 +227,14 @@ def test_the_names_may_be_bytes_or_missing(face: Head, shift: np.ndarray, tmp_pa
 
 def test_h5py_is_an_extra(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(FacerfError, match=r"pip install 'facerf\[face-models\]'"):
-        read_basel_2017(tmp_path / "model.h5")
+    refused(FacerfError, "pip install 'facerf[face-models]'", read_basel_2017, tmp_path / "model.h5")
 
 
 WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     "no basis": (lambda m: {key: value for key, value in m.items() if key != "shapePC"}, "it lacks shapePC"),
     "a basis of another mesh": (
         lambda m: {**m, "shapePC": np.zeros((9, 199))},
-        r"shapePC has shape \[9, 199",
+        "shapePC has shape [9, 199",
     ),
     "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "not a Basel"),
     "triangles beyond": (lambda m: {**m, "tl": m["tl"] + 1}, "does not have"),
@@ -250,9 +248,7 @@ WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
 def test_what_is_not_basel_2009_is_refused_in_one_line(face: Head, tmp_path: Path, case: str) -> None:
     change, message = WRONG_MAT[case]
     path = written_mat(tmp_path / "a.mat", change(mat(face)))
-    with pytest.raises(InputError, match=message) as refused:
-        import_face_model("basel-2009", path)
-    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+    refused(InputError, f"{path} ... {message}", import_face_model, "basel-2009", path)
 
 
 def test_a_matrix_of_matlab_7_3_and_other_files_are_refused(tmp_path: Path) -> None:
@@ -262,11 +258,8 @@ def test_a_matrix_of_matlab_7_3_and_other_files_are_refused(tmp_path: Path) -> N
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     (tmp_path / "b.mat").write_bytes(b"no matrix at all" * 20)
     for name in "ab":
-        with pytest.raises(InputError, match="not a Basel Face Model 2009") as refused:
-            read_basel_2009(tmp_path / f"{name}.mat")
-        assert "\n" not in str(refused.value)
-    with pytest.raises(InputError, match="no such file"):
-        read_basel_2009(tmp_path)
+        refused(InputError, "not a Basel Face Model 2009", read_basel_2009, tmp_path / f"{name}.mat")
+    refused(InputError, "no such file", read_basel_2009, tmp_path)
 
 
 WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
@@ -275,13 +268,13 @@ WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
         "it lacks expression/model",
     ),
     "text for numbers": ({"shape/model/mean": "text"}, "shape/model/mean is "),
-    "a basis of another mesh": ({"shape/model/pcaBasis": np.zeros((9, 199))}, r"pcaBasis has shape \[9"),
+    "a basis of another mesh": ({"shape/model/pcaBasis": np.zeros((9, 199))}, "pcaBasis has shape [9"),
     "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "not of unit length"),
     "variance below zero": ({"shape/model/pcaVariance": -np.ones(199)}, "pcaVariance is negative"),
     "triangles beyond": ({"shape/representer/cells": np.full((3, 9), 99999)}, "does not have"),
     "not finite": ({"shape/model/mean": np.full(10800, np.nan)}, "not finite"),
-    "a link to another file": ({"shape/model/mean": h5py.ExternalLink("b.h5", "/a")}, "it lacks|2017"),
-    "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "it lacks|2017"),
+    "a link to another file": ({"shape/model/mean": h5py.ExternalLink("b.h5", "/a")}, "2017"),
+    "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "2017"),
     "names of another kind": ({"metadata/landmarks/json": "[1, 2]"}, "not a Basel Face Model 2017"),
     "metres": ({"shape/model/mean": np.zeros(10800)}, "the unit of its"),
 }
@@ -294,17 +287,13 @@ def test_what_is_not_basel_2017_is_refused_in_one_line(
 ) -> None:
     changes, message = WRONG_H5[case]
     path = h5(tmp_path / "a.h5", face, shift, **changes)
-    with pytest.raises(InputError, match=message) as refused:
-        import_face_model("basel-2017", path)
-    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+    refused(InputError, f"{path} ... {message}", import_face_model, "basel-2017", path)
 
 
 def test_a_huge_claim_takes_no_room(tmp_path: Path, face: Head, shift: np.ndarray) -> None:
     path = h5(tmp_path / "a.h5", face, shift, **{"shape/model/pcaBasis": None})
     with h5py.File(path, "a") as file:
         file.create_dataset("shape/model/pcaBasis", (10**9, 199), "f4", chunks=(1000, 199))
-    with pytest.raises(InputError, match="allocate"):
-        read_basel_2017(path)
+    refused(InputError, "allocate", read_basel_2017, path)
     (tmp_path / "b.h5").write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(InputError, match="not a Basel Face Model 2017"):
-        read_basel_2017(tmp_path / "b.h5")
+    refused(InputError, "not a Basel Face Model 2017", read_basel_2017, tmp_path / "b.h5")

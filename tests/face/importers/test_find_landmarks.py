@@ -10,6 +10,7 @@ from facerf_cli.face.importers.ict import LANDMARK_IDS
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.topology import LANDMARKS_M, MIRROR_68
 from tests.face.importers.heads import head
+from tests.refusals import refused
 
 
 @pytest.fixture(scope="module")
@@ -55,5 +56,4 @@ def test_turned_mirrored_and_missing_faces_and_any_winding() -> None:
     assert np.linalg.norm(mirrored[MIRROR_68] * flip - found, axis=-1).mean() < 0.0007
     x, y = np.meshgrid(np.linspace(-0.1, 0.1, 40), np.linspace(-0.1, 0.1, 40))
     plane = np.stack([x.ravel(), np.zeros(x.size), y.ravel()], -1)
-    with pytest.raises(InputError, match="no face is found"):
-        find_landmarks(plane, head(40, 40).triangles, {})
+    refused(InputError, "no face is found", find_landmarks, plane, head(40, 40).triangles, {})

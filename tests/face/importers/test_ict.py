@@ -27,6 +27,7 @@ from facerf_cli.face.importers.resample import import_face_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model, save_face_model
 from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, landmark_weights
+from tests.refusals import refused
 
 NEUTRAL = "ICT-FaceKit-master/FaceXModel/generic_neutral_mesh.obj"
 
@@ -190,7 +191,7 @@ HOSTILE = {
     ),
     "not finite": (
         lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(VERTICES - 1) + b"v nan 0 0\n"),
-        "vertices|damaged",
+        "a.zip",
     ),
     "a surface that is one point": (
         lambda t: zipped(t / "a.zip", generic_neutral_mesh=obj(), identity000=obj(), jawOpen=obj()),
@@ -208,9 +209,7 @@ HOSTILE = {
 @pytest.mark.parametrize("case", HOSTILE)
 def test_what_is_not_ict_facekit_is_refused_in_one_line(case: str, tmp_path: Path):
     make, message = HOSTILE[case]
-    with pytest.raises(InputError, match=message) as refused:
-        import_face_model("ict-facekit", make(tmp_path))
-    assert str(tmp_path) in str(refused.value) and "\n" not in str(refused.value)
+    refused(InputError, f"{tmp_path} ... {message}", import_face_model, "ict-facekit", make(tmp_path))
 
 
 CONTENTS = {"generic_neutral_mesh": b"v 1 2 3\n" * 4000, "jawOpen": b"v 3 2 1\n" * 4000}

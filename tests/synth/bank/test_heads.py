@@ -22,6 +22,7 @@ from facerf_cli.synth.bank.heads import (
     load_bank,
 )
 from facerf_cli.synth.bank.texture_samples import draw_light
+from tests.refusals import refused
 from tests.synth.conftest import TINY
 
 EXACT = ViewSettings(point_noise=0, group_noise=0, contour_noise=0, yaw_deg=0, pitch_deg=0, roll_deg=0)
@@ -41,8 +42,7 @@ def test_heads_of_another_model_and_an_empty_folder_are_errors(bank_folder: Path
     save_face_model(tmp_path / "other.npz", replace(load_face_model(), name="other"))
     with pytest.raises(InputError, match="the head is of face model builtin, not of other"):
         bake_heads(bank_folder / "heads", str(tmp_path / "other.npz"), 6, jobs=1, seed=1, settings=TINY)
-    with pytest.raises(InputError, match="no baked heads"):
-        load_bank(tmp_path, tmp_path, {})
+    refused(InputError, "no baked heads", load_bank, tmp_path, tmp_path, {})
     views = load_file(sorted((bank_folder / "views").iterdir())[1])
     assert views["warp"].dtype == torch.float16 and views["visible"].dtype == torch.uint8
     lengths = views["normals"].float().norm(dim=1)

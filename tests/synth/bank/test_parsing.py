@@ -13,6 +13,7 @@ from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
 from facerf_cli.synth.bank import parsing
 from facerf_cli.synth.bank.parsing import FeatureWarp, PortraitCrops, StoredPortraits
 from tests.kinds import Folders, Patch
+from tests.refusals import refused
 
 SIDE, STORED = 64, 96
 LANDMARKS = 68 + len(MORE_LANDMARKS)
@@ -64,8 +65,7 @@ def test_a_draw_is_a_function_of_its_generator_and_an_empty_folder_none(
         one, two = drawn(portraits, seed), drawn(portraits, seed)
         assert all(torch.equal(getattr(one, name), getattr(two, name)) for name in vars(one))
         assert one.crops.min() >= 0 and one.crops.max() <= 1 and one.crops.isfinite().all()
-    with pytest.raises(InputError, match="no portraits"):
-        StoredPortraits(tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
+    refused(InputError, "no portraits", StoredPortraits, tmp_path, torch.zeros(1, 3, 8, 8).byte(), {})
 
 
 @pytest.mark.usefixtures("plain")

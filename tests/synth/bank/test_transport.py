@@ -32,6 +32,7 @@ from facerf_cli.synth.bank.portrait_samples import (
 from facerf_cli.synth.bank.transport import SCALES, TransportBankSettings, add_transport, seen_path
 from facerf_cli.synth.portraits import albedo_of, images_under
 from facerf_cli.synth.subjects import Subject
+from tests.refusals import refused
 from tests.synth.conftest import SMALL, backgrounds
 
 SIDE_PX = SMALL.side_px
@@ -234,5 +235,4 @@ def test_finished_people_are_kept_and_a_bank_without_portraits_refused(
     add_transport(tmp_path, ["a", "b"], range(2), 1, 0, SMALL)
     add_transport(tmp_path, ["a", "b"], range(3), 1, 0, SMALL)
     assert made == [0, 1, 2] and len(list(tmp_path.iterdir())) == 6
-    with pytest.raises(InputError, match="no portraits"):
-        StoredTransport(tmp_path, backgrounds(), {})
+    refused(InputError, "no portraits", StoredTransport, tmp_path, backgrounds(), {})

@@ -1,0 +1,338 @@
+"""Lines that are refused in one line, before anything is written: for each verb a table of line -> words."""
+
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.files.write import write_exr
+from facerf_cli.main import main
+from facerf_cli.network.checkpoint import save_checkpoint, save_networks
+from facerf_cli.network.files import SHIPPED
+from tests.astronaut import PATH as PHOTO
+from tests.capture.yale_fixture import write_yale_b
+from tests.cli.toy_checkpoint import save_toy_checkpoint
+from tests.dataset.dataset_fixture import write_small_dataset
+from tests.kinds import Folders, Patch, Said
+from tests.worlds import write_flat_stage
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: Folders) -> Path:
+    """A folder with data/, stage/, photos, a map, facts, checkpoints, folders of images and a database."""
+    folder = tmp_path_factory.mktemp("place")
+    write_small_dataset(folder / "data", counts=(1, 0, 1), lights=12, crop_px=32)
+    assert main(["relight-dataset", str(folder / "data"), "--envmaps", "procedural:2", "--lazy"]) == 0
+    (folder / "stage").mkdir()
+    write_flat_stage(folder / "stage", subjects={"0000": {}, "0001": {}})
+    for name in ("a.jpg", "b.jpg", "one/c.jpg", "index/index.jpg"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        shutil.copy(PHOTO, folder / name)
+    (folder / "link.jpg").symlink_to("a.jpg")
+    (folder / "who.csv").write_text("name,person\nastronot,Eileen\n")
+    (folder / "empty").mkdir()
+    for name in ("good/0.exr", "truth/0.exr"):
+        write_exr(folder / name, np.ones((4, 5, 3), np.float32))
+    write_exr(folder / "sky.exr", np.ones((8, 16, 3), np.float32))
+    write_yale_b(folder / "yale")
+    network = save_toy_checkpoint(folder / "toy.st")
+    save_networks(folder / "other.st", {"reflectance": network}, {"layout_version": 99})
+    described = {"reflectance": network.as_metadata()}
+    save_checkpoint(folder / "torn.st", {}, {"layout_version": LAYOUT_VERSION, "networks": described})
+    return folder
+
+
+WRONG: dict[str, dict[str, str]] = {
+    "": {
+        "nonsense": "No such command 'nonsense'. (a verb comes first",
+        "--nonsense": "No such option: --nonsense",
+        "doctor --nonsense": "see 'facerf doctor --help'",
+        "--seed x doctor": "Invalid value for '--seed'",
+        "--device abacus doctor": "--device abacus: not the name of a device; give auto,",
+        "-v -q doctor": "-v and -q: contradict each other",
+        "--seed": "'--seed' requires an argument",
+        "-v": "Missing command",
+        "doctor extra": "unexpected extra argument(s) (extra)",
+        "doctor --config none.toml": "no such file",
+    },
+    "relight a.jpg": {
+        "": "no light given; add --envmap, --light",
+        "--light 1": "give AZ,EL or AZ,EL,STRENGTH or AZ,EL,R,G,B, numbers sep",
+        "--light key=1,2 --light key=3,4": "'key': give each light a name of its own",
+        "--light own --pose 10,0,0": "--light own",
+        "--light own --composite face": "--light own",
+        "--light own --reflectance diffuse-sh": "--light own",
+        "--light even --reflectance diffuse-sh": "--light even",
+        "--envmap sky.exr --room 0.1": "--room 0.1: is added to lights; add --light",
+    },
+    "relight a.jpg --light 0,0": {
+        "--light-from background": "add --background FILE",
+        "--light-from sky=background": "add --background FILE",
+        "--fov 50": "--fov: is for --light-from",
+        "--fov 180 --light-from a.jpg": "170",
+        "--rotate left": "give DEG or FROM:TO:N, a number",
+        "--pose 1,2": "give YAW,PITCH,ROLL",
+        "--pose 100,20,0": "turns the face away",
+        "--pose 25,0,0 --composite photo": "use --composite face with it",
+        "--exposure bright": "give auto or face or EV",
+        "--photo b.jpg": "--photo: is for OLAT stacks",
+        "--ocio who.csv": "Error reading OCIO config",
+        "--ocio missing.ocio": "--ocio missing.ocio: no such file; give",
+        "--lights 0": "give 1 to 4096",
+        "--texture-size 100": "give a multiple of 256",
+        "--envmap-sampling best": "'best' is not one of 'cell'",
+        "--background-blur nan": "--background-blur",
+        "--light-wrap 0.5": "--light-wrap: is of another background; add --background FILE, COLOUR",
+        "--light-wrap 2 --background black": "--light-wrap",
+        "--light wrap=left --light-wrap 1 --background black": "a light has the name wrap, as a layer",
+        "--light person=left": "a light has the name person, as a layer of the EXR; give it another",
+        "--background nothing.png": "--background",
+        "--background 1,2,-3": "--background",
+        "--matte none.exr": "--matte ",
+        "--room=2": "--room",
+        "--room walls": "--room",
+        "--reflectance wax": "specular-sh",
+        "--reflectance prt --network-alone": "--network-alone: is for --reflectance portrait or field",
+        "--input-colourspace nope": "unknown colour space 'nope'",
+        "--identity --composite face": "--identity: is for the whole photo",
+        "--aov beauty": "--aov 'beauty': no such layer",
+        "--view nope": "unknown view 'nope' (known: none, soft, aces, ",
+        "--output-colourspace ACEScgg": "unknown colour space 'ACEScgg' (similar names: ACEScg",
+        "--output-colourspace sRGB": "--output-colourspace sRGB: EXR and TIFF are linear",
+        "--format gif": "--format 'gif': no such format; give some of exr, png, png16, tiff, jpg",
+        "--format png --aov normal": "--aov is for exr; add that to --format",
+        "--format jpg --output-colourspace ACEScg": "--output-colourspace is for exr, tiff; add",
+        "--format exr,tiff --view none": "--view is for png, png16, jpg; add that to --format",
+        "--format tiff --compression zip": "--compression is for exr; add that to --format",
+        "--format png --quality 90": "--quality is for jpg",
+        "-o me.gif": "me.gif: is a file's name; give a folder",
+        "-o who.csv/out": "cannot be written to",
+        "-o two.png --light 9,9": "-o two.png: is ",
+        "-o wrong.png --format exr": "-o wrong.png: is ",
+        "-o a.jpg": "-o a.jpg: is ",
+    },
+    "predict-olat a.jpg": {
+        "--lights 0": "give 1 to 4096",
+        "--lights few": "no such file; pass a number",
+        "--lights 1,nan": "numbers separated by commas",
+        "--pose 10,20": "--pose",
+        "--frame photo --pose 20,0,0": "use --frame face or uv with it",
+        "--frame photo --page --network-alone": "give neither --pose nor --network-alone",
+        "--texture-size 300": "multiple of 256",
+        "--precision int8": "int8",
+        "--memory 0": "memory",
+        "--face best": "--face",
+        "--input-colourspace nonsense": "unknown colour space",
+    },
+    "estimate-light a.jpg": {
+        "--vgg-weights imagenet": "--refine features",
+        "--reflectance prt --signed": "--reflectance prt",
+        "--lights 2000": "1024",
+        "--width 101": "even",
+        "--matte nowhere.png": "no such file",
+    },
+    "segment a.jpg": {
+        "-o me.jpg": "or a file as .png or .exr",
+        "-o me.JSON": "me.JSON: is a file's name; give a folder",
+        "-o me.png --face all": "is one file",
+        "-o me.png b.jpg": "is one file",
+        "-o me.png --name {stem}": "--name: is not for",
+        "-o a.JPG": "is a file's name",
+        "--person none.png": "no such file or folder",
+    },
+    "fit-geometry a.jpg": {
+        "--geometry network --landmarks who.csv": "--landmarks: --geometry network uses none",
+        "--landmarks none": "no such file or folder",
+    },
+    "view": {"a.jpg b.jpg -o me.html": "is one file", "index": "rename the photo"},
+    "convert-light sky.exr": {
+        "--to dpr": "--to dpr: no such form; give one of latlong, json",
+        "--to latlong --width 33": "even number",
+        "--to sh --width 64": "--width is for --to latlong, blender, mitsuba",
+        "--to blender --to latlong --order 3": "--order is for --to json, sh",
+        "--to sh --lights 40": "--lights is for --to json",
+        "--to sh --signed": "--signed is for",
+        "--to json --lights many": "--lights",
+        "": "--to",
+        "-o b.exr --to json": "or a file as .json",
+        "-o b.exr --to latlong --to blender": "is one file",
+        "-o sky.exr --to latlong": "is the input sky.exr",
+    },
+    "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
+    "synth-stage": {"--renderer mitsuba --transport": "--transport"},
+    "prepare-dataset stage": {
+        "--split 300/10/40": "the capture has 2",
+        "--split half": "--split",
+        "--crop 97": "--crop",
+        "--layout multipie": "there is extended-yale-b, faceolat, faceolat-linear, stage",
+        "--checks only --shard 1/2": "--shard: --checks only checks all subjects; omit it",
+        "--pattern x": "--pattern is for --describe",
+    },
+    "prepare-dataset": {"one": "stage.json: no such file"},
+    "relight-dataset data --per-subject 4": {
+        "--envmaps empty": "empty: no inputs found (looked for .exr .hdr)",
+        "--envmaps procedural:999999999": "give at most 1000000",
+        "--envmaps procedural:3 --memory inf": "--memory inf: not a size; give a number",
+        "--envmaps nowhere": "--envmaps nowhere: no such folder",
+    },
+    "train": {
+        "--form cubist": "form cubist: no such Reflectance Network; give one of default, paper",
+        "--dataset d --heads 20": "--heads: is for synthetic heads, which --dataset replaces",
+        "--dataset d --heads-from builtin": "--heads-from: is for synthetic heads",
+        "--texture-size 64": "--texture-size: applies to a dataset; give --dataset, too",
+        "--preset paper": "--stage joint: needs a prepared dataset; give --dataset",
+        "--stage joint --dataset d --heads 20": "--heads: does not apply to the stage",
+        "--stage geometry --dataset d": "--dataset: does not apply to the stage geometry",
+        "--photos p": "--photos: does not apply to the stage reflectance",
+        "--stage light-features --mean-face": "--mean-face: does not apply to the stage light",
+        "--dataset d --mean-face": "--mean-face: the dataset is fitted already",
+        "--without-normals --start-from f": "--without-normals: --start-from fixes",
+        "--stage joint --dataset d --geometry landmarks --photos p": "--photos: is for the Geometry Network",
+        "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
+        "--preset paper --dataset d --vgg-weights v --appearance-features a": "takes the place of",
+        "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE ... --crop 512",
+        f"--checkpoint {SHIPPED['parsing']}": "holds a Parsing Network ... uses no network",
+        f"--checkpoint {SHIPPED['portrait']}": "holds a Portrait Network ... uses the Parsing",
+        "--heads 13": "--heads 13: the mean face and 12 heads are held out; give more",
+        "--stage parsing --preset tiny --heads 4": "4 people are held out; give more",
+        **{
+            f"--max-time={time}": f"--max-time {time}: not a time; write a number and s, m or h, such as 45m"
+            for time in ("5", "-3m", "0s")
+        },
+    },
+    "face-model": {
+        "import ict-facekit nowhere -o m.zip": "ends in .npz",
+        "import basel nowhere -o m.npz": "basel",
+        "import ict-facekit nowhere": "--output",
+        "import": "KIND",
+        "": "Missing command",
+        "fetch flame": "flame",
+        "show -o a.exr": "ends in .png",
+    },
+    "evaluate": {
+        "olat data --preset paper --every 2": "exclude each other",
+        "cases data --pairs x.json --every 2": "--pairs: is a list of its own",
+        "olat data --split validation": "no pairs in the split validation",
+        "olat data --reflectance phong": "give portrait, field, diffuse-sh",
+        "olat data --reflectance prt --network-alone": "is for the field",
+        "olat data --against none.safetensors": "no such file",
+        "olat data --against field.safetensors": "two methods have the name 'field'",
+        "geometry data a.jpg": "one dataset among several inputs",
+        "geometry a.jpg --against a.jpg": "--mean-checkpoint",
+        "geometry a.jpg --every 2": "--every is for a prepared dataset",
+        "geometry data --facts who.csv": "--facts is for photos",
+        "reconstruction a.jpg --every 1": "--every is for a prepared dataset",
+        "reconstruction a.jpg --joint-fit": "--joint-fit is for a prepared dataset",
+        "reconstruction data --face all": "--face is for photos",
+        "transfer a.jpg": "give --photos",
+        "transfer data --landmarks .": "--landmarks is for photos",
+        "transfer --photos a.jpg": "two of each person",
+        "transfer --photos a.jpg a.jpg": "given twice",
+        "transfer --photos a.jpg link.jpg": "given twice",
+        "compare truth": "no method; give --method",
+        "compare truth --method none": "no such folder",
+        "compare truth --method good -o truth": "lies in truth, which is read",
+        "compare truth --method good -o good/here": "lies in good, which is read",
+        "compare truth --method good --lpips y": "--vgg-weights",
+        "compare truth --method good --preset paper": "--preset",
+        "compare truth --method good --method=good": "two methods have the name 'good'",
+        "compare truth --method good --method=same=good": "given twice",
+        "compare truth --method good --network-alone": "is for the field",
+        "yale-b yale --subjects yaleB07,yaleB99": "--subjects yaleB99: not in",
+        "yale-b yale --keep-eyes": "--keep-eyes",
+    },
+}
+FAILING: dict[str, dict[str, str]] = {
+    "relight a.jpg --light 0,0": {"--face-model nope.npz": "nope.npz: no such face model"},
+    "predict-olat a.jpg": {
+        "--face-model none.npz": "no such face model",
+        "--checkpoint other.st": "another UV layout",
+        "--checkpoint torn.st": "do not fit",
+        "--checkpoint none.st": "no such checkpoint",
+    },
+    "synth-stage": {"--face-model nothing.npz": "no such face model"},
+    "prepare-dataset stage": {"--face-model nowhere.npz": "nowhere.npz"},
+    "relight-dataset": {"empty --envmaps procedural:3": "dataset.json: no such file"},
+    "train": {
+        "--heads-from nobody.npz": "nobody.npz: no such face model",
+        "--start-from who.csv": "not a facerf checkpoint",
+        "--start-from torn.st": "torn.st: its weights do not fit",
+        "--dataset one": "one/dataset.json: no such file",
+    },
+    "face-model": {
+        "import ict-facekit nowhere -o m.npz": "nowhere: no such file; give the ICT-FaceKit",
+        "import flame nowhere.pkl -o m.npz": "nowhere.pkl: no such file; give FLAME's .pkl",
+        "import basel-2009 nowhere.mat -o m.npz": "01_MorphableModel.mat",
+        "import basel-2009 a.mat -o m.npz --landmarks a.npy": "a .txt of 68 vertex",
+        "show nowhere.npz": "nowhere.npz: no such face model",
+    },
+    "evaluate": {
+        "reconstruction a.jpg --facts who.csv": "astronot is no photo of this run; give names such as a",
+        "yale-b nowhere": "no such folder",
+        "yale-b .": "no folders yaleB01",
+        "yale-b yale --shifts shifts.csv": "shifts.csv: no such file",
+        "olat data --against a.jpg": "a.jpg",
+        "geometry a.jpg --mean-checkpoint b.jpg": "b.jpg",
+    },
+}
+TABLES = [
+    (head, line, words, code)
+    for code, table in ((2, WRONG), (1, FAILING))
+    for head, rows in table.items()
+    for line, words in rows.items()
+]
+WITHOUT_OUTPUT = ("", "face-model", "relight-dataset")
+
+
+@pytest.mark.parametrize(("head", "line", "words", "code"), TABLES)
+def test_a_line(
+    place: Path, capsys: Said, monkeypatch: Patch, head: str, line: str, words: str, code: int
+) -> None:
+    monkeypatch.chdir(place)
+    before = set(place.rglob("*"))
+    unasked = " -o " in f" {line}" or head.partition(" ")[0] in WITHOUT_OUTPUT
+    assert main([*head.split(), *shlex.split(line), *([] if unasked else ["-o", "out"])]) == code
+    out, err = capsys.readouterr()
+    said = [each for each in err.splitlines() if all(part in each for part in words.split(" ... "))]
+    assert (out, len(said)) == ("", 1), err
+    made = {path.name for path in set(place.rglob("*")) - before}
+    assert not made if code == 2 or head != "evaluate" else "summary.json" not in made
+
+
+CONFIGURATIONS = {
+    "[train.loss]\nphotometric = -9": "[train.loss] photometric is -9; give a number from 0 on",
+    "[train.optimizer]\nname = 'SGD'": "name is 'SGD'; give one of AdamW, Adadelta",
+    "[train.optimizer]\nbetas = [0.9]": "betas is [0.9]; give 2 numbers",
+    "[train]\nschedule = 3": "[train.schedule] is no table",
+    "[relight]\nexpo = 1": "[relight] expo: no such option; see `facerf relight --help-all`",
+    "[relighting]\n": "[relighting] is no verb",
+    "[evaluate.olat]\nx = 1": "see `facerf evaluate olat --help-all`",
+    "[relight": "not TOML",
+    "a = " + "[" * 5000: "not TOML",
+    "#" * (1 << 20): "larger than 1 MiB",
+    "[global]\nseed = -1": "--seed",
+    "[relight]\noverwrite = 'x'": "--overwrite",
+}
+
+
+@pytest.mark.parametrize(("text", "words"), CONFIGURATIONS.items(), ids=range(len(CONFIGURATIONS)))
+def test_a_configuration(text: str, words: str, tmp_path: Path, capsys: Said) -> None:
+    (tmp_path / "c.toml").write_text(text + "\n")
+    verb = ["train"] if "[train" in text else ["relight", "a.png"]
+    assert main([*verb, "-o", str(tmp_path / "out"), "--config", str(tmp_path / "c.toml")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert words in line and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["olat", "reconstruction", "transfer", "geometry", "yale-b", "cases", "compare"]
+)
+def test_every_protocol_has_help_and_the_shared_options(name: str, capsys: Said) -> None:
+    assert main(["evaluate", name, "--help-all"]) == 0
+    out = capsys.readouterr().out
+    assert "--output" in out and ("--space" in out) == (name != "cases") and "{options}" not in out
+    assert ("--form" in out) == ("--reflectance" in out) == (name != "cases")
+    assert ("--keep-eyes" in out) == (name not in ("yale-b", "compare"))

@@ -1,0 +1,56 @@
+"""Networks and objectives of code that the user has installed."""
+
+from pathlib import Path
+
+import pytest
+
+from facerf_cli.errors import InputError, UsageError
+from facerf_cli.face.topology import LAYOUT_VERSION
+from facerf_cli.network import checkpoint
+from facerf_cli.network.checkpoint import form_of, load_networks, new_network, save_networks, use_form
+from facerf_cli.network.installed import installed
+from tests.own_package import FORMS, NAME, write_own_package
+from tests.refusals import refused
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with an installed package."""
+    write_own_package(tmp_path / "site", monkeypatch)
+    return tmp_path / "site"
+
+
+def test_an_own_network_is_saved_and_needs_its_name(package: Path, tmp_path: Path) -> None:
+    use_form(NAME)
+    network = new_network("reflectance", NAME, {})
+    path = tmp_path / "own.safetensors"
+    save_networks(path, {"reflectance": network}, {"layout_version": LAYOUT_VERSION})
+    loaded = load_networks(path, LAYOUT_VERSION)[0]["reflectance"]
+    assert type(loaded) is type(network) and type(loaded).__name__ == "Darker"
+    del checkpoint._CLASSES["reflectance", NAME]
+    with pytest.raises(
+        InputError, match=f"own.safetensors: its network is {NAME}, code of your own; give --form"
+    ):
+        load_networks(path, LAYOUT_VERSION)
+
+
+def test_a_class_that_extends_a_form_is_made_like_it(package: Path) -> None:
+    use_form(NAME)
+    assert form_of("reflectance", NAME) == "default"
+    for network, form in (("reflectance", "paper"), ("geometry", "paper"), ("reflectance", "my_lab:Other")):
+        assert form_of(network, form) == form
+
+
+def test_what_is_not_installed_is_one_line(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.chdir(package)  # nothing comes from the working directory
+        refused(UsageError, "install the package that has it", installed, "my_lab.networks:Darker", "--form")
+    for name in ("my_lab.networks:Nobody", "nobody.networks:Darker", "my_lab.networks:number"):
+        refused(UsageError, f"--objective {name}: ", installed, name, "--objective")
+
+
+def test_facerfs_own_forms_import_nothing() -> None:
+    use_form("paper")
+    use_form(None)
+    assert checkpoint._CLASSES == FORMS
+    refused(UsageError, "no such Reflectance Network", new_network, "reflectance", "os:system", {})

@@ -1,0 +1,183 @@
+"""Several people in one image, by people with known answers."""
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from facerf_cli.batch.inputs import Item
+from facerf_cli.batch.settings import Settings
+from facerf_cli.errors import InputError
+from facerf_cli.files.read import LinearImage
+from facerf_cli.portrait.find import Face, FaceBox, choose_face
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.relightable import RenderRequest
+from facerf_cli.run import memory
+from facerf_cli.run.memory import batches
+from facerf_cli.work import photos
+from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photos import PhotoFace
+from facerf_cli.work.plan import beside_people, require_people
+from facerf_cli.work.sequence import OpenShot
+from tests.refusals import refused
+
+SIZE = (4, 6)
+POINTS = np.arange(136.0).reshape(68, 2)
+
+
+@dataclass
+class Lit:
+    grey: float
+    own: None = None
+
+
+@dataclass
+class Plain:
+    """A person of one grey, who covers some columns by a share, before a background of 0.5.
+
+    As photographed they have the background's grey.
+    """
+
+    columns: slice
+    strength: float
+
+    size_px, nbytes, photo = SIZE, 0, np.full((*SIZE, 3), 0.5)
+    own = photo
+
+    @property
+    def matte(self) -> np.ndarray:
+        matte = np.zeros(SIZE)
+        matte[:, self.columns] = self.strength
+        return matte
+
+    def share(self, rows: slice) -> np.ndarray:
+        return self.matte[rows]
+
+    def ready(self, relit: float, layers: Any) -> Lit:
+        return Lit(relit)
+
+    def observe(self, rows: slice) -> slice:
+        return rows
+
+    def pixels(self, relit: Lit, rows: slice) -> np.ndarray:
+        return np.full((*SIZE, 3), relit.grey)[rows]
+
+    def layer(self, name: str, relit: Lit, rows: slice) -> dict[str, np.ndarray]:
+        matte = self.matte[rows]
+        whole = matte[..., None]
+        return {
+            "class.skin": matte,
+            "depth": relit.grey * (whole > 0),
+            "albedo": relit.grey * whole.repeat(3, -1),
+        }
+
+    def exposure_ev(self, relit: float, rule: str) -> float:
+        return relit
+
+
+def group(background: Any = "photo") -> Any:
+    left, right = Plain(slice(0, 2), 1.0), Plain(slice(3, 5), 0.5)
+    return PeopleInPhoto([left, right], background)  # type: ignore[list-item]
+
+
+def test_each_person_is_relit_over_the_photo_and_alpha_and_layers_hold_all() -> None:
+    people = group()
+    image = people.rendered(RenderRequest([2.0, 8.0], ev=1.0))
+    assert set(image) == {"rgb"} and people.alpha() is None
+    np.testing.assert_allclose(image["rgb"][0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
+    people = group("none")
+    pixels, alpha = people.rendered(RenderRequest([2.0, 8.0]))["rgb"], people.alpha()
+    np.testing.assert_allclose(alpha[0], [1, 1, 0, 0.5, 0.5, 0])
+    np.testing.assert_allclose((pixels * alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
+    assert pixels[0, 3, 0] == 8  # not premultiplied
+    people = group()
+    one, other, both = (people.light_layer(lit) for lit in ([1.0, 3.0], [1.0, 5.0], [2.0, 8.0]))
+    np.testing.assert_allclose(one + other, both)
+    # Shares and colours add up, before others and the background; no depth lies between two people.
+    far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
+    people = PeopleInPhoto([far, near, faint])  # type: ignore[list-item]
+    layers = people.rendered(RenderRequest([2.0, 8.0, 4.0], layers=["all"]))
+    for shares in (people.matte, layers["class.skin"]):
+        np.testing.assert_allclose(shares[0], [1, 1, 1, 1, 0.6, 0])
+    np.testing.assert_allclose(layers["depth"][0, :, 0], [2, 2, 2, 8, 8, 0])
+    np.testing.assert_allclose(
+        layers["albedo"][0, :, 2], [2, 0.4 * 4 + 0.6 * 2, 2, 0.6 * 8 + 0.4 * 2, 0.6 * 8, 0]
+    )
+    assert group().exposure_ev([2.0, 8.0], "auto") == 2.0
+
+
+def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    faces = [PhotoFace(f"_face{k}", "a.png", FaceBox((k, 0, k + 1, 1), 1.0)) for k in range(3)]
+    fitted: list[str] = []
+    monkeypatch.setattr(photos, "find_people", lambda *_: list(faces))
+    monkeypatch.setattr(photos, "_fitted", lambda face, *_: fitted.append(face.tag) or face)
+    item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
+    options = PhotoOptions(Settings(), face="all")
+    each = photos.fit_each(item, image, options)
+    assert next(each).tag == "_face2" and fitted == ["_face2"]
+    memory.set_limit(100 << 20)
+    refused(InputError, "3 people in one image: needs ... --composite face", require_people, 3, (4, 6))
+
+
+@pytest.mark.parametrize(("which", "numbers"), [("largest", [1]), ("1", [1]), ("0", [0]), ("all", [0, 1])])
+def test_a_chosen_face_keeps_its_number_from_the_left(
+    monkeypatch: pytest.MonkeyPatch, which: str, numbers: list[int]
+) -> None:
+    faces = [Face((k, 0, k + side, side), 1.0, POINTS, number=k) for k, side in ((0, 1), (1, 3))]
+    monkeypatch.setattr(photos, "load_models_once", lambda *_: None)
+    monkeypatch.setattr(photos, "find_faces", lambda models, photo, which, *_: choose_face(faces, which, "a"))
+    item, image = Item(Path("a.png"), Path("a"), "a"), LinearImage(np.zeros((4, 6, 3), np.float32))
+    people = photos.find_people(item, image, PhotoOptions(Settings(), face=which), matte=None)
+    assert [face.number for face in people] == numbers
+
+
+def test_the_face_of_a_shot_has_the_number_by_which_it_was_chosen() -> None:
+    head = SimpleNamespace(
+        landmarks_px=None, fit=SimpleNamespace(crop=SimpleNamespace(to_photo=lambda _: POINTS))
+    )
+    steady = SimpleNamespace(head=head, segmentation=SimpleNamespace(matte=None))
+    shot: Any = SimpleNamespace(
+        take_of=lambda _: SimpleNamespace(window=lambda *_: steady),
+        shot=SimpleNamespace(frames=[Item(Path("a.0001.png"), Path("a.0001"), "a.0001")]),
+        frames=SimpleNamespace(image=lambda _: None),
+        _naming=lambda _: nullcontext(),
+        _options=PhotoOptions(Settings(), face="2"),
+        _facts_of=lambda *_: {},
+    )
+    assert OpenShot.fitted(shot, 0)[1].number == 2
+
+
+def test_people_leave_less_memory_for_lights_at_once() -> None:
+    memory.set_limit(1 << 30)
+    alone = len(batches(100, 4 << 20))
+    with beside_people(8, (400, 600)):
+        assert len(batches(100, 4 << 20)) > 2 * alone
+    with beside_people(1, (400, 600)):
+        assert len(batches(100, 4 << 20)) == alone
+
+
+def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
+    """In a crowd each face would else cost the whole photo."""
+    drawn: list[int] = []
+
+    class Below(Plain):
+        @property
+        def matte(self) -> np.ndarray:
+            return super().matte * (np.arange(SIZE[0]) > 1)[:, None]
+
+        def observe(self, rows: slice) -> slice:
+            drawn.append(rows.start)
+            return rows
+
+    people = PeopleInPhoto([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
+    request = RenderRequest((0.2, 0.8), {"key": (0.2, 0.8)}).ready(people)
+    rows = [people.render(request, slice(row, row + 1)) for row in range(SIZE[0])]
+    assert drawn == [2, 3]
+    for name in ("rgb", "key"):
+        assert rows[0][name][0, 1] == pytest.approx(0.2) and rows[2][name][0, 1] == pytest.approx(0.5)

@@ -1,0 +1,117 @@
+"""The Geometry Network's own stage: crops that show what their truth says, and a loss that falls."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+
+from facerf_cli.errors import InputError
+from facerf_cli.face.fit import fit_batch
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
+from facerf_cli.raster.camera import crop_camera
+from facerf_cli.synth.bank.face_crops import RenderedFaces, add_head_images
+from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
+from facerf_cli.training.objective import seeded
+from tests.refusals import refused
+
+FEW = GeometryObjectiveSettings(held_out_heads=1, held_out_draws=4)
+
+
+@pytest.fixture(scope="module")
+def images(bank_folder: Path) -> Path:
+    """Two pictures of each of the first three heads of the test bank."""
+    heads = bank_folder / "three"
+    heads.mkdir()
+    for path in sorted((bank_folder / "heads").glob("*.safetensors"))[:3]:
+        (heads / path.name).symlink_to(path)
+    add_head_images(heads, bank_folder / "pictures", 2, jobs=1, seed=3)
+    return bank_folder / "pictures"
+
+
+@pytest.fixture(scope="module")
+def faces(images: Path) -> RenderedFaces:
+    return RenderedFaces(images, {"licence": "MIT"})
+
+
+@pytest.fixture
+def objective(faces: RenderedFaces) -> GeometryObjective:
+    torch.manual_seed(0)
+    return GeometryObjective(faces, settings=FEW)
+
+
+def draw(objective, count=4, seed=7):
+    return objective.draw(count, lambda index: seeded(seed, index), 0)
+
+
+def test_images_show_a_face_and_the_paper_form_learns_from_them(faces):
+    image = faces.images[1]["pictures"][0]
+    cover = image[3].float() / 255
+    assert image.shape == (4, 160, 160) and 0.3 < cover.mean() < 0.95
+    inner = faces.images[1]["landmarks_px"][0, 27:36].long() + 16  # nose and its root: skin everywhere
+    assert cover[inner[:, 1], inner[:, 0]].min() == 1
+    lit = image[:3].float().mean(0)
+    assert lit[cover > 0].mean() > 10 and lit[cover == 0].max() == 0
+    network = GeometryNetwork(GeometryNetworkSettings("paper", 80, 29))
+    objective = GeometryObjective(faces, network, FEW)
+    sum(objective(draw(objective, 1)).values()).backward()
+    assert network.trunk[0].weight.grad.abs().max() > 0
+
+
+def test_samples_depend_on_no_neighbours_and_terms_are_means(objective):
+    both, second = draw(objective, 2), objective.draw(1, lambda index: seeded(7, index + 1), 0)
+    for field in fields(both):
+        assert torch.equal(getattr(both, field.name)[1:], getattr(second, field.name)), field.name
+    batch = draw(objective, 4)
+    halves = [
+        type(batch)(*(getattr(batch, f.name)[part] for f in fields(batch))) for part in ([0, 1], [2, 3])
+    ]
+    whole, (one, other) = objective(batch), (objective(half) for half in halves)
+    for name, value in whole.items():
+        assert float((one[name] + other[name]).detach() / 2) == pytest.approx(float(value.detach()), rel=1e-4)
+    batch = draw(objective, 8)
+    truth = GeometryEstimate(batch.rotation, batch.translation_m, batch.alpha[:, :40], batch.beta)
+    percent = 100 * objective.distances_iod(truth, batch)
+    assert percent[:, 17:].mean() < 4  # the built-in model's fit to other heads
+    mirrored = truth._replace(rotation=truth.rotation.flip(0))
+    assert objective.distances_iod(mirrored, batch).mean() > 2 * percent.mean() / 100
+
+
+def test_the_pose_follows_every_move_of_the_crop(objective):
+    """The fit to the moved landmarks is the stored fit, moved: mirror, turn, scale and shift are right."""
+    batch = draw(objective, 12)
+    fit = fit_batch(load_face_model(), batch.landmarks_px, crop_camera(64))
+    assert (fit.rotation.float() - batch.rotation).flatten(1).norm(dim=1).max() < 0.05  # 2 degrees
+    assert (fit.translation_m.float() - batch.translation_m).abs().max() < 0.012
+    assert (fit.beta.float() - batch.beta).abs().max() < 0.3 < fit.beta.abs().max()
+
+
+def test_a_few_steps_lower_the_loss(objective):
+    batch = draw(objective, 8)
+    optimizer = torch.optim.AdamW(objective.networks.parameters(), lr=2e-3)
+    losses = []
+    for _ in range(8):
+        terms = objective(batch)
+        loss = sum(terms.values())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert set(terms) == {"landmarks", "rotation", "depth", "coefficients"}
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_validation_is_the_same_every_time_and_shows_it(objective):
+    first, second = objective.validate(), objective.validate()
+    assert first.metrics == second.metrics and objective.chooses_by in first.metrics
+    assert 5 < first.metrics["landmarks_percent"] < 150  # untrained: the mean head
+    side = first.sheet.shape[0]
+    assert first.sheet.shape == (side, FEW.held_out_draws * side, 3)
+    for colour in ((0, 1, 0), (1, 0, 0)):  # true landmarks, and where the network has them
+        assert (first.sheet == colour).all(-1).any()
+
+
+def test_no_images_is_said(tmp_path):
+    refused(InputError, "no images of heads", RenderedFaces, tmp_path, {})
+    refused(InputError, "no baked heads", add_head_images, tmp_path, tmp_path / "out", 1, 1, 0)

@@ -1,0 +1,154 @@
+"""The terms of the stage parsing against known answers."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from facerf_cli.dataset.synthhuman import LICENCE, SynthHuman
+from facerf_cli.errors import InputError
+from facerf_cli.network.parsing import Parsing, ParsingNetwork
+from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
+from facerf_cli.training.parsing import ParsingObjective
+from tests.refusals import refused
+from tests.training.synthhuman_folder import write_synthhuman
+from tests.training.toy_parsing import SETTINGS, SIDE, TINY, Portraits, truth
+
+
+def seen(batch: PortraitCrops, sure: float = 30.0) -> Parsing:
+    """What a perfect network says."""
+    shown = torch.where(batch.alpha > 0.5, batch.label, 0)
+    logits = sure * nn.functional.one_hot(shown, len(CLASSES)).permute(0, 3, 1, 2).float()
+    return Parsing(logits, batch.landmarks.clone(), torch.full((1, LANDMARKS), -3.0), torch.full((1,), sure))
+
+
+class Answers(nn.Module):
+    """A network that gives one answer."""
+
+    side = SIDE
+
+    def __init__(self, answer: Parsing) -> None:
+        super().__init__()
+        self.answer = answer
+        self.weight = nn.Parameter(torch.zeros(1))
+
+    def forward(self, crops: Tensor) -> Parsing:
+        return self.answer
+
+
+def objective_of(answer: Parsing) -> ParsingObjective:
+    portraits = cast(StoredPortraits, Portraits())
+    return ParsingObjective(portraits, cast(ParsingNetwork, Answers(answer)), SETTINGS)
+
+
+def terms(answer: Parsing, batch: PortraitCrops | None = None) -> dict[str, float]:
+    found = objective_of(answer)(batch or truth())
+    return {name: float(term) for name, term in found.items()}
+
+
+def test_a_perfect_network_pays_for_its_doubts_alone() -> None:
+    found = terms(seen(truth()))
+    assert found["classes"] < 1e-6 and found["matte"] < 1e-6
+    assert found["distance"] == 0 and found["presence"] < 1e-6
+    assert found["landmarks"] == pytest.approx(SETTINGS.landmarks * 2 * -3.0)
+    validation = objective_of(seen(truth())).validate()
+    assert validation.metrics["mean_iou"] == pytest.approx(1) and validation.metrics["matte_error"] < 1e-6
+    assert validation.metrics["landmarks_percent"] == 0 and validation.metrics["presence_wrong"] == 0
+    assert validation.sheet is not None and validation.sheet.shape == (SIDE, 2 * SIDE, 3)
+    answer = seen(truth())
+    answer.logits[:, :, :, 5] = answer.logits[:, :, :, 6]  # the person ends a column too early
+    assert terms(answer)["matte"] == pytest.approx(1 / 8 + 2 / 7, rel=1e-3)
+
+
+def test_landmarks_weigh_by_their_expected_error_and_cost_nothing_unknown() -> None:
+    answer = seen(truth())
+    answer.landmarks[:, 3, 0] += 0.1
+    found = terms(answer)
+    assert found["distance"] == pytest.approx(SETTINGS.distance * 0.1 / 68, rel=1e-5)
+    expected = SETTINGS.landmarks * (-6.0 + 0.1 * torch.tensor(3.0).exp() / 68)
+    assert found["landmarks"] == pytest.approx(float(expected), rel=1e-5)
+    answer.log_error[:, 3] = -1.0
+    assert terms(answer)["landmarks"] < found["landmarks"] + SETTINGS.landmarks * 4 / 68
+    answer = seen(truth())
+    answer.landmarks[:, 70] += 0.3
+    assert terms(answer) == terms(seen(truth()))
+
+
+def test_rare_classes_weigh_more_and_unknown_pixels_nothing() -> None:
+    def cost(row: int, weight: float) -> float:
+        batch, answer = truth(), seen(truth())
+        answer.logits[:, :, row, 0] = 0
+        batch.weight[:, row, 0] = weight
+        return terms(answer, batch)["classes"]
+
+    even = float(torch.tensor(len(CLASSES)).log()) / SIDE**2
+    assert cost(4, 1.0) == pytest.approx(even, rel=1e-4)  # skin
+    assert cost(0, 1.0) == pytest.approx(SETTINGS.rare * even, rel=1e-4)  # ears
+    assert cost(0, 0.0) < 1e-6
+
+
+def test_a_soft_edge_is_best_met_by_its_own_share() -> None:
+    batch = truth()
+    batch.alpha[:, 4, 4] = 0.3
+
+    def cost(share: float) -> float:
+        answer = seen(batch)
+        answer.logits[:, :, 4, 4] = -30.0
+        answer.logits[:, class_index("skin"), 4, 4] = float(torch.tensor(share).log())
+        answer.logits[:, 0, 4, 4] = float(torch.tensor(1 - share).log())
+        found = terms(answer, batch)
+        return found["classes"] + found["matte"]
+
+    assert cost(0.3) < min(cost(0.2), cost(0.4))
+
+
+def test_the_loss_of_a_real_network_falls() -> None:
+    torch.manual_seed(0)
+    portraits = cast(StoredPortraits, Portraits())
+    objective = ParsingObjective(portraits, ParsingNetwork(TINY), SETTINGS)
+    batch = truth(32)
+    optimizer = torch.optim.Adam(objective.parameters(), 3e-3)
+    losses = []
+    for _ in range(30):
+        loss = torch.stack(list(objective(batch).values())).sum()
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0] - 1
+
+
+def test_where_the_alpha_alone_is_known_any_class_of_a_person_is_right() -> None:
+    unknown = replace(truth(), label=torch.full((1, SIDE, SIDE), -1), known=torch.zeros(1, LANDMARKS).bool())
+    sure = seen(truth())
+    other = torch.where(truth().alpha > 0.5, sure.logits.roll(3, 1), sure.logits)
+    garment = sure._replace(logits=other)
+    for answer in (sure, garment, sure._replace(presence=-sure.presence)):
+        found = terms(answer, unknown)
+        assert max(found["classes"], found["matte"], found["presence"]) < 1e-5 and found["distance"] == 0
+    missed = torch.zeros_like(sure.logits)
+    missed[:, 0] = 30
+    assert terms(sure._replace(logits=missed), unknown)["classes"] > 1
+
+
+def test_a_share_of_the_samples_is_of_synthhuman(tmp_path: Path) -> None:
+    folder = write_synthhuman(tmp_path, 3)
+    images = SynthHuman(folder)
+    crop = images.draw(SIDE, torch.Generator().manual_seed(0))
+    assert crop.alpha.min() < 0.2 and crop.alpha.max() > 0.8 and (crop.label == -1).all()
+    assert (crop.crops[0, 0] - crop.alpha[0]).abs().max() < 0.02  # its people are white, before black
+    objective = ParsingObjective(cast(StoredPortraits, Portraits()), ParsingNetwork(TINY), SETTINGS, images)
+    assert objective.provenance["licence"] == f"MIT; {LICENCE}"
+    drawn = [objective.draw_one(torch.Generator().manual_seed(seed)) for seed in range(40)]
+    share = sum(bool((one.label < 0).all()) for one in drawn) / len(drawn)
+    assert 0.1 < share < 0.4
+    (folder / "0/alpha_0000000.png").unlink()
+    with pytest.raises(InputError, match="alpha_0000000"):
+        for seed in range(20):
+            images.draw(SIDE, torch.Generator().manual_seed(seed))
+    refused(InputError, "has no rgb_*.png; give a folder of SynthHuman", SynthHuman, tmp_path / "none")
