@@ -1,10 +1,10 @@
-# make demo | test | test-slow | lint | docs | bench | man | completions | dist. The first call makes the virtual environment.
+# make demo | test | test-slow | lint | docs | bench | man | dist. The first call makes the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 STAMP := $(VENV)/.installed
 FACERF := $(VENV)/bin/facerf
 
-.PHONY: demo test test-slow lint docs bench man completions dist setup clean
+.PHONY: demo test test-slow lint docs bench man dist setup clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml constraints.txt
@@ -41,10 +41,7 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 man: $(STAMP)
-	$(VENV)/bin/python -m facerf_cli.cli.manual man man
-
-completions: $(STAMP)
-	$(VENV)/bin/python -m facerf_cli.cli.manual completions completions
+	$(VENV)/bin/python -m facerf_cli.cli.manual man
 
 # The source distribution, and the wheel from it, as tests/test_distribution.py builds them.
 dist: $(STAMP)
