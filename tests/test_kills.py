@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ class Undisturbed:
     """A finished run: inputs, outputs by name, seconds until it makes its folder and until it ends."""
 
     inputs: Path
-    outputs: dict[str, bytes]
+    outputs: dict[str, tuple[int, str]]
     first_s: float
     end_s: float
 
@@ -53,10 +54,11 @@ def ended(process: "subprocess.Popen[str]") -> int:
     return process.returncode
 
 
-def outputs_of(folder: Path) -> dict[str, bytes]:
-    """Visible files of an output folder, by name, without the report."""
+def outputs_of(folder: Path) -> dict[str, tuple[int, str]]:
+    """Size in bytes and digest of the visible files of an output folder, by name, without the report."""
     files = [path for path in folder.glob("[!.]*") if path.name != REPORT_NAME] if folder.exists() else []
-    return {path.name: path.read_bytes() for path in files}
+    contents = {path.name: path.read_bytes() for path in files}
+    return {name: (len(content), sha256(content).hexdigest()) for name, content in contents.items()}
 
 
 def assert_whole(folder: Path, undisturbed: Undisturbed) -> None:
@@ -109,7 +111,7 @@ def test_a_killed_run_is_completed_by_a_later_run(
 
 
 def test_files_that_may_not_grow_are_written_by_a_later_run(undisturbed: Undisturbed, tmp_path: Path) -> None:
-    size = max(map(len, undisturbed.outputs.values())) // 3
+    size = max(size for size, _ in undisturbed.outputs.values()) // 3
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
@@ -133,7 +135,7 @@ def small_disk(at: Path, size: int) -> Iterator[None]:
 
 def test_what_a_full_disk_lacks_is_written_by_a_later_run(undisturbed: Undisturbed, tmp_path: Path) -> None:
     disk = tmp_path / "disk"
-    with small_disk(disk, sum(map(len, undisturbed.outputs.values())) // 2):
+    with small_disk(disk, sum(size for size, _ in undisturbed.outputs.values()) // 2):
         assert ended(started(undisturbed.inputs, disk / "out")) in (1, 2)
         subprocess.run(["mount", "-o", "remount,size=64m", str(disk)], check=True)
         assert_finishes(disk / "out", undisturbed)
