@@ -12,7 +12,6 @@ RUN apt-get update \
 COPY pyproject.toml MANIFEST.in constraints.txt LICENSE README.md MODEL_CARD.md CHANGELOG.md /src/
 COPY facerf_cli /src/facerf_cli
 COPY man /src/man
-COPY completions /src/completions
 COPY docs /src/docs
 COPY examples /src/examples
 RUN pip install --no-cache-dir --extra-index-url https://download.pytorch.org/whl/cpu -c /src/constraints.txt /src \

@@ -1,10 +1,10 @@
-# make demo | test | test-slow | lint | docs | bench | man | completions | dist. The first call makes the virtual environment.
+# make demo | lint | test | check | test-slow | docs | man | dist. The first call makes the virtual environment.
 PYTHON ?= python3
 VENV ?= .venv
 STAMP := $(VENV)/.installed
 FACERF := $(VENV)/bin/facerf
 
-.PHONY: demo test test-slow lint docs bench man completions dist setup clean
+.PHONY: demo lint test check test-slow docs man dist setup clean
 .DEFAULT_GOAL := demo
 
 $(STAMP): pyproject.toml constraints.txt
@@ -26,25 +26,22 @@ lint: $(STAMP)
 
 PYTEST := OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-test: lint
+test: $(STAMP)
 	$(PYTEST) -m "not slow"
+
+check: lint
+	$(MAKE) test
 
 test-slow: $(STAMP)
 	$(PYTEST) -m slow
 
-# A benchmark that lacks its data says so in one line and succeeds.
-bench: $(STAMP)
-	set -e; for script in benchmarks/[a-z]*.py; do echo "== $$script"; $(VENV)/bin/python $$script; done
-
 # The site, into site/; a dead link or a warning fails.
 docs: $(STAMP)
+	$(VENV)/bin/python -m tools.pages build/pages
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
 
 man: $(STAMP)
-	$(VENV)/bin/python -m facerf_cli.cli.manual man man
-
-completions: $(STAMP)
-	$(VENV)/bin/python -m facerf_cli.cli.manual completions completions
+	$(VENV)/bin/python -m facerf_cli.cli.manual man
 
 # The source distribution, and the wheel from it, as tests/test_distribution.py builds them.
 dist: $(STAMP)

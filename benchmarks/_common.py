@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
+from PIL import Image
 from safetensors.torch import load_file
+from skimage.data import astronaut
 
 from facerf_cli.image.metrics import Interval
 from facerf_cli.synth.bank.heads import Bank
@@ -22,9 +24,6 @@ ASTRONAUT = ROOT / "examples" / "astronaut.jpg"
 PHOTOS, YALE_B, MAPS = (SHARED / "data" / name for name in ("photos", "extended_yale_b", "hdri"))
 WHOLE_YALE_B = SHARED / "data" / "yale_b_full"  # uncropped frames of some people
 BENCHMARK_DATA = ROOT / "benchmarks" / "data"  # outlines and shifts, measured for facerf
-SHIFTS = BENCHMARK_DATA / "yale_b_shifts.csv"
-ICT_FACEKIT = SHARED / "data" / "ict_facekit" / "ICT-FaceKit-master.tar.xz"
-sys.path.append(str(ROOT))  # benchmarks import from tools/
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 
 T = TypeVar("T")
@@ -36,7 +35,7 @@ def arguments(doc: str | None) -> argparse.ArgumentParser:
 
 
 def skip(needs: str, give: str) -> NoReturn:
-    """End the script with success, so that `make bench` goes on, and one line that says what it lacks."""
+    """End the script with success and one line that names the data it lacks."""
     print(f"{Path(sys.argv[0]).stem}: skipped: needs {needs}; give {give}")
     raise SystemExit(0)
 
@@ -65,6 +64,14 @@ def photos(given: list[Path]) -> list[Path]:
         inside = sorted(entry.iterdir()) if entry.is_dir() else [entry]
         found += [path for path in inside if path.suffix.lower() in _SUFFIXES]
     return found
+
+
+def enlarged(folder: Path, megapixels: float) -> Path:
+    """Write the astronaut's photo at a size in megapixels into a folder; return its path."""
+    width = round((megapixels * 1e6 * 4 / 3) ** 0.5)
+    path = folder / f"{width}.jpg"
+    Image.fromarray(astronaut()[:384]).resize((width, width * 3 // 4), Image.Resampling.BICUBIC).save(path)
+    return path
 
 
 def first_heads(bank: Path, heads: int) -> Bank:

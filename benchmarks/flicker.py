@@ -32,6 +32,7 @@ from pathlib import Path
 import numpy as np
 from _common import arguments, print_header, print_row
 from _film_of_photo import frames_of
+from _talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from skimage.registration import optical_flow_ilk
@@ -46,7 +47,6 @@ from facerf_cli.person import Person
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.relighting.sequence import Follower, SteadyShot
-from tools.talking_head import LIGHTS, TARGET, Clip, filmed, kept_clip, still
 
 PATCH = 1 / 64  # of the side
 FLOOR = 0.02  # radiance added to results and truth before their ratio

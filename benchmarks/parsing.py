@@ -124,7 +124,9 @@ def measure_yale_b(folder: Path, every: int) -> None:
     counts: dict[str, np.ndarray] = defaultdict(lambda: np.zeros(3, int))
     for subject in database.subjects:
         frontal = min(database.flashes(subject), key=lambda flash: flash.angle_deg)
-        reference = found_by_both(_displayed(database.image(subject, frontal)))[1][0].landmarks_px
+        references = dlib_faces(_displayed(database.image(subject, frontal)))
+        if not references:
+            print(f"{subject}: dlib finds no face in the frontal image; only counted")
         for index, flash in enumerate(database.flashes(subject)):
             if index % every and flash != frontal:
                 continue
@@ -133,8 +135,8 @@ def measure_yale_b(folder: Path, every: int) -> None:
             angle = flash.angle_deg
             bin_ = next(f"{a}-{b} deg" for a, b in pairwise(ANGLES_DEG) if angle < b)
             counts[bin_] += np.array([1, bool(own), bool(other)])
-            if own:
-                off = [(subject, apart_percent(own[0].landmarks_px, reference))]
+            if own and references:
+                off = [(subject, apart_percent(own[0].landmarks_px, references[0].landmarks_px))]
                 apart["frontal"] += off if flash == frontal else []
                 apart["up to 60 deg"] += off if angle <= 60 else []
                 apart["beyond 60 deg"] += off if angle > 60 else []

@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("--drawn", type=int, default=24)
     options = parser.parse_args()
     bank = required(options.bank, "a bank of portraits", "--bank")
-    view = load_view(min(bank.glob("[0-9]*_0.safetensors")))
+    view = load_view(min((bank / "transport").glob("[0-9]*_0.safetensors")))
     models = load_models()
     looks = [
         materials_of(view.portrait, draw_appearance(LOOK_PX, seeded(SEED, number)))

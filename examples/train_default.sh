@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# How the default checkpoint was trained: heads of ICT-FaceKit (MIT), fitted with the built-in model as photos are.
+# This does not reproduce the shipped weights: those are the fourth run of a chain (docs/training.md); this is one run.
+# The data are those of the default checkpoint: heads of ICT-FaceKit (MIT), fitted with the built-in model as photos are.
 # Run it again after an interruption: what is finished is kept, and the runs go on where they were saved.
 # Usage: examples/train_default.sh ICT-FaceKit.tar.xz RUN [TIME]
 set -euo pipefail

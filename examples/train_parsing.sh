@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# The shipped Parsing Network: synthetic people from head to chest, nothing else. Two processor cores, about five hours.
-# Run it again after an interruption: it goes on. The shipped one's first two legs saw no decoys, and its third none
-# that touch the person; all do now. MAPS are environment maps that people stand before in the third leg
+# This does not reproduce the shipped weights: their first two legs saw no decoys, and their third none that touch the
+# person; all do now. Legs also end by time, not by steps.
+# A Parsing Network: synthetic people from head to chest, nothing else. Two processor cores, about five hours.
+# Run it again after an interruption: it goes on. MAPS are environment maps that people stand before in the third leg
 # (examples/add_backgrounds.py).
 # Usage: [PEOPLE=240] [MAPS="a.hdr b.hdr"] examples/train_parsing.sh ICT-FaceKit.tar.xz RUN [TIME] [OF THE THIRD LEG]
 set -euo pipefail

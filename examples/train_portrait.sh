@@ -1,8 +1,9 @@
 #!/usr/bin/env bash
+# This does not reproduce the shipped weights: those are of an earlier recipe, whose squares were of three faces alone.
 # A Portrait Network: synthetic people from face to hips, nothing else. Two processor cores, about seven hours: two to bake
 # the people, two for a first leg of training, three for a second one that starts from it.
-# Run it again after an interruption: it goes on. The shipped one is of an earlier recipe, whose squares were of three faces
-# alone. To go on from it, give only the second command, with --start-from facerf_cli/assets/portrait.safetensors.
+# Run it again after an interruption: it goes on. To go on from the shipped one, give only the second command, with
+# --start-from facerf_cli/assets/portrait.safetensors.
 # Usage: [PEOPLE=340] examples/train_portrait.sh ICT-FaceKit.tar.xz RUN [TIME OF THE FIRST LEG] [OF THE SECOND]
 set -euo pipefail
 archive=$1 run=$2 first=${3:-120m} second=${4:-180m}

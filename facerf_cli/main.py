@@ -132,8 +132,6 @@ def _command(name: str) -> Any:
 
 
 class _Verbs(Verbs):
-    """The group of all verbs."""
-
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
         self.commands = _Commands(self.commands)  # type: ignore[assignment]

@@ -38,6 +38,10 @@ synth/head/test_hair.py
 """
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--kills", type=int, default=3, help="runs that tests/test_kills.py kills")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     places = {Path(__file__).parent / name: place for place, name in enumerate(LONG.split())}
     items.sort(key=lambda item: places.get(item.path, len(places)))

@@ -1,33 +1,52 @@
-"""Readers and writers of text with drawn inputs: what is written comes back, the rest is one clean line."""
+"""Readers with drawn and with stored damaged inputs: each is read, or refused in one printable line."""
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facerf_cli.batch.inputs import NamePattern
+from facerf_cli.batch.made_from import FolderIndex, keyed
+from facerf_cli.batch.run import open_report
 from facerf_cli.batch.settings import Shard
+from facerf_cli.cli.installation import read_config
 from facerf_cli.errors import FacerfError
+from facerf_cli.evaluation.folders import read_facts
+from facerf_cli.evaluation.report import images_csv, read_figures
+from facerf_cli.face.fit import load_fit
+from facerf_cli.face.importers.flame import read_embedding, read_flame
+from facerf_cli.face.importers.ict import read_ict_facekit
 from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
+from facerf_cli.files.arrays import read_array
+from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.light_files import (
     Harmonics,
     LightRecord,
     read_light,
+    read_map_file,
     write_light,
 )
+from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_olats
+from facerf_cli.files.read import read_image
 from facerf_cli.files.spaces import space_of_profile
 from facerf_cli.files.texts import read_light_list, read_rig
 from facerf_cli.light.entries import lit_images, parse_lights
+from facerf_cli.main import app
+from facerf_cli.network.checkpoint import load_checkpoint, load_networks
 from facerf_cli.run.logs import escaped, json_line, printable_line
 from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import parse_pose
 
-# The same examples each time, in a second or two; the campaign of benchmarks/faults is for more.
+# The same examples each time, in a second or two.
 DRAWN = settings(derandomize=True, max_examples=100, deadline=None, database=None)
 FINITE = st.floats(width=32, allow_nan=False, allow_infinity=False, min_value=-(2.0**90), max_value=2.0**90)
 FIELDS = st.sampled_from(["dir", "stem", "ext", "frame"])
@@ -133,3 +152,70 @@ def test_any_profile_is_understood_or_not(content: bytes) -> None:
     space_of_profile(content, "drawn")
     header = bytes(36) + b"acsp" + bytes(88)
     space_of_profile(header + content, "drawn")
+
+
+def _image(path: Path) -> None:
+    read_header(path)
+    is_olat_stack(path)
+    read_image(path)
+
+
+def _olat_stack(path: Path) -> None:
+    is_olat_stack(path)
+    read_olat_header(path)
+    read_olats(path)
+
+
+def _checkpoint(path: Path) -> None:
+    load_checkpoint(path)
+    load_networks(path, LAYOUT_VERSION)
+
+
+def _flame(path: Path) -> None:
+    if path.name.startswith("embedding"):
+        read_embedding(path, load_face_model().mean.numpy(), grid_triangles().numpy())
+    else:
+        read_flame(path)
+
+
+def _index(path: Path) -> None:
+    recipes, index = keyed([{"verb": "segment", "files": {}}]), FolderIndex(path.parent, "segment")
+    index.why_again(path, [path.parent / "x.png"], recipes)
+    index.open(recipes, has_work=True)
+
+
+def _options(path: Path) -> None:
+    text = path.read_bytes().decode("utf-8", "surrogateescape")
+    for read in OPTIONS.values():
+        refused_or_read(lambda read=read: read(text))
+
+
+# Folders of tests/corpus: files that readers once failed on with a traceback, a crash or much memory.
+CORPUS = Path(__file__).parent / "corpus"
+OF_CORPUS: dict[str, Callable[[Path], object]] = {
+    "AVIF": _image,
+    "CSV_tables": read_facts,
+    "FLAME": _flame,
+    "ICT_FaceKit": read_ict_facekit,
+    "OLAT_stacks": _olat_stack,
+    "configuration": lambda path: read_config(path, typer.main.get_command(app)),
+    "environment_maps": read_map_file,
+    "figures": lambda path: images_csv(read_figures(path).rows),
+    "files_of_lights": lambda path: parse_lights(str(path)),
+    "fits": load_fit,
+    "images": _image,
+    "index": _index,
+    "landmarks": read_landmarks,
+    "npy_images": read_array,
+    "options": _options,
+    "report": lambda path: open_report(path, "segment", [], [], lambda _: []),
+    "rigs": lambda path: lit_images([str(path)]),
+    "safetensors": _checkpoint,
+}
+STORED = sorted(path.relative_to(CORPUS) for path in CORPUS.rglob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("stored", STORED, ids=lambda path: path.as_posix())
+def test_a_stored_finding_is_read_or_refused(stored: Path, tmp_path: Path) -> None:
+    path = Path(shutil.copy(CORPUS / stored, tmp_path))
+    refused_or_read(lambda: OF_CORPUS[stored.parts[0]](path))

@@ -16,7 +16,6 @@ from pathlib import Path
 import pytest
 
 from facerf_cli import __version__
-from facerf_cli.cli import manual
 
 ROOT = Path(__file__).parents[1]
 NOT_SOURCE = shutil.ignore_patterns(
@@ -68,8 +67,6 @@ def test_the_wheel_has_all_of_the_package_and_its_documents(wheel: zipfile.ZipFi
         {f"man/man1/{Path(name).name}" for name in tracked("man/*.1")}
         | {f"doc/facerf/{name}" for name in tracked("docs/**/*") | tracked("examples/**/*")}
         | {f"doc/facerf/{name}" for name in ("README.md", "MODEL_CARD.md", "CHANGELOG.md")}
-        | {"bash-completion/completions/facerf.bash", "zsh/site-functions/_facerf"}
-        | {"fish/vendor_completions.d/facerf.fish"}
     )
     assert "man/man1/facerf-relight.1" in shared
 
@@ -89,7 +86,7 @@ def test_the_metadata_describe_it(metadata: Message, wheel: zipfile.ZipFile) -> 
 def test_the_source_distribution_has_what_the_tests_read_and_no_cache(built: Path) -> None:
     with tarfile.open(built / f"facerf-{__version__}.tar.gz") as archive:
         names = {member.name.partition("/")[2] for member in archive.getmembers() if member.isfile()}
-    for folder in ("tests/**", "docs", "examples/**", "man", "completions", "benchmarks", "tools"):
+    for folder in ("tests/**", "docs", "examples/**", "man", "benchmarks", "tools"):
         assert {name for name in tracked(f"{folder}/*") if "__pycache__" not in name} <= names
     assert {
         "Makefile",
@@ -178,22 +175,3 @@ def test_the_installed_wheel_runs_away_from_its_source(built: Path, wheel: zipfi
     assert done.returncode == 0, done.stdout + done.stderr  # a missing asset fails
     assert f"{__version__}" in done.stdout
     assert next(prefix.glob("**/share/man/man1/facerf.1")).is_file()
-
-
-def test_completion_files_are_in_step_with_typer() -> None:
-    held = {path.name: path.read_text() for path in (ROOT / "completions").iterdir()}
-    assert held == manual.scripts(), "run `make completions`"
-    assert (ROOT / "completions/_facerf").read_text().startswith("#compdef facerf\n")
-
-
-@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
-def test_bash_completes_a_verb_by_the_shipped_file(tmp_path: Path) -> None:
-    program = tmp_path / "facerf"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m facerf_cli "$@"\n')
-    program.chmod(0o755)
-    line = (
-        f'PATH="{tmp_path}:$PATH"; source completions/facerf.bash; COMP_WORDS=(facerf estim); COMP_CWORD=1; '
-        '_facerf_completion facerf; echo "${COMPREPLY[@]}"'
-    )
-    done = subprocess.run(["bash", "-c", line], cwd=ROOT, capture_output=True, text=True)
-    assert done.stdout.split() == ["estimate-light"], done.stderr

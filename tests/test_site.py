@@ -1,36 +1,28 @@
 """The site of the documents: pages made of other files, and links; `make docs` builds all of it, strictly."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import pytest
-
-pytest.importorskip("mkdocs")
-from mkdocs.structure.files import Files
 
 from tools import pages
 
-
-def linked(uri: str, markdown: str) -> str:
-    config: Any = SimpleNamespace(repo_url="https://host/facerf", site_dir="site", use_directory_urls=False)
-    config.plugins = SimpleNamespace(_current_plugin=None)
-    files = pages.on_files(Files([]), config)
-    page: Any = SimpleNamespace(file=SimpleNamespace(src_uri=uri))
-    return pages.on_page_markdown(markdown, page, config, files)
+FILES = {"index.md", "paper.md", "lights.md", "changelog.md"}
 
 
 @pytest.mark.parametrize(
     ("uri", "link", "becomes"),
     [
-        ("paper.md", "(../examples/README.md#a)", "(https://host/facerf/blob/main/examples/README.md#a)"),
-        ("index.md", "(benchmarks)", "(https://host/facerf/tree/main/benchmarks)"),
+        (
+            "paper.md",
+            "(../examples/README.md#a)",
+            "(https://github.com/facerf/facerf/blob/main/examples/README.md#a)",
+        ),
+        ("index.md", "(benchmarks)", "(https://github.com/facerf/facerf/tree/main/benchmarks)"),
         ("lights.md", "(../README.md#use)", "(index.md#use)"),
         ("index.md", "(docs/gone.md)", "(gone.md)"),  # which mkdocs refuses
         ("paper.md", "(https://host/x.md)", "(https://host/x.md)"),
     ],
 )
 def test_links_lead_to_pages_or_to_the_repository(uri: str, link: str, becomes: str) -> None:
-    assert linked(uri, f"[a]{link}") == f"[a]{becomes}"
+    assert pages.linked(uri, f"[a]{link}", FILES) == f"[a]{becomes}"
 
 
 def test_a_verb_has_a_page_of_its_manual_and_of_its_own_verbs() -> None:
@@ -48,4 +40,4 @@ def test_text_of_the_manual_is_shown_literally() -> None:
 def test_lists_are_written_as_python_markdown_reads_them() -> None:
     page = "a:\n- b\n\n  ```sh\n  c\n  ```\n- d\n- e\n1. f\n   g\n\nh\n\n```\n- i\n  j\n```"
     read = "a:\n\n- b\n\n    ```sh\n    c\n    ```\n\n- d\n- e\n1. f\n    g\n\nh\n\n```\n- i\n  j\n```"
-    assert linked("paper.md", page) == read
+    assert pages.linked("paper.md", page, FILES) == read

@@ -1,17 +1,16 @@
-"""Hooks of mkdocs (mkdocs.yml): pages made of other files, and links that leave the folder of pages.
+"""Write the pages of the site into a folder, which mkdocs.yml reads: `python -m tools.pages FOLDER`.
 
-The README is the home page; each verb's page is made of its man pages. A link to a file that is no page
-becomes its address in the repository.
+They are those of docs/, the README as home page, other files of the root, and a page for each verb, made of
+its man pages. A link to a file that is no page becomes its address in the repository.
 """
 
 import re
-from collections.abc import Iterator
+import shutil
+import sys
+import tomllib
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from posixpath import join, normpath, relpath
-
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
 
 from facerf_cli.main import VERBS
 
@@ -26,30 +25,35 @@ _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#]+)")
 _MARKER = re.compile(r"(?:-|\d+\.) +")
 _CODE_OR_SPECIAL = re.compile(r"`[^`]*`|[*_<]")
 _API = "# Python API\n\n[Python](python.md) shows how it is used.\n\n::: facerf_cli.api\n"
+_REPOSITORY = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Repository"]
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that are not in docs/."""
-    made = {page: (ROOT / source).read_text() for source, page in MADE.items()} | {"api.md": _API}
-    made |= {f"verbs/{verb}.md": "\n".join(_manual(verb)) for verb in ("facerf", *VERBS)}
-    for page, text in made.items():
-        files.append(File.generated(config, page, content=text))
-    return files
+def write_pages(folder: Path) -> None:
+    """Replace a folder by the pages and pictures of the site."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(ROOT / "docs", folder)
+    texts = {page: (ROOT / source).read_text() for source, page in MADE.items()} | {"api.md": _API}
+    texts |= {path.name: path.read_text() for path in (ROOT / "docs").glob("*.md")}
+    verbs = {f"verbs/{verb}.md": "\n".join(_manual(verb)) for verb in ("facerf", *VERBS)}
+    pictures = [path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()]
+    files = {*texts, *verbs, *pictures}
+    (folder / "verbs").mkdir()
+    for page, text in ({page: linked(page, text, files) for page, text in texts.items()} | verbs).items():
+        (folder / page).write_text(text)
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn each link to a file into one to its page, or to the repository; mkdocs refuses what is neither."""
-    uri = page.file.src_uri
-    folder = "" if uri in MADE.values() else "docs"
+def linked(page: str, markdown: str, files: Collection[str]) -> str:
+    """The text of a page, its links to pages or to the repository; mkdocs refuses those that are neither."""
+    folder = "" if page in MADE.values() else "docs"
 
     def address(link: re.Match[str]) -> str:
         path = normpath(join(folder, link[1]))
         target = MADE.get(path, path.removeprefix("docs/"))
-        if files.get_file_from_path(target) or not (ROOT / path).exists():
-            return relpath(target, Path(uri).parent)
-        return f"{config.repo_url}/{'tree' if (ROOT / path).is_dir() else 'blob'}/main/{path}"
+        if target in files or not (ROOT / path).exists():
+            return relpath(target, Path(page).parent)
+        return f"{_REPOSITORY}/{'tree' if (ROOT / path).is_dir() else 'blob'}/main/{path}"
 
-    return markdown if uri.startswith("verbs/") else _LINK.sub(address, _lists(markdown))
+    return _LINK.sub(address, _lists(markdown))
 
 
 def _lists(markdown: str) -> str:
@@ -127,3 +131,7 @@ def _text(text: str) -> str:
         lambda found: {"<": "&lt;"}.get(found[0], found[0] if found[0][0] == "`" else f"\\{found[0]}"),
         _plain(text),
     )
+
+
+if __name__ == "__main__":
+    write_pages(Path(sys.argv[1]))

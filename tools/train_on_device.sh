@@ -1,4 +1,5 @@
 #!/bin/sh
+# This does not reproduce the shipped weights: it starts from them.
 # Train the Portrait Network on a machine with a GPU: bake people on all cores for a while, then train from the
 # shipped weights, with samples drawn on all cores. RUN has the weights (last, best), log.jsonl and the settings.
 #

@@ -51,7 +51,7 @@ def explain_texture(
     """Estimate albedo and light of a texture; the light as signed weights of the paper's 150 lights.
 
     `fine` applies the network's gain and bias at the side of the texture, else at that of the network.
-    `refit` improves the network's light by `refitted`. Both improve the baseline (benchmarks/baselines.py).
+    `refit` improves the network's light by `refitted`. Both improve the baseline.
     """
     device, side = next(network.parameters()).device, face.texture.shape[-1]
     inputs = [x[None].to(device) for x in (face.texture, face.normals, face.visible[None])]

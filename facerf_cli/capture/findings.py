@@ -193,7 +193,6 @@ def require_sound(subject: str, findings: Iterable[Finding], strict: bool) -> No
 
 
 def write_findings(path: Path, findings: Iterable[Finding]) -> None:
-    """Write a row for each finding."""
     with atomic_path(path) as temporary:
         rows = (json_line(found.row()) + "\n" for found in findings)
         temporary.write_text("".join(rows), encoding="utf-8")

@@ -179,8 +179,6 @@ class CameraEntry(Document):
 
 
 class StageDocument(Document):
-    """The document."""
-
     format: StageFormat
     axes: Literal["opencv"]
     unit: Literal["m"]

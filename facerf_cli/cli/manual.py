@@ -1,12 +1,5 @@
-"""Man pages and shell completion, from the app.
+"""Man pages from the app: `python -m facerf_cli.cli.manual DIR` writes facerf.1 and a page for each verb."""
 
-`python -m facerf_cli.cli.manual man DIR` writes facerf.1 and a page for each verb;
-`python -m facerf_cli.cli.manual completions DIR` a script for bash, zsh and fish. The scripts name no option:
-at every TAB they ask `facerf` itself, so they change with typer only.
-"""
-
-import os
-import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -20,9 +13,6 @@ from facerf_cli.cli.options import EPILOG
 from facerf_cli.errors import UsageError
 from facerf_cli.main import app
 
-FILES = {"bash": "facerf.bash", "zsh": "_facerf", "fish": "facerf.fish"}  # the names that the shells look for
-# zsh runs the file at the first TAB; without a call, that TAB would only define the function.
-_LAST_LINES = {"zsh": '\n_facerf_completion "$@"'}
 _EXIT_CODES = (
     ("0", "All is done."),
     ("1", "Some input failed; each is named in a line on standard error."),
@@ -113,25 +103,11 @@ def _text(text: str) -> str:
     return f"\\&{text}" if text.startswith((".", "'")) else text
 
 
-def scripts() -> dict[str, str]:
-    """File name to script."""
-    return {name: _script(shell) for shell, name in FILES.items()}
-
-
-def _script(shell: str) -> str:
-    """The script that typer makes for a shell; `#compdef` must be the first line of a zsh file."""
-    environment = os.environ | {"_FACERF_COMPLETE": f"source_{shell}"}
-    command = [sys.executable, "-m", "facerf_cli"]
-    made = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    return made.stdout.strip() + _LAST_LINES.get(shell, "") + "\n"
-
-
 def main(arguments: list[str]) -> None:
-    """Write all pages or scripts into the folder named, and remove pages of verbs that are gone."""
-    makers = {"man": pages, "completions": scripts}
-    if len(arguments) != 2 or arguments[0] not in makers:
-        raise UsageError("usage: python -m facerf_cli.cli.manual man|completions DIR")
-    folder, written = Path(arguments[1]), makers[arguments[0]]()
+    """Write all pages into the folder named, and remove pages of verbs that are gone."""
+    if len(arguments) != 1:
+        raise UsageError("usage: python -m facerf_cli.cli.manual DIR")
+    folder, written = Path(arguments[0]), pages()
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("facerf*.1"):
         if old.name not in written:

@@ -8,7 +8,7 @@ stack. Both have the exposure of the texture stages: the source so that the face
 
 Crops move at random, because at test time a crop is cut around a detector's box, not around landmarks. The
 spreads are those of `face.crop.from_box` against `face.crop.from_landmarks` on synthetic people in eight
-cameras (`benchmarks/crop_boxes.py`): a detector's box is off to the side where a head is turned.
+cameras: a detector's box is off to the side where a head is turned.
 
 `open_photos` gives crops of faces in photos, with detected landmarks: found once, kept in a cache.
 """

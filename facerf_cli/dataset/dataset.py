@@ -55,7 +55,6 @@ class DatasetFolder:
     folder: Path
 
     def stack_path(self, subject: str, camera: str) -> Path:
-        """Path of the OLAT stack of a subject and camera."""
         return self.folder / "olat" / subject / f"{camera}.exr"
 
     def fit_path(self, subject: str, camera: str) -> Path:

@@ -115,7 +115,6 @@ def draw_pair(dataset: Dataset, maps: Sequence[str], seed: int, subject: str, in
 
 
 def pairs_path(dataset: Dataset) -> Path:
-    """Path of a dataset's pairs."""
     return dataset.folder / RELIT / PAIRS_NAME
 
 

@@ -103,8 +103,6 @@ def _envmap_names(option: str, envmaps: str, output: Path, seed: int, first: int
 
 @dataclass(frozen=True)
 class _Relight(Job):
-    """Relights one subject."""
-
     verb = "relight-dataset"
 
     dataset: Dataset

@@ -194,7 +194,6 @@ class EvaluateOptions(BatchOptions):
         return bool({"field", "portrait"} & set(self.reflectance) or self.against)
 
     def item(self, path: Path, name: str) -> Item:
-        """An item of this run."""
         return Item(path, self.output / name, name)
 
     def check(self) -> None:

@@ -119,7 +119,6 @@ class Evaluation(Job):
         return self
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
-        """The recipe of all items."""
         recipe: Recipe = {"measuring": _MEASURING, "protocol": self.protocol.name}
         for part in (self.photo, self.chosen, self.options):
             recipe |= recipe_of(part, digest_of)

@@ -15,7 +15,7 @@ from facerf_cli.image.strips import strips
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's pixels
-# A detector's box in `from_landmarks` crops (benchmarks/crop_boxes.py): the crop's side in sides of the box,
+# A detector's box in `from_landmarks` crops: the crop's side in sides of the box,
 # and how far above the box's centre the crop's lies.
 _PER_BOX, _ABOVE_BOX = 1.48, 0.02
 MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead

@@ -98,7 +98,6 @@ class Film:
         self._coder.thread_type = "AUTO"
 
     def close(self) -> None:
-        """Close the file."""
         self._container.close()
 
     def _presented(self) -> list[int]:

@@ -38,7 +38,6 @@ def display(config: str = "") -> str:
 
 
 def displays(config: str = "") -> list[str]:
-    """List the displays of the configuration."""
     return list(_opened(config).getDisplayNames())
 
 

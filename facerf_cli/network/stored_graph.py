@@ -39,7 +39,6 @@ class StoredGraph(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """The device of its weights."""
         return next(iter(self.constants.values())).device
 
     def _apply(self, function: Callable[[Tensor], Tensor], recurse: bool = True) -> "StoredGraph":

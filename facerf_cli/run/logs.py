@@ -112,7 +112,6 @@ class LineFormatter(logging.Formatter):
     """Formats `facerf: warning: …`; information has no prefix. A traceback follows if one is attached."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Format the record as text."""
         prefix = "" if record.levelno <= logging.INFO else f"facerf: {record.levelname.lower()}: "
         text = prefix + printable_line(record.getMessage())
         if not record.exc_info:
@@ -125,7 +124,6 @@ class JsonFormatter(logging.Formatter):
     """Formats a JSON object per line (`--log-json`)."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Format the record as a JSON line."""
         row = {
             "time": self.formatTime(record, "%Y-%m-%dT%H:%M:%S%z"),
             "level": record.levelname.lower(),

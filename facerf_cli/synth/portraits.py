@@ -64,7 +64,6 @@ class BakedPortrait:
 
     @property
     def side_px(self) -> int:
-        """Side of the image."""
         return len(self.classes)
 
     def summed(self, columns: Tensor) -> Tensor:

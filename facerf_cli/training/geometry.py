@@ -73,7 +73,6 @@ class GeometryObjective(Objective):
         return self.faces.draw(head, self.side, generator)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> FaceCrops:
-        """Draw a crop of a held-out head."""
         return self.faces.draw(person, self.side, generator)
 
     def forward(self, batch: FaceCrops) -> dict[str, Tensor]:

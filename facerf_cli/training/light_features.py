@@ -46,7 +46,6 @@ class LightFeaturesObjective(HeadsObjective):
             self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
 
     def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LightCrops:
-        """Draw a face."""
         if isinstance(self.source, LightStacks):
             return self.source.draw(head, self.settings.lights, generator)
         sample = self.source.draw(head, self.settings.lights, generator)
@@ -137,7 +136,6 @@ class AppearanceObjective(Objective):
         self._validation: list[list[CropPairs]] | None = None  # of people that are known, and of others
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
-        """Draw pairs."""
         return self._train.draw(count, generator_of, step)
 
     def forward(self, batch: CropPairs) -> dict[str, Tensor]:

@@ -98,7 +98,6 @@ class Objective(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Device of the networks."""
         return next(self.networks.parameters()).device
 
 

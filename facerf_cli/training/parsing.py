@@ -74,7 +74,6 @@ class ParsingObjective(Objective):
         return self.portraits.draw(self.people, self.side, generator)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitCrops:
-        """Draw a crop of a held-out person."""
         return self.portraits.draw([person], self.side, generator)
 
     def forward(self, batch: PortraitCrops) -> dict[str, Tensor]:

@@ -86,7 +86,6 @@ class PortraitObjective(Objective):
         )
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitSample:
-        """Draw a sample of a held-out person."""
         return self.portraits.draw([person], self.settings.targets, generator)
 
     def forward(self, batch: PortraitSample | SeenNormals) -> dict[str, Tensor]:

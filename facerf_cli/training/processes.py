@@ -91,7 +91,6 @@ def broadcast_from_first(values: Tensor) -> Tensor:
 
 
 def mean_over_processes(values: Tensor) -> Tensor:
-    """Mean of values over all processes."""
     if process_count() > 1:
         dist.all_reduce(values)
         values = values / process_count()

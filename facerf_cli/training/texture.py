@@ -42,16 +42,13 @@ class HeadsObjective(Objective):
         self.heads, self.held_out = source.heads(settings.held_out_heads)
 
     def draw_one(self, generator: torch.Generator) -> Any:
-        """Draw a face."""
         head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
         return self.draw_head(head, generator)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> Any:
-        """Draw a held-out face."""
         return self.draw_head(torch.tensor([person]), generator)
 
     def draw_head(self, head: Tensor, generator: torch.Generator) -> Any:
-        """Draw a sample of a head [1]."""
         raise NotImplementedError
 
 
@@ -102,11 +99,9 @@ class TextureObjective(HeadsObjective):
         self.source_colours = SourceColours.of(torch.cat(colours))
 
     def draw_head(self, head: Tensor, generator: torch.Generator) -> TextureBatch:
-        """Draw a face."""
         return TextureBatch(self.source.draw(head, self.settings.lights, generator), head)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> Sample:
-        """Draw a held-out face."""
         return self.source.draw(torch.tensor([person]), self.settings.held_out_lights, generator)
 
     def forward(self, batch: TextureBatch) -> dict[str, Tensor]:

@@ -86,7 +86,6 @@ def _checkpoint(path: Path) -> dict[str, Any]:
 
 
 def _extra_model() -> dict[str, str]:
-    """The model of the extra `dlib`."""
     try:
         return {"licence": DESCRIPTOR_LICENCE, "size": _size(descriptor_path())}
     except FacerfError:

@@ -105,7 +105,6 @@ class OutputOptions:
     file_suffix: str = field(default="", metadata=NOT_IN_RECIPE)  # of the one file that -o names
 
     def suffix_of(self, name: Format) -> str:
-        """The suffix of files of a format."""
         return self.file_suffix or SUFFIXES[name]
 
     @property

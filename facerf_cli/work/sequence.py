@@ -148,7 +148,6 @@ class ShotTrack:
 
     @property
     def takes(self) -> list[range]:
-        """The frames of each take."""
         return takes(len(self.sightings), self.cuts)
 
     @property

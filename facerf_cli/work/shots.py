@@ -227,7 +227,6 @@ class FilmOutput:
 
     @property
     def formats(self) -> tuple[Format, ...]:
-        """The format of the frames."""
         return (_FORMATS[self.path.suffix.lower()],)
 
     @property

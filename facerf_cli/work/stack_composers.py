@@ -96,7 +96,6 @@ class StackImages(Relightable):
 
     @property
     def person_matte(self) -> np.ndarray | None:
-        """The matte of a person."""
         return None if self.face is None else self.matte
 
     def relit(self, lights: Lights) -> Iterator[Relit]:

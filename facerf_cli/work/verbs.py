@@ -143,7 +143,6 @@ class PhotoWork(Job):
         return self.files_of(item, self.photo.first_tag)
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
-        """The recipe of all outputs."""
         return [recipe_of(self, digest_of) | recipe_of_shots(self.shots.all, digest_of)]
 
     def __call__(self, item: Item) -> Outcome:

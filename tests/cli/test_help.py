@@ -69,7 +69,7 @@ def test_help_and_man_pages_have_panels_and_paragraphs(tmp_path: Path) -> None:
     assert top.index("fBrelight\\fR") < top.index(".SS Make") < top.index("fBenvmap\\fR")
     assert manual._text(".a-b\\c") == "\\&.a\\-b\\ec"
     (tmp_path / "facerf-gone.1").touch()
-    manual.main(["man", str(tmp_path)])
+    manual.main([str(tmp_path)])
     assert {path.name for path in tmp_path.iterdir()} == set(manual.pages())
 
 

@@ -87,7 +87,7 @@ def test_the_crop_follows_the_face_and_that_of_a_box_is_larger():
     plain, moved = from_landmarks(frontal_landmarks(), 256), from_landmarks(2 * frontal_landmarks(), 256)
     assert moved.side_px == pytest.approx(2 * plain.side_px)
     assert moved.x0_px == pytest.approx(2 * plain.x0_px)
-    # A detector's box holds brows to chin; the spans are measured (benchmarks/crop_boxes.py).
+    # A detector's box holds brows to chin; the spans are measured.
     crop = from_box((100.0, 40.0, 200.0, 140.0), 64)
     assert crop == Crop(150 - 74, 90 - 2 - 74, 148, 64)
     for bad in ((5.0, 0.0, 5.0, 0.0), (0.0, 0.0, np.inf, 9.0), (0.0, 0.0, np.nan, 9.0)):

@@ -43,7 +43,6 @@ def _fill_shard(
 
 
 def file_of(folder: Path, name: str) -> Path:
-    """A file of a bank."""
     return folder / f"{name}.safetensors"
 
 

@@ -127,7 +127,6 @@ class _Photo:
         return self.alpha.shape[-1]
 
     def mirrored(self) -> "_Photo":
-        """The mirrored photo."""
         flipped = self.landmarks_px[torch.from_numpy(MIRROR)] * torch.tensor([-1.0, 1.0])
         moved = flipped + torch.tensor([float(self.side_px), 0.0])
         return _Photo(self.radiance.flip(-1), self.alpha.flip(-1), self.label.flip(-1), moved)

@@ -55,7 +55,6 @@ class StoredView:
 
 
 def load_view(path: Path) -> StoredView:
-    """Read a view."""
     tensors = load_file(path)
     albedo, specular, roughness = (
         tensors.pop(f"look_{name}").float() for name in ("albedo", "specular", "roughness")

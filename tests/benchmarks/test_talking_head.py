@@ -1,14 +1,20 @@
 """A person of the stage who moves: the face by expressions, the head by the camera, and no light with it."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from _talking_head import Actor, seen_from, turned
 
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.raster.camera import rotation_to_pose
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.subjects import draw_subject
 from facerf_cli.synth.views import stage_cameras
-from tools.talking_head import Actor, seen_from, turned
 
 
 def test_the_jaw_opens_and_the_hair_stays() -> None:

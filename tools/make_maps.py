@@ -1,4 +1,4 @@
-"""Make the four environment maps of the examples: `python examples/make_maps.py [FOLDER]`.
+"""Make the four environment maps of the examples: `python tools/make_maps.py [FOLDER]`.
 
 Scene-linear Rec.709, OpenEXR's lat-long convention (the centre is +z, behind the camera). Each is built from
 directions, not from pictures, so nothing in them belongs to anyone. Their mean radiance over the sphere is 1.
@@ -105,6 +105,6 @@ def make_map(radiance: Callable[[Tensor], Tensor]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "maps"
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "examples/maps"
     for name, radiance in MAPS.items():
         write_exr(folder / f"{name}.exr", make_map(radiance), metadata={"Software": "facerf make_maps.py"})

@@ -1,6 +1,6 @@
 """Put a portrait of facerf into a Blender scene, lit by the map that facerf used.
 
-    blender --python integrations/blender/facerf_scene.py -- me.exr sky.exr 30
+    blender --python examples/blender/facerf_scene.py -- me.exr sky.exr 30
 
 me.exr is an image of `facerf relight --background none --aov albedo,normal`; 30 is its --rotate. The portrait
 stands in the plane x, z and looks along -y. World and plane agree with facerf: light from the image's right

@@ -20,7 +20,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture(scope="module")
 def package() -> ModuleType:
     """The package as ComfyUI loads it: by its path, under any name."""
-    folder = ROOT / "integrations/comfyui"
+    folder = ROOT / "examples/comfyui"
     spec = importlib.util.spec_from_file_location(
         "custom_facerf", folder / "__init__.py", submodule_search_locations=[str(folder)]
     )

@@ -25,7 +25,7 @@ from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from tests.cli.toy_checkpoint import save_toy_checkpoint
-from tests.integrations.test_nuke_and_blender import ROOT
+from tests.examples.test_blender import ROOT
 
 PROGRAMS = ("oiiotool", "ffmpeg", "ffprobe", "exiftool", "magick", "convert", "find", "jq", "parallel")
 # They download, install, start a service, submit a job, or need a screen.

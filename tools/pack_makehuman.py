@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Pack the upper body, garments, hat and hand of MakeHuman that synthetic people wear.
 
-    python examples/pack_makehuman.py makehuman_hair_clothes.tar.xz facerf_cli/assets/makehuman.safetensors
+    python tools/pack_makehuman.py makehuman_hair_clothes.tar.xz facerf_cli/assets/makehuman.safetensors
 
 The shapes are CC0 (github makehumancommunity/makehuman-assets and makehuman). MakeHuman's unit is the
 decimetre. The packed meshes are in metres with the middle of the neck at the origin, x to the image's right,

@@ -1,1 +1,0 @@
-complete --command facerf --no-files --arguments "(env _FACERF_COMPLETE=complete_fish _TYPER_COMPLETE_FISH_ACTION=get-args _TYPER_COMPLETE_ARGS=(commandline -cp) facerf)" --condition "env _FACERF_COMPLETE=complete_fish _TYPER_COMPLETE_FISH_ACTION=is-args _TYPER_COMPLETE_ARGS=(commandline -cp) facerf"
