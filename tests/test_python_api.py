@@ -28,7 +28,7 @@ KEY = facerf.Light.single(60, 30)
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The names that the code of docs/python.md leaves, run down to its gradients, with rigs of few lights."""
+    """The names that the code of docs/python.md before Gradients leaves, with rigs of few lights."""
     folder = tmp_path_factory.mktemp("page")
     (folder / "examples").symlink_to(ROOT / "examples")
     text = (ROOT / "docs/python.md").read_text().partition("\n## Gradients\n")[0]
