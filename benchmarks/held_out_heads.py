@@ -142,7 +142,7 @@ def groups(
 
 
 def print_tables(textures: list[RelitTexture]) -> None:
-    """Print both tables in Markdown, as they are in docs/measurements.md."""
+    """Print both tables in Markdown, as they are in docs/results.md."""
     rows, tones = groups(textures)
     print_header("held-out heads", *_COLUMNS)
     for name, chosen in rows.items():

@@ -288,7 +288,7 @@ class Person(PersonOrGroup):
             room: Share of the lights' sum that a white room sends back; of maps none.
             alone: The face alone, with alpha [H, W, 4].
 
-        A light or pose of tensors gives tensors, through which gradients flow (docs/gradients.md); so does
+        A light or pose of tensors gives tensors, through which gradients flow (docs/python.md); so does
         a texture of which a gradient is wanted.
         """
         if not alone and pose is None:
@@ -566,7 +566,7 @@ class Person(PersonOrGroup):
             network: Any = self.models.networks.portrait
             if any(values.requires_grad for values in network.parameters()):
                 raise UsageError(
-                    "Portrait Network: has no gradient in the photo; take its maps' (docs/gradients.md), or "
+                    "Portrait Network: has no gradient in the photo; take its maps' (docs/python.md), or "
                     "freeze it by requires_grad_(False)"
                 )
         return wanted

@@ -320,8 +320,9 @@ def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    for block in re.findall(r"```python\n(.*?)```", (ROOT / "docs/gradients.md").read_text(), re.S):
-        exec(compile(block, "docs/gradients.md", "exec"), names)
+    page = (ROOT / "docs/python.md").read_text().partition("\n## Gradients\n")[2]
+    for block in re.findall(r"```python\n(.*?)```", page, re.S):
+        exec(compile(block, "docs/python.md", "exec"), names)
     light, toward = names["light"], torch.from_numpy(facerf.Light.single(60, 30).directions)[0]
     brightest = names["directions"][light.weights.sum(1).argmax()]
     assert float(brightest @ toward) > 0.6  # the nearest of the rig

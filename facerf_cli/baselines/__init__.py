@@ -1,4 +1,4 @@
-"""The reflectance models with which the paper compares ('Light Estimation'); see docs/baselines.md."""
+"""The reflectance models with which the paper compares ('Light Estimation'); see docs/paper.md."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Memory of a photo's work (docs/memory.md): what is refused, and what goes to disk.
+"""Memory of a photo's work (docs/reliability.md): what is refused, and what goes to disk.
 
 One rule: all is counted in images of `IMAGE_PX` bytes a pixel, on top of what a reader decodes. Images are
 made some rows at a time, and a slow test measures the peak (tests/run/test_memory.py).
