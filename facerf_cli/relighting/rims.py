@@ -3,7 +3,8 @@
 Such a light is seen where surfaces turn away, in a line along the outline that is thinner than the pixels of
 the maps. At a distance d inside the outline it is read from a distance g(d) in the maps, and g'(d) times as
 bright: along the outline's normal its integral stays what it was. g(0) = 0, g'(0) is the sharpness, and from
-the reach on g(d) = d.
+the reach on g(d) = d. Deeper inside, it fades: the network draws such a light on cheek and nose, too, where hair
+or the head itself is in its way.
 """
 
 import numpy as np
@@ -15,10 +16,11 @@ from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.raster.texture import smoothstep
 
-_FROM, _WHOLE = 0.6, 0.9  # -z of the directions from which on light is partly, and wholly, from behind
+_FROM, _WHOLE = 0.35, 0.75  # -z of the directions from which on light is partly, and wholly, from behind
 _SHARPNESS, _REACH = 2.0, 0.2  # g'(0), at most 4, and the reach, in extents of the face
 _SMOOTH = 0.006  # standard deviation of the blur of the outline's distance, in extents of the face
 _OUTSIDE = 0.015  # of the outline, in extents of the face, over which brightness fades to what it was
+_FADES = (0.04, 0.16)  # distances inside the outline from which on light fades, and is none, in extents
 _SIDE_PX = 640  # longest side of the photo in which distances are measured
 
 
@@ -51,7 +53,8 @@ class Rims:
         deeper = more * distance.clip(0) * (1 - share) ** 2
         slope = more * (1 - share) * (1 - 3 * share) * (1 + distance.clip(max=0) / _OUTSIDE).clip(0)
         self._maps[:2] = deeper * inward * face_px
-        self._maps[2] = 1 + slope * np.square(inward).sum(0).clip(max=1)
+        fading = smoothstep(torch.from_numpy((_FADES[1] - distance) / (_FADES[1] - _FADES[0]))).numpy()
+        self._maps[2] = fading * (1 + slope * np.square(inward).sum(0).clip(max=1))
 
     def at(self, rows: slice, columns: slice) -> tuple[Tensor, Tensor]:
         """Offsets [2, h, w] in pixels of the photo, x and y, and brightness [h, w]."""
