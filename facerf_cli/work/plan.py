@@ -19,7 +19,7 @@ from facerf_cli.image.strips import Empty
 from facerf_cli.run import memory
 
 IMAGE_PX = 12  # bytes of a pixel of an image of floats
-KEPT_PX = 22  # of what work makes of a photo: an 8-bit copy, the matte, the view of a face, the grain
+KEPT_PX = 18  # of what work makes of a photo: an 8-bit copy, the matte, the view of a face
 _MATTE_PX = 4
 _PERSON_BYTES = 80 << 20  # of each of several people: transport, and maps of the light that is shown
 _STRIPS_BYTES = 32 << 20
