@@ -3,8 +3,8 @@
 Such a light is seen where surfaces turn away, in a line along the outline that is thinner than the pixels of
 the maps. At a distance d inside the outline it is read from a distance g(d) in the maps, and g'(d) times as
 bright: along the outline's normal its integral stays what it was. g(0) = 0, g'(0) is the sharpness, and from
-the reach on g(d) = d. Deeper inside, it fades: the network draws such a light on cheek and nose, too, where hair
-or the head itself is in its way.
+the reach on g(d) = d. Deeper inside, the brightness fades to 0: the network also draws such a light on cheek
+and nose, where hair or the head itself blocks it.
 """
 
 import numpy as np
