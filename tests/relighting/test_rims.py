@@ -1,4 +1,4 @@
-"""Light from behind is moved toward the outline, and none of it is lost."""
+"""Light from behind is moved toward the outline, and fades inside."""
 
 import numpy as np
 import pytest
@@ -18,18 +18,20 @@ def half_plane() -> Rims:
     return Rims(matte, FACE_PX)
 
 
-@pytest.mark.parametrize("width_px", [8.0, 16.0, 1e9])
-def test_the_integral_along_the_outlines_normal_stays(width_px: float) -> None:
-    """Closed form: the sum over pixels of S(g(d)) g'(d) is that of S."""
+@pytest.mark.parametrize("width_px", [2.0, 8.0, 1e9])
+def test_light_near_the_outline_stays_and_none_is_added(width_px: float) -> None:
+    """The sum over pixels of S(g(d)) g'(d) is that of S, less what fades inside."""
     offsets_px, brightness = half_plane().at(slice(10, 11), slice(EDGE_PX, SIZE_PX[1]))
     inside_px = torch.arange(SIZE_PX[1] - EDGE_PX) + 0.5
     before = torch.exp(-inside_px / width_px)
     after = torch.exp(-(inside_px + offsets_px[0, 0]) / width_px) * brightness[0]
-    assert float(after.sum()) == pytest.approx(float(before.sum()), rel=0.03)
+    assert float(after.sum()) < 1.03 * float(before.sum())
+    if width_px < 0.04 * FACE_PX:  # nearly all of it lies where nothing fades
+        assert float(after.sum()) > 0.9 * float(before.sum())
     assert offsets_px[1].abs().max() < 1e-3 and brightness.min() >= 0
 
 
-def test_a_rim_is_thinner_and_brighter_and_nothing_changes_far_from_it() -> None:
+def test_a_rim_is_thinner_and_brighter_and_none_is_far_inside() -> None:
     offsets_px, brightness = half_plane().at(slice(10, 11), slice(EDGE_PX, SIZE_PX[1]))
     inside_px = torch.arange(SIZE_PX[1] - EDGE_PX) + 0.5
     before = torch.exp(-inside_px / 16)
@@ -39,8 +41,9 @@ def test_a_rim_is_thinner_and_brighter_and_nothing_changes_far_from_it() -> None
     assert half[1] < 0.7 * half[0]
     far = slice(EDGE_PX + round(FACE_PX / 4), SIZE_PX[1])
     whole = Rims(np.ones(SIZE_PX, np.float32), FACE_PX).at(slice(0, SIZE_PX[0]), slice(0, SIZE_PX[1]))
-    for offsets_px, brightness in (half_plane().at(slice(0, SIZE_PX[0]), far), whole):
-        assert offsets_px.abs().max() == 0 and (brightness == 1).all()
+    inside = half_plane().at(slice(0, SIZE_PX[0]), far)
+    for (offsets_px, brightness), wanted in ((inside, 0), (whole, 1)):
+        assert offsets_px.abs().max() == 0 and (brightness == wanted).all()
 
 
 def test_rims_lie_along_the_outline_of_a_photo_of_any_size() -> None:
@@ -57,6 +60,6 @@ def test_rims_lie_along_the_outline_of_a_photo_of_any_size() -> None:
     assert (small - means).abs().mean() < 0.02 * small.std()
 
 
-@pytest.mark.parametrize(("azimuth_deg", "share"), [(0, 0), (90, 0), (120, 0), (160, 1)])
+@pytest.mark.parametrize(("azimuth_deg", "share"), [(0, 0), (90, 0), (110, 0), (160, 1)])
 def test_a_light_ahead_or_aside_makes_no_rim(azimuth_deg: float, share: float) -> None:
     assert float(from_behind(azel_to_direction(azimuth_deg, 0))) == pytest.approx(share)
