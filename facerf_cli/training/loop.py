@@ -180,7 +180,6 @@ def drawn_batches(
         batch_size=None,
         sampler=steps,
         num_workers=workers,
-        multiprocessing_context="forkserver" if workers else None,  # torch does not survive a fork
         pin_memory=pinned,
         worker_init_fn=_leave_signals,
         generator=torch.Generator(),  # not the global one, which would differ in a resumed run
