@@ -51,6 +51,7 @@ def test_a_run_has_its_folder_to_itself(tmp_path: Path, monkeypatch: Patch) -> N
 def test_the_form_is_apart_from_the_preset(tmp_path: Path) -> None:
     write_small_dataset(tmp_path / "data", counts=(1, 1, 1), lights=30, crop_px=64)
     line = ["--dataset", str(tmp_path / "data"), "--texture-size", "32", "--steps", "1"]
+    line += ["--workers", "0"]  # forked from a process that has computed with torch, a worker may hang
     assert main(["train", "-o", str(tmp_path / "run"), "--preset", "tiny", "--form", "paper", *line]) == 0
     networks, metadata = load_networks(tmp_path / "run/last.safetensors", LAYOUT_VERSION)
     assert metadata["networks"]["reflectance"]["form"] == "paper" and "reflectance" in networks
