@@ -19,6 +19,7 @@ from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
+from facerf_cli.portrait.cloth import with_cloth
 from facerf_cli.portrait.confidence import matte_facts
 from facerf_cli.portrait.matte import shrunk, solid
 from facerf_cli.portrait.mesh import find_meshes, first_squares
@@ -101,9 +102,13 @@ def segment(
     """
     small = small_image(image_srgb)
     if matte is not None:
-        return within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
+        found = within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
+        return replace(
+            found, classes=with_cloth(found.classes, small, _head(landmarks_px, image_srgb, small))
+        )
     classes, shares, head = _look(people, image_srgb, landmarks_px, small, others)
-    found = segmentation_of(_within_share(classes, shares.person), image_srgb, landmarks_px)
+    classes = with_cloth(_within_share(classes, shares.person), small, head)
+    found = segmentation_of(classes, image_srgb, landmarks_px)
     places = _places((small.shape[1], small.shape[2]), found.matte.shape).astype(int)
     small_matte = found.matte[places[..., 1], places[..., 0]]
     return replace(found, facts=matte_facts(shares, 1 - classes[0].numpy(), small_matte, head))
@@ -113,8 +118,8 @@ def seen_classes(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
     """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
-    classes, shares, _ = _look(people, image_srgb, landmarks_px, small)
-    return _within_share(classes, shares.person)
+    classes, shares, head = _look(people, image_srgb, landmarks_px, small)
+    return with_cloth(_within_share(classes, shares.person), small, head)
 
 
 def _look(
@@ -126,12 +131,16 @@ def _look(
 ) -> tuple[Tensor, PersonShares, HeadPlace]:
     """Shares of the classes as the Parsing Network sees them, those of the person, and the head's place."""
     classes = parsed(people.parsing, image_srgb, landmarks_px, small)
-    scale = small.shape[2] / image_srgb.shape[1]
-    head = HeadPlace.of(landmarks_px * scale)
+    head = _head(landmarks_px, image_srgb, small)
     others = list(_neighbours(people, image_srgb, landmarks_px)) if others is None else others
-    around = [one.scaled(scale) for one in others]
+    around = [one.scaled(small.shape[2] / image_srgb.shape[1]) for one in others]
     shares = person_among(people, small.permute(1, 2, 0).numpy(), head, around, 1 - classes[0].numpy())
     return classes, shares, head
+
+
+def _head(landmarks_px: np.ndarray, image_srgb: np.ndarray, small: Tensor) -> HeadPlace:
+    """The head of landmarks [68, 2] of an image, in pixels of the small one."""
+    return HeadPlace.of(landmarks_px * (small.shape[2] / image_srgb.shape[1]))
 
 
 def _neighbours(
