@@ -65,6 +65,16 @@ class SeenPerson:
         """Radiance of the photo over that of the network's input."""
         return float(skin_exposure(self.image[None], self.classes[None]))
 
+    @property
+    def exposed(self) -> Tensor:
+        """The image [3, S, S] in the units of the network's input."""
+        return self.image / self.exposure
+
+    @property
+    def own_pixels(self) -> Tensor:
+        """1 where the person covers most of a pixel [S, S], else 0."""
+        return (1 - self.classes[0] > 0.5).float()
+
     def visibility(self, directions: Tensor) -> Tensor:
         """Share [L, s, s] of lights [L, 3] that reaches the person, at half the square's side."""
         return self.shadows.along(directions)
@@ -118,11 +128,12 @@ class SeenPerson:
     def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible, self.sides)
-        exposed = self.image[None] / self.exposure
         reached = reached_by(rig, visible, self.square.size_px)
         sides = torch.full((1, 1, 1, 1), self.sides)
         surface = surface_of(self.maps)
-        return PortraitInputs(exposed, self.classes[None], *surface, reached[None], own[None], sides)
+        return PortraitInputs(
+            self.exposed[None], self.classes[None], *surface, reached[None], own[None], sides
+        )
 
 
 def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:

@@ -66,8 +66,9 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     fine = wide.clone()
     fine[traced] = visibility(person.proxy, maps, traced, wide, ends, isinstance(light, PointLights))
     fine = F.avg_pool2d(fine[None], _PATTERN, 1, _PATTERN // 2, count_include_pad=False)[0]
-    own = (1 - person.classes[0] > 0.5).float()
-    return CastShadow(torch.stack([torch.lerp(wide, fine, share), wide]), inpaint(torch.stack(shades), own))
+    return CastShadow(
+        torch.stack([torch.lerp(wide, fine, share), wide]), inpaint(torch.stack(shades), person.own_pixels)
+    )
 
 
 def visibility(

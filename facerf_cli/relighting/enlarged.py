@@ -29,7 +29,6 @@ _GLOSS_PX = 0.8  # blur of highlights, which the network draws in pairs of pixel
 _HAIR = ("hair", "beard")
 _SOLID = ("glasses", "headwear", "garment", "hand")  # their edges are kept sharp
 _MOST_CHANGE = 2.0  # of the shading by normals that are finer than the maps
-_SURE = 0.5  # share of the person from which on a pixel of the maps is its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +68,15 @@ class Enlarged:
     def __init__(self, view: PortraitView, size_px: tuple[int, int]) -> None:
         self._view, self._size_px = view, size_px
         classes = view.person.classes
-        self.own = (1 - classes[0] > _SURE).float()
-        self._colours = colours_of(view.person.image / view.person.exposure)
+        self.own = view.person.own_pixels
+        self._colours = colours_of(view.person.exposed)
         hair, solid = (
             classes[[class_index(name) for name in names]].sum(0, keepdim=True) for names in (_HAIR, _SOLID)
         )
         self._trust = 1 - self.own * (1 - trust_in(self._colours, solid[0], hair[0]))
         kept = self._trust * (1 - classes[class_index("garment")])
         self._edges = EdgeFill.of(self._colours, self._trust, self.own, kept)
-        coloured = torch.cat([view.maps.albedo[0], view.person.image / view.person.exposure])
+        coloured = torch.cat([view.maps.albedo[0], view.person.exposed])
         coloured = self._filled(self._edges.filled(coloured))
         self._fixed_maps = torch.cat([coloured, classes[BARE].sum(0, keepdim=True)])
         self._own_light = None if view.own is None else self.ready(view.own)

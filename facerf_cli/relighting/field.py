@@ -98,7 +98,7 @@ class Field:
         texture = self.face.texture.detach()
         weight = (self.face.visible * region_mask("skin", texture.shape[-1]) > _VISIBLE).float()
         finer = contrast(texture, weight, _DETAIL_PX, NOISE * float(texture.mean()))
-        grey, colour = ((1 - slope(*pair)) * one for one, *pair in zip(finer, shown, kept, strict=True))
+        grey, colour = ((1 - _slope(*pair)) * one for one, *pair in zip(finer, shown, kept, strict=True))
         return replace(self, detail=lost_detail(grey, colour, weight, _DETAIL_PX))
 
     @property
@@ -135,7 +135,7 @@ class Field:
         return max(1, min(most, limit_bytes() // bytes_per_light))
 
 
-def slope(x: Tensor, y: Tensor) -> float:
+def _slope(x: Tensor, y: Tensor) -> float:
     """Return the slope of y as a multiple of x, within 0..1."""
     return float(((x * y).sum() / (x * x).sum().clamp_min(1e-9)).clamp(0, 1))
 

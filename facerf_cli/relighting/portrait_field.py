@@ -48,7 +48,6 @@ _SKIN = class_index("skin")
 _APART = 0.01  # blur of what is no skin, in sides: skin near to it keeps its make-up and its hair
 _CLOTH = ("garment", "headwear")
 _DETAIL_PX = 2.0  # standard deviation of the blur of detail, in pixels of the maps
-_MOSTLY = 0.5  # least share of the person in a pixel whose detail counts
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
 
@@ -160,9 +159,9 @@ class PortraitView:
     def _with_detail(self) -> "PortraitView":
         """Return the view with the detail of the photo that its albedo has lost (`detail.py`)."""
         person, hair = self.person, self.person.classes[list(HAIRY)].sum(0)
-        weight = (1 - person.classes[0] > _MOSTLY).float()
+        weight = person.own_pixels
         floor = MEAN_RADIANCE * (NOISE + (FLOOR - NOISE) * hair)
-        images = person.image / person.exposure, self.maps.albedo[0]
+        images = person.exposed, self.maps.albedo[0]
         shown, kept = (contrast(image, weight, _DETAIL_PX, floor) for image in images)
         grey, colour = (one - other for one, other in zip(shown, kept, strict=True))
         return self._with_albedo(lost_detail(grey, colour, weight, _DETAIL_PX, hair))

@@ -513,10 +513,10 @@ def _steadied_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int)
             found = F.normalize(found, dim=0)
         means[name] = (found.exp() if name == "gain" else found)[None]
     person = near[middle][0]
-    albedo = person.image[None] / person.exposure * means["gain"] + means["bias"]
+    albedo = person.exposed[None] * means["gain"] + means["bias"]
     return PortraitMaps(albedo=albedo, **means)
 
 
 def _encoded(person: SeenPerson) -> Tensor:
     """The person's image [3, S, S] for comparison, display-encoded in 0..1; the skin is about middle grey."""
-    return (person.image / person.exposure / 2).clamp(0, 1).pow(1 / 2.2)
+    return (person.exposed / 2).clamp(0, 1).pow(1 / 2.2)

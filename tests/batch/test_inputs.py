@@ -37,16 +37,6 @@ from tests.kinds import Log, Patch, Said
 from tests.refusals import refused
 
 
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    for name in ("b.jpg", "a.png", "x/a.jpg", "x/c.png", "x/note.txt", ".hidden/c.jpg", "x/.d.jpg", "Z.EXR"):
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(name.encode())
-    return folder
-
-
 def names(tmp_path: Path, *inputs: Path, pattern: str | None = None) -> list[str]:
     chosen = NamePattern.parse(pattern, "--name") if pattern else None
     items = collect_items([str(path) for path in inputs], tmp_path / "out", PHOTO_SUFFIXES, chosen)

@@ -30,16 +30,6 @@ from tests.processes import wait_until
 from tests.refusals import refused
 
 
-@pytest.fixture
-def photos(tmp_path: Path) -> Path:
-    folder = tmp_path / "photos"
-    for name in ("b.jpg", "a.png", "x/a.jpg", "x/c.png", "x/note.txt", ".hidden/c.jpg", "x/.d.jpg", "Z.EXR"):
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(name.encode())
-    return folder
-
-
 def test_a_name_that_is_not_utf8_is_in_the_report(tmp_path: Path) -> None:
     photo = tmp_path / os.fsdecode(b"a\xff.png")
     photo.write_bytes(b"bad")
