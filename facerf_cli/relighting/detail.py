@@ -10,9 +10,9 @@ strong contrast is the edge of a shadow or a highlight, which the network has re
 
 `finer_detail` multiplies the relit image. With the photo P and the same photo S at the resolution of the maps
 it is (P + f) / (S + f) per channel; f is a small floor that keeps noise in dark pixels low. On skin, pixels
-brighter than their surroundings are mostly highlights of the photo's light, and their factor is limited.
-Where skin is brighter and whiter than the rest, it glares (Shafer, *Using color to separate reflection
-components*, 1985), and luminance detail fades.
+brighter than their surroundings are mostly highlights of the photo's light, and far darker ones belong to the
+other side of an edge, as at a collar: their factors are limited. Where skin is brighter and whiter than the
+rest, it glares (Shafer, *Using color to separate reflection components*, 1985), and luminance detail fades.
 """
 
 from dataclasses import dataclass
@@ -31,10 +31,10 @@ from facerf_cli.raster.texture import blurred_within, inpaint
 
 NOISE = 0.03  # radiance of skin in the maps below which colour is noise, as a fraction of its mean
 FLOOR = 0.01  # f, and the same limit in hair
-_BRIGHTEST = 0.25  # limit of the logarithm of luminance factors on skin
+_BRIGHTEST, _DARKEST = 0.25, 1.0  # limits of the logarithm of luminance factors on skin
 _MOST_COLOUR = 1.5  # limit of a channel's factor over that of luminance
-_GLARE = 1.5  # loss of luminance detail per fraction of white in glare
-_GLARING = (1.0, 1.6)  # brightness over the mean of the skin at which glare begins, and is certain
+_GLARE = 2.5  # loss of luminance detail per fraction of white in glare
+_GLARING = (0.9, 1.4)  # brightness over the mean of the skin at which glare begins, and is certain
 _PALE = 0.003  # keeps the fraction of white near 0 if the skin itself is nearly white
 _STRONG = 0.2  # standard deviation of log luminance at which lost luminance is restored to 1 / e
 _MOST_LOST = 0.7  # limit of the logarithm of lost detail
@@ -84,7 +84,8 @@ def finer_detail(pixels: Tensor, coarse: Tensor, skin: Tensor, typical: Tensor) 
     weights = torch.from_numpy(luminance(np.eye(3, dtype=np.float32)))
     grey = (pixels @ weights / (coarse @ weights))[..., None]
     logs = grey.log()
-    limited = torch.minimum(logs, _BRIGHTEST * (logs / _BRIGHTEST).tanh()) * (1 - _glare(coarse, typical))
+    limited = torch.minimum(logs, _BRIGHTEST * (logs / _BRIGHTEST).tanh()).clamp_min(-_DARKEST)
+    limited = limited * (1 - _glare(coarse, typical))
     colour = (pixels / coarse / grey).clamp(1 / _MOST_COLOUR, _MOST_COLOUR)
     return torch.lerp(logs, limited, skin).exp() * colour
 

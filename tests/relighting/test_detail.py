@@ -58,6 +58,11 @@ def test_freckles_stay_and_highlights_of_the_old_light_are_limited() -> None:
     torch.testing.assert_close(factor(3 * SKIN, skin=0.0) * SKIN, 3 * SKIN, rtol=0.03, atol=0)
 
 
+def test_shade_beyond_an_edge_draws_no_dark_line_on_skin() -> None:
+    shaded = 0.02 * SKIN
+    assert (factor(shaded) > 0.3).all() and (factor(shaded, skin=0.0) < 0.05).all()
+
+
 def test_noise_of_black_pixels_gets_no_colour() -> None:
     black = 0.002 * SKIN
     noisy = black * torch.tensor([3.0, 0.1, 3.0])
