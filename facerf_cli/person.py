@@ -3,28 +3,23 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.checkpoint import checkpoint
 
 from facerf_cli import pipeline
 from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Reflectance
-from facerf_cli.errors import InputError, UsageError
+from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import check_landmarks
-from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays, fit_to_arrays
+from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.landmarks import to_display
-from facerf_cli.face.morphable import floats, read_npz
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import photo_camera
-from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.texts import require_regular
-from facerf_cli.image.strips import covering, in_strips, strips
+from facerf_cli.image.strips import covering, in_strips
 from facerf_cli.light.envmap import Backdrop, check_envmap
 from facerf_cli.light.light import (
     Array,
@@ -87,14 +82,10 @@ def find_faces(
     return pipeline.find_for(models.networks.people, chosen, _pixels_of(name, photo), name, which)
 
 
-@overload
-def fit(models: Models, photo: Array, *choices: Any, **more: Any) -> "Person": ...
-@overload
-def fit(models: Models, photo: Sequence[Array], *choices: Any, **more: Any) -> "list[Person]": ...
 @torch.no_grad()
 def fit(
     models: Models,
-    photo: Array | Sequence[Array],
+    photo: Array,
     landmarks_px: Any = None,
     geometry: Geometry | None = None,
     reflectance: RelightKind = "portrait",
@@ -106,12 +97,12 @@ def fit(
     head: Head | None = None,
     steady: SteadyFrame | None = None,
     normals: Any = None,
-) -> "Person | list[Person]":
+) -> "Person":
     """Fit a person of a photo, by default that with the largest face, once for all lights.
 
     Args:
         models: The networks and the face model, from `load_models`.
-        photo: Scene-linear [H, W, 3], which is not copied; a list of photos gives a list of people.
+        photo: Scene-linear [H, W, 3], which is not copied.
         landmarks_px: The face's 68 landmarks [68, 2] in the photo's pixels, in place of the detector's.
         geometry: "landmarks", or "network": the Geometry Network regresses the head, without landmarks; by
             default as the networks were trained.
@@ -129,8 +120,8 @@ def fit(
             field: camera space, x to the right, y up and z toward the camera, or y down and z away; 0 where
             there are none.
 
-    Of a list of photos landmarks, mattes and normals are lists, too. Raises InputError where no face is
-    found, landmarks clearly lie off the face, the fit fails, or normals are not those of the face.
+    Raises InputError where no face is found, landmarks clearly lie off the face, the fit fails, or normals
+    are not those of the face.
     """
     one_of(RelightKind, "reflectance", reflectance)
     if white is not None:
@@ -143,15 +134,6 @@ def fit(
         raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     if landmarks_px is not None and geometry == "network":
         raise UsageError("geometry: 'network' uses no landmarks; leave one out")
-    if isinstance(photo, Sequence):
-        each = ([None] * len(photo) if given is None else given for given in (landmarks_px, matte, normals))
-        people = []
-        for number, (one, points, share, surface) in enumerate(zip(photo, *each, strict=True)):
-            if points is None:
-                (face,) = find_faces(models, one, "largest", geometry, f"photo {number}")
-            choices = geometry, reflectance, network_alone, share, texture_side, white
-            people.append(fit(models, one, points, *choices, face, normals=surface))
-        return people
     pixels = _pixels_of("photo", photo)
     if matte is not None:
         matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
@@ -288,8 +270,8 @@ class Person(PersonOrGroup):
             room: Share of the lights' sum that a white room sends back; of maps none.
             alone: The face alone, with alpha [H, W, 4].
 
-        A light or pose of tensors gives tensors, through which gradients flow (docs/python.md); so does
-        a texture of which a gradient is wanted.
+        A light or pose of tensors gives tensors. Gradients flow through the face alone (docs/python.md);
+        UsageError says so where one through an image in the photo is wanted.
         """
         if not alone and pose is None:
             return self._group.relight(light, background, layers, room)
@@ -477,51 +459,6 @@ class Person(PersonOrGroup):
         whole = replace(found, field=field) if isinstance(found, PortraitField) else field
         return replace(self, reflectance=whole)
 
-    def save(self, path: str | Path) -> None:
-        """Write photo, fit and texture as .npz; `Person.load` reads the rest from the photo."""
-        arrays: dict[str, Any] = {"photo": self.photo, "cropped": self.head.cropped, "kind": self.kind}
-        maps = {name: getattr(self._face, name) for name in FaceTexture.__dataclass_fields__}
-        arrays |= {name: tensor.detach().numpy() for name, tensor in maps.items()}
-        arrays |= {
-            "network_alone": self.network_alone,
-            "white": self.white or "",
-            **fit_to_arrays(self.head.fit),
-        }
-        arrays |= {} if self.given_matte is None else {"matte": self.given_matte}
-        if isinstance(self.reflectance, PortraitField) and self.reflectance.person.normals is not None:
-            arrays["given_normals"] = self.reflectance.person.normals
-        with atomic_path(Path(path)) as temporary, temporary.open("wb") as file:
-            np.savez(file, **arrays)
-
-    @staticmethod
-    def load(models: Models, path: str | Path) -> "Person":
-        """Read what `save` wrote; the networks of the models see the photo again, the fit stays.
-
-        Raises InputError for any other file, and for a fit of another face model.
-        """
-        require_regular(Path(path), "give one that Person.save wrote")
-        try:
-            arrays = read_npz(Path(path))
-            fitted, side = fit_from_arrays(arrays), min(arrays["visible"].shape[-1], LARGEST_TEXTURE)
-            maps = {"texture": (3, side, side), "visible": (side, side), "normals": (3, side, side)}
-            face = FaceTexture(**{name: floats(arrays, name, shape) for name, shape in maps.items()})
-            photo = linear_pixels("photo", arrays["photo"]).numpy()
-            cropped = floats(arrays, "cropped", (fitted.crop.size_px, fitted.crop.size_px, 3)).numpy()
-            matte = floats(arrays, "matte", photo.shape[:2]).numpy() if "matte" in arrays else None
-            normals = floats(arrays, "given_normals", photo.shape) if "given_normals" in arrays else None
-            fitted.vertices_camera(models.face)
-            one_of(RelightKind, "kind", kind := str(arrays["kind"]))
-            alone = bool(arrays["network_alone"])
-            white = str(arrays.get("white", "photo")) or None
-            if white is not None:
-                one_of(White, "white", white)
-        except (ValueError, TypeError, LookupError, OverflowError) as error:
-            said = f"{path}: not a person that facerf wrote ({error}); fit the photo again"
-            raise InputError(said) from None
-        head = Head(cropped, fitted, face)
-        choices: dict[str, Any] = {"reflectance": kind, "network_alone": alone, "white": white, "head": head}
-        return fit(models, photo, matte=matte, normals=normals, **choices)
-
     def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
         """The face alone under each light; gradients reach all that it is made of."""
         fit = self.head.fit
@@ -553,23 +490,12 @@ class Person(PersonOrGroup):
         """The face as it is relit: the photo's, or that of `with_texture`."""
         return self._field.face if isinstance(self._field, Field) else self.head.face
 
-    def _has_gradients_in_photo(self) -> bool:
-        """If gradients reach texture or Reflectance Network; UsageError where others are wanted."""
-        field, portrait = self._field, isinstance(self.reflectance, PortraitField)
+    @property
+    def _has_gradients(self) -> bool:
+        """If a gradient of the texture or of a network is wanted."""
+        field, portrait = self._field, self.models.networks.portrait
         wanted = isinstance(field, Field) and field.has_gradients
-        if wanted and not portrait:
-            raise UsageError(
-                "texture and network: have no gradient in the photo with reflectance='field'; "
-                "give alone=True, or detach them"
-            )
-        if portrait and torch.is_grad_enabled():
-            network: Any = self.models.networks.portrait
-            if any(values.requires_grad for values in network.parameters()):
-                raise UsageError(
-                    "Portrait Network: has no gradient in the photo; take its maps' (docs/python.md), or "
-                    "freeze it by requires_grad_(False)"
-                )
-        return wanted
+        return wanted or (self.kind == "portrait" and any(one.requires_grad for one in portrait.parameters()))
 
     @cached_property
     def _group(self) -> "Group":
@@ -616,8 +542,9 @@ class Group(PersonOrGroup):
         if not kinds <= {"portrait", "field"} and any(one.own_rgb is not None for one in lights):
             raise UsageError("Light.own(): is of the whole photo; leave out baselines")
         _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
-        textures = [person._wanted for person in self.people]
-        return self._answer(light, lights, textures, self._photos(lights, background, layers), layers)
+        _refuse_gradients(lights, self.people)
+        with torch.no_grad():
+            return self._answer(light, lights, [], self._photos(lights, background, layers), layers)
 
     @property
     def matte(self) -> Array:
@@ -648,7 +575,7 @@ class Group(PersonOrGroup):
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
     ) -> Iterator[Any]:
-        """The photo under each light, as dicts of arrays; gradients reach weights, textures, networks."""
+        """The photo under each light, as dicts of arrays."""
         people, behind = self.composed_once, None
         if not isinstance(background, str):
             pixels = np.array(background)[None, None] if isinstance(background, tuple) else background
@@ -657,29 +584,10 @@ class Group(PersonOrGroup):
             one_of(Literal["photo", "none"], "background", background)
         if straight := isinstance(background, str) and background == "none":
             people = replace(people, background="none")
-        of_faces = any([person._has_gradients_in_photo() for person in self.people])
         for part in batches(len(lights), people.nbytes):
-            some = sums_of(lights[part])
-            if some.directions.requires_grad:
-                raise UsageError("directions: have no gradient in the photo; give alone=True, or detach them")
-            with torch.set_grad_enabled(of_faces):  # of weights `_OfWeights` has those
-                relit = list(people.relit(replace(some, weights=some.weights.detach()) if of_faces else some))
-            each = Lights.each(some.directions, some.keys)
-            for weights, own, one in zip(some.weights, some.owns, relit, strict=True):
-                with torch.no_grad():
-                    arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
+            for one in people.relit(sums_of(lights[part])):
+                arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
                 image = torch.from_numpy(arrays.pop("rgb"))
-                if weights.requires_grad:
-                    image = _OfWeights.apply(weights, each, people, image)  # type: ignore[no-untyped-call]
-                if own is not None and own.requires_grad:
-                    layer = people.own_image() if straight else people.own_layer()
-                    image = image + (own - own.detach()) * torch.from_numpy(layer)
-                if of_faces:
-                    light, every = people.ready(one), strips(people.size_px)
-                    faces = torch.cat(
-                        [checkpoint(people.of_faces, light, rows, use_reentrant=False) for rows in every]
-                    )
-                    image = image + (faces - faces.detach())
                 if straight:
                     image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
                 found = {"person.A": people.matte, **arrays} if layers else arrays
@@ -693,26 +601,6 @@ def _one_by_one(people: PeopleInPhoto, each: Lights) -> Iterator[Any]:
             yield from people.relit(each[first : first + _LIGHTS_AT_ONCE])
 
 
-class _OfWeights(torch.autograd.Function):
-    """An image [H, W, 3] as a function of the weights [L, 3] of lights [L, 3], in which it is linear."""
-
-    @staticmethod
-    def forward(ctx: Any, weights: Tensor, each: Lights, people: PeopleInPhoto, image: Tensor) -> Tensor:
-        """The image, which is rendered already."""
-        ctx.each, ctx.people = each, people
-        return image
-
-    @staticmethod
-    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-        """Sum the gradient [H, W, 3] over the image of each light."""
-        people: PeopleInPhoto = ctx.people
-        sums = []
-        for relit in _one_by_one(people, ctx.each):
-            image = people.light_layer(relit) if people.keeps_photo else people.image(relit).pixels
-            sums.append((slopes[0].cpu() * torch.from_numpy(image)).sum((0, 1)))
-        return torch.stack(sums), None, None, None
-
-
 def _lights_of(light: Any, room: float) -> list[Light]:
     return [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
 
@@ -721,6 +609,17 @@ def _check_layers(layers: Sequence[str], known: Sequence[str]) -> None:
     """Raise ValueError for what is no list of known layers."""
     if isinstance(layers, str) or not set(layers) <= set(known):
         raise ValueError(f"layers is {layers!r}, not a list of some of {', '.join(dict.fromkeys(known))}")
+
+
+def _refuse_gradients(lights: Sequence[Light], people: Sequence[Person]) -> None:
+    """Raise UsageError where a gradient through an image in the photo is wanted."""
+    arrays = (array for one in lights for array in (one.directions, one.weights, one.own_rgb))
+    wanted = any(isinstance(array, Tensor) and array.requires_grad for array in arrays)
+    if torch.is_grad_enabled() and (wanted or any(person._has_gradients for person in people)):
+        raise UsageError(
+            "gradients: do not go through images in the photo; give alone=True, weigh the images of olat, or "
+            "use torch.no_grad()"
+        )
 
 
 def _gradients(*given: Any) -> torch.set_grad_enabled:

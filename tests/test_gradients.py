@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,7 @@ from torch import Tensor
 
 import facerf_cli as facerf
 from facerf_cli.errors import UsageError
-from facerf_cli.image.strips import strips
-from facerf_cli.light.light import sums_of
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.portrait_field import PortraitField, maps_of
-from facerf_cli.relighting.relightable import Relit
 from tests import astronaut
 from tests.refusals import refused
 
@@ -72,10 +67,7 @@ def compared(function: Loss, at: Tensor, step: float, along: Tensor | None = Non
     return float((at.grad * along).sum()), float(difference) / (2 * step)
 
 
-@pytest.mark.parametrize(
-    "shown",
-    [{"alone": True}, {"pose": (5, 3, 1)}, {}, {"background": "none"}, {"background": (0.1, 0.2, 0.3)}],
-)
+@pytest.mark.parametrize("shown", [{"alone": True}, {"pose": (5, 3, 1)}])
 def test_of_the_weights_of_a_light(person: facerf.Person, light: facerf.Light, shown: dict[str, Any]) -> None:
     directions, weights = light.directions, torch.as_tensor(light.weights)
     rows = torch.linspace(-1, 2, astronaut.photo().shape[0], dtype=torch.float64)[:, None, None]
@@ -92,7 +84,7 @@ def test_of_the_weights_of_lights_in_a_list_and_of_the_pixels_of_a_map(
 ) -> None:
     def both(weights: Tensor) -> Tensor:
         one, two = facerf.Light(light.directions, weights), facerf.Light.single(40, 10)
-        first, second = person.relight([one, two + 2 * one])
+        first, second = person.relight([one, two + 2 * one], alone=True)
         return loss(first) + 3 * loss(second)
 
     found, expected = compared(both, torch.as_tensor(light.weights), 0.1)
@@ -128,53 +120,6 @@ def test_of_the_texture(person: facerf.Person, light: facerf.Light, loss: Loss, 
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
-@pytest.mark.parametrize(
-    "shown",
-    [
-        {"background": "none"},
-        pytest.param({}, marks=pytest.mark.slow),
-        pytest.param({"background": (0.1, 0.2, 0.3)}, marks=pytest.mark.slow),
-    ],
-)
-def test_of_texture_and_weights_in_the_photo(person: facerf.Person, shown: dict[str, Any]) -> None:
-    texture = torch.from_numpy(person.texture)
-    rows = torch.linspace(-1, 2, astronaut.photo().shape[0], dtype=torch.float64)[:, None, None]
-    weights = torch.tensor([[2.0, 1.5, 1.0], [0.5, 0.8, 1.2]])
-
-    def lit(texture: Tensor, weights: Tensor = weights) -> Tensor:
-        both = replace(facerf.Light.single(60, 30) + facerf.Light.single(-50, 10), weights=weights)
-        return (person.with_texture(texture).relight(both, **shown)[..., :3] * rows).sum()
-
-    found, expected = compared(lit, texture, 0.1, texture)
-    assert abs(expected) > 1 and found == pytest.approx(expected, rel=1e-3)
-    textured = texture.clone().requires_grad_()
-    found, expected = compared(lambda weights: lit(textured, weights), weights, 0.1)
-    assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
-    assert textured.grad is not None
-
-
-def test_of_relit_textures_in_the_photo(person: facerf.Person) -> None:
-    """Noise, which grain and the edges of shadows change; the photo is linear in it."""
-    people = person._group.composed_once
-    keys = facerf.Light.single(60, 30), facerf.Light.single(-50, 10)
-    (one,) = next(people.relit(sums_of([keys[0] + keys[1]])))
-    generator = torch.Generator().manual_seed(2)
-    noise, marks = (torch.randn(size, generator=generator) for size in ((3, 64, 64), (*people.size_px, 3)))
-
-    def moved(one: Relit, step: Any) -> Relit:
-        assert one.mouth is not None
-        alone = tuple((moved(key, step), shadow) for key, shadow in one.keys)
-        return replace(one, texture=one.texture + step * noise, mouth=one.mouth + step * noise, keys=alone)
-
-    step = torch.zeros((), requires_grad=True)
-    light = people.ready([moved(one, step)])
-    faces = torch.cat([people.of_faces(light, rows) for rows in strips(people.size_px)])
-    (found,) = torch.autograd.grad((faces.double() * marks).sum(), step)
-    less, more = (torch.from_numpy(people.image([moved(one, end)]).pixels) for end in (-1, 1))
-    expected = float(((more - less).double() * marks).sum() / 2)
-    assert abs(expected) > 1 and float(found) == pytest.approx(expected, rel=LINEAR)
-
-
 def test_another_texture_is_seen_in_the_photo(person: facerf.Person) -> None:
     key = facerf.Light.single(60, 30)
     face = person.relight(key, alone=True)[..., 3] > 0.9
@@ -195,7 +140,7 @@ def test_black_texels_do_not_lead_the_gradient(person: facerf.Person, light: fac
     assert squares[20:24, 20:24].sum() < 0.5 * squares.sum()
 
 
-def test_a_texture_keeps_its_gradient_under_lights_of_numpy_or_is_refused(
+def test_a_texture_keeps_its_gradient_under_lights_of_numpy(
     person: facerf.Person, light: facerf.Light
 ) -> None:
     texture = torch.from_numpy(person.texture).requires_grad_()
@@ -203,10 +148,29 @@ def test_a_texture_keeps_its_gradient_under_lights_of_numpy_or_is_refused(
     person.with_texture(texture).relight(plain, alone=True).sum().backward()
     assert texture.grad is not None and texture.grad.abs().sum() > 0
     assert person.with_texture(texture).uv_olat(plain.directions).requires_grad
-    assert person.with_texture(texture).relight(plain).requires_grad
     assert isinstance(person.with_texture(texture.detach()).relight(plain), np.ndarray)
-    face = facerf.fit(person.models, astronaut.photo(), reflectance="field", texture_side=64)
-    refused(UsageError, "texture and network: have no gradient in", face.with_texture(texture).relight, plain)
+
+
+def test_images_in_the_photo_have_no_gradients_and_say_so(
+    models: Models, person: facerf.Person, light: facerf.Light
+) -> None:
+    directions, weights = (torch.as_tensor(one).clone() for one in (light.directions, light.weights))
+    plain = facerf.Light.single(60, 30)
+    each = {
+        "weights": (person, facerf.Light(directions, weights.clone().requires_grad_())),
+        "directions": (person, facerf.Light(directions.clone().requires_grad_(), weights)),
+        "own": (person, facerf.Light.own() * torch.ones((), requires_grad=True)),
+        "texture": (person.with_texture(torch.from_numpy(person.texture).requires_grad_()), plain),
+    }
+    for one, lit in each.values():
+        refused(UsageError, "do not go through images in the photo; give alone=True", one.relight, lit)
+        with torch.no_grad():
+            assert not torch.as_tensor(one.relight(lit)).requires_grad
+    for network in (models.networks.reflectance, models.networks.portrait):
+        weight = next(network.parameters()).requires_grad_(True)
+        refused(UsageError, "do not go through images in the photo", person.relight, plain)
+        weight.requires_grad_(False)
+    assert isinstance(person.relight(facerf.Light(directions, weights)), Tensor)
 
 
 def test_of_the_directions_of_a_light(person: facerf.Person, light: facerf.Light, loss: Loss) -> None:
@@ -217,8 +181,6 @@ def test_of_the_directions_of_a_light(person: facerf.Person, light: facerf.Light
 
     found, expected = compared(lit, directions, 0.02)
     assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
-    with pytest.raises(UsageError, match="directions: have no gradient in the photo"):
-        person.relight(facerf.Light(directions.clone().requires_grad_(), light.weights))
 
 
 def slopes(value: Callable[[], Tensor], weight: Tensor, step: float) -> tuple[float, float]:
@@ -245,50 +207,19 @@ def test_of_the_weights_of_the_reflectance_network(
         assert gradient.abs().sum() > 0
     first.requires_grad_(False)
     weight = network.head.weight.requires_grad_(True)
-    each = ({"alone": True}, {}, {"background": "none"})
-    pairs = [slopes(lambda x=x: loss(person.relight(light, **x)), weight, 0.03) for x in each]
+    found, expected = slopes(lambda: loss(person.relight(light, alone=True)), weight, 0.03)
     weight.requires_grad_(False)
-    for found, expected in pairs:
-        assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
 
 
-def test_values_without_gradients_stay_so(person: facerf.Person, light: facerf.Light, tmp_path: Path) -> None:
-    """Layers and files."""
+def test_layers_and_the_mesh_have_no_gradients(person: facerf.Person, light: facerf.Light) -> None:
     weights = torch.as_tensor(light.weights).clone().requires_grad_()
     texture = torch.from_numpy(person.texture).requires_grad_()
     pose = POSE.clone().requires_grad_()
     lit = facerf.Light(light.directions, weights)
     turned = person.relight(lit, pose=pose, layers=["normal", "depth"])
     assert turned["image"].requires_grad and not turned["normal"].requires_grad
-    textured = person.with_texture(texture)
-    with torch.no_grad():
-        assert not textured.relight(lit, layers=["albedo"])["image"].requires_grad
-    textured.save(tmp_path / "person.npz")
-    assert textured.mesh.visual.material.image.size == (64, 64)
-
-
-def test_of_the_maps_of_the_portrait(models: Models, person: facerf.Person, light: facerf.Light) -> None:
-    assert isinstance(person.reflectance, PortraitField)
-    view, portrait = person.reflectance.views[0], models.networks.portrait
-    directions, weights = torch.as_tensor(light.directions), torch.as_tensor(light.weights)
-    marks = F.interpolate(torch.rand(1, 3, 8, 8), view.person.image.shape[1:], mode="bicubic")
-
-    def shown(weights: Tensor) -> Tensor:
-        return (view.relit(view.lit(directions, weights[None])).double() * marks).sum()
-
-    found, expected = compared(shown, weights, 0.1)
-    assert abs(expected) > 1 and found == pytest.approx(expected, rel=LINEAR)
-
-    weight = next(portrait.parameters()).requires_grad_(True)
-    refused(UsageError, "Portrait Network: has no gradient in the photo", person.relight, light)
-
-    def seen() -> Tensor:
-        again = replace(view, maps=maps_of(portrait, view.person))
-        return (again.relit(again.lit(directions, weights[None])).double() * marks).sum()
-
-    found, expected = slopes(seen, weight, 0.01)
-    weight.requires_grad_(False)
-    assert abs(expected) > 1 and found == pytest.approx(expected, rel=SMOOTH)
+    assert person.with_texture(texture).mesh.visual.material.image.size == (64, 64)
 
 
 def test_a_light_times_a_tensor_has_gradients() -> None:

@@ -192,56 +192,6 @@ def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pyt
         one.relight(KEY, pose=(10, 0, 0))
 
 
-def test_a_list_of_photos_gives_a_list_of_people(person: facerf.Person) -> None:
-    photos = [astronaut.photo(), astronaut.photo()[:, ::-1]]
-    first, second = facerf.fit(
-        astronaut.models(), photos, [person.landmarks, None], reflectance="field", texture_side=64
-    )
-    mirrored = astronaut.photo().shape[1] - second.landmarks[30, 0]
-    assert abs(mirrored - first.landmarks[30, 0]) < 3
-    with pytest.raises(InputError, match="photo 1: no face found"):
-        facerf.fit(astronaut.models(), [photos[0], np.full_like(photos[0], 0.3)])
-
-
-def test_a_person_comes_back_from_its_file_whose_keys_are_in_the_docs(
-    person: facerf.Person, tmp_path: Path
-) -> None:
-    matte = np.zeros(astronaut.photo().shape[:2], np.float32)
-    matte[:350] = 1
-    kept = replace(person, given_matte=matte)
-    kept.save(tmp_path / "person.npz")
-    again = facerf.Person.load(astronaut.models(), tmp_path / "person.npz")
-    np.testing.assert_allclose(again.relight(KEY), kept.relight(KEY), atol=1e-5)
-    np.testing.assert_array_equal(again.matte, matte)
-    replace(person, given_matte=person.share).save(tmp_path / "person.npz")
-    documented = set(re.findall(r"`(\w+)`", (ROOT / "docs/formats.md").read_text()))
-    with np.load(tmp_path / "person.npz", allow_pickle=False) as file:
-        assert set(file) <= documented
-
-
-@pytest.mark.parametrize(
-    ("name", "array"),
-    [
-        ("visible", np.ones((8, 8))),
-        ("photo", np.ones((20, 20))),
-        ("photo", np.array([{}], object)),
-        ("rotation", np.eye(2)),
-        ("kind", "nonsense"),
-        ("model", "another"),
-        ("matte", np.ones((3, 3))),
-        ("texture", np.full((3, 64, 64), np.nan)),
-    ],
-)
-def test_a_file_that_is_no_person_is_refused(
-    person: facerf.Person, tmp_path: Path, name: str, array: Any
-) -> None:
-    person.save(tmp_path / "person.npz")
-    with np.load(tmp_path / "person.npz") as file:
-        arrays = dict(file) | {name: array}
-    np.savez(tmp_path / "other.npz", **arrays)
-    refused(InputError, "other.npz", facerf.Person.load, astronaut.models(), tmp_path / "other.npz")
-
-
 def test_a_given_matte_says_who_is_relit() -> None:
     photo = astronaut.photo()
     matte = np.zeros(photo.shape[:2], np.float32)
@@ -266,7 +216,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
         person.relight(KEY, layers=["albedo"])
     refused(ValueError, "texture_side is 7, not 16 to", facerf.fit, models, photo, texture_side=7)
     refused(ValueError, "pixels have shape ... 4, 4", facerf.write_image, "x.png", np.ones((4, 4)))
-    refused(InputError, "give one that Person.save wrote", facerf.Person.load, models, "nowhere.npz")
+    refused(TypeError, "photo is list, not an array", facerf.fit, models, [photo, photo])
     refused(TypeError, "light has shape ... not a facerf.Light", person.relight, np.array([60.0, 30.0, 1.0]))
     refused(TypeError, "light is tuple, not a facerf", person.relight, [(60, 30)])
     refused(ValueError, "background has shape ... 4, 4", person.relight, KEY, background=np.ones((4, 4)))

@@ -4,14 +4,12 @@ Before the photo's own background the image is the photo, without its people as 
 people over it. So edges come back exactly, and layers of lights add up.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import in_strips
@@ -98,22 +96,7 @@ class PeopleInPhoto(Relightable):
 
     def own_layer(self) -> np.ndarray:
         """The people [H, W, 3] as photographed, over black."""
-        return in_strips(partial(self._as_photographed, over=_over), *self.size_px)["own"]
-
-    def own_image(self) -> np.ndarray:
-        """The people [H, W, 3] as photographed, not multiplied by alpha."""
-        return in_strips(partial(self._as_photographed, over=_straight), *self.size_px)["own"]
-
-    def of_faces(self, relit: Sequence[Any], rows: slice) -> Tensor:
-        """The part [h, W, 3] of rows of the image that the faces' textures give, with gradients."""
-        present, over = self._present(rows), _over if self.keeps_photo else _straight
-        parts = []
-        for one in present:
-            if not isinstance(one.person, PersonInPhoto):
-                continue
-            share = over(present, [np.full(1, other is one, np.float32) for other in present])
-            parts.append(one.person.of_face(relit[one.number], rows) * torch.from_numpy(share))
-        return torch.stack(parts).sum(0)
+        return in_strips(self._as_photographed, *self.size_px)["own"]
 
     def _present(self, rows: slice) -> list[_Present]:
         """The people in some rows: the first, and of a crowd few others."""
@@ -127,9 +110,9 @@ class PeopleInPhoto(Relightable):
     def _shares(self, rows: slice) -> dict[str, np.ndarray]:
         return {"alpha": _alpha(self._present(rows))[..., 0]}
 
-    def _as_photographed(self, rows: slice, over: Callable[..., np.ndarray]) -> dict[str, np.ndarray]:
+    def _as_photographed(self, rows: slice) -> dict[str, np.ndarray]:
         present = self._present(rows)
-        return {"own": over(present, _own(present, rows))}
+        return {"own": _over(present, _own(present, rows))}
 
     def _image(
         self, request: RenderRequest, present: Sequence[_Present], seen: Sequence[Any], rows: slice

@@ -200,23 +200,6 @@ class PersonInPhoto:
             pixels[:, part] += image[:, part] * change
         return self._eyes.lit(self._spread(pixels, among), relit.mirrored, rows)
 
-    def of_face(self, relit: PersonLight, rows: slice) -> Tensor:
-        """The part [h, W, 3] of rows of the photo that the face's textures give, with gradients.
-
-        `pixels` are this part, which is linear in the textures, and others that do not depend on them.
-        """
-        seen, found = self.observe(rows), torch.zeros(rows.stop - rows.start, self.size_px[1], 3)
-        if seen.detail is None:
-            return found
-        columns = seen.columns
-        by_maps = self._face_by_maps(relit, seen)
-        found[:, columns] = by_maps
-        for alone, part, change in self._shadows(relit, rows, columns):
-            image = by_maps if alone is None else self._face_by_maps(alone, seen)
-            found[:, columns][:, part] += image[:, part] * torch.from_numpy(change)
-        ones, nothing = np.ones(found.shape, np.float32), [np.zeros_like(image) for image in relit.mirrored]
-        return found * torch.from_numpy(self._eyes.lit(ones, nothing, rows))
-
     def _shadows(
         self, relit: PersonLight, rows: slice, among: slice
     ) -> Iterator[tuple[PersonLight | None, slice, np.ndarray]]:
@@ -230,28 +213,6 @@ class PersonInPhoto:
             if change.any():
                 yield alone, _within(columns, among), change[..., None]
 
-    def _face_by_maps(self, relit: PersonLight, seen: PersonRows) -> Tensor:
-        """The part [h, w, 3] of `_by_maps` that the face's textures give, with gradients."""
-        person = torch.zeros(seen.rows.stop - seen.rows.start, seen.columns.stop - seen.columns.start, 3)
-        at, share, detail = self._face_at(relit, seen)
-        person[at] = torch.from_numpy(share) * detail
-        if self._field.person.normals is not None:
-            person = person * torch.from_numpy(self._change_by_normals(relit, seen))
-        return person
-
-    def _face_at(
-        self, relit: PersonLight, seen: PersonRows
-    ) -> tuple[tuple[slice, slice], np.ndarray, Tensor]:
-        """Rows and columns of observed pixels that show the face, its share [h, w, 1], its own pixels."""
-        assert seen.detail is not None
-        rows, among = self.view.rows_of(seen.inside, seen.rows), seen.columns
-        window = self.view.window[1]
-        start = max(window.start, among.start)
-        common = slice(start, max(start, min(window.stop, among.stop)))
-        own = _within(common, window)
-        detail = self._detail.pixels(relit.face, seen.detail, seen.inside)[:, own]
-        return (rows, _within(common, among)), seen.face_share[:, own, None], detail
-
     def _by_maps(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
         """Observed pixels [h, w, 3] without what only the photo's pixels show: shadows' edges, and eyes."""
         rims = self._rims if relit.from_behind else None
@@ -259,8 +220,13 @@ class PersonInPhoto:
         shown = [view.radiance(light, rows, rims) for view, light, rows in used]
         person, behind = np.split(_joined(shown, seen.parts), [3], -1)
         if seen.detail is not None:  # the field of the face knows no hair around it
-            at, share, detail = self._face_at(relit, seen)
-            person[at] += share * (detail.numpy() - person[at])
+            among, window = seen.columns, self.view.window[1]
+            start = max(window.start, among.start)
+            common = slice(start, max(start, min(window.stop, among.stop)))
+            at = self.view.rows_of(seen.inside, seen.rows), _within(common, among)
+            own = _within(common, window)
+            face = self._detail.pixels(relit.face, seen.detail, seen.inside)[:, own].numpy()
+            person[at] += seen.face_share[:, own, None] * (face - person[at])
         if self._field.person.normals is not None:
             person = person * self._change_by_normals(relit, seen)
         return person + behind if behind.size else person

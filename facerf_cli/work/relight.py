@@ -119,8 +119,8 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
                     texture_side=plan.photo.texture_side,
                     white=options.white,
                     face=face.found,
-                    head=known and known.head,
-                    steady=known and known.steady,
+                    head=known.head if known else None,
+                    steady=known.steady if known else None,
                     normals=normals,
                 )
             fitted.append((_described(face, person, matte, options), person))

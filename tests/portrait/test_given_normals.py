@@ -109,12 +109,6 @@ def test_bumps_change_nothing_in_the_photos_own_light(person: Person) -> None:
     np.testing.assert_allclose(enlarged.change_by_normals(enlarged.ready(view.own), seen), 1, atol=1e-5)
 
 
-def test_a_person_with_normals_is_saved_and_loaded(person: Person, tmp_path: Path) -> None:
-    person.save(tmp_path / "me.npz")
-    again = Person.load(person.models, tmp_path / "me.npz")
-    np.testing.assert_allclose(again.normals, person.normals, atol=1e-5)
-
-
 def test_what_are_not_the_normals_of_the_face_is_refused(bumpy: np.ndarray) -> None:
     with pytest.raises(InputError, match=r"not those of the face \(mean cosine 0\.\d+\)"):
         fitted(bumpy[..., ::-1].copy())  # as OpenCV writes RGB
