@@ -54,11 +54,13 @@ def with_cloth(classes: Tensor, image: Tensor, head: HeadPlace) -> Tensor:
     skin = shares[_SKIN].sum(0) > _MAYBE * np.maximum(person, _MAYBE)
     edges = gaussian_gradient_magnitude(np.log(image.numpy().mean(0) + _DARK), 1.0) > _EDGE
     certain = (shares[_FACE].sum(0) > _SURE_BESIDE) | (shares[_HAND] > _SURE_BESIDE)
-    parts, count = label(skin & ~edges)
+    parts, _ = label(skin & ~edges)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
     cloth = np.zeros_like(skin)
-    for number in range(1, count + 1):
+    for number in np.flatnonzero(sizes > _LEAST * person.sum()):
         part = parts == number
-        if part.sum() > _LEAST * person.sum() and outside[part].mean() > 0.5:
+        if outside[part].mean() > 0.5:
             part |= binary_dilation(part, iterations=_EDGE_PX, mask=skin & outside)
             outline = binary_dilation(part) & ~part
             if certain[outline].mean() < _TOUCHES:
