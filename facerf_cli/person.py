@@ -493,9 +493,10 @@ class Person(PersonOrGroup):
     @property
     def _has_gradients(self) -> bool:
         """If a gradient of the texture or of a network is wanted."""
-        field, portrait = self._field, self.models.networks.portrait
-        wanted = isinstance(field, Field) and field.has_gradients
-        return wanted or (self.kind == "portrait" and any(one.requires_grad for one in portrait.parameters()))
+        if isinstance(self._field, Field) and self._field.has_gradients:
+            return True
+        portrait = isinstance(self.reflectance, PortraitField)  # others do not load its network
+        return portrait and any(one.requires_grad for one in self.models.networks.portrait.parameters())
 
     @cached_property
     def _group(self) -> "Group":
