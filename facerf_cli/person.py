@@ -153,7 +153,7 @@ def fit(
         models, head, reflectance, network_alone, pixels, steady, matte, white, normals
     )
     tensors = isinstance(photo, Tensor)
-    return Person(models, pixels, head, found, matte, reflectance, network_alone, tensors, white)
+    return Person(models, pixels, head, found, matte, reflectance, tensors)
 
 
 class PhotoCamera(NamedTuple):
@@ -229,9 +229,7 @@ class Person(PersonOrGroup):
         reflectance: The person under any lights.
         given_matte: Share [H, W] of the photo, if it was given.
         kind: Which reflectance it is.
-        network_alone: The networks' prediction without the photo's correction.
         tensors: True of a photo that was given as a tensor: all arrays are tensors on the models' device.
-        white: Whose colours skin has under even white light.
     """
 
     models: Models
@@ -240,9 +238,7 @@ class Person(PersonOrGroup):
     reflectance: Reflectance
     given_matte: np.ndarray | None = None
     kind: RelightKind = "portrait"
-    network_alone: bool = False
     tensors: bool = False
-    white: White | None = "photo"
 
     def __repr__(self) -> str:
         """A line for a notebook."""
