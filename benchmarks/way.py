@@ -4,7 +4,8 @@
 
 One photo is relit by one light in this process, with a profile of every call. Frames are the functions of the
 package that are open, from the verb's own to that where networks read the person; files are those whose
-functions run. Caches and lines are counted in the source.
+functions run. Calls are the functions of the package from `relight_item` to the deepest one that reads the
+maps of the light at the pixels of a strip (`grid_sample`). Caches and lines are counted in the source.
 """
 
 import argparse
@@ -21,6 +22,7 @@ os.environ["OMP_NUM_THREADS"] = "1"  # all in one thread, whose frames are count
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "facerf_cli"
 VERB = PACKAGE / "cli" / "relight.py"
+STRIPS = PACKAGE / "image" / "strips.py"
 _CACHES = ("cache", "lru_cache", "cached_property")
 
 
@@ -32,8 +34,13 @@ def main() -> None:
     photo = parser.parse_args().photo
     files: set[str] = set()
     stacks: list[list[str]] = []
+    deepest: list[str] = []
 
-    def profile(frame: FrameType, event: str, _: Any) -> None:
+    def profile(frame: FrameType, event: str, called: Any) -> None:
+        if event == "c_call" and getattr(called, "__name__", "") == "grid_sampler":
+            calls = _calls_to_pixel(frame)
+            if len(calls) > len(deepest):
+                deepest[:] = calls
         if event != "call" or not frame.f_code.co_filename.startswith(str(PACKAGE)):
             return
         name = frame.f_code.co_name
@@ -54,6 +61,7 @@ def main() -> None:
     sources = {path: path.read_text() for path in PACKAGE.rglob("*.py")}
     tests = [path.read_text() for path in (ROOT / "tests").rglob("*.py")]
     counts = {
+        "calls from relight_item to a pixel's sum": len(deepest),
         "frames from verb to network": len(stacks[0]),
         "modules that relight imports": len(modules),
         "files that one photo enters": len(files),
@@ -65,7 +73,8 @@ def main() -> None:
     }
     for name, count in counts.items():
         print(f"{count:7,}  {name}")
-    print("\n" + "\n".join(stacks[0]))
+    for frames in (stacks[0], deepest):
+        print("\n" + "\n".join(frames))
 
 
 def _open_frames(frame: FrameType | None) -> list[str]:
@@ -79,6 +88,20 @@ def _open_frames(frame: FrameType | None) -> list[str]:
             break
         frame = frame.f_back
     return found[::-1]
+
+
+def _calls_to_pixel(frame: FrameType | None) -> list[str]:
+    """Functions of the package that are open from `relight_item` on, while a strip is rendered."""
+    found, in_strip = [], False
+    while frame is not None:
+        path = Path(frame.f_code.co_filename)
+        in_strip |= path == STRIPS
+        if path.is_relative_to(PACKAGE) and not frame.f_code.co_name.startswith("<"):
+            found.append(f"{path.relative_to(PACKAGE)} {frame.f_code.co_qualname}")
+        if frame.f_code.co_name == "relight_item":
+            return found[::-1] if in_strip else []
+        frame = frame.f_back
+    return []
 
 
 def caches(text: str) -> int:
