@@ -38,14 +38,16 @@ from scipy.ndimage import gaussian_filter
 from skimage.registration import optical_flow_ilk
 from skimage.transform import warp
 
-from facerf_cli import pipeline
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.person import Person
+from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.sequence import Follower, SteadyShot
 
 PATCH = 1 / 64  # of the side
@@ -58,8 +60,8 @@ def one_by_one(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
     """Relight each frame as a photo."""
     results = []
     for frame in frames:
-        face = pipeline.find_for(models.networks.people, "landmarks", frame, "frame")[0]
-        results.append(relit(models, frame, pipeline.head_of(models, frame, face)))
+        face = find_faces(models.networks.people, frame, "frame")[0]
+        results.append(relit(models, frame, head_of(models, frame, face)))
     return results
 
 
@@ -78,7 +80,7 @@ def steady_shot(models: Models, frames: list[np.ndarray]) -> SteadyShot:
 
 def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | None = None) -> np.ndarray:
     """Relight a frame by the target's light."""
-    reflectance = pipeline.reflectance_of(models, head, "portrait", photo=frame, steady=steady)
+    reflectance = reflectance_of(models, head, "portrait", photo=frame, steady=steady)
     light = RigLight(rig_directions(LIGHTS), TARGET)
     return Person(models, frame, head, reflectance).image(light).pixels
 

@@ -21,8 +21,8 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.person import Target, fit
-from facerf_cli.pipeline import find_for
 from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.portrait_samples import StoredView, load_view
@@ -90,9 +90,7 @@ def measured(
     wall = MEAN_RADIANCE / 2 * (1 - view.alpha)
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
-    person = fit(
-        models, photo, white=None, face=find_for(models.networks.people, "landmarks", photo, "the photo")[0]
-    )
+    person = fit(models, photo, white=None, face=find_faces(models.networks.people, photo, "the photo")[0])
     composition = person.composed(Target(background="none"))
     shown = {}
     lit = composition.relit(Lights(rig, torch.cat([lamp, natural[1:]])))

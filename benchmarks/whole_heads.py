@@ -16,7 +16,7 @@ from _common import WHOLE_YALE_B, arguments, required
 from facerf_cli.errors import FacerfError
 from facerf_cli.light.sphere import RigLight, azel_to_direction
 from facerf_cli.person import fit
-from facerf_cli.pipeline import find_for
+from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.models import load_models
 
 
@@ -41,7 +41,7 @@ def main() -> None:
                 models,
                 photo,
                 white=None,
-                face=find_for(models.networks.people, "landmarks", photo, source)[0],
+                face=find_faces(models.networks.people, photo, source)[0],
             )
         except FacerfError as error:
             print(f"{subject} {source}: {error}", file=sys.stderr)

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli import pipeline
 from facerf_cli.baselines import RelightKind
 from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import UsageError
@@ -34,8 +33,9 @@ from facerf_cli.light.light import (
 )
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import Lights
+from facerf_cli.portrait import find
 from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.find import FaceBox, face_with
+from facerf_cli.portrait.find import Face, face_with
 from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
@@ -43,11 +43,14 @@ from facerf_cli.relighting import White
 from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
 from facerf_cli.relighting.face_in_photo import FaceInPhoto
 from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
 from facerf_cli.relighting.people_in_photo import Background as Behind
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.person_in_photo import PERSON_LAYERS, PersonInPhoto
+from facerf_cli.relighting.photo_light import estimate_light
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import Relightable, RelitImage, RenderRequest
 from facerf_cli.relighting.white import Balance
 from facerf_cli.run.memory import batches
@@ -64,22 +67,19 @@ def find_faces(
     models: Models,
     photo: Array,
     which: str = "all",
-    geometry: Geometry | None = None,
     name: str = "photo",
-) -> Sequence[FaceBox]:
+) -> list[Face]:
     """Find the faces of a photo, from left to right, for `fit`.
 
     Args:
         models: The networks and the face model.
         photo: Scene-linear [H, W, 3].
         which: "all", "largest", or a number from the left.
-        geometry: By which they will be fitted; see `fit`.
         name: The photo's name, for messages.
 
     Raises InputError where no face is found.
     """
-    chosen = geometry or models.default_geometry
-    return pipeline.find_for(models.networks.people, chosen, _pixels_of(name, photo), name, which)
+    return find.find_faces(models.networks.people, _pixels_of(name, photo), name, which)
 
 
 @torch.no_grad()
@@ -93,7 +93,7 @@ def fit(
     matte: Any = None,
     texture_side: int | None = None,
     white: White | None = "photo",
-    face: FaceBox | None = None,
+    face: Face | None = None,
     head: Head | None = None,
     steady: SteadyFrame | None = None,
     normals: Any = None,
@@ -147,11 +147,9 @@ def fit(
         if landmarks_px is not None:
             face = face_with(models.networks.people, to_display(pixels), check_landmarks(landmarks_px))
         elif face is None:
-            (face,) = find_faces(models, pixels, "largest", geometry)
-        head = pipeline.head_of(models, pixels, face, models.sides(texture_side), matte)
-    found = pipeline.reflectance_of(
-        models, head, reflectance, network_alone, pixels, steady, matte, white, normals
-    )
+            (face,) = find_faces(models, pixels, "largest")
+        head = head_of(models, pixels, face, geometry, models.sides(texture_side), matte)
+    found = reflectance_of(models, head, reflectance, network_alone, pixels, steady, matte, white, normals)
     tensors = isinstance(photo, Tensor)
     return Person(models, pixels, head, found, matte, reflectance, tensors)
 
@@ -309,9 +307,7 @@ class Person(PersonOrGroup):
         """
         kind = "field" if self.kind == "portrait" else self.kind
         with torch.no_grad():
-            found = pipeline.estimate_light(
-                self.models, self.head, kind, rig_directions(lights), white="scene"
-            ).light
+            found = estimate_light(self.models, self.head, kind, rig_directions(lights), white="scene").light
         return Light(found.directions.numpy(), found.weights.numpy())
 
     def backdrop(self, envmap: Array, rotate_deg: float = 0.0, blur: float = 0.0) -> Array:

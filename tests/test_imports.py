@@ -13,7 +13,7 @@ LEVELS = (
     ("__main__", "main", "cli"),
     ("work", "api", "evaluation"),
     ("training", "viewer", "capture", "dataset", "synth"),
-    ("person", "pipeline", "relighting", "portrait", "baselines", "network", "face"),
+    ("person", "relighting", "portrait", "baselines", "network", "face"),
     ("batch", "light", "raster", "image", "files", "run", "errors", "option", "_version"),
 )
 LEVEL = {room: level for level, rooms in enumerate(LEVELS) for room in rooms}

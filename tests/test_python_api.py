@@ -186,7 +186,7 @@ def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pyt
 
     for name in ("FaceAlone", "PersonInPhoto"):
         monkeypatch.setattr(f"facerf_cli.person.{name}", made_again)
-    monkeypatch.setattr("facerf_cli.pipeline.reflectance_of", made_again)
+    monkeypatch.setattr("facerf_cli.person.reflectance_of", made_again)
     assert np.isfinite(one.relight(facerf.Light.single(20, 0))).all()
     with pytest.raises(AssertionError, match="made again"):
         one.relight(KEY, pose=(10, 0, 0))

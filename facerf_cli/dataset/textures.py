@@ -133,7 +133,7 @@ class DatasetTextures:
             normals_source=source.normals,
             target=images,
             lights=target.directions[chosen],
-            # The source's normals turned, as in `pipeline.predict_olat`.
+            # The source's normals turned, as in `Field.olats`.
             normals_target=torch.einsum("dc,cij->dij", source_to_target, source.normals),
             weight=target.visible * (0.3 + 0.7 * source.visible),
         )

@@ -12,8 +12,8 @@ from facerf_cli.evaluation.options import EvaluateOptions, portrait_name
 from facerf_cli.evaluation.people import Bench, Method, Portrait, Reading
 from facerf_cli.network.files import checkpoint_file, serving_files, title_of
 from facerf_cli.network.stored_graph import ASSET
-from facerf_cli.pipeline import Estimator
 from facerf_cli.relighting.models import Models, load_models
+from facerf_cli.relighting.photo_light import Estimator
 from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
 from facerf_cli.work.photos import fit_faces, load_models_once, read_photo

@@ -27,11 +27,13 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.person import Person, Target
-from facerf_cli.pipeline import DEFAULT_ESTIMATOR, Estimator, explain, find_for, head_of, reflectance_of
-from facerf_cli.portrait.find import FaceBox, NoFaceError
+from facerf_cli.portrait.find import Face, NoFaceError, find_faces
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
+from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import Models, Sides
+from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, explain
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run.logs import LOGGER_NAME
 
 _MASK_SIDE = 256  # texels of the masks
@@ -87,10 +89,9 @@ class Reading:
     geometry: Geometry | None = None
     keep_eyes: bool = False
 
-    def find(self, image: np.ndarray, name: str) -> FaceBox:
+    def find(self, image: np.ndarray, name: str) -> Face:
         """The largest face in an image; InputError where none is found."""
-        assert self.geometry is not None
-        return find_for(self.people, self.geometry, image, name)[0]
+        return find_faces(self.people, image, name)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ class Portrait:
     name: str
     case: Case
     photo: LinearImage
-    face: FaceBox | FaceFit
+    face: Face | FaceFit
     reading: Reading
     origin: "tuple[DatasetPerson, Pair] | None" = None
     _views: dict[int, tuple[Models, HeadView]] = field(default_factory=dict)
@@ -140,7 +141,7 @@ class Portrait:
             if isinstance(face, FaceFit):
                 head = Head(image, face, unwrap_face(models.face, face, image, sides.texture, image.shape))
             else:
-                head = head_of(models, image, face, sides)
+                head = head_of(models, image, face, self.reading.geometry, sides)
             view = self._view(models, head, head.fit)
             masked = head.without(models.face, self._inside(head.fit.crop))
             self._views[id(models)] = models, replace(view, head=masked)
@@ -231,7 +232,7 @@ class DatasetPerson:
     def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
         header = self.header(camera)
         assert self.reading is not None
-        face: FaceBox | FaceFit
+        face: Face | FaceFit
         if self.reading.geometry is None:
             fit = fit_from_arrays(header.fit)
             side_px = fit.crop.size_px  # the crop's pixels are the photo's
@@ -293,13 +294,13 @@ class Bench:
     mean: Models | None = None
     faces_of: Callable[[Item], Iterable[Portrait]] = lambda _: ()
 
-    def heads(self, photo: np.ndarray, face: FaceBox) -> Iterator[tuple[Method, Head]]:
+    def heads(self, photo: np.ndarray, face: Face) -> Iterator[tuple[Method, Head]]:
         """Yield each method with its head of a face; methods over the same networks share the fit."""
         heads: dict[int, Head] = {}
         for method in self.methods:
             key = id(method.models)
             if key not in heads:
-                heads[key] = head_of(method.models, photo, face)
+                heads[key] = head_of(method.models, photo, face, self.reading.geometry)
             yield method, heads[key]
 
 

@@ -24,7 +24,6 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.person import Target
-from facerf_cli.portrait.find import Face
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
 ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera
@@ -187,7 +186,7 @@ def compare_subject(database: YaleB, name: str, bench: Bench, room: float = 0.0)
     subject = YaleSubject(database, name)
     relightings = list(subject.relightings())
     face = bench.reading.find(_rgb(subject.image("frontal")), str(database.folder / name))
-    places_px = face.landmarks_px if isinstance(face, Face) else None
+    places_px = None if bench.reading.geometry == "network" else face.landmarks_px
     for source in dict.fromkeys(one.source for one in relightings):
         of_source = [one for one in relightings if one.source == source]
         photo = _rgb(subject.image(source))

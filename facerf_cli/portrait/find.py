@@ -28,7 +28,7 @@ from facerf_cli.portrait.mesh import (
     unsteadiness,
 )
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
-from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME, step
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -45,15 +45,17 @@ class NoFaceError(InputError):
 
 
 @dataclass(frozen=True, eq=False)
-class FaceBox:
-    """A face in a photo: its box in the photo's pixels, and what the Parsing Network sees around it.
+class Face:
+    """A face in a photo: its box and its landmarks [68, 2] in the photo's pixels.
 
-    `view` is None for a face that no network has looked at. The photo's other heads are there where they were
-    looked for. `number` counts the faces that were found from the left, from 0.
+    `view` is what the Parsing Network sees around it, also other landmarks and their errors; None where it
+    has not looked. `others` are the photo's other heads; None where they were not searched. `number` counts
+    the faces from the left, from 0.
     """
 
     box_px: Box
     score: float
+    landmarks_px: np.ndarray = field(repr=False)
     view: SquareView | None = field(default=None, kw_only=True, repr=False)
     others: Sequence[OtherHead] | None = field(default=None, kw_only=True, repr=False)
     number: int = field(default=0, kw_only=True)
@@ -63,18 +65,6 @@ class FaceBox:
         """The area of the box."""
         left, top, right, bottom = self.box_px
         return (right - left) * (bottom - top)
-
-
-@dataclass(frozen=True, eq=False)
-class Face(FaceBox):
-    """A face with its landmarks [68, 2] in the photo's pixels; `view` also holds others, and their errors."""
-
-    landmarks_px: np.ndarray = field(repr=False)
-
-    @property
-    def box(self) -> FaceBox:
-        """The face without its landmarks."""
-        return FaceBox(self.box_px, self.score, view=self.view, others=self.others, number=self.number)
 
 
 def face_at(landmarks_px: np.ndarray) -> Face:
@@ -105,6 +95,7 @@ def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
     return [faces[int(which)]]
 
 
+@step("find")
 def find_faces(
     people: PeopleNetworks,
     pixels_linear: np.ndarray,

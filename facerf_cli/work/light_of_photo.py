@@ -31,9 +31,9 @@ from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
-from facerf_cli.pipeline import Estimator, LightEstimate, estimate_light
 from facerf_cli.portrait.confidence import confidence_of
 from facerf_cli.portrait.find import NoFaceError
+from facerf_cli.relighting.photo_light import Estimator, LightEstimate, estimate_light
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import (

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -26,18 +26,18 @@ from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
 from facerf_cli.network.files import serving_files
 from facerf_cli.person import find_faces
-from facerf_cli.pipeline import head_of
 from facerf_cli.portrait.confidence import (
     SCALES,
     confidence_of,
     face_facts,
     touched_sides,
 )
-from facerf_cli.portrait.find import FaceBox, face_with
+from facerf_cli.portrait.find import Face, face_with
 from facerf_cli.portrait.given import given_matte_facts
 from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
+from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
@@ -73,7 +73,7 @@ class PhotoFace:
 
     tag: str
     name: str
-    found: FaceBox
+    found: Face
     facts: dict[str, float] = field(default_factory=dict)
     touches: dict[str, list[float]] = field(default_factory=dict)
     number: int = 0  # from the left
@@ -185,7 +185,7 @@ def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[
     So the first one's files are written last, and mark the photo as finished.
     """
     matte = person_matte(item, image.pixels, options)
-    found = find_people(item, image, options, matte, True)
+    found = find_people(item, image, options, matte)
     return (_fitted(found.pop(), image, options, matte) for _ in range(len(found)))
 
 
@@ -211,22 +211,20 @@ def write_each(
 
 
 def find_people(
-    item: Item, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None, to_fit: bool = False
+    item: Item, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
 ) -> list[PhotoFace]:
-    """Find the faces that the options choose, from left to right, with landmarks or what a fit needs.
+    """Find the faces that the options choose, from left to right.
 
     Raises InputError for given landmarks, or a given matte [H, W], that do not show the face.
     """
     models = load_models_once(options)
-    faces: Sequence[FaceBox]
     if options.landmarks is not None:
         path = companion(item, options.landmarks, "--landmarks")
         landmarks_px = read_landmarks(path)
         with naming(path):
             faces = [face_with(models.networks.people, to_display(image.pixels), landmarks_px)]
     else:
-        geometry = options.geometry if to_fit else "landmarks"
-        faces = find_faces(models, image.pixels, options.face, geometry, str(item.input_path))
+        faces = find_faces(models, image.pixels, options.face, str(item.input_path))
     found = []
     for face in faces:
         name, number, (left, top, right, bottom) = str(item.input_path), face.number, face.box_px
@@ -241,7 +239,7 @@ def find_people(
 
 
 def facts_of_face(
-    item: Item, face: FaceBox, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
+    item: Item, face: Face, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
 ) -> dict[str, float]:
     """Measure a face in a photo [H, W, 3], its turn by the face model, and its matte [H, W] if that is given.
 
@@ -290,7 +288,8 @@ def _fitted(
 ) -> FittedFace:
     with naming(face.name):
         models = load_models_once(options)
-        head = head_of(models, image.pixels, face.found, models.sides(options.texture_side), matte)
+        sides = models.sides(options.texture_side)
+        head = head_of(models, image.pixels, face.found, options.geometry, sides, matte)
     return fitted_face(face, head, matte)
 
 

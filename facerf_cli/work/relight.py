@@ -92,7 +92,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
     else:
         image = read_photo(item, plan.photo)
         matte = person_matte(item, image.pixels, plan.photo)
-        faces = find_people(item, image, plan.photo, matte, to_fit=True)
+        faces = find_people(item, image, plan.photo, matte)
     photo, background = image.pixels, options.background.kind
     normals = read_normals(item, options.normals_from, photo.shape[:2])
     check_faces(item, [face.number for face in faces], plan)
@@ -113,6 +113,7 @@ def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScen
                 person = fit(
                     load_models_once(plan.photo),
                     photo,
+                    geometry=plan.photo.geometry,
                     reflectance=options.reflectance,
                     network_alone=options.network_alone,
                     matte=matte,

@@ -58,7 +58,6 @@ def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[lis
     if place := open_at(shots, item, options):
         shot, number = place
         image, person, found = shot.segmented(number)
-        assert isinstance(person.found, Face)
         _write_segment(item, "", image, to_display(image.pixels), person.found, found)
         return [""], facts_of([person.rated(quiet=True)], options)
     image = read_photo(item, options, KEPT_PX + 4)  # a class, too
@@ -66,7 +65,6 @@ def write_segments(item: Item, options: PhotoOptions, shots: Shots) -> tuple[lis
     networks, matte = load_models_once(options).networks.people, person_matte(item, image.pixels, options)
     people = find_people(item, image, options, matte)
     for person in reversed(people):
-        assert isinstance(person.found, Face)
         found = segment(networks, display, person.found.landmarks_px, matte, person.found.others)
         person.see(found)
         if not (found.cut(image.alpha).matte > _SHOWS_PERSON).any():

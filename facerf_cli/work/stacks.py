@@ -22,8 +22,9 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
 from facerf_cli.light.studio_points import Lights, rig_by_text
 from facerf_cli.person import Target, fit
-from facerf_cli.pipeline import predict_olat
 from facerf_cli.raster.camera import crop_camera
+from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
@@ -137,8 +138,10 @@ def _of_face(
         seen = large[1]
 
     def olats() -> Iterator[Tensor]:
-        alone, bf16 = work.network_alone, work.precision == "bf16"
-        for textures in predict_olat(models, face.head, directions, rotation, alone, bf16, work.white):
+        field = reflectance_of(models, face.head, "field", work.network_alone, white=work.white)
+        assert isinstance(field, Field)
+        turn = None if rotation is None else face.fit.turn_to(rotation)
+        for textures in replace(field, bf16=work.precision == "bf16").olats(directions, turn):
             tiles.append(avg_pool2d(render_face(textures, *small), 2).permute(0, 2, 3, 1).numpy())
             yield render_face(textures, *large) if work.frame == "face" else textures
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli import pipeline
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.dataset import read_dataset
@@ -32,6 +31,7 @@ from facerf_cli.network import checkpoint
 from facerf_cli.network.checkpoint import new_network, save_checkpoint, save_networks, use_form
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.portrait.find import Face, face_at
+from facerf_cli.relighting import photo_light
 from facerf_cli.relighting.models import Models
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import load_models_once
@@ -172,8 +172,8 @@ def test_one_table_of_facerf_an_own_network_and_a_folder(
     """On cases that are frozen without any checkpoint; the own network is a form of an installed package."""
     write_own_package(tmp_path / "site", monkeypatch)
     face = load_fit(read_dataset(folder).fit_path("0001", "C0")).landmarks_px.double().numpy()
-    monkeypatch.setattr(people, "find_for", lambda *given: [face_at(face)])
-    monkeypatch.setattr(cases, "find_faces", lambda *given: [face_at(face)])
+    monkeypatch.setattr(people, "find_faces", lambda *_: [face_at(face)])
+    monkeypatch.setattr(cases, "find_faces", lambda *_: [face_at(face)])
     frozen, theirs, out = (tmp_path / name for name in ("cases", "theirs", "out"))
     assert run("cases", folder, "-o", frozen, "--every", "4") == 0
     listed = read_facts(frozen / "cases.csv")
@@ -236,10 +236,10 @@ def test_people_of_a_dataset_by_every_protocol(folder: Path, tmp_path: Path, mon
     dataset = read_dataset(folder)
     cameras = {f"{p.subject}/{p.index:05d}": (p.subject, p.source_camera) for p in read_pairs(dataset)}
 
-    def find(_: object, geometry: str, image: np.ndarray, name: str) -> list[Face]:
+    def find(_: object, image: np.ndarray, name: str) -> list[Face]:
         return [face_at(load_fit(dataset.fit_path(*cameras[name])).landmarks_px.double().numpy())]
 
-    monkeypatch.setattr(people, "find_for", find)
+    monkeypatch.setattr(people, "find_faces", find)
     assert run("geometry", folder, "-o", tmp_path / "g", "--every", "12", "--jobs", "1") == 0
     assert len(images(tmp_path / "g")) == 2
 
@@ -265,7 +265,7 @@ def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch
         asked.append(given["estimator"])
         return SimpleNamespace(light=None)
 
-    monkeypatch.setattr(pipeline, "estimate_light", estimate)
-    monkeypatch.setattr(pipeline, "reflectance_of", lambda *given: None)
+    monkeypatch.setattr(photo_light, "estimate_light", estimate)
+    monkeypatch.setattr(photo_light, "reflectance_of", lambda *given: None)
     method.explained(None)  # type: ignore[arg-type]
     assert asked == [method.estimator]

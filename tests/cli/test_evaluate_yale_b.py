@@ -44,7 +44,7 @@ def toys(monkeypatch: Patch) -> None:
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("overhead",))
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
-    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_an_own_field_is_measured_alone_or_its_row_names_both(
     monkeypatch.setattr(run, "bench_of", toys)
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ())
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ())
-    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
     line = ["evaluate", "yale-b", str(folder), "-o", str(out), "--subjects", "yaleB07"]
     lines: list[tuple[list[str], list[str], dict[str, Path]]] = [
         ([], ["portrait"], {"Reflectance Network": SHIPPED["reflectance"]}),

@@ -191,8 +191,7 @@ def found_by_truth(dataset: Dataset, monkeypatch: Patch, blind: str = "") -> Per
     joint = person_of(dataset)
     cameras = {camera: joint.lit(camera).face for camera in ("C0", "C1")}
 
-    def find(_: object, geometry: Geometry, image: np.ndarray, name: str) -> list[Face]:
-        assert geometry == "landmarks"
+    def find(_: object, image: np.ndarray, name: str) -> list[Face]:
         camera = name.rpartition("/")[2]
         if camera not in cameras:  # a source, of C0 if its index is even
             camera = f"C{int(camera) % 2}"
@@ -202,7 +201,7 @@ def found_by_truth(dataset: Dataset, monkeypatch: Patch, blind: str = "") -> Per
         assert isinstance(fit, FaceFit)
         return [face_at(fit.landmarks_px.double().numpy())]
 
-    monkeypatch.setattr(people, "find_for", find)
+    monkeypatch.setattr(people, "find_faces", find)
     return person_of(dataset, "landmarks")
 
 

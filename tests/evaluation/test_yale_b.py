@@ -30,9 +30,10 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Person
-from facerf_cli.pipeline import fit_photo, head_of, reflectance_of
 from facerf_cli.portrait.find import Face
+from facerf_cli.relighting.heads import fit_photo, head_of
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
+from facerf_cli.relighting.reflectance import reflectance_of
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
@@ -100,7 +101,7 @@ def test_scores_are_the_benchmarks(
     databases: tuple[YaleB, Any], reference: tuple[ModuleType, ModuleType], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bright: Any = SimpleNamespace(reading=READING, heads=lambda photo, face: [(TooBright(), face)])
-    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
     comparisons = list(compare_subject(databases[0], "yaleB05", bright))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
@@ -147,7 +148,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
     monkeypatch.setattr(yale_b, "_CORE", (Flash(0, 0), Flash(-70, 0)))
-    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
     monkeypatch.setattr(Person, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32)))
     monkeypatch.setattr(people, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
     flat = np.full((192, 168), 128)  # an image without detail: the prediction is the method's own
@@ -192,7 +193,7 @@ def test_environments_come_from_their_side(small: YaleB) -> None:
 
 
 def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(people, "find_for", lambda parsing, geometry, image, name, **_: [someone()])
+    monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
     models = load_models()
     subject = YaleSubject(small, "yaleB07")
     photo = np.repeat(subject.image("win_left")[..., None], 3, -1)

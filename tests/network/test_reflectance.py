@@ -1,4 +1,4 @@
-"""Every form of the Reflectance Network fits the interface that the pipeline and training use."""
+"""Every form of the Reflectance Network fits the interface that relighting and training use."""
 
 from typing import Any
 

@@ -13,7 +13,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import LinearImage
-from facerf_cli.portrait.find import Face, FaceBox, choose_face
+from facerf_cli.portrait.find import Face, choose_face
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run import memory
@@ -113,7 +113,7 @@ def test_each_person_is_relit_over_the_photo_and_alpha_and_layers_hold_all() -> 
 def test_people_that_do_not_fit_together_are_refused_and_faces_are_fitted_one_by_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    faces = [PhotoFace(f"_face{k}", "a.png", FaceBox((k, 0, k + 1, 1), 1.0)) for k in range(3)]
+    faces = [PhotoFace(f"_face{k}", "a.png", Face((k, 0, k + 1, 1), 1.0, POINTS)) for k in range(3)]
     fitted: list[str] = []
     monkeypatch.setattr(photos, "find_people", lambda *_: list(faces))
     monkeypatch.setattr(photos, "_fitted", lambda face, *_: fitted.append(face.tag) or face)

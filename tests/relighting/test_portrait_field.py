@@ -20,7 +20,6 @@ from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.person import Person, Target, fit
-from facerf_cli.pipeline import reflectance_of
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.person import SEEN_PX, wider_square
@@ -28,6 +27,7 @@ from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView, maps_of
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.relighting.source_light import source_light
 from tests import astronaut

@@ -10,11 +10,12 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.topology import region_mask
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.skin import skin_albedo
-from facerf_cli.pipeline import estimate_light, predict_olat, reflectance_of
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import Field, shrunk
+from facerf_cli.relighting.photo_light import estimate_light
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.white import SURE, Balance
 from tests import astronaut
 
@@ -138,7 +139,9 @@ def test_the_whole_person_and_the_faces_own_field_have_the_same_white() -> None:
         assert light[0] > 0.3 and light[1] < -0.3
     toward = torch.nn.functional.normalize(torch.tensor([[0.6, 0.3, 0.8]]), dim=1)
     shown = [
-        next(predict_olat(astronaut.models(), astronaut.head(), toward, white=white, network_alone=alone))
+        reflectance_of(astronaut.models(), astronaut.head(), "field", alone, white=white).relit(
+            toward, torch.ones(1, 1, 3)
+        )
         for white in ("photo", None)
         for alone in (False, True)
     ]

@@ -31,10 +31,12 @@ from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_di
 from facerf_cli.light.studio_points import Lights, far_samples
 from facerf_cli.main import main
 from facerf_cli.person import Person
-from facerf_cli.pipeline import find_for, head_of, reflectance_of
+from facerf_cli.portrait.find import find_faces
+from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import lights_over_rig, with_room
@@ -80,7 +82,7 @@ class Shown:
 def shown() -> Shown:
     models = load_models()
     photo = read_image(ASTRONAUT).pixels
-    face = find_for(models.networks.people, models.default_geometry, photo, "astronaut")[0]
+    face = find_faces(models.networks.people, photo, "astronaut")[0]
     photo, head = shrunk_photo(photo, head_of(models, photo, face, models.sides(128)), 384)
     photo = np.clip(photo, 0, 1)
     basis, plate = of_photo(models, photo, head)

@@ -1,6 +1,6 @@
 """Bank of baked heads: light transport in UV space, views as fits to photos see them, and their samples.
 
-Noisy landmarks give the crop and the fit of each photo, as in the pipeline. Unwrapping an image of the true
+Noisy landmarks give the crop and the fit of each photo, as for a real photo. Unwrapping an image of the true
 (u, v) then gives the warp: the true texel that each texel of the fitted UV map shows.
 """
 

@@ -13,12 +13,14 @@ from facerf_cli.light.estimate import estimate_signed_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
 from facerf_cli.person import Person, Target
-from facerf_cli.pipeline import Estimator, estimate_light, fit_photo, predict_olat, reflectance_of
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
+from facerf_cli.relighting.heads import fit_photo
 from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.photo_light import Estimator, estimate_light
+from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run import memory
 from facerf_cli.work.plan import require_face
 from tests import astronaut
@@ -35,10 +37,19 @@ def head() -> Head:
     return astronaut.head()
 
 
+def olats_of(
+    models: Models, head: Head, lights: Tensor, turn: Tensor | None = None, network_alone: bool = False
+) -> Tensor:
+    """OLAT textures [L, 3, T, T] of the face."""
+    field = reflectance_of(models, head, "field", network_alone)
+    assert isinstance(field, Field)
+    return torch.cat(list(field.olats(lights, turn)))
+
+
 def test_relit_by_its_own_light_the_photo_comes_back(models: Models, head: Head) -> None:
     rig = rig_directions(60)
-    own = torch.cat(list(predict_olat(models, head, rig, network_alone=True)))
-    corrected = torch.cat(list(predict_olat(models, head, rig)))
+    own = olats_of(models, head, rig, network_alone=True)
+    corrected = olats_of(models, head, rig)
     seen = head.face.visible > 0.9
     texture = head.face.texture[:, seen]
 
@@ -118,7 +129,7 @@ def test_the_light_of_the_photo_explains_it_and_a_mask_that_hides_nothing_change
     network = WritesDown()
     blue = replace(head.face, texture=head.face.texture * torch.tensor([0.05, 0.3, 3.0]).view(3, 1, 1))
     unknown = replace(models.with_networks(reflectance=network), source_colours=None)
-    list(predict_olat(unknown, replace(head, face=blue), rig_directions(4), network_alone=True))
+    olats_of(unknown, replace(head, face=blue), rig_directions(4), network_alone=True)
     assert torch.equal(network.encoded[0], blue.texture[None])
     size, unit = (512, 512), 1 << 20
     memory.set_limit(64 * unit)
@@ -164,7 +175,7 @@ def test_the_network_gets_what_the_paper_says(models: Models, head: Head) -> Non
     lit = replace(head, face=replace(face, texture=face.texture * blue))
     lights = torch.stack([azel_to_direction(60.0, 30.0), azel_to_direction(-70.0, 0.0)])
     rotation = pose_to_rotation(40.0, 0.0, 0.0)
-    list(predict_olat(models.with_networks(reflectance=network), lit, lights, rotation, network_alone=True))
+    olats_of(models.with_networks(reflectance=network), lit, lights, head.fit.turn_to(rotation), True)
     texture, normals, visible = network.encoded
     assert models.source_colours is not None
     cast = colour_cast(lit.face.texture[None], face.visible[None, None], models.source_colours)
@@ -185,7 +196,7 @@ def test_a_field_that_is_corrected_sees_no_coloured_shade(models: Models, head: 
     for alone in (True, False):
         network = WritesDown()
         own = models.with_networks(reflectance=network)
-        list(predict_olat(own, shaded, azel_to_direction(0.0, 0.0)[None], network_alone=alone))
+        olats_of(own, shaded, azel_to_direction(0.0, 0.0)[None], network_alone=alone)
         well = face.visible[:, :half] > 0.9
         colour = network.encoded[0][0, :, :, :half][:, well].mean(1)
         seen.append(float(colour[2] / colour[1]))
