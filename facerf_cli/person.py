@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 Pose = tuple[float, float, float] | Tensor  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"] | Array | tuple[float, float, float]
-_LIGHTS_AT_ONCE = 8
+_LIGHTS_AT_ONCE, _PIXELS_AT_ONCE = 8, 1 << 23  # of OLAT images, at most
 
 
 def find_faces(
@@ -280,11 +280,9 @@ class Person(PersonOrGroup):
 
         `lights` are unit directions [L, 3], or the size of a uniform rig, `facerf.rig(lights)`.
         """
-        people = self._group.composed_once
-        found = [
-            people.light_layer(relit) for relit in _one_by_one(people, Lights.each(directions_of(lights)))
-        ]
-        return self._out(np.stack(found), lights)
+        with torch.no_grad():
+            images = list(olat_images(self._group.composed_once, directions_of(lights)))
+        return self._out(np.concatenate(images), lights)
 
     def uv_olat(self, lights: int | Array = 150, pose: Pose | None = None) -> Array:
         """The face's UV texture under each light alone [L, T, T, 3], by the neural field; see `olat`."""
@@ -497,8 +495,10 @@ class Person(PersonOrGroup):
     def _layer(self, name: str) -> Any:
         if name == "albedo" and self.kind != "portrait":
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
-        relit = next(_one_by_one(self._group.composed_once, Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
-        return self._out(self._group.composed_once.rendered(RenderRequest(relit, layers=[name]))[name])
+        people = self._group.composed_once
+        with torch.no_grad():
+            relit = next(people.relit(Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
+            return self._out(people.rendered(RenderRequest(relit, layers=[name]))[name])
 
     @property
     def _photo_camera(self) -> Camera:
@@ -587,11 +587,18 @@ class Group(PersonOrGroup):
                 yield {"image": image, **found}
 
 
-def _one_by_one(people: PeopleInPhoto, each: Lights) -> Iterator[Any]:
-    """The person under each of L lights alone, some at a time."""
-    with torch.no_grad():
-        for first in range(0, len(each), _LIGHTS_AT_ONCE):
-            yield from people.relit(each[first : first + _LIGHTS_AT_ONCE])
+def olat_images(subject: Relightable, directions: Tensor) -> Iterator[np.ndarray]:
+    """Yield images [l, H, W, 3] of a subject over black under each of the lights [L, 3] alone."""
+    height, width = subject.size_px
+    at_once = max(1, min(_LIGHTS_AT_ONCE, _PIXELS_AT_ONCE // (height * width)))
+    return (_under_each(subject, some) for some in torch.split(directions, at_once))
+
+
+def _under_each(subject: Relightable, directions: Tensor) -> np.ndarray:
+    images = np.empty((len(directions), *subject.size_px, 3), np.float32)
+    lights = {str(number): one for number, one in enumerate(subject.relit(Lights.each(directions)))}
+    subject.rendered(RenderRequest(lights=lights), lambda number, shape: images[int(number)])
+    return images
 
 
 def _lights_of(light: Any, room: float) -> list[Light]:

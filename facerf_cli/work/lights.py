@@ -180,6 +180,15 @@ def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
     return tuple(replace(setup, lights=(light,)) for light in setup.lights)
 
 
+def as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[LightSetup, ...]:
+    """Setups as they shine on one of the people, with the light of their rooms.
+
+    After one whose lights have names comes each of these alone.
+    """
+    lit = [with_room(as_in_photo(on_face(setup, face), even)) for setup in setups]
+    return tuple(one for setup in lit for one in (setup, *(each_alone(setup) if setup.names else ())))
+
+
 def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Lights:
     """The lights of M setups by a stack's own [L, 3]; single lights are shared by those around."""
     weights, _ = _map_weights(setups, directions, sampling, with_keys=False)

@@ -1,11 +1,12 @@
-"""One item of `facerf relight`: read, its people fitted, relit by every setup, exposed, written."""
+"""One item of `facerf relight`: read, find, fit, light, relight, write."""
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache, partial
+from itertools import accumulate, islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,21 +17,26 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
+from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.light_wrap import LightWrap
-from facerf_cli.image.strips import Empty, rows_of
+from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
+from facerf_cli.light.envmap import Backdrop
+from facerf_cli.light.studio_points import Lights, intensity_of
 from facerf_cli.person import Group, Person, Target, fit
-from facerf_cli.relighting.people_in_photo import Background
-from facerf_cli.relighting.relightable import RenderRequest
+from facerf_cli.raster.camera import Camera, rays_of_rows
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line, step
 from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import lights_over_rig, with_room
+from facerf_cli.work.lights import as_lit, lights_over_rig, read_map, with_room
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
     PhotoFace,
+    companion,
     facts_of,
     find_people,
     fitted_face,
@@ -43,12 +49,12 @@ from facerf_cli.work.photos import (
     read_photo,
     rotation_of,
 )
-from facerf_cli.work.plan import beside_people, canvas, require_face, require_people
-from facerf_cli.work.relight_options import RelightOptions, RelightPlan
-from facerf_cli.work.relight_scenes import LitScene, as_lit, backdrop, check_faces, with_background
+from facerf_cli.work.plan import beside, beside_people, canvas, require_face, require_people
+from facerf_cli.work.relight_options import BackgroundChoice, RelightPlan
 
 log = logging.getLogger(LOGGER_NAME)
 _digest_once = lru_cache(maxsize=256)(file_sha256)
+Behind = Callable[[LightSetup, float], Rows | None]  # the image behind a person, for a setup and an exposure
 
 
 def relight_item(plan: RelightPlan, item: Item) -> Outcome:
@@ -59,9 +65,9 @@ def relight_item(plan: RelightPlan, item: Item) -> Outcome:
     plan = replace(plan, setups=plan.setups_of(item))
     shared_ev = _shared_exposures(item, plan)
     plan = with_background(plan, item)
-    for scene in scenes_of(item, plan, together=plan.options.composite == "photo"):
+    for scene in _scenes_of(item, plan):
         with beside_people(len(scene.faces), scene.subject.size_px):
-            written |= _write_setups(item, scene, plan, shared_ev)
+            written |= _write_images(item, scene, plan, shared_ev)
         people[:0] = [face.described() for face in scene.people]
         facts = facts_of(people, plan.photo) if people else scene.facts
     outputs = [path.with_suffix(suffix) for path in written for suffix in plan.options.output.suffixes]
@@ -70,104 +76,213 @@ def relight_item(plan: RelightPlan, item: Item) -> Outcome:
     return Outcome(outputs, {**facts, **each})
 
 
-def scenes_of(item: Item, plan: RelightPlan, together: bool) -> Iterator[LitScene]:
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What one image shows: people of a photo, a face alone, or a stack; their lights, and what is behind.
+
+    Attributes:
+        subject: What is relit.
+        setups: The lights of each image.
+        lights_of: Gives setups as sums of far and near lights.
+        metadata: Of all images.
+        people: Of a photo, from left to right.
+        faces: Their numbers, from the left, the nearest first.
+        evens: Brightness of even light on each.
+        tag: What follows the photo's name in those of its images.
+        alpha: The photo's [H, W].
+        behind: Gives the image behind the person.
+        plate: Metadata of the photo that results keep.
+        identity: Distance of an exposed image to the photo.
+        facts: Of a stack's fit, for the report.
+    """
+
+    subject: Relightable
+    setups: tuple[LightSetup, ...]
+    lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    metadata: Mapping[str, Any]
+    people: Sequence[FittedFace] = ()
+    faces: tuple[int, ...] = (0,)
+    evens: tuple[float, ...] = (1.0,)
+    tag: str = ""
+    alpha: np.ndarray | None = None
+    behind: Behind | None = None
+    plate: Mapping[str, Any] = field(default_factory=dict)
+    identity: Callable[[np.ndarray], float] | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @cached_property
+    def lights(self) -> list[Lights]:
+        """The lights of all setups, as `as_lit` lists them, on each of the people."""
+        people = zip(self.faces, self.evens, strict=True)
+        return [self.lights_of(as_lit(self.setups, *one)) for one in people]
+
+    @property
+    def ends(self) -> list[int]:
+        """The end of each setup among the sums of `lights`, after a first 0."""
+        alone = (len(with_room(setup).names) if setup.names else 0 for setup in self.setups)
+        return list(accumulate((1 + lights for lights in alone), initial=0))
+
+    @property
+    def parts(self) -> list[slice]:
+        """As many of the setups at a time as fit the memory."""
+        most = max(last - first for first, last in pairwise(self.ends))
+        return batches(len(self.setups), most * self.subject.nbytes)
+
+    @step("render")
+    def relit(self, part: slice) -> list[list[Any]]:
+        """The people under some of the setups: under all of its lights, and under each that has a name."""
+        ends = self.ends[part.start : part.stop + 1]
+        lights = [of_one[ends[0] : ends[-1]] for of_one in self.lights]
+        found = self.subject.relit(lights if isinstance(self.subject, PeopleInPhoto) else lights[0])
+        return [list(islice(found, last - first)) for first, last in pairwise(ends)]
+
+
+def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
     """All chosen people of a photo in one image, or each face alone, the last first; or a stack."""
     if item.input_path.suffix.lower() == ".exr":
         from facerf_cli.files.olat_stack import is_olat_stack
 
         if is_olat_stack(item.input_path):
-            from facerf_cli.work.stack_composers import scene_of_stack
-
-            yield scene_of_stack(item, plan)
+            yield _scene_of_stack(item, plan)
             return
-    options, rotation = plan.options, rotation_of(plan.options.pose)
-    lights_of = partial(lights_over_rig, rig=options.rig, sampling=plan.sampling)
+    lights_of = partial(lights_over_rig, rig=plan.options.rig, sampling=plan.sampling)
     lights_of(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
-    in_photo = options.composite == "photo"
+    read = _read(item, plan)
+    _check_faces(item, [face.number for face in read.faces], plan)
+    if plan.options.composite == "photo":
+        with naming(item.input_path):
+            require_people(len(read.faces), read.image.pixels.shape[:2])
+        yield _scene_in_photo(item, plan, read, lights_of)
+        return
+    for face in reversed(read.faces):
+        yield _scene_of_face(item, plan, read, face, lights_of)
+
+
+def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
+    from facerf_cli.work.stack_composers import open_stack
+
+    _check_faces(item, [0], plan)
+    stack, options = open_stack(item, plan), plan.options
+    behind = (
+        None if stack.camera is None else _backdrop(options.background, options.background_blur, stack.camera)
+    )
+    setups = plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups)
+    return Scene(stack.subject, setups, stack.lights_of, stack.metadata, behind=behind, facts=stack.facts)
+
+
+class _Read(NamedTuple):
+    """A photo, the faces found in it from left to right, and what is given for it: matte and normals."""
+
+    image: LinearImage
+    faces: Sequence[PhotoFace]
+    matte: np.ndarray | None
+    normals: np.ndarray | None
+    in_shot: bool
+
+
+def _read(item: Item, plan: RelightPlan) -> _Read:
+    """Read a photo and find its faces; a frame of a shot has one, which is fitted already."""
     faces: Sequence[PhotoFace]
     if place := _in_shot(item, plan):
         shot, frame = place
-        image, face = shot.fitted(frame, options.reflectance == "portrait")
-        faces, matte = [face], face.matte
+        image, fitted = shot.fitted(frame, plan.options.reflectance == "portrait")
+        faces, matte = [fitted], fitted.matte
     else:
         image = read_photo(item, plan.photo)
         matte = person_matte(item, image.pixels, plan.photo)
         faces = find_people(item, image, plan.photo, matte)
-    photo, background = image.pixels, options.background.kind
-    normals = read_normals(item, options.normals_from, photo.shape[:2])
-    check_faces(item, [face.number for face in faces], plan)
-    target = Target(composite="face")
-    if in_photo:
-        shown = None
-        if options.matte is not None:
-            shown = read_matte(item, options.matte, photo.shape[:2], in_shot=place is not None)
-        behind: Background = background if background in ("photo", "none") else "given"
-        target = Target(matte=shown, alpha=None if behind == "photo" else image.alpha, background=behind)
-        with naming(item.input_path):
-            require_people(len(faces), photo.shape[:2])
-    for some in [faces] if together else ([face] for face in reversed(faces)):
-        fitted: list[tuple[FittedFace, Person]] = []
-        for face in some:
-            known = face if isinstance(face, FittedFace) else None  # of a frame of a shot
-            with naming(face.name):
-                person = fit(
-                    load_models_once(plan.photo),
-                    photo,
-                    geometry=plan.photo.geometry,
-                    reflectance=options.reflectance,
-                    network_alone=options.network_alone,
-                    matte=matte,
-                    texture_side=plan.photo.texture_side,
-                    white=options.white,
-                    face=face.found,
-                    head=known.head if known else None,
-                    steady=known.steady if known else None,
-                    normals=normals,
-                )
-            fitted.append((_described(face, person, matte, options), person))
-        people = [face for face, _ in fitted]
-        fitted.sort(key=lambda one: -one[0].fit.crop.side_px)  # the nearest first
-        persons = [person for _, person in fitted]
-        subject = persons[0] if len(persons) == 1 else Group(persons)
-        if rotation is not None:
-            target = replace(target, fit=replace(people[0].fit, rotation=rotation))
-        with naming(item.input_path):
-            for face, person in fitted:
-                require_face(person.models.face, target.fit or face.fit, photo.shape[:2])
-        scene = LitScene(
-            setups=plan.setups,
-            lights_of=lights_of,
-            metadata=_metadata(item, plan),
-            people=people,
-            faces=tuple(face.number for face, _ in fitted),
-            evens=tuple(person.even_brightness for person in persons),
-            plate=plate_metadata(image.metadata),
-            subject=subject.composed(target),
-        )
-        if not in_photo:
-            yield replace(scene, tag=people[0].tag)
-            continue
-        nearest = fitted[0][0]
-        camera = photo_camera(nearest.fit.crop, *photo.shape[:2])
-        yield replace(
-            scene,
-            alpha=image.alpha if background == "photo" else None,
-            behind=backdrop(options.background, options.background_blur, camera),
-            identity=_identity_of(photo, nearest) if options.identity else None,
-        )
+    normals = read_normals(item, plan.options.normals_from, image.pixels.shape[:2])
+    return _Read(image, faces, matte, normals, in_shot=place is not None)
 
 
-def _described(
-    face: PhotoFace, person: Person, matte: np.ndarray | None, options: RelightOptions
-) -> FittedFace:
-    """The face of a person, with what is known of its fit and its matte."""
-    if isinstance(face, FittedFace):
-        return face
-    found = fitted_face(face, person.head, matte)
+def _scene_in_photo(
+    item: Item, plan: RelightPlan, read: _Read, lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+) -> Scene:
+    """The people of a photo in one image."""
+    photo, alpha, options = read.image.pixels, read.image.alpha, plan.options
+    keeps_photo, shown = options.background.kind == "photo", None
+    if options.matte is not None:
+        shown = read_matte(item, options.matte, photo.shape[:2], in_shot=read.in_shot)
+    target = Target(
+        matte=shown,
+        alpha=None if keeps_photo else alpha,
+        background=options.background.kind if options.background.kind in ("photo", "none") else "given",
+    )
+    fitted = [_fitted(plan, read, face) for face in read.faces]
+    people = [face for face, _ in fitted]
+    fitted.sort(key=lambda one: -one[0].fit.crop.side_px)  # the nearest first
+    with naming(item.input_path):
+        for face, person in fitted:
+            require_face(person.models.face, face.fit, photo.shape[:2])
+    nearest = fitted[0][0]
+    camera = photo_camera(nearest.fit.crop, *photo.shape[:2])
+    return Scene(
+        subject=Group([person for _, person in fitted]).composed(target),
+        setups=plan.setups,
+        lights_of=lights_of,
+        metadata=_metadata(item, plan),
+        people=people,
+        faces=tuple(face.number for face, _ in fitted),
+        evens=tuple(person.even_brightness for _, person in fitted),
+        alpha=alpha if keeps_photo else None,
+        behind=_backdrop(options.background, options.background_blur, camera),
+        plate=plate_metadata(read.image.metadata),
+        identity=_identity_of(photo, nearest) if options.identity else None,
+    )
+
+
+def _scene_of_face(
+    item: Item,
+    plan: RelightPlan,
+    read: _Read,
+    face: PhotoFace,
+    lights_of: Callable[[tuple[LightSetup, ...]], Lights],
+) -> Scene:
+    """One face alone, in the photo's pose or in that of `--pose`."""
+    fitted, person = _fitted(plan, read, face)
+    rotation = rotation_of(plan.options.pose)
+    posed = None if rotation is None else replace(fitted.fit, rotation=rotation)
+    with naming(item.input_path):
+        require_face(person.models.face, posed or fitted.fit, read.image.pixels.shape[:2])
+    return Scene(
+        subject=person.composed(Target(posed, "face")),
+        setups=plan.setups,
+        lights_of=lights_of,
+        metadata=_metadata(item, plan),
+        people=[fitted],
+        faces=(fitted.number,),
+        evens=(person.even_brightness,),
+        tag=fitted.tag,
+        plate=plate_metadata(read.image.metadata),
+    )
+
+
+def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace, Person]:
+    """The person of a face, with what is known of its fit and its matte."""
+    options = plan.options
+    known = face if isinstance(face, FittedFace) else None  # of a frame of a shot
+    with naming(face.name):
+        person = fit(
+            load_models_once(plan.photo),
+            read.image.pixels,
+            geometry=plan.photo.geometry,
+            reflectance=options.reflectance,
+            network_alone=options.network_alone,
+            matte=read.matte,
+            texture_side=plan.photo.texture_side,
+            white=options.white,
+            face=face.found,
+            head=known.head if known else None,
+            steady=known.steady if known else None,
+            normals=read.normals,
+        )
+    if known:
+        return known, person
+    found = fitted_face(face, person.head, read.matte)
     if person.balance is not None and person.balance.is_far and options.white == "photo":
         log.info("%s: its light has a strong colour (--white scene takes it out)", face.name)
     found.see(person.segmentation)
-    return found
+    return found, person
 
 
 def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
@@ -205,7 +320,7 @@ def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
     if not {setup.name for setup in plan.setups} <= set(known):
         if isinstance(rule := plan.exposure_rule, float):
             return dict.fromkeys((setup.name for setup in plan.setups), rule)
-        scene = next(scenes_of(leader, with_background(plan, leader), together=True))
+        scene = next(_scenes_of(leader, with_background(plan, leader)))
         known |= _exposures_ev(scene, scene.relit, plan)
     return known
 
@@ -219,9 +334,9 @@ def _in_shot(item: Item, plan: RelightPlan) -> Any:
     return open_at(plan.shots, item, plan.photo, plan.options.white)
 
 
-def _write_setups(
+def _write_images(
     item: Item,
-    scene: LitScene,
+    scene: Scene,
     plan: RelightPlan,
     shared_ev: Mapping[str, float] | None,
 ) -> dict[Path, dict[str, float]]:
@@ -272,7 +387,7 @@ def _made_by(setup: LightSetup, plan: RelightPlan) -> dict[str, str]:
 
 @step("render")
 def _rendered(
-    scene: LitScene,
+    scene: Scene,
     setup: LightSetup,
     relit: Any,
     each: Sequence[Any],
@@ -335,7 +450,7 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
 
 
 def _exposures_ev(
-    scene: LitScene, relit_by: Callable[[slice], list[list[Any]]], plan: RelightPlan
+    scene: Scene, relit_by: Callable[[slice], list[list[Any]]], plan: RelightPlan
 ) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(rule := plan.exposure_rule, float):
@@ -352,3 +467,49 @@ def _exposures_ev(
             found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
             del relit  # a view of one holds all of its part, beside the next
     return found
+
+
+def with_background(plan: RelightPlan, item: Item) -> RelightPlan:
+    """Choose the image of `--background` that goes with an item: by its place in its shot, or by its name."""
+    choice = plan.options.background
+    path = choice.path and companion(item, choice.path, "--background")
+    if choice.frames:
+        path = choice.frames[plan.shots.places[item.output_base][1]]
+    return replace(plan, options=replace(plan.options, background=replace(choice, path=path, frames=())))
+
+
+def _backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:
+    """Images [H, W, 3] behind a person, scene-linear; None for the photo's own, or for nothing.
+
+    A file and a colour look as they are at the exposure, in EV. A map is as bright as its light; single
+    lights have a black surrounding.
+    """
+    fixed, size_px = None, (camera.height_px, camera.width_px)
+    if choice.colour is not None:
+        fixed = np.broadcast_to(np.array(choice.colour, np.float32), (*size_px, 3))
+    elif choice.path is not None:
+        with beside(size_px, images=3):
+            fixed = covering(read_image(choice.path, with_alpha=False).pixels, *size_px)
+
+    def behind(setup: LightSetup, ev: float) -> Rows | None:
+        if choice.kind != "envmap":
+            return None if fixed is None else Scaled(fixed, np.float32(2.0**-ev))
+        if (light := setup.envmap) is None or light.envmap is None:
+            return np.broadcast_to(np.float32(0), (*size_px, 3))
+        with beside(size_px, images=2):
+            envmap = read_map(light.envmap)
+        rays, colour = partial(rays_of_rows, camera), intensity_of(light).numpy()
+        around = Backdrop(envmap, size_px, rays, light.rotate_deg, blur)
+        return Scaled(around, colour)
+
+    return behind
+
+
+def _check_faces(item: Item, relit: Sequence[int], plan: RelightPlan) -> None:
+    """Raise InputError if a light is for a face that is not among the relit ones, given by their numbers."""
+    if others := plan.lit_faces.difference(relit):
+        numbers = ", ".join(map(str, relit))
+        raise InputError(
+            f"{item.input_path}: a light is for face {min(others)}, but only face {numbers} is relit; "
+            "add --face all, or remove that light"
+        )

@@ -1,12 +1,12 @@
 """OLAT stacks that are relit: sums of their lights, in their frame or on their photo; their scenes."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -24,15 +24,16 @@ from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
 from facerf_cli.image.strips import Resized, Rows, Scaled
 from facerf_cli.light.studio_points import Lights
+from facerf_cli.raster.camera import Camera
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import weighted_sum
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
+from facerf_cli.work.light_setups import LightSetup
 from facerf_cli.work.lights import lights_over_stack, off_rig_deg
 from facerf_cli.work.photos import companion, face_model, fit_facts
 from facerf_cli.work.plan import KEPT_PX, beside
 from facerf_cli.work.relight_options import RelightPlan
-from facerf_cli.work.relight_scenes import Behind, LitScene, backdrop, check_faces
 
 log = logging.getLogger(LOGGER_NAME)
 _OFF_RIG_DEG = 1.0  # from which on a light that a stack lacks is named
@@ -187,10 +188,19 @@ def _fit_of(item: Item) -> Iterator[None]:
         raise InputError(f"{item.input_path}: the fit in it cannot be used: {error}") from None
 
 
-def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
-    """A stack under its own lights."""
+class OpenStack(NamedTuple):
+    """A stack that can be relit by its own lights; the photo's camera, if the stack is put back on it."""
+
+    subject: Relightable
+    lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    metadata: Mapping[str, Any]
+    facts: Mapping[str, Any]
+    camera: Camera | None = None
+
+
+def open_stack(item: Item, plan: RelightPlan) -> OpenStack:
+    """Open a stack; raises InputError for options that only a photo can have."""
     _check_stack(item, plan)
-    check_faces(item, [0], plan)
     header = read_olat_header(item.input_path)
     own = torch.from_numpy(header.directions).float()
     if (off_deg := off_rig_deg(plan.setups, own)) > _OFF_RIG_DEG:
@@ -201,9 +211,9 @@ def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
         log.warning(said, item.input_path, off_deg)
     lights_of = partial(lights_over_stack, directions=own, sampling=plan.sampling)
     subject: Relightable
-    behind = None
+    camera = None
     if header.kind == "photo":
-        subject, behind, facts = _person_of_stack(item, header, plan)
+        subject, camera, facts = _person_of_stack(item, header, plan)
     elif plan.options.photo_of_stack is not None:
         raise InputError(f"{item.input_path}: not in its photo's frame; predict it with --frame photo")
     elif header.kind == "image":
@@ -212,9 +222,8 @@ def scene_of_stack(item: Item, plan: RelightPlan) -> LitScene:
         head = head_in_stack(item, header)  # of textures, in the frame of its crop
         subject = FaceAlone(face_model(plan.photo), head, StackTextures(item.input_path))
         facts = fit_facts(head.fit)
-    lit = plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups)
     metadata = attributes_of_sum(header.metadata, item.input_path.name, item.key)
-    return LitScene(subject, lit, lights_of, metadata, behind=behind, facts=facts)
+    return OpenStack(subject, lights_of, metadata, facts, camera)
 
 
 def _check_stack(item: Item, plan: RelightPlan) -> None:
@@ -246,7 +255,7 @@ def _check_stack(item: Item, plan: RelightPlan) -> None:
 
 def _person_of_stack(
     item: Item, header: StackHeader, plan: RelightPlan
-) -> tuple[StackImages, Behind | None, dict[str, Any]]:
+) -> tuple[StackImages, Camera | None, dict[str, Any]]:
     """The images of a stack of a photo's person, on its photo if that is given, and facts of its fit."""
     fit, face = face_in_stack(item, header, face_model(plan.photo))
     size_px, stack = header.seen.shape, StackImages(header, item.input_path, face)
@@ -260,4 +269,4 @@ def _person_of_stack(
         raise InputError(f"{path}: not the photo of {item.input_path}, whose sides have another ratio")
     camera = photo_camera(fit.crop.of_scaled(scale), *photo.shape[:2])
     on_photo = replace(stack, photo=photo, keeps_background=plan.options.background.kind == "photo")
-    return on_photo, backdrop(plan.options.background, plan.options.background_blur, camera), fit_facts(fit)
+    return on_photo, camera, fit_facts(fit)

@@ -21,11 +21,11 @@ from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
 from facerf_cli.light.studio_points import Lights, rig_by_text
-from facerf_cli.person import Target, fit
+from facerf_cli.person import Target, fit, olat_images
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.reflectance import reflectance_of
-from facerf_cli.relighting.relightable import Relightable, RenderRequest
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
     FittedFace,
@@ -42,7 +42,6 @@ from facerf_cli.work.verbs import PredictOlat, Written
 from facerf_cli.work.view_photos import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
-_AT_ONCE, _AT_ONCE_PX = 8, 1 << 23  # lights of a person in the photo's frame, and pixels of their images
 
 
 def write_stacks(item: Item, work: PredictOlat) -> Written:
@@ -91,9 +90,8 @@ def _of_person(
     subject = person.composed(Target(alpha=alpha, background="none"))
 
     def olats() -> Iterator[Tensor]:
-        height, width = subject.size_px
-        for some in torch.split(directions, max(1, min(_AT_ONCE, _AT_ONCE_PX // (height * width)))):
-            batch = torch.from_numpy(_under_each(subject, some)).permute(0, 3, 1, 2)
+        for images in olat_images(subject, directions):
+            batch = torch.from_numpy(images).permute(0, 3, 1, 2)
             scale = _tile_px(len(directions)) / max(batch.shape[-2:])
             small = interpolate(batch, scale_factor=scale, mode="area") if scale < 1 else batch
             tiles.append(small.permute(0, 2, 3, 1).numpy())
@@ -111,14 +109,6 @@ def _of_person(
         **_about(item, directions, work),
     )
     return header, one_ahead(olats())
-
-
-def _under_each(subject: Relightable, directions: Tensor) -> np.ndarray:
-    """Images [l, H, W, 3] of a subject under each of some lights [l, 3]."""
-    images = np.empty((len(directions), *subject.size_px, 3), np.float32)
-    lights = {str(number): one for number, one in enumerate(subject.relit(Lights.each(directions)))}
-    subject.rendered(RenderRequest(lights=lights), lambda number, shape: images[int(number)])
-    return images
 
 
 def _of_face(

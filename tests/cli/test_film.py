@@ -23,8 +23,8 @@ from facerf_cli.main import main
 from facerf_cli.work import light_of_picture
 from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.relight import with_background
 from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
-from facerf_cli.work.relight_scenes import with_background
 from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
 from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate

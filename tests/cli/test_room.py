@@ -15,9 +15,8 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, in_room
-from facerf_cli.work.lights import lights_over_rig, with_room
+from facerf_cli.work.lights import as_lit, lights_over_rig, with_room
 from facerf_cli.work.relight_options import parse_background
-from facerf_cli.work.relight_scenes import as_lit
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight
 from tests.exr_layers import exr_layers
