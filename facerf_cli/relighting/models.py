@@ -1,8 +1,8 @@
 """The face model and every trained network, on its device, from the shipped file or the user's."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,7 @@ class Networks:
         given: Mapping[str, nn.Module] | None = None,
     ) -> None:
         self.files, self.device, self._given = dict(files), device, dict(given or {})
-        self.__dict__.update(self._given)  # as a `cached_property` keeps them
+        self._loaded: dict[str, Any] = dict(self._given)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send the files to another process, which loads each network once, or the given networks."""
@@ -64,60 +64,61 @@ class Networks:
             return Networks, (self.files, self.device, self._given)
         return _networks_once, (tuple(self.files.items()), self.device)
 
-    @cached_property
+    @property
     def reflectance(self) -> ReflectanceNetwork:
         """The Reflectance Network."""
-        return self._loaded("reflectance")
+        return self._get("reflectance")
 
-    @cached_property
+    @property
     def geometry(self) -> nn.Module:
         """The Geometry Network."""
-        network = self._loaded("geometry")
-        _require_builtin_coefficients(self.files["geometry"], network)
-        return network
+        return self._get("geometry")
 
-    @cached_property
+    @property
     def diffuse_sh(self) -> DiffuseNetwork:
         """The network of the baseline of this name."""
-        return self._loaded("diffuse_sh")
+        return self._get("diffuse_sh")
 
-    @cached_property
+    @property
     def light_features(self) -> LightNetwork:
         """S_f, frozen."""
-        return self._loaded("light_features")
+        return self._get("light_features")
 
-    @cached_property
+    @property
     def parsing(self) -> ParsingNetwork:
         """The Parsing Network."""
-        network = self._loaded("parsing")
-        if (network.settings.classes, network.settings.landmarks) != (len(CLASSES), LANDMARKS):
-            path = self.files["parsing"]
-            raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
-        return network
+        return self._get("parsing")
 
-    @cached_property
+    @property
     def portrait(self) -> PortraitNetwork:
         """The Portrait Network."""
-        return self._loaded("portrait")
+        return self._get("portrait")
 
-    def _loaded(self, name: str) -> Any:
-        """A network of a file; raises InputError for one that is damaged or of another version."""
-        network = load_networks(self.files[name], LAYOUT_VERSION, (name,))[0][name]
-        return network.to(self.device).eval().requires_grad_(False)
-
-    @cached_property
+    @property
     def people(self) -> PeopleNetworks:
         """The networks that find people and cut them out."""
-        return PeopleNetworks(self.parsing, *mediapipe_networks(self.device))
+        if "people" not in self._loaded:
+            self._loaded["people"] = PeopleNetworks(self.parsing, *mediapipe_networks(self.device))
+        return self._loaded["people"]
+
+    def _get(self, name: str) -> Any:
+        """A network; raises InputError for a file that is damaged or of another version."""
+        if name not in self._loaded:
+            path = self.files[name]
+            network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
+            if name in _CHECKS:
+                _CHECKS[name](path, network)
+            self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
+        return self._loaded[name]
 
     def load(self, names: Iterable[str]) -> None:
         """Load networks by name; raises InputError for a file that is damaged or of another version."""
         for name in names:
-            getattr(self, name)
+            self._get(name)
 
     def with_networks(self, **networks: nn.Module) -> "Networks":
         """Return the same networks with others in place of some."""
-        loaded = {name: network for name, network in vars(self).items() if name in SHIPPED}
+        loaded = {name: network for name, network in self._loaded.items() if name in SHIPPED}
         return Networks(self.files, self.device, {**loaded, **networks})
 
     def sha256(self, name: str) -> str:
@@ -126,10 +127,28 @@ class Networks:
 
     def served(self) -> dict[str, dict[str, str]]:
         """File and SHA-256 of each network that was needed so far, for reports."""
-        files = {name: self.files[name] for name in SHIPPED if name in vars(self)}
-        if "people" in vars(self):
+        files = {name: self.files[name] for name in SHIPPED if name in self._loaded}
+        if "people" in self._loaded:
             files["mediapipe"] = ASSET
         return {name: described_file(path) for name, path in files.items()}
+
+
+def _check_parsing(path: Path, network: ParsingNetwork) -> None:
+    """Raise InputError for a Parsing Network of other classes or landmarks."""
+    if (network.settings.classes, network.settings.landmarks) != (len(CLASSES), LANDMARKS):
+        raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
+
+
+def _check_geometry(path: Path, network: GeometryNetwork) -> None:
+    """Raise InputError where a Geometry Network regresses more coefficients than the built-in model has."""
+    model, settings = load_face_model(BUILTIN), network.settings
+    if settings.face_model != BUILTIN:
+        return
+    if settings.identity > len(model.identity) or settings.expression > len(model.expression):
+        raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
+
+
+_CHECKS: dict[str, Callable[[Path, Any], None]] = {"parsing": _check_parsing, "geometry": _check_geometry}
 
 
 @cache  # loaded once a process
@@ -215,15 +234,6 @@ def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | Non
         return SourceColours.from_metadata(metadata["source_colours"])
     except (LookupError, TypeError, ValueError):
         raise InputError(f"{path}: invalid source_colours in its metadata; train it again") from None
-
-
-def _require_builtin_coefficients(path: Path, geometry: GeometryNetwork) -> None:
-    """Raise InputError where a Geometry Network regresses more coefficients than the built-in model has."""
-    model, settings = load_face_model(BUILTIN), geometry.settings
-    if settings.face_model != BUILTIN:
-        return
-    if settings.identity > len(model.identity) or settings.expression > len(model.expression):
-        raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
 
 
 @cache  # of many MB
