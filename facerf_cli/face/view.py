@@ -17,7 +17,7 @@ from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel
 from facerf_cli.face.topology import CONTOUR, grid_triangles, grid_uv, region_mask
 from facerf_cli.image.colour import auto_exposure_ev
-from facerf_cli.image.strips import strips
+from facerf_cli.image.strips import Window, strips
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, smoothstep, vertex_normals
@@ -51,13 +51,11 @@ _COLOURS = {
 class FaceView:
     """A fitted face rendered by its photo's camera, ready to be textured any number of times.
 
-    All tensors cover the window [h, w] of the photo [H, W] whose first row and column are `top` and `left`.
+    All tensors cover the window [h, w] of the photo [H, W].
     """
 
-    height_px: int
-    width_px: int
-    top: int
-    left: int
+    size_px: tuple[int, int]  # of the photo
+    window: Window
     uv: Tensor  # [h, w, 2]
     coverage: Tensor  # [h, w] 0 or 1
     mask: Tensor  # [h, w] 0..1, the face inside jaw and hairline with a soft border
@@ -79,39 +77,15 @@ class FaceView:
         """Unit normals [h, w, 3], camera space."""
         return self.surface(slice(0, len(self.uv)))[..., :3]
 
-    def render(self, texture: Tensor, rows: slice = slice(None)) -> Tensor:
-        """Render a texture [C, T, T] in the window [h, w, C], or in rows of it, zero off the mesh."""
-        return sample_texture(texture, self.uv[rows]) * self.coverage[rows][..., None]
+    def render(self, texture: Tensor, part: Window | slice = slice(None)) -> Tensor:
+        """Render a texture [C, T, T] in the window [h, w, C], or in a part of it, zero off the mesh."""
+        return sample_texture(texture, self.uv[part]) * self.coverage[part][..., None]
 
-    def full(self, window: Tensor) -> np.ndarray:
+    def full(self, values: Tensor) -> np.ndarray:
         """Place values of the window [h, w, ...] in the photo [H, W, ...], zero elsewhere."""
-        return self.placed(window, slice(0, self.height_px))
-
-    def placed(self, values: Tensor, rows: slice) -> np.ndarray:
-        """Rows [n, W, ...] of the photo with values [m, w, ...] of the `rows_inside` them, zero elsewhere."""
-        frame = np.zeros((rows.stop - rows.start, self.width_px, *values.shape[2:]), np.float32)
-        if len(values):
-            frame[self.rows_of(self.rows_inside(rows), rows), self.window[1]] = values.detach().numpy()
-        return frame
-
-    def rows_inside(self, rows: slice) -> slice:
-        """The window's rows, counted from its own first one, among rows of the photo; maybe none."""
-        first, last = rows.start - self.top, min(len(self.coverage), rows.stop - self.top)
-        return slice(max(0, first), max(0, first, last))
-
-    def in_photo(self, inside: slice) -> slice:
-        """Rows of the window as rows of the photo."""
-        return slice(inside.start + self.top, inside.stop + self.top)
-
-    def rows_of(self, inside: slice, rows: slice) -> slice:
-        """Rows of the window as counted from the first of some rows of the photo."""
-        return slice(inside.start + self.top - rows.start, inside.stop + self.top - rows.start)
-
-    @property
-    def window(self) -> tuple[slice, slice]:
-        """The window's rows and columns in the photo."""
-        height, width = self.coverage.shape
-        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+        return Window(*(slice(0, length) for length in self.size_px)).framed(
+            values.detach().numpy(), self.window
+        )
 
 
 def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
@@ -123,13 +97,13 @@ def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
 
 def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceView:
     """Render the mesh [V, 3] with a camera; `side_px` is the crop's side in the camera's pixels."""
-    top, left, window = face_window(vertices_camera, camera)
+    top, left, seen = face_window(vertices_camera, camera)
     triangles = grid_triangles()
-    size = window.height_px, window.width_px
+    size = seen.height_px, seen.width_px
     uv, coverage, mask = torch.empty(*size, 2), torch.empty(size), torch.empty(size)
     region = region_mask("face", _MASK_SIDE)[None]
     for rows in strips(size):
-        fragments = rasterize(vertices_camera, triangles, rows_of_camera(window, rows))
+        fragments = rasterize(vertices_camera, triangles, rows_of_camera(seen, rows))
         uv[rows] = interpolate(grid_uv(), triangles, fragments)
         coverage[rows] = fragments.covered.float()
         mask[rows] = sample_texture(region, uv[rows])[..., 0]
@@ -137,7 +111,8 @@ def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceVi
     if not inside.all():  # where the face turns away the UV mask is steep in the image, so it is softened
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
         mask = mask * smoothstep(edge_px / max(_FEATHER * side_px, 1))
-    return FaceView(camera.height_px, camera.width_px, top, left, uv, coverage, mask, vertices_camera, window)
+    window = Window(slice(top, top + size[0]), slice(left, left + size[1]))
+    return FaceView((camera.height_px, camera.width_px), window, uv, coverage, mask, vertices_camera, seen)
 
 
 def rows_of_camera(camera: Camera, rows: slice) -> Camera:

@@ -4,7 +4,7 @@ import logging
 import mmap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -42,6 +42,36 @@ class Scaled:
     def __getitem__(self, rows: slice, /) -> np.ndarray:
         """Some rows [h, W, C]."""
         return np.asarray(self.image[rows] * self.factor)
+
+
+class Window(NamedTuple):
+    """Rows and columns of an image, which its array [H, W, ...] is indexed by."""
+
+    rows: slice
+    columns: slice
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of its rows and of its columns."""
+        return self.rows.stop - self.rows.start, self.columns.stop - self.columns.start
+
+    def common(self, other: "Window") -> "Window":
+        """The part that another window has, too; maybe none."""
+        starts = [max(one.start, two.start) for one, two in zip(self, other, strict=True)]
+        stops = [min(one.stop, two.stop) for one, two in zip(self, other, strict=True)]
+        return Window(*(slice(start, max(start, stop)) for start, stop in zip(starts, stops, strict=True)))
+
+    def inside(self, other: "Window") -> "Window":
+        """The same as counted from the first row and column of another window."""
+        return Window(*(slice(a.start - b.start, a.stop - b.start) for a, b in zip(self, other, strict=True)))
+
+    def framed(self, values: np.ndarray, part: "Window") -> np.ndarray:
+        """An array of all of the window with values [h, w, ...] of a part of it, 0 elsewhere."""
+        if part == self:
+            return values
+        found = np.zeros((*self.shape, *values.shape[2:]), np.float32)
+        found[part.inside(self)] = values
+        return found
 
 
 def strips(shape: Sequence[int], strip_px: int | None = None) -> Iterator[slice]:

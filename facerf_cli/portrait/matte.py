@@ -1,7 +1,6 @@
 """The matte of a person, solved at its outline, at the photo's resolution; and the person's own colours."""
 
 import math
-import threading
 from functools import partial
 
 import numpy as np
@@ -108,21 +107,14 @@ class PersonColours:
             person = _unmixed(mixture, share, own, background)
         self._means = np.concatenate([own, background], -1)
         self.small = person * (share > 0)[..., None]  # [h, w, 3], of at most `_COLOURS_PX`
-        self._last = threading.local()  # rows and colours: of one image they are read thrice
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
-        start, stop, _ = rows.indices(self.shape[0])
-        first, kept = getattr(self._last, "kept", (0, self._photo[:0]))
-        if not first <= start <= stop <= first + len(kept):
-            first, kept = self._last.kept = start, self._found(slice(start, stop))
-        return kept[start - first : stop - first]
-
-    def _found(self, rows: slice) -> np.ndarray:
+        """Some rows [h, W, 3]."""
         photo, matte = self._photo[rows], self._matte[rows]
         found = photo * (matte > 0)[..., None]
         mixed = np.nonzero((matte > 0) & (matte < 1))
         if len(mixed[0]):
-            y = mixed[0] + rows.start
+            y = mixed[0] + rows.indices(self.shape[0])[0]
             own, background = np.split(_looked_up(self._means, y, mixed[1], self.shape), 2, -1)
             mixture, share = photo[mixed], matte[mixed]
             own = _unmixed(mixture, share, own, background)

@@ -15,7 +15,7 @@ other side of an edge, as at a collar: their factors are limited. Where skin is 
 rest, it glares (Shafer, *Using color to separate reflection components*, 1985), and luminance detail fades.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import FaceView
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import Rows
+from facerf_cli.image.strips import Window
 from facerf_cli.raster.texture import blurred_within, inpaint
 
 NOISE = 0.03  # radiance of skin in the maps below which colour is noise, as a fraction of its mean
@@ -98,23 +98,14 @@ def _glare(coarse: Tensor, typical: Tensor) -> Tensor:
     return ((_GLARE * whiter).clamp(0, 1) * brighter.clamp(0, 1))[..., None]
 
 
-@dataclass(frozen=True, eq=False)
-class DetailRows:
-    """Pixels, detail factors and the fraction of own regions in rows [h, w] of the window of a face."""
-
-    pixels: Tensor
-    gain: Tensor
-    own: Tensor
-
-
 class FaceDetail:
-    """Add the detail of a photo [H, W, 3] to relit textures of a face, in the window [h, w] of a view.
+    """Add the detail of a photo to relit textures of a face, in the window [h, w] of a view.
 
     Eyes, brows and teeth are not relit from the texture. Their pixels are scaled by the change of light on
     the skin around them, teeth by the light that falls into the mouth.
     """
 
-    def __init__(self, face: FaceTexture, view: FaceView, photo: Rows) -> None:
+    def __init__(self, face: FaceTexture, view: FaceView) -> None:
         self._view = view
         masks = torch.stack([region_mask(name, _OWN_SIDE) for name in _OWN_REGIONS])[None]
         masks = F.interpolate(masks, face.texture.shape[1:], mode="bilinear", align_corners=False)[0]
@@ -123,14 +114,7 @@ class FaceDetail:
         self._typical = mean_colour(face.texture, self._skin) + TINY
         least = _LEAST_AROUND * float(self._typical.mean())
         self._around_source = inpaint(face.texture, self._skin).clamp(min=least)
-        self._source, self._photo = torch.cat([face.texture, own[None]]), photo
-
-    def observe(self, inside: slice) -> DetailRows:
-        """Read rows of the window."""
-        photo = self._photo[self._view.in_photo(inside)][:, self._view.window[1]].clip(min=0)
-        pixels = torch.from_numpy(photo)
-        source, own = torch.split(self._view.render(self._source, inside), [3, 1], -1)
-        return DetailRows(pixels, finer_detail(pixels, source, 1 - own, self._typical), own)
+        self._source = torch.cat([face.texture, own[None]])
 
     def ready(self, texture: Tensor, mouth: Tensor | None = None) -> Tensor:
         """Return a relit texture [3, T, T] and the change of light on the skin, in one tensor [6, T, T].
@@ -142,10 +126,17 @@ class FaceDetail:
             around = torch.lerp(around, inpaint(mouth, self._skin), _CAVITY * self._mouth)
         return torch.cat([texture, around / self._around_source])
 
-    def pixels(self, relit: Tensor, seen: DetailRows, inside: slice) -> Tensor:
-        """Return the pixels [h, w, 3] of observed rows under the light of `ready`."""
-        skin, change = self._view.render(relit, inside).chunk(2, -1)
-        return torch.lerp(skin * seen.gain, change * seen.pixels, seen.own)
+    def over(self, part: Window, photo: np.ndarray) -> Callable[[Tensor], np.ndarray]:
+        """What gives a part of the window, where the photo is [h, w, 3], under a light of `ready`."""
+        inside, pixels = part.inside(self._view.window), torch.from_numpy(photo.clip(min=0))
+        source, own = torch.split(self._view.render(self._source, inside), [3, 1], -1)
+        gain = finer_detail(pixels, source, 1 - own, self._typical)
+
+        def lit(light: Tensor) -> np.ndarray:
+            skin, change = self._view.render(light, inside).chunk(2, -1)
+            return torch.lerp(skin * gain, change * pixels, own).numpy()
+
+        return lit
 
 
 def mean_colour(texture: Tensor, weight: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import Rows
+from facerf_cli.image.strips import Rows, Window
 from facerf_cli.light.sphere import RIG_LIGHTS
 from facerf_cli.light.studio_points import is_of_rig
 from facerf_cli.portrait.mesh import SeenEyes
@@ -63,8 +63,7 @@ class _Iris:
     """
 
     number: int  # among the person's irises
-    rows: slice
-    columns: slice
+    window: Window
     kept: np.ndarray
     mirrors: np.ndarray
     grid: Tensor
@@ -83,15 +82,13 @@ class Eyes:
         """Mirror images [h, w, 3] in the windows of the irises, of those [N, 3, s, s] of the corneas."""
         return [_placed(iris, mirrored[iris.number]) for iris in self._irises]
 
-    def lit(self, pixels: np.ndarray, images: Sequence[np.ndarray], rows: slice) -> np.ndarray:
-        """Some rows [h, W, 3] of a relit image, in place, with the mirror images in its eyes."""
+    def lit(self, pixels: np.ndarray, images: Sequence[np.ndarray], window: Window) -> np.ndarray:
+        """A window [h, w, 3] of a relit image, in place, with the mirror images in its eyes."""
         for iris, image in zip(self._irises, images, strict=True):
-            first, last = max(rows.start, iris.rows.start), min(rows.stop, iris.rows.stop)
-            if first < last:
-                part = pixels[first - rows.start : last - rows.start, iris.columns]
-                own = slice(first - iris.rows.start, last - iris.rows.start)
-                part *= iris.kept[own]
-                part += image[own]
+            part = window.common(iris.window)
+            shown, own = pixels[part.inside(window)], part.inside(iris.window)
+            shown *= iris.kept[own]
+            shown += image[own]
         return pixels
 
 
@@ -122,9 +119,8 @@ def _iris(photo: Rows, eyes: SeenEyes, number: int, size_px: tuple[int, ...]) ->
     shade = gaussian_filter(share, _LASHES * radius_px, mode="constant")
     grid = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))], -1)[None]
     mirrors = share * (2 * shade - 1).clip(0)
-    return _Iris(
-        number, rows, columns, 1 + share[..., None] * (kept - 1), mirrors, grid.float(), radius_px, blur
-    )
+    kept = 1 + share[..., None] * (kept - 1)
+    return _Iris(number, Window(rows, columns), kept, mirrors, grid.float(), radius_px, blur)
 
 
 def _placed(iris: _Iris, mirrored: Tensor) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
+from facerf_cli.image.strips import Window
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.relighting.field import Field, near_texture, weighted_sums
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
@@ -59,7 +60,7 @@ class FaceAlone(Relightable):
     @property
     def size_px(self) -> tuple[int, int]:
         """Height and width of the frame."""
-        return self.view.height_px, self.view.width_px
+        return self.view.size_px
 
     @cached_property
     def matte(self) -> np.ndarray:
@@ -77,22 +78,22 @@ class FaceAlone(Relightable):
         turn = None if self.fit is None else self.head.fit.turn_to(self.fit.rotation)
         return relit_faces(self.reflectance, lights, self.vertices_m, self.head, turn)
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> Relit:
-        """The same, since textures are rendered as they are; raises UsageError for layers of whole people."""
-        require_face_layers(layers)
-        return relit
+    def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
+        """What gives rows of the image, not multiplied by the mask, of lights over black, and of layers."""
+        require_face_layers(request.layers)
+        return partial(self._render, request)
 
-    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
-        """Some rows of the image, not multiplied by the mask, of lights over black, and of layers."""
-        view, inside = self.view, self.view.rows_inside(rows)
-        found = {}
+    def _render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
+        view, window = self.view, Window(rows, slice(0, self.view.size_px[1]))
+        part = window.common(view.window)
+        inside, found = part.inside(view.window), {}
         if request.image is not None:
-            found["rgb"] = view.placed(view.render(request.image.texture, inside), rows)
+            found["rgb"] = window.framed(view.render(request.image.texture, inside).detach().numpy(), part)
         for name in request.layers:
-            found |= face_layer(view, name, rows)
+            found |= face_layer(view, name, window)
         for name, light in request.lights.items():
             shown = view.render(light.texture, inside) * view.mask[inside][..., None]
-            found[name] = view.placed(shown, rows)
+            found[name] = window.framed(shown.detach().numpy(), part)
         return found
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
@@ -155,13 +156,14 @@ def require_face_layers(names: Sequence[str]) -> None:
             raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
 
 
-def face_layer(view: FaceView, name: str, rows: slice) -> dict[str, np.ndarray]:
-    """Some rows [h, W, C] of one of `FACE_LAYERS` in the photo's frame, by its name in a file."""
-    inside = view.rows_inside(rows)
+def face_layer(view: FaceView, name: str, window: Window) -> dict[str, np.ndarray]:
+    """A window [h, w, C] of one of `FACE_LAYERS` in the photo's frame, by its name in a file."""
+    part = window.common(view.window)
+    inside = part.inside(view.window)
     if name == "face":
-        return {_FACE_ALPHA: view.placed(view.mask[inside], rows)}
+        return {_FACE_ALPHA: window.framed(view.mask[inside].numpy(), part)}
     if name == "uv":
-        return {name: view.placed(view.uv[inside], rows)}
-    surface = view.surface(inside)
+        return {name: window.framed(view.uv[inside].numpy(), part)}
+    surface = view.surface(inside.rows)[:, inside.columns]
     values = {"normal": surface[..., :3], "position": surface[..., 3:], "depth": -surface[..., 5:]}[name]
-    return {name: view.placed(values, rows)}
+    return {name: window.framed(values.numpy(), part)}

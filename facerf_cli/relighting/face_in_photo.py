@@ -19,12 +19,12 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule
-from facerf_cli.image.strips import Rows
+from facerf_cli.image.strips import Rows, Window
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE, PIXEL_CENTRE, Camera
 from facerf_cli.raster.texture import inpaint, smoothstep
-from facerf_cli.relighting.detail import TINY, DetailRows, FaceDetail
+from facerf_cli.relighting.detail import TINY, FaceDetail
 from facerf_cli.relighting.face_alone import exposure_of_face, face_layer, relit_faces, require_face_layers
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.relightable import Relit
@@ -45,6 +45,7 @@ class FaceLight:
     change: Tensor
     face: Tensor
     own: Tensor | None
+    layers: Sequence[str]
 
 
 class FaceInPhoto:
@@ -65,7 +66,7 @@ class FaceInPhoto:
         self.vertices_m = head.fit.vertices_camera(model)
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
-        self._detail = FaceDetail(head.face, self.view, self.own)
+        self._detail = FaceDetail(head.face, self.view)
         face = reflectance.face if isinstance(reflectance, Field) else head.face
         self.surround = Surround(self.vertices_m, crop, face.texture, self.size_px[1])
 
@@ -76,8 +77,8 @@ class FaceInPhoto:
 
     def share(self, rows: slice) -> np.ndarray:
         """Share [h, W] of the face in rows of the photo."""
-        mask = self.view.placed(self.view.mask[self.view.rows_inside(rows)], rows)
-        return np.minimum(self.matte[rows], mask)
+        window = Window(rows, slice(0, self.size_px[1]))
+        return np.minimum(self.matte[rows], face_layer(self.view, "face", window)["face.A"])
 
     def relit(self, lights: Lights) -> Iterator[Relit]:
         """Relight face and surround by each sum of lights."""
@@ -88,29 +89,27 @@ class FaceInPhoto:
         """Compute all that does not depend on rows; raises UsageError for layers of people."""
         require_face_layers(layers)
         assert relit.change is not None
-        return FaceLight(relit.change, self._detail.ready(relit.texture), relit.own)
+        return FaceLight(relit.change, self._detail.ready(relit.texture), relit.own, layers)
 
-    def observe(self, rows: slice) -> tuple[slice, DetailRows | None]:
-        """Read rows of the photo, as far as no light changes them."""
-        inside = self.view.rows_inside(rows)
-        return rows, self._detail.observe(inside) if inside.start < inside.stop else None
-
-    def pixels(self, relit: FaceLight, seen: tuple[slice, DetailRows | None]) -> np.ndarray:
-        """Pixels [h, W, 3] of observed rows, without the photo's own light."""
-        rows, detail = seen
-        found = self.surround.over_photo(self.own, relit.change, rows)
-        if detail is not None:
-            inside = self.view.rows_inside(rows)
-            part = found[self.view.rows_of(inside, rows), self.view.window[1]]
-            share = self.view.mask[inside].numpy()[..., None]
-            part += share * (self._detail.pixels(relit.face, detail, inside).numpy() - part)
-        return found
-
-    def layer(
-        self, name: str, relit: FaceLight, seen: tuple[slice, DetailRows | None]
-    ) -> dict[str, np.ndarray]:
-        """A layer [h, W, C] of observed rows."""
-        return face_layer(self.view, name, seen[0])
+    def render(
+        self, window: Window, own: np.ndarray, lights: Sequence[FaceLight]
+    ) -> Iterator[dict[str, np.ndarray]]:
+        """Yield rows of the photo, whose person has its `own` colours [h, W, 3], under each light."""
+        part = window.common(self.view.window)
+        share = self.view.mask[part.inside(self.view.window)].numpy()[..., None]
+        at = part.inside(window)
+        if on_face := all(part.shape):
+            face = self._detail.over(part, own[at])
+        for light in lights:
+            found = self.surround.over_photo(own, light.change, window.rows)
+            if on_face:
+                found[at] += share * (face(light.face) - found[at])
+            if light.own is not None and light.own.any():
+                found = found + light.own.detach().numpy() * own
+            image = {"rgb": found}
+            for name in light.layers:
+                image |= face_layer(self.view, name, window)
+            yield image
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule, of the face's texture."""
@@ -149,12 +148,12 @@ class Surround:
         """Size of one change of light."""
         return 3 * self._mask.nbytes
 
-    def over_photo(self, photo: Rows, change: Tensor, rows: slice) -> np.ndarray:
-        """Some rows [h, W, 3] of the photo under a change of light [3, s, s]."""
+    def over_photo(self, photo: np.ndarray, change: Tensor, rows: slice) -> np.ndarray:
+        """Rows of the photo, which are [h, W, 3], under a change of light [3, s, s]."""
         grid = _photo_grid(self._crop, rows, self._width_px)
         over = F.grid_sample(change[None], grid, mode="bicubic", padding_mode="border", align_corners=False)
         # bicubic weights undershoot a little
-        return np.asarray(photo[rows] * over[0].permute(1, 2, 0).clamp(min=0).numpy())
+        return np.asarray(photo * over[0].permute(1, 2, 0).clamp(min=0).numpy())
 
     def _mean_and_blur(self, textures: Tensor) -> tuple[Tensor, Tensor]:
         """Mean colours [N, 3, 1, 1] of textures [N, 3, T, T] on the face, and their blur [N, 3, s, s]."""

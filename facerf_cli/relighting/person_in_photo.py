@@ -4,10 +4,9 @@ Of the field's views the narrower lies over the wider one, and fades toward its 
 field's texture is blended in. Both have the photo's detail (`detail.py`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -18,13 +17,14 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule
+from facerf_cli.image.strips import Window
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.parse import UncoveredRows
 from facerf_cli.raster.texture import smoothstep
 from facerf_cli.relighting.cast_shadows import CastShadow, cast_shadow
-from facerf_cli.relighting.detail import DetailRows, FaceDetail
-from facerf_cli.relighting.enlarged import Enlarged, ViewLight, ViewRows
+from facerf_cli.relighting.detail import FaceDetail
+from facerf_cli.relighting.enlarged import VIEW_LAYERS, Enlarged, Maps
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.face_alone import FACE_LAYERS, face_layer
 from facerf_cli.relighting.field import near_texture
@@ -35,45 +35,19 @@ from facerf_cli.relighting.surface import Surface
 from facerf_cli.run.threads import both
 
 PERSON_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes")
-T = TypeVar("T")
 COLOURS = ("albedo", "specular")  # layers that are radiance
 _LIPS = 0.7  # cosine to the face's front from which on lips keep no light from the teeth
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
-
-
-class _Part(NamedTuple):
-    """A view as far as it shows in some rows: its number, columns, and weight [h, w] over wider views."""
-
-    number: int
-    columns: slice
-    weight: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class PersonRows:
-    """Values in some rows of the photo that no light changes.
-
-    They are of the columns in which these rows show the person, and of its views there.
-    """
-
-    rows: slice
-    columns: slice
-    parts: list[_Part]
-    views: list[ViewRows]
-    inside: slice  # of the face's window
-    detail: DetailRows | None
-    face_share: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class PersonLight:
     """A person under one sum of lights, ready to be rendered by rows."""
 
-    views: list[ViewLight]
+    views: list[Maps]
     face: Tensor
-    from_behind: bool
     mirrored: list[np.ndarray]
-    layers: dict[str, list[Tensor]]
+    layers: Sequence[str]
     keys: list[tuple["PersonLight | None", CastShadow]]  # each light alone; None: it is all of this light
     own: Tensor | None
 
@@ -91,8 +65,8 @@ class PersonInPhoto:
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
         self._bare_face = UncoveredRows(field.person.segmentation.classes, self.size_px)
-        self._views = [Enlarged(view, self.size_px) for view in field.views]
-        self._detail = FaceDetail(head.face, self.view, self.own)
+        self._views = [Enlarged(view) for view in field.views]
+        self._detail = FaceDetail(head.face, self.view)
 
     @property
     def nbytes(self) -> int:
@@ -155,104 +129,114 @@ class PersonInPhoto:
     def ready(self, relit: Relit, layers: Sequence[str] = ()) -> PersonLight:
         """Compute all that does not depend on rows; raises UsageError for an unknown layer."""
         assert relit.mirrored is not None
-        maps = {}
         for name in layers:
-            if name in ("albedo", "normal", "shadow", "specular"):
-                lit = zip(self._views, relit.views, strict=True)
-                maps[name] = [view.layer_maps(name, light) for view, light in lit]
-            elif name not in (*PERSON_LAYERS, *FACE_LAYERS):
+            if name not in (*PERSON_LAYERS, *FACE_LAYERS):
                 raise UsageError(f"--aov {name}: is no layer; give {', '.join(PERSON_LAYERS)}")
+        of_views = [name for name in layers if name in VIEW_LAYERS]
+        behind = any(bool(light.behind.any()) for light in relit.views)
         return PersonLight(
-            views=[view.ready(light) for view, light in zip(self._views, relit.views, strict=True)],
-            face=self._detail.ready(relit.texture, relit.mouth),
-            mirrored=self._eyes.ready(relit.mirrored),
-            from_behind=any(bool(light.behind.any()) for light in relit.views),
-            layers=maps,
-            keys=[
-                (None if one.texture is relit.texture else self.ready(one), shadow)
-                for one, shadow in relit.keys
-            ],
-            own=relit.own,
+            [view.ready(one, of_views, behind) for view, one in zip(self._views, relit.views, strict=True)],
+            self._detail.ready(relit.texture, relit.mouth),
+            self._eyes.ready(relit.mirrored),
+            layers,
+            [(None if key.texture is relit.texture else self.ready(key), cast) for key, cast in relit.keys],
+            relit.own,
         )
 
-    def observe(self, rows: slice) -> PersonRows:
-        """Read rows of the photo, as far as no light changes them."""
-        columns, inside = seen_columns(self.matte[rows]), self.view.rows_inside(rows)
-        parts, own = self._parts(rows, columns), self.own[rows]
-        views = [
-            self._views[part.number].observe(own[:, part.columns].clip(min=0), rows, part.columns)
-            for part in parts
-        ]
-        detail, share = None, np.zeros(0, np.float32)
-        if inside.start < inside.stop:
-            detail = self._detail.observe(inside)
-            bare = self._bare_face[self.view.in_photo(inside)][:, self.view.window[1]]
-            share = self.view.mask[inside].numpy() * bare
-        return PersonRows(rows, columns, parts, views, inside, detail, share)
+    def render(
+        self, window: Window, own: np.ndarray, lights: Sequence[PersonLight]
+    ) -> Iterator[dict[str, np.ndarray]]:
+        """Yield rows of the photo, whose person has its `own` colours [h, W, 3], under each light.
 
-    def pixels(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
-        """Pixels [h, W, 3] of observed rows, without the photo's own light; 0 where nobody is."""
-        rows, among = seen.rows, seen.columns
-        by_maps = self._by_maps(relit, seen)
-        pixels = by_maps.copy() if relit.keys else by_maps
-        for alone, part, change in self._shadows(relit, rows, among):
-            image = by_maps if alone is None else self._by_maps(alone, seen)
-            pixels[:, part] += image[:, part] * change
-        return self._eyes.lit(self._spread(pixels, among), relit.mirrored, rows)
+        "rgb" [h, W, 3] is the image, 0 where nobody is; others are the light's layers.
+        """
+        among = Window(window.rows, seen_columns(self.matte[window.rows]))
+        rims = self._rims if any("behind" in maps for light in lights for maps in light.views) else None
+        by_maps = self._by_maps(among, own[:, among.columns], rims)
+        for light in lights:
+            found = by_maps(light)
+            whole = found["rgb"]
+            pixels = whole.copy() if light.keys else whole
+            for key, part, change in self._shadows(light, among):
+                alone = whole if key is None else by_maps(key)["rgb"]
+                pixels[part] += alone[part] * change
+            pixels = self._eyes.lit(window.framed(pixels, among), light.mirrored, window)
+            if light.own is not None and light.own.any():
+                pixels = pixels + light.own.detach().numpy() * own
+            shown = {name: window.framed(found[name], among) for name in VIEW_LAYERS if name in found}
+            image = {"rgb": pixels}
+            for name in light.layers:
+                image |= self._layer(name, window, shown)
+            yield image
 
     def _shadows(
-        self, relit: PersonLight, rows: slice, among: slice
-    ) -> Iterator[tuple[PersonLight | None, slice, np.ndarray]]:
-        """Each key light alone, and columns among those given in which its shadow changes it by [h, w, 1].
+        self, light: PersonLight, among: Window
+    ) -> Iterator[tuple[PersonLight | None, Window, np.ndarray]]:
+        """Each key light alone, and the part of a window that its shadow changes, by [h, w, 1].
 
         A shadow is that of the narrower view.
         """
-        columns, weight = self._views[0].weight(rows, among)
-        for alone, shadow in relit.keys if weight.any() else ():
-            change = weight * (self._views[0].change(shadow, rows, columns) - 1)
+        view = self._views[0]
+        part, weight = view.weight(among)
+        for key, shadow in light.keys if weight.any() else ():
+            change = weight * (view.change(shadow, part) - 1)
             if change.any():
-                yield alone, _within(columns, among), change[..., None]
+                yield key, part.inside(among), change[..., None]
 
-    def _by_maps(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
-        """Observed pixels [h, w, 3] without what only the photo's pixels show: shadows' edges, and eyes."""
-        rims = self._rims if relit.from_behind else None
-        used = self._used(relit.views, seen)
-        shown = [view.radiance(light, rows, rims) for view, light, rows in used]
-        person, behind = np.split(_joined(shown, seen.parts), [3], -1)
-        if seen.detail is not None:  # the field of the face knows no hair around it
-            among, window = seen.columns, self.view.window[1]
-            start = max(window.start, among.start)
-            common = slice(start, max(start, min(window.stop, among.stop)))
-            at = self.view.rows_of(seen.inside, seen.rows), _within(common, among)
-            own = _within(common, window)
-            face = self._detail.pixels(relit.face, seen.detail, seen.inside)[:, own].numpy()
-            person[at] += seen.face_share[:, own, None] * (face - person[at])
-        if self._field.person.normals is not None:
-            person = person * self._change_by_normals(relit, seen)
-        return person + behind if behind.size else person
+    def _by_maps(
+        self, among: Window, own: np.ndarray, rims: Rims | None
+    ) -> Callable[[PersonLight], dict[str, np.ndarray]]:
+        """What gives a window under a light, as the maps show it: without edges of shadows, and eyes.
 
-    def _change_by_normals(self, relit: PersonLight, seen: PersonRows) -> np.ndarray:
-        """Factor [h, w, 3] of observed pixels by given normals."""
-        used = self._used(relit.views, seen)
-        return _joined([view.change_by_normals(light, one) for view, light, one in used], seen.parts)
+        `own` [h, w, 3] are the person's colours in the photo.
+        """
+        parts = self._parts(among)
+        views = [
+            self._views[number].over(part, own[:, part.inside(among).columns].clip(min=0), rims)
+            for number, part, _ in parts
+        ]
+        part = among.common(self.view.window)
+        at = part.inside(among)
+        if on_face := all(part.shape):
+            face, share = self._detail.over(part, own[at]), self._face_share(part)[..., None]
 
-    def layer(self, name: str, relit: PersonLight, seen: PersonRows) -> dict[str, np.ndarray]:
-        """A layer [h, W, C] of observed rows, by the names that it has in a file.
+        def lit(light: PersonLight) -> dict[str, np.ndarray]:
+            *narrower, found = (
+                view(light.views[number]) for view, (number, *_) in zip(views, parts, strict=True)
+            )
+            for one, (_, place, weight) in zip(narrower[::-1], parts[-2::-1], strict=True):
+                for name, values in one.items():
+                    below = found[name][place.inside(among)]
+                    below += weight[..., None] * (values - below)
+            person = found["rgb"]
+            if on_face:  # the field of the face knows no hair around it
+                person[at] += share * (face(light.face) - person[at])
+            if "change" in found:
+                person = person * found["change"]
+            return found | {"rgb": person + found["behind"] if "behind" in found else person}
+
+        return lit
+
+    def _face_share(self, part: Window) -> np.ndarray:
+        """Share [h, w] that the field of the face has in a part of its window."""
+        bare = self._bare_face[part.rows][:, part.columns]
+        return np.asarray(self.view.mask[part.inside(self.view.window)].numpy() * bare)
+
+    def _layer(self, name: str, window: Window, shown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """A layer [h, W, C] of some rows, by the names that it has in a file; `shown` are those of the views.
 
         albedo: radiance of the person in a light of rgb 1 that reaches all; specular: that of the highlights;
         shadow: the share of the light that arrives; normal and position: camera space, m; depth: m; classes:
         shares. All are 0 off the person, whose share is the matte: colours are multiplied by it, as layers of
         lights are.
         """
-        rows = seen.rows
+        rows = window.rows
         if name == "classes":
             return self._field.person.segmentation.layers(rows)
         if name not in PERSON_LAYERS:
-            return face_layer(self.view, name, rows)
-        if name in relit.layers:
-            used = self._used(relit.layers[name], seen)
-            shown = _joined([view.layer(name, maps, one) for view, maps, one in used], seen.parts)
-            values = self._spread(shown, seen.columns)
+            return face_layer(self.view, name, window)
+        if name in shown:
+            values = shown[name]
         else:
             values = {"depth": self._surface.depth_m, "position": self._surface.position_m}[name](rows)
         share = self.matte[rows][..., None]
@@ -270,28 +254,15 @@ class PersonInPhoto:
     def _surface(self) -> Surface:
         return Surface(self._field.person, self.size_px)
 
-    def _used(self, values: Sequence[T], seen: PersonRows) -> Iterator[tuple[Enlarged, T, ViewRows]]:
-        """The views that are seen in rows, each with its value."""
-        for part, view in zip(seen.parts, seen.views, strict=True):
-            yield self._views[part.number], values[part.number], view
-
-    def _parts(self, rows: slice, columns: slice) -> list[_Part]:
-        """The views as far as they show in some rows and columns; the last in all of them."""
+    def _parts(self, among: Window) -> list[tuple[int, Window, np.ndarray]]:
+        """The views in a window: number, part, and weight [h, w] over the next view; the last has none."""
         parts = []
         for number, view in enumerate(self._views[:-1]):
-            part = _Part(number, *view.weight(rows, columns))
-            parts += [part] if part.weight.any() else []
-            if part.columns == columns and part.weight.min() == 1:  # it hides wider ones
+            part, weight = view.weight(among)
+            parts += [(number, part, weight)] if weight.any() else []
+            if part == among and weight.min() == 1:  # it hides wider ones
                 return parts
-        return [*parts, _Part(len(self._views) - 1, columns, np.ones(0))]
-
-    def _spread(self, values: np.ndarray, columns: slice) -> np.ndarray:
-        """Values [h, W, C] of those in some columns [h, w, C], 0 in the others."""
-        if values.shape[1] == self.size_px[1]:
-            return values
-        found = np.zeros((len(values), self.size_px[1], values.shape[2]), np.float32)
-        found[:, columns] = values
-        return found
+        return [*parts, (len(self._views) - 1, among, np.ones(0))]
 
 
 def seen_columns(shown: np.ndarray) -> slice:
@@ -303,17 +274,3 @@ def seen_columns(shown: np.ndarray) -> slice:
 def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
     """Share [...] of lights from directions [..., 3] that falls between lips; the face looks `forward`."""
     return smoothstep(directions @ forward / _LIPS)
-
-
-def _joined(shown: Sequence[np.ndarray], parts: Sequence[_Part]) -> np.ndarray:
-    """Values [h, w, C] of what each view shows; the widest, the last, lies below."""
-    found = shown[-1]
-    for values, one in reversed(list(zip(shown[:-1], parts[:-1], strict=True))):
-        part = found[:, _within(one.columns, parts[-1].columns)]
-        part += one.weight[..., None] * (values - part)
-    return found
-
-
-def _within(columns: slice, among: slice) -> slice:
-    """Columns of an image as counted from the first of those among which they are."""
-    return slice(columns.start - among.start, columns.stop - among.start)

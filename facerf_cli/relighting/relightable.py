@@ -5,9 +5,8 @@ frame, some rows at a time. Both are linear in light: layers of single lights ad
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -68,12 +67,12 @@ class RenderRequest:
     background: Rows | None = None
     wrap: Rows | None = None
 
-    def ready(self, subject: "Relightable") -> "RenderRequest":
-        """The same with all that does not depend on rows computed."""
-        image = None if self.image is None else subject.ready(self.image, self.layers)
-        return replace(
-            self, image=image, lights={name: subject.ready(one) for name, one in self.lights.items()}
-        )
+    def wrapped(self, found: dict[str, np.ndarray], rows: slice) -> dict[str, np.ndarray]:
+        """Arrays of some rows, with the background's light over the edge."""
+        if self.wrap is not None and self.image is not None:
+            found["wrap"] = self.wrap[rows]
+            found["rgb"] = found["rgb"] + found["wrap"]
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,12 +113,11 @@ class Relightable(ABC):
         """Relight the subject by M sums of lights at once; one prediction serves all."""
 
     @abstractmethod
-    def ready(self, relit: Any, layers: Sequence[str] = ()) -> Any:
-        """Make what `relit` gave ready to be rendered by rows, and layers with it."""
+    def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
+        """What gives rows [h, W, ...] of all that is asked; what does not depend on rows is computed first.
 
-    @abstractmethod
-    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
-        """Some rows [h, W, ...] of all that is asked; the request is `RenderRequest.ready`."""
+        Raises UsageError for layers that this subject lacks.
+        """
 
     @abstractmethod
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
@@ -130,15 +128,7 @@ class Relightable(ABC):
 
         Raises UsageError for layers that this subject lacks.
         """
-        return in_strips(partial(self._wrapped, request.ready(self)), *self.size_px, empty)
-
-    def _wrapped(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
-        """Some rows of all that is asked, with the background's light over the edge."""
-        found = self.render(request, rows)
-        if request.wrap is not None and request.image is not None:
-            found["wrap"] = request.wrap[rows]
-            found["rgb"] = found["rgb"] + found["wrap"]
-        return found
+        return in_strips(self.renderer(request), *self.size_px, empty)
 
     def image(self, relit: Any, ev: float = 0.0, background: Rows | None = None) -> RelitImage:
         """The image under one sum of lights."""

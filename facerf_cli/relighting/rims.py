@@ -12,7 +12,7 @@ import torch
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 from torch import Tensor
 
-from facerf_cli.image.strips import enlarged, fitted
+from facerf_cli.image.strips import Window, enlarged, fitted
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.raster.texture import smoothstep
 
@@ -56,7 +56,7 @@ class Rims:
         fading = smoothstep(torch.from_numpy((_FADES[1] - distance) / (_FADES[1] - _FADES[0]))).numpy()
         self._maps[2] = fading * (1 + slope * np.square(inward).sum(0).clip(max=1))
 
-    def at(self, rows: slice, columns: slice) -> tuple[Tensor, Tensor]:
+    def at(self, window: Window) -> tuple[Tensor, Tensor]:
         """Offsets [2, h, w] in pixels of the photo, x and y, and brightness [h, w]."""
-        maps = enlarged(self._maps, self._size_px, rows)[..., columns]
+        maps = enlarged(self._maps, self._size_px, window.rows)[..., window.columns]
         return torch.from_numpy(maps[:2]), torch.from_numpy(maps[2])

@@ -1,7 +1,7 @@
 """OLAT stacks that are relit: sums of their lights, in their frame or on their photo; their scenes."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -104,21 +104,33 @@ class StackImages(Relightable):
         textures = weighted_sum(stream_olats(self.path), lights.weights)
         return (Relit(texture, own=own) for texture, own in zip(textures, lights.owns, strict=True))
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> StackLight:
-        """A sum in its frame; raises UsageError for layers other than normals."""
-        if other := [name for name in layers if name != "normal"]:
+    def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
+        """What gives rows of the image, of lights over black, and of normals."""
+        if other := [name for name in request.layers if name != "normal"]:
             raise UsageError(f"--aov {other[0]}: a stack of images holds normals alone; give --aov normal")
+        image = None if request.image is None else self._ready(request.image)
+        return partial(
+            self._render, request, image, {name: self._ready(one) for name, one in request.lights.items()}
+        )
+
+    def _ready(self, relit: Relit) -> StackLight:
+        """A sum in its frame."""
         lit, source = self._lit(relit), self.header.source
         own = None if relit.own is None or self.photo is None else relit.own.numpy()
         if self.photo is None or self.size_px == self.header.seen.shape:
             return StackLight(lit, False, own)
         return StackLight(Resized(lit / (source + _DARK * source.mean()), self.size_px), True, own)
 
-    def render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
-        """Some rows of the image, of lights over black, and of normals."""
+    def _render(
+        self,
+        request: RenderRequest,
+        image: StackLight | None,
+        lights: Mapping[str, StackLight],
+        rows: slice,
+    ) -> dict[str, np.ndarray]:
         matte, found = self.matte[rows][..., None], {}
-        if request.image is not None:
-            found["rgb"] = self._pixels(request.image, rows)
+        if image is not None:
+            found["rgb"] = self._pixels(image, rows)
             below = request.background
             if below is None and self.keeps_photo:
                 assert self.photo is not None
@@ -128,7 +140,8 @@ class StackImages(Relightable):
                 found["rgb"] = under + matte * (found["rgb"] - under)
             for name in request.layers:
                 found[name] = self._normals[rows]
-        return found | {name: self._pixels(one, rows) * matte for name, one in request.lights.items()}
+        found |= {name: self._pixels(one, rows) * matte for name, one in lights.items()}
+        return request.wrapped(found, rows)
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
         """The exposure in EV, by a rule; a face alone is shown well, for it has no photo to compare with."""

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
-from facerf_cli.image.strips import block_means, box_means, enlarged, in_strips, strips
+from facerf_cli.image.strips import Window, block_means, box_means, enlarged, in_strips, strips
 from facerf_cli.portrait.matte import PersonColours, lifted, shrunk
 from tests.kinds import Patch
 from tests.oracles.person_colours import slow_person_colours
@@ -127,3 +127,18 @@ def test_a_matte_is_enlarged_by_strips_as_at_once(monkeypatch: Patch) -> None:
     found = lifted(rough, guide, photo)
     monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
     np.testing.assert_allclose(found, lifted(rough, guide, photo), atol=1e-6)
+
+
+def test_a_window_says_where_its_parts_lie_in_an_array() -> None:
+    image = DRAW.random((20, 30, 3), np.float32)
+    one, other = Window(slice(2, 12), slice(5, 25)), Window(slice(8, 20), slice(0, 9))
+    part = one.common(other)
+    assert part == other.common(one) == Window(slice(8, 12), slice(5, 9)) and part.shape == (4, 4)
+    for window in (one, other):
+        assert (image[window][part.inside(window)] == image[part]).all()
+    framed = one.framed(image[part], part)
+    assert framed.shape == (10, 20, 3) and (framed[part.inside(one)] == image[part]).all()
+    assert framed.sum() == pytest.approx(image[part].sum())
+    apart = one.common(Window(slice(15, 18), slice(26, 30)))
+    assert apart.shape == (0, 0) and image[one][apart.inside(one)].size == 0
+    assert (one.framed(image[apart], apart) == 0).all()

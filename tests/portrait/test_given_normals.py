@@ -12,6 +12,7 @@ import torch
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.image.strips import Window
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.main import main
@@ -103,10 +104,16 @@ def test_bumps_are_lit_by_their_side_and_the_photos_own_light_gives_the_photo_ba
 def test_bumps_change_nothing_in_the_photos_own_light(person: Person) -> None:
     view, photo = field_of(person).views[0], astronaut.photo()
     assert view.own is not None
-    enlarged, rows, columns = Enlarged(view, photo.shape[:2]), slice(100, 140), slice(200, 260)
-    seen = enlarged.observe(photo[rows, columns], rows, columns)
-    assert seen.finer is not None and seen.finer.abs().max() > 0.2
-    np.testing.assert_allclose(enlarged.change_by_normals(enlarged.ready(view.own), seen), 1, atol=1e-5)
+    without, window = (
+        replace(view, person=replace(view.person, normals=None)),
+        Window(slice(100, 140), slice(200, 260)),
+    )
+    shown, plain = (
+        enlarged.over(window, photo[window])(enlarged.ready(view.own, ("normal",)))
+        for enlarged in map(Enlarged, (view, without))
+    )
+    assert np.abs(shown["normal"] - plain["normal"]).max() > 0.2
+    np.testing.assert_allclose(shown["change"], 1, atol=1e-5)
 
 
 def test_what_are_not_the_normals_of_the_face_is_refused(bumpy: np.ndarray) -> None:

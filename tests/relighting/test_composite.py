@@ -15,6 +15,7 @@ from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles, grid_uv, region_mask
 from facerf_cli.face.view import FaceView, photo_camera, view_face
+from facerf_cli.image.strips import Window
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
@@ -107,9 +108,10 @@ def compose(
     return PeopleInPhoto([face]).image([Relit(relit, face.surround.changes(relit[None])[0])]).pixels
 
 
-def detailed(detail: FaceDetail, texture: Tensor, rows: slice) -> np.ndarray:
-    """The photo's pixels in rows of the window under a relit texture."""
-    return detail.pixels(detail.ready(texture), detail.observe(rows), rows).numpy()
+def detailed(face: FaceTexture, screen: FaceView, photo: np.ndarray, texture: Tensor) -> np.ndarray:
+    """The pixels of a photo of a whole screen under a relit texture."""
+    detail = FaceDetail(face, screen)
+    return detail.over(screen.window, photo)(detail.ready(texture))
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
@@ -138,7 +140,7 @@ def test_own_light_gives_the_photo_back_and_eyes_keep_their_detail() -> None:
     eyes = region_mask("eyes", 128) > 0.99
     source[:, eyes] = torch.rand(int(eyes.sum()), generator=torch.Generator().manual_seed(1))
     face, screen, photo = flat_face(source)
-    relit = detailed(FaceDetail(face, screen, photo), torch.full((3, 128, 128), 0.2), slice(0, 128))
+    relit = detailed(face, screen, photo, torch.full((3, 128, 128), 0.2))
     np.testing.assert_allclose(relit[eyes], 0.5 * photo[eyes], rtol=0.02, atol=1e-3)
 
 
@@ -227,7 +229,8 @@ def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:
     uv = torch.stack(torch.meshgrid(centres, centres, indexing="xy"), -1)
     whole = torch.ones(side, side)
     camera = Camera(1.0, side, side, side / 2, side / 2)
-    screen = FaceView(side, side, 0, 0, uv, whole, whole, torch.zeros(1, 3), camera)
+    window = Window(slice(0, side), slice(0, side))
+    screen = FaceView((side, side), window, uv, whole, whole, torch.zeros(1, 3), camera)
     return FaceTexture(source, whole, source), screen, screen.render(source).numpy()
 
 
@@ -236,14 +239,14 @@ def test_a_dark_source_is_rendered_and_not_multiplied() -> None:
     source[:, 16:19, 22:25] = 1e-6  # a cheek's
     face, screen, shown = flat_face(source)
     photo = shown + np.float32(1e-3)  # noise of the photo over the texture
-    relit = detailed(FaceDetail(face, screen, photo), torch.full((3, 32, 32), 0.3), slice(0, 32))
+    relit = detailed(face, screen, photo, torch.full((3, 32, 32), 0.3))
     np.testing.assert_allclose(relit, 0.3, rtol=0.3)  # the quotient would be 300; factors are limited
     source = torch.full((3, 32, 32), 0.4)
     source[:, 16:19, 22:25] = torch.tensor([0.02, 0.016, 0.012])[:, None, None]  # hair on a cheek
     face, screen, shown = flat_face(source)
     photo = shown.copy()
     photo[17, 23] = 0.02, 0.013, 0.0  # a camera's black in one channel
-    relit = detailed(FaceDetail(face, screen, photo), torch.full((3, 32, 32), 0.4), slice(0, 32))[17, 23]
+    relit = detailed(face, screen, photo, torch.full((3, 32, 32), 0.4))[17, 23]
     assert relit[2] > 0.4 * relit[0]  # the quotient would be yellow: 0
 
 
@@ -253,10 +256,9 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
     skin = torch.tensor([0.6, 0.4, 0.3])[:, None, None]
     face, screen, shown = flat_face(skin * (0.6 + 0.4 * torch.rand(1, 48, 48, generator=noise)))
     photo = (shown * np.random.default_rng(0).normal(1, 0.05, shown.shape)).astype(np.float32)
-    detail, rows = FaceDetail(face, screen, photo), slice(0, 48)
-    np.testing.assert_allclose(detailed(detail, face.texture, rows), photo, rtol=0.04)
+    np.testing.assert_allclose(detailed(face, screen, photo, face.texture), photo, rtol=0.04)
     one_sided = face.texture * (torch.arange(48) > 24)
-    assert detailed(detail, one_sided, rows).min() >= 0
+    assert detailed(face, screen, photo, one_sided).min() >= 0
 
 
 def test_the_mask_lies_on_the_face_that_both_cameras_see() -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.image.colour import luminance
+from facerf_cli.image.strips import Window
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.raster.texture import blurred
 from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
@@ -126,9 +127,9 @@ def test_no_light_of_a_hand_is_on_the_cloth_behind_it(glossy: bool) -> None:
     light = PortraitLight(*parts, reached=lit, behind=torch.zeros(6, size, size))
     both = skin(side_px + 20, 1)[:side_px], distance(side_px + 20, 1)[:side_px].numpy()
     photo = mixed(both[0], DARK, BRIGHT)[..., None].expand(-1, -1, 3).numpy().copy()
-    enlarged = Enlarged(replace(view, person=person, maps=maps), photo.shape[:2])
-    seen = enlarged.observe(photo, slice(0, side_px), slice(0, side_px + 20))
-    relit = luminance(enlarged.radiance(enlarged.ready(light), seen, None))
+    enlarged = Enlarged(replace(view, person=person, maps=maps))
+    shown = enlarged.over(Window(slice(0, side_px), slice(0, side_px + 20)), photo)
+    relit = luminance(shown(enlarged.ready(light))["rgb"])
     cloth, far = (both[1] < -BESIDE) & (both[1] > -FAR), (both[1] < -FAR) & (both[1] > -3 * FAR)
     assert np.abs(np.diff(relit, axis=1))[:, 30:50].max() < 0.15 * relit[far].mean()
     assert np.abs(relit[cloth] / relit[far].mean() - 1).max() < (0.2 if glossy else 0.15)

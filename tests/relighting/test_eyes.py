@@ -10,6 +10,7 @@ from skimage.draw import polygon2mask
 from torch import Tensor
 
 from facerf_cli.image.colour import luminance
+from facerf_cli.image.strips import Window
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights, far_samples
@@ -61,7 +62,7 @@ def eyes(photo: np.ndarray) -> Eyes:
 def lit(photo: np.ndarray, relit: np.ndarray, mirrored: Tensor, rows: slice = slice(0, SIDE)) -> np.ndarray:
     """Some rows of a relit image with mirror images in the eyes."""
     seen = eyes(photo)
-    return seen.lit(relit[rows].copy(), seen.ready(mirrored), rows)
+    return seen.lit(relit[rows].copy(), seen.ready(mirrored), Window(rows, slice(0, SIDE)))
 
 
 def test_the_photos_catchlight_gives_way_and_a_lid_keeps_its_light() -> None:

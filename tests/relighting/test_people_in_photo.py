@@ -1,5 +1,6 @@
 """Several people in one image, by people with known answers."""
 
+from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import LinearImage
+from facerf_cli.image.strips import Window
 from facerf_cli.portrait.find import Face, choose_face
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import RenderRequest
@@ -27,12 +29,6 @@ from tests.refusals import refused
 
 SIZE = (4, 6)
 POINTS = np.arange(136.0).reshape(68, 2)
-
-
-@dataclass
-class Lit:
-    grey: float
-    own: None = None
 
 
 @dataclass
@@ -57,23 +53,19 @@ class Plain:
     def share(self, rows: slice) -> np.ndarray:
         return self.matte[rows]
 
-    def ready(self, relit: float, layers: Any) -> Lit:
-        return Lit(relit)
+    def ready(self, relit: float, layers: Any) -> Any:
+        return relit, layers
 
-    def observe(self, rows: slice) -> slice:
-        return rows
-
-    def pixels(self, relit: Lit, rows: slice) -> np.ndarray:
-        return np.full((*SIZE, 3), relit.grey)[rows]
-
-    def layer(self, name: str, relit: Lit, rows: slice) -> dict[str, np.ndarray]:
-        matte = self.matte[rows]
+    def render(self, window: Window, own: np.ndarray, lights: list[Any]) -> Iterator[dict[str, np.ndarray]]:
+        matte = self.matte[window.rows]
         whole = matte[..., None]
-        return {
-            "class.skin": matte,
-            "depth": relit.grey * (whole > 0),
-            "albedo": relit.grey * whole.repeat(3, -1),
-        }
+        for grey, layers in lights:
+            found = {
+                "class.skin": matte,
+                "depth": grey * (whole > 0),
+                "albedo": grey * whole.repeat(3, -1),
+            }
+            yield {"rgb": np.full(own.shape, grey)} | (found if layers else {})
 
     def exposure_ev(self, relit: float, rule: str) -> float:
         return relit
@@ -171,13 +163,13 @@ def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
         def matte(self) -> np.ndarray:
             return super().matte * (np.arange(SIZE[0]) > 1)[:, None]
 
-        def observe(self, rows: slice) -> slice:
-            drawn.append(rows.start)
-            return rows
+        def render(self, window: Window, *given: Any) -> Iterator[dict[str, np.ndarray]]:
+            drawn.append(window.rows.start)
+            return super().render(window, *given)
 
     people = PeopleInPhoto([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
-    request = RenderRequest((0.2, 0.8), {"key": (0.2, 0.8)}).ready(people)
-    rows = [people.render(request, slice(row, row + 1)) for row in range(SIZE[0])]
+    render = people.renderer(RenderRequest((0.2, 0.8), {"key": (0.2, 0.8)}))
+    rows = [render(slice(row, row + 1)) for row in range(SIZE[0])]
     assert drawn == [2, 3]
     for name in ("rgb", "key"):
         assert rows[0][name][0, 1] == pytest.approx(0.2) and rows[2][name][0, 1] == pytest.approx(0.5)

@@ -15,7 +15,7 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.strips import strips
+from facerf_cli.image.strips import Window, strips
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.portrait import PortraitInputs
@@ -87,9 +87,8 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     height, width = shown.size_px
     half = np.tile(np.arange(width) < width // 2, (height, 1))
     shown._bare_face = half  # type: ignore[assignment]
-    seen = shown.observe(slice(0, height))
-    mask = shown.view.mask[seen.inside].numpy()
-    np.testing.assert_array_equal(seen.face_share, mask * half[shown.view.window])
+    share = shown._face_share(shown.view.window)
+    np.testing.assert_array_equal(share, shown.view.mask.numpy() * half[shown.view.window])
 
 
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
@@ -298,8 +297,8 @@ def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(fie
     head, wide = field.views
     assert wide.person.square.side_px > head.person.square.side_px
     matte = head.person.segmentation.matte
-    columns, weight = Enlarged(head, matte.shape).weight(slice(0, len(matte)), slice(0, matte.shape[1]))
-    assert weight.max() == 1 and weight[matte[:, columns] > 0.5].min() == 0
+    part, weight = Enlarged(head).weight(Window(*(slice(0, length) for length in matte.shape)))
+    assert weight.max() == 1 and weight[matte[part] > 0.5].min() == 0
     assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
     head, matte = Crop(40, 30, 60, SEEN_PX), np.zeros((300, 200), np.float32)
     matte[40:80, 50:90] = 1
@@ -316,22 +315,14 @@ def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(fie
 def test_the_photos_detail_is_in_light_from_the_front_and_from_behind(field: PortraitField) -> None:
     """Shading of 1: both lights show the same image, which in hair has the photo's contrast."""
     view, photo = field.views[0], astronaut.photo()
-    enlarged, rows, columns = (
-        Enlarged(view, photo.shape[:2]),
-        slice(0, len(photo)),
-        slice(0, photo.shape[1]),
-    )
+    enlarged, window = Enlarged(view), Window(slice(0, len(photo)), slice(0, photo.shape[1]))
     ones = torch.ones(3, *view.person.image.shape[1:])
     lit = PortraitLight(ones, 0 * ones, ones, torch.cat([ones, 0 * ones]))
-    where_they_are = SimpleNamespace(
-        at=lambda rows, columns: (torch.zeros(2, *photo[rows, columns].shape[:2]), torch.tensor(1.0))
-    )
-    seen = enlarged.observe(photo, rows, columns)
-    front, behind = np.split(enlarged.radiance(enlarged.ready(lit), seen, cast(Any, where_they_are)), 2, -1)
+    where_they_are = SimpleNamespace(at=lambda window: (torch.zeros(2, *window.shape), torch.tensor(1.0)))
+    shown = enlarged.over(window, photo, cast(Any, where_they_are))(enlarged.ready(lit, behind=True))
+    front, behind = shown["rgb"], shown["behind"]
     np.testing.assert_allclose(behind, front, rtol=1e-5)
-    classes = F.grid_sample(
-        view.person.classes[None], enlarged._grid(rows, columns)[None], align_corners=False
-    )
+    classes = F.grid_sample(view.person.classes[None], enlarged._grid(window)[None], align_corners=False)
     hair = classes[0, class_index("hair")].numpy() > 0.8
     of_relit, of_photo = (_fine(luminance(image))[hair] for image in (front, photo))
     assert np.corrcoef(of_relit, of_photo)[0, 1] > 0.9 and of_relit.std() > 0.7 * of_photo.std()

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from facerf_cli.image.strips import Window
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.relighting.rims import Rims, from_behind
 
@@ -21,7 +22,7 @@ def half_plane() -> Rims:
 @pytest.mark.parametrize("width_px", [2.0, 8.0, 1e9])
 def test_light_near_the_outline_stays_and_none_is_added(width_px: float) -> None:
     """The sum over pixels of S(g(d)) g'(d) is that of S, less what fades inside."""
-    offsets_px, brightness = half_plane().at(slice(10, 11), slice(EDGE_PX, SIZE_PX[1]))
+    offsets_px, brightness = half_plane().at(Window(slice(10, 11), slice(EDGE_PX, SIZE_PX[1])))
     inside_px = torch.arange(SIZE_PX[1] - EDGE_PX) + 0.5
     before = torch.exp(-inside_px / width_px)
     after = torch.exp(-(inside_px + offsets_px[0, 0]) / width_px) * brightness[0]
@@ -32,7 +33,7 @@ def test_light_near_the_outline_stays_and_none_is_added(width_px: float) -> None
 
 
 def test_a_rim_is_thinner_and_brighter_and_none_is_far_inside() -> None:
-    offsets_px, brightness = half_plane().at(slice(10, 11), slice(EDGE_PX, SIZE_PX[1]))
+    offsets_px, brightness = half_plane().at(Window(slice(10, 11), slice(EDGE_PX, SIZE_PX[1])))
     inside_px = torch.arange(SIZE_PX[1] - EDGE_PX) + 0.5
     before = torch.exp(-inside_px / 16)
     after = torch.exp(-(inside_px + offsets_px[0, 0]) / 16) * brightness[0]
@@ -40,8 +41,8 @@ def test_a_rim_is_thinner_and_brighter_and_none_is_far_inside() -> None:
     half = [int((line > line[0] / 2).sum()) for line in (before, after)]
     assert half[1] < 0.7 * half[0]
     far = slice(EDGE_PX + round(FACE_PX / 4), SIZE_PX[1])
-    whole = Rims(np.ones(SIZE_PX, np.float32), FACE_PX).at(slice(0, SIZE_PX[0]), slice(0, SIZE_PX[1]))
-    inside = half_plane().at(slice(0, SIZE_PX[0]), far)
+    whole = Rims(np.ones(SIZE_PX, np.float32), FACE_PX).at(Window(slice(0, SIZE_PX[0]), slice(0, SIZE_PX[1])))
+    inside = half_plane().at(Window(slice(0, SIZE_PX[0]), far))
     for (offsets_px, brightness), wanted in ((inside, 0), (whole, 1)):
         assert offsets_px.abs().max() == 0 and (brightness == wanted).all()
 
@@ -52,7 +53,7 @@ def test_rims_lie_along_the_outline_of_a_photo_of_any_size() -> None:
     def of(side_px: int) -> torch.Tensor:
         at = (np.arange(side_px) + 0.5) / side_px - 0.5
         matte = (np.hypot(*np.meshgrid(at, at)) < 0.25).astype(np.float32)
-        offsets_px, brightness = Rims(matte, side_px / 2).at(slice(0, side_px), slice(0, side_px))
+        offsets_px, brightness = Rims(matte, side_px / 2).at(Window(slice(0, side_px), slice(0, side_px)))
         return torch.cat([offsets_px / side_px, brightness[None]])
 
     small, large = of(320), of(1280)

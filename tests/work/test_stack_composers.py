@@ -58,9 +58,9 @@ def test_a_large_photo_is_composed_in_rows() -> None:
     behind = np.full((2048, 512, 3), 3.0, np.float32)
     for given in (None, behind):
         request = RenderRequest(lit(0.6), ev=1.0, background=given)
-        ready, whole = request.ready(composer), composer.rendered(request)["rgb"]
+        render, whole = composer.renderer(request), composer.rendered(request)["rgb"]
         tracemalloc.start()
-        middle = composer.render(ready, slice(1000, 1010))["rgb"]
+        middle = render(slice(1000, 1010))["rgb"]
         peak = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert middle.shape == (10, 512, 3) and peak < photo.nbytes / 10
