@@ -29,7 +29,7 @@ from facerf_cli.face.gauss_newton import (
     total_cost,
     weak_perspective,
 )
-from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model, read_npz
+from facerf_cli.face.morphable import MorphableModel, load_face_model, read_npz
 from facerf_cli.face.topology import (
     CONTOUR,
     CONTOUR_RAYS,
@@ -187,23 +187,19 @@ def fit_landmarks(
     )
 
 
-def regressed_fit(model: MorphableModel, regressed: FitStart, crop: Crop) -> FaceFit:
-    """The head that a Geometry Network regressed [1, ...] from a crop (paper, 'Network Architecture').
+def regressed_fit(
+    model: MorphableModel, regressed: tuple[Tensor, Tensor, Tensor, Tensor], crop: Crop
+) -> FaceFit:
+    """The head that a Geometry Network regressed from a crop (paper, 'Network Architecture').
 
-    A model other than that of its coefficients gets the head closest to it by least squares over the mesh.
+    `regressed` are rotation [1, 3, 3], translation [1, 3] in metres, and the model's first alpha [1, Ki] and
+    beta [1, Ke].
     """
-    if model.name == (regressed.model.name if regressed.model else BUILTIN):
-        alpha, beta = (
-            torch.nn.functional.pad(found[0].float(), (0, len(basis) - found.shape[1]))
-            for found, basis in ((regressed.alpha, model.identity), (regressed.beta, model.expression))
-        )
-        rotation, translation_m = regressed.rotation[0].float(), regressed.translation_m[0].float()
-    else:
-        basis = fit_basis(model, FitSettings())
-        state = seeded_state(basis, regressed)
-        coefficients = (state.coordinates @ basis.spread.mT)[0].float()
-        alpha, beta = coefficients[: len(model.identity)], coefficients[len(model.identity) :]
-        rotation, translation_m = state.rotation[0].float(), state.translation_m[0].float()
+    rotation, translation_m, *found = (tensor[0].float() for tensor in regressed)
+    alpha, beta = (
+        torch.nn.functional.pad(some, (0, len(basis) - len(some)))
+        for some, basis in zip(found, (model.identity, model.expression), strict=True)
+    )
     vertices = model.vertices(alpha[None], beta[None])[0] @ rotation.mT + translation_m
     landmarks_px = project(model.landmarks(vertices[None])[0], crop.camera)
     return FaceFit(model.name, crop, rotation, translation_m, alpha, beta, landmarks_px, math.nan)
