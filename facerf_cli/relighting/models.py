@@ -220,8 +220,6 @@ def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | Non
 def _require_builtin_coefficients(path: Path, geometry: GeometryNetwork) -> None:
     """Raise InputError where a Geometry Network regresses more coefficients than the built-in model has."""
     model, settings = load_face_model(BUILTIN), geometry.settings
-    if settings.face_model != BUILTIN:
-        return
     if settings.identity > len(model.identity) or settings.expression > len(model.expression):
         raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
 
