@@ -1,4 +1,4 @@
-"""The Geometry Network: its landmark error on images it was not trained on, and the steps that it saves.
+"""The Geometry Network: its landmark error on images it was not trained on.
 
     python benchmarks/geometry_network.py [PHOTO|DIR ...] [--crops RUN/bank/pictures] [--dataset DATASET]
 
@@ -7,38 +7,34 @@
 - Photos: against the landmarks that are found in them.
 
 Errors are means in percent of the distance of the outer eye corners; the contour slides along the estimated
-outline, as in the fit. Steps of the fit are counted until its cost is within 1 % of the least. Naive twin:
-the fit that starts from the landmarks alone.
+outline, as in the fit. Naive twin: the fit to the landmarks.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
-from _common import arguments, best_s, photos, required
+from _common import arguments, photos, required
 from torch import Tensor
 
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import FitSettings, FitStart, better_start, fit_batch, fit_problem, start_states
-from facerf_cli.face.gauss_newton import FitState, Problem, minimise, residuals, total_cost
+from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.files.read import read_image
-from facerf_cli.network.geometry import GeometryNetwork
+from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork
+from facerf_cli.network.inputs import concatenate
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, load_models
 from facerf_cli.synth.bank.face_crops import RenderedFaces
 from facerf_cli.training.geometry import GeometryObjective, GeometryObjectiveSettings
+from facerf_cli.training.joint import LANDMARKS, chosen, pose_heads
 
 CROP_PX = 256
 DETECTOR_NOISE = 0.014  # of the inter-ocular distance, added to true landmarks
-COUNTED_STEPS, ALL_STEPS = 12, 40
-ENOUGH = 1.01  # times the least cost
-_ROUNDS = 5
 
 
 def main() -> None:
@@ -64,53 +60,25 @@ def main() -> None:
         report("dataset, lit from all sides", network, *captured(folder, given.cameras.split(",")))
 
 
+@torch.no_grad()
 def report(name: str, network: GeometryNetwork, crops: Tensor, landmarks_px: Tensor) -> None:
     """Print the figures of crops [B, 3, S, S] and a detector's landmarks [B, 68, 2] in their pixels."""
-    model, camera = load_face_model(), crop_camera(crops.shape[-1])
-    with torch.no_grad():
-        start = FitStart(*network(crops))
-    trust = torch.ones(landmarks_px.shape[:2], dtype=torch.float64)
-    problem, cold = fit_problem(model, landmarks_px.double(), camera, FitSettings(), trust)
-    percent = landmark_percent(problem, start_states(problem, start)[0])
-    print(f"{name}: {len(crops)} crops, landmark error of the network {percent.mean():.1f} %, inner 51 "
-          f"{percent[:, len(CONTOUR):].mean():.1f} %, worst crop {percent.mean(1).max():.1f} %")  # fmt: skip
-    needed = steps_needed(problem, {"landmarks alone": cold, "network": better_start(problem, cold, start)})
-    steps = ", ".join(f"{key} {count.double().mean():.2f}" for key, count in needed.items())
-    ends = [
-        100 * fit_batch(model, landmarks_px, camera, start=begin).error_iod.mean() for begin in (None, start)
-    ]
-    print(
-        f"  Gauss-Newton steps from {steps}; error of the fit {ends[0]:.3f} % and {ends[1]:.3f} %", flush=True
-    )
-    ways: dict[str, Callable[[], object]] = {
-        "network": lambda: network(crops[:1]),
-        "step": lambda: fit_batch(model, landmarks_px[:1], camera, FitSettings(steps=1)),
-    }
-    seconds, _ = best_s(ways, _ROUNDS)
-    print(f"  the network takes {seconds['network'] / seconds['step']:.2f} times a fit of one step")
+    fit = fit_batch(load_face_model(), landmarks_px, crop_camera(crops.shape[-1]))
+    fitted = GeometryEstimate(*(x.float() for x in (fit.rotation, fit.translation_m, fit.alpha, fit.beta)))
+    print(f"{name}: {len(crops)} crops")
+    for way, estimate in (("network", network(crops)), ("fit to landmarks", fitted)):
+        percent = landmark_percent(estimate, landmarks_px, crops.shape[-1])
+        inner = percent[:, [landmark not in CONTOUR for landmark in LANDMARKS]]
+        print(f"  landmark error of the {way} {percent.mean():.1f} %, inner {inner.mean():.1f} %, "
+              f"worst crop {percent.mean(1).max():.1f} %", flush=True)  # fmt: skip
 
 
-def landmark_percent(problem: Problem, state: FitState) -> Tensor:
-    """Errors [B, 68] of a state, with the contour on the estimated outline."""
+def landmark_percent(estimate: GeometryEstimate, landmarks_px: Tensor, side_px: int) -> Tensor:
+    """Errors [B, L] of an estimate in crops of a side, with the contour on the estimated outline."""
+    found_px = pose_heads(load_face_model(), estimate).landmarks_px(landmarks_px, crop_camera(side_px))
     left, right = OUTER_EYE_CORNERS
-    eyes_px = (problem.target_px[:, left] - problem.target_px[:, right]).norm(dim=-1)
-    return 100 * residuals(problem, state).difference_px.norm(dim=-1) / eyes_px[:, None]
-
-
-def steps_needed(problem: Problem, starts: dict[str, FitState]) -> dict[str, Tensor]:
-    """Count steps from each start until the cost is low enough, for faces that end alike from all starts."""
-    costs = {
-        name: torch.stack(
-            [total_cost(problem, minimise(problem, state, n)) for n in (*range(COUNTED_STEPS), ALL_STEPS)]
-        )
-        for name, state in starts.items()
-    }
-    ends = torch.stack([cost[-1] for cost in costs.values()])
-    enough = ENOUGH * ends.amin(0)
-    alike = (ends <= enough).all(0)
-    if not alike.all():
-        print(f"  {int((~alike).sum())} crops are not counted: their fits end elsewhere from some start")
-    return {name: (cost > enough).sum(0)[alike] for name, cost in costs.items()}
+    eyes_px = (landmarks_px[:, left] - landmarks_px[:, right]).norm(dim=-1)
+    return 100 * (found_px - chosen(landmarks_px, LANDMARKS)).norm(dim=-1) / eyes_px[:, None]
 
 
 def of_photos(paths: list[Path]) -> tuple[Tensor, Tensor]:
@@ -133,7 +101,7 @@ def held_out(network: GeometryNetwork, folder: Path, count: int, draws: int) -> 
     print(
         "held-out heads, true landmarks:", ", ".join(f"{key} {value:.2f}" for key, value in metrics.items())
     )
-    batch = objective._held_out()
+    batch = concatenate(objective.held_out_samples())
     left, right = OUTER_EYE_CORNERS
     eyes_px = (batch.landmarks_px[:, left] - batch.landmarks_px[:, right]).norm(dim=-1)
     noise = torch.randn(batch.landmarks_px.shape, generator=torch.Generator().manual_seed(0))

@@ -66,15 +66,16 @@ VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}
 _FILES = {"doctor": "installation"}  # of commands whose file has another name
 
 # The networks that verbs use; with some options they use fewer.
-_ALL = networks_of(NETWORKS) | {"light_features"}
+_GEOMETRY = frozenset({"geometry"})  # of --geometry network
+_ALL = networks_of(NETWORKS) | {"light_features"} | _GEOMETRY
 USES: dict[str, frozenset[str]] = {
     "demo": _ALL,
     "relight": _ALL,
-    "view": networks_of(["portrait"]),
+    "view": networks_of(["portrait"]) | _GEOMETRY,
     "estimate-light": _ALL - {"portrait"},
-    "predict-olat": networks_of(["portrait"]),
+    "predict-olat": networks_of(["portrait"]) | _GEOMETRY,
     "segment": frozenset({"parsing"}),
-    "fit-geometry": FITTING,
+    "fit-geometry": FITTING | _GEOMETRY,
     "evaluate": _ALL,
     "prepare-dataset": frozenset({"parsing"}),  # which finds faces
     "train": frozenset({"parsing"}),

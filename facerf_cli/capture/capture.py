@@ -18,9 +18,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import is_name
 from facerf_cli.files.read import read_image
+from facerf_cli.raster.camera import PosedCamera
 
 FIELDS = ("subject", "camera", "light")
 FULL_NAMES = ("full", "full_on", "fullon", "all", "all_on")  # in a light's place: a frame with all lights on

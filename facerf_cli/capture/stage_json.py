@@ -45,9 +45,9 @@ from facerf_cli.capture.capture import (
     require_pattern,
 )
 from facerf_cli.errors import UsageError
-from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.documents import Direction, Document, Matrix3, Name, Three, distinct, read_document
 from facerf_cli.image.colour import named_space
+from facerf_cli.raster.camera import PosedCamera
 
 StageFormat = Literal["facerf-stage-1"]
 STAGE_FORMAT: StageFormat = "facerf-stage-1"

@@ -26,10 +26,10 @@ import torch
 
 from facerf_cli.capture.capture import Capture, shift_image
 from facerf_cli.errors import InputError
-from facerf_cli.face.joint_fit import PosedCamera
 from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import read_text
 from facerf_cli.light.sphere import azel_to_direction
+from facerf_cli.raster.camera import PosedCamera
 
 WIDTH_PX, HEIGHT_PX = 168, 192
 CAMERA = "P00"  # the frontal pose, the only one of the cropped database

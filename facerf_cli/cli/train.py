@@ -109,6 +109,11 @@ def _refuse_conflicts(context: typer.Context, options: TrainOptions) -> None:
             raise UsageError(
                 f"{flag(name)}: is for the Geometry Network, which --geometry landmarks leaves out"
             )
+    if stage == "joint" and options.geometry == "network" and options.fit_with != "builtin":
+        raise UsageError(
+            "--fit-with: the Geometry Network learns the built-in face model; leave it out, or give "
+            "--geometry landmarks"
+        )
     if "texture_size" in given and options.dataset is None:
         raise UsageError("--texture-size: applies to a dataset; give --dataset, too")
     if {"mean_face", "dataset"} <= given and stage == "reflectance":

@@ -6,6 +6,7 @@ see the face is left out as well. `index_page` shows all subjects: each one's sh
 """
 
 import logging
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,8 +22,15 @@ from facerf_cli.capture.findings import Finding, Selection
 from facerf_cli.dataset.dataset import DatasetFolder
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
-from facerf_cli.face.fit import FaceFit, fit_to_arrays, quality_of, save_fit
-from facerf_cli.face.joint_fit import JointFit, fit_in_crop, fit_views
+from facerf_cli.face.fit import (
+    FaceFit,
+    Heads,
+    fit_in_crop,
+    fit_to_arrays,
+    fit_views,
+    quality_of,
+    save_fit,
+)
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
@@ -77,19 +85,22 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
     person = _Subject(capture, subject, chosen.lights, how)
     landmarks = [_find_landmarks(person, camera) for camera in chosen.cameras]
     try:
-        joint = fit_views(how.model, [capture.cameras[camera] for camera in chosen.cameras], landmarks)
+        posed = [capture.cameras[camera] for camera in chosen.cameras]
+        head, errors_iod = fit_views(how.model, posed, landmarks)
     except InputError as error:
         raise InputError(f"{subject}: {error}") from None
-    head_m = joint.vertices_world(how.model).mean(0).numpy()
-    person = replace(person, capture=capture.about(head_m))
+    middle_m = head.vertices(how.model)[0].mean(0).numpy()
+    person = replace(person, capture=capture.about(middle_m))
+    mean_error_iod = float(np.nanmean(errors_iod))
     cameras, rows, dropped = {}, [], dict(chosen.dropped)
-    for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, joint.error_iod, strict=True):
-        seen_px = None if error_iod is None else landmarks_px  # missing or rejected without an error
-        error_iod = joint.mean_error_iod if error_iod is None else error_iod
-        posed = capture.cameras[camera]
+    for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, errors_iod.tolist(), strict=True):
+        lost = math.isnan(error_iod)  # landmarks are missing or rejected
+        seen_px, error_iod = (None, mean_error_iod) if lost else (landmarks_px, error_iod)
         try:
-            fit, off_iod = fit_in_crop(how.model, joint, posed, seen_px, error_iod, how.crop_px)
-            header = _header(person, camera, joint, fit)
+            fit, off_iod = fit_in_crop(
+                how.model, head, capture.cameras[camera], seen_px, error_iod, how.crop_px
+            )
+            header = _header(person, camera, head, fit)
         except InputError as error:
             dropped[camera] = str(error)
             continue
@@ -107,8 +118,8 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
     write_display(how.dataset.sheet_path(subject), sheet, metadata=person.provenance())
     record = {
         "prepared": how.made_from,
-        "error_iod": round(joint.mean_error_iod, 5),
-        "quality": quality_of(joint.mean_error_iod),
+        "error_iod": round(mean_error_iod, 5),
+        "quality": quality_of(mean_error_iod),
         "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
         "cameras": cameras,
         **_optional_entries(person, chosen),
@@ -234,11 +245,11 @@ def stack_header(
     )
 
 
-def _header(person: _Subject, camera: str, joint: JointFit, fit: FaceFit) -> StackHeader:
+def _header(person: _Subject, camera: str, head: Heads, fit: FaceFit) -> StackHeader:
     """Make the header of a camera's stack with a black source; raise InputError where it sees no face."""
     posed = person.capture.cameras[camera]
     # World to crop by way of the head, so that lights turn with the normals.
-    world_to_crop = fit.rotation.double() @ joint.rotation.mT
+    world_to_crop = fit.rotation.double() @ head.rotation[0].mT
     directions = person.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
     inside = fit.crop.valid(posed.height_px, posed.width_px)

@@ -50,7 +50,7 @@ from facerf_cli.dataset.prepare import (
 )
 from facerf_cli.dataset.settings import DatasetSettings
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.joint_fit import CROP_STEP_PX
+from facerf_cli.face.fit import CROP_STEP_PX
 from facerf_cli.face.morphable import BUILTIN, BUILTIN_PATH, load_face_model
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document

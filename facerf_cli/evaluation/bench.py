@@ -16,7 +16,7 @@ from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.photo_light import Estimator
 from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
-from facerf_cli.work.photos import fit_faces, load_models_once, read_photo
+from facerf_cli.work.photos import fit_faces, load_models_once, networks_of_geometry, read_photo
 
 
 @cache
@@ -84,6 +84,8 @@ def networks_named(options: EvaluateOptions, photo: PhotoOptions) -> dict[str, P
     uses = networks_used(options)
     if not uses:
         return {}
+    regressing = () if options.joint_fit else networks_of_geometry(photo)
+    uses = {*uses, *regressing}
     files = serving_files(photo.settings.checkpoints)
     named = {title_of(name): path for name, path in files.items() if name in uses}
     others = {one.name: one.path for one in options.against}
@@ -91,6 +93,8 @@ def networks_named(options: EvaluateOptions, photo: PhotoOptions) -> dict[str, P
         others["the mean face"] = options.mean_checkpoint
     for method, path in others.items():
         by = serving_files((checkpoint_file(path),))
-        own = {name for name in networks_of(("field",)) if by[name] != named.get(title_of(name))}
+        own = {
+            name for name in (*networks_of(("field",)), *regressing) if by[name] != named.get(title_of(name))
+        }
         named |= {f"{title_of(name)} of {method}": by[name] for name in sorted(own)}
     return named | {"networks of MediaPipe": ASSET}

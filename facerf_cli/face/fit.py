@@ -5,8 +5,8 @@ alone constrain identity little and most of the surface not at all, so the prior
 """
 
 import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -16,36 +16,44 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import Crop, check_landmarks
+from facerf_cli.face.crop import Crop, check_landmarks, from_landmarks
 from facerf_cli.face.gauss_newton import (
-    INNER_COUNT,
     FitBasis,
     FitState,
     Problem,
-    fit_points,
-    minimise,
-    pose_from_landmarks,
+    Views,
+    least_from_pitches,
     residuals,
-    total_cost,
     weak_perspective,
 )
-from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model, read_npz
+from facerf_cli.face.morphable import MorphableModel, read_npz
 from facerf_cli.face.topology import (
     CONTOUR,
     CONTOUR_RAYS,
+    LANDMARK_UV,
     LANDMARKS_M,
     NOSE,
     OUTER_EYE_CORNERS,
     POINTS_PER_RAY,
+    band_uv,
+    grid_triangles,
+    locate,
 )
 from facerf_cli.files.texts import require_regular
-from facerf_cli.raster.camera import Camera, project, skew_matrix, so3_exp
+from facerf_cli.raster.camera import Camera, PosedCamera, project
+from facerf_cli.raster.rasterize import front_facing
 
 GOOD_ERROR_IOD, FAIR_ERROR_IOD = 0.045, 0.08  # the largest mean landmark errors of a good and of a fair fit
 IOD_M = float(np.linalg.norm(np.subtract(*LANDMARKS_M[list(OUTER_EYE_CORNERS)])))
 _INVISIBLE_M = 1e-4  # a shape direction that moves every landmark by less at one deviation is left out
-_SEED_ROUNDS = 2
-_NOISE_M = 0.0003  # this distance of a seed's point costs as much as one standard deviation of a coordinate
+LOST_IOD = 0.15  # landmarks with a larger mean error belong to no face or to another one
+# The last bits of linear algebra depend on memory alignment. Results are rounded far above those bits and far
+# below what can be measured, so that the same input gives the same bytes.
+DECIMALS = 6
+CROP_PX, CROP_STEP_PX = 256, 8  # side of a prepared crop, at most by default, and what divides it
+_CROP_STRIDE = 5  # the pose in a crop is fitted to every fifth vertex
+_LEAST_FACING = 0.1  # share of the vertices that must face the camera
+_NO_OUTLIER = 1e9  # errors up to this many deviations count by their squares
 _BORDER = 0.01  # share of the crop's side: contour landmarks closer to the photo's border are guesses
 _LARGEST_CROP_PX = 8192
 _MOST_ARRAY_BYTES = 1 << 16  # of a fit in a file
@@ -120,29 +128,19 @@ class FaceFit:
 
 
 @dataclass(frozen=True)
-class FitStart:
-    """Heads of B faces to start from, in the space of the fit's camera.
+class Heads:
+    """Fitted heads of B faces in the space that their views share, float64."""
 
-    alpha and beta may have fewer coefficients than their model; the missing ones are zero.
-    """
-
-    rotation: Tensor  # [B, 3, 3] head_to_camera
+    rotation: Tensor  # [B, 3, 3], from the head frame
     translation_m: Tensor  # [B, 3]
     alpha: Tensor  # [B, Ki]
     beta: Tensor  # [B, Ke]
-    model: MorphableModel | None = field(default=None, kw_only=True)  # theirs; None: the built-in
+    off: Tensor  # [N], the mean distance of each view's trusted landmarks over the focal length
 
-
-@dataclass(frozen=True)
-class FitBatch(FitStart):
-    """Fits of B faces, float64."""
-
-    error_iod: Tensor  # [B], see FaceFit
-
-    def vertices_camera(self, model: MorphableModel) -> Tensor:
-        """The mesh in camera space [B, V, 3], float32."""
-        vertices = model.vertices(self.alpha.float(), self.beta.float())
-        return vertices @ self.rotation.float().mT + self.translation_m.float()[:, None]
+    def vertices(self, model: MorphableModel) -> Tensor:
+        """The meshes [B, V, 3] in the shared space, float64."""
+        vertices = model.vertices(self.alpha.float(), self.beta.float()).double()
+        return vertices @ self.rotation.mT + self.translation_m[:, None]
 
 
 def quality_of(error_iod: float) -> Quality:
@@ -160,7 +158,6 @@ def fit_landmarks(
     crop: Crop,
     settings: FitSettings = FitSettings(),
     trust: np.ndarray | None = None,
-    start: FitStart | None = None,
 ) -> FaceFit:
     """Fit one face to landmarks.
 
@@ -170,11 +167,12 @@ def fit_landmarks(
         crop: The crop, whose camera is fixed.
         settings: Weights and steps.
         trust: Weight [68] in 0..1 of each landmark.
-        start: A Geometry Network's prediction [1, ...] for the crop, see `fit_batch`.
     """
     target_px = torch.from_numpy(check_landmarks(landmarks_px))
     weights = None if trust is None else torch.from_numpy(np.asarray(trust, np.float64))[None]
-    fit = fit_batch(model, target_px[None], crop.camera, settings, weights, start)
+    fit = fit_batch(model, target_px[None], crop.camera, settings, weights)
+    left, right = OUTER_EYE_CORNERS
+    iod_px = (target_px[left] - target_px[right]).norm()
     return FaceFit(
         model=model.name,
         crop=crop,
@@ -183,27 +181,23 @@ def fit_landmarks(
         alpha=fit.alpha[0].float(),
         beta=fit.beta[0].float(),
         landmarks_px=target_px.float(),
-        error_iod=float(fit.error_iod[0]),
+        error_iod=float(fit.off[0] * crop.camera.focal_px / iod_px),
     )
 
 
-def regressed_fit(model: MorphableModel, regressed: FitStart, crop: Crop) -> FaceFit:
-    """The head that a Geometry Network regressed [1, ...] from a crop (paper, 'Network Architecture').
+def regressed_fit(
+    model: MorphableModel, regressed: tuple[Tensor, Tensor, Tensor, Tensor], crop: Crop
+) -> FaceFit:
+    """The head that a Geometry Network regressed from a crop (paper, 'Network Architecture').
 
-    A model other than that of its coefficients gets the head closest to it by least squares over the mesh.
+    `regressed` are rotation [1, 3, 3], translation [1, 3] in metres, and the model's first alpha [1, Ki] and
+    beta [1, Ke].
     """
-    if model.name == (regressed.model.name if regressed.model else BUILTIN):
-        alpha, beta = (
-            torch.nn.functional.pad(found[0].float(), (0, len(basis) - found.shape[1]))
-            for found, basis in ((regressed.alpha, model.identity), (regressed.beta, model.expression))
-        )
-        rotation, translation_m = regressed.rotation[0].float(), regressed.translation_m[0].float()
-    else:
-        basis = fit_basis(model, FitSettings())
-        state = seeded_state(basis, regressed)
-        coefficients = (state.coordinates @ basis.spread.mT)[0].float()
-        alpha, beta = coefficients[: len(model.identity)], coefficients[len(model.identity) :]
-        rotation, translation_m = state.rotation[0].float(), state.translation_m[0].float()
+    rotation, translation_m, *found = (tensor[0].float() for tensor in regressed)
+    alpha, beta = (
+        torch.nn.functional.pad(some, (0, len(basis) - len(some)))
+        for some, basis in zip(found, (model.identity, model.expression), strict=True)
+    )
     vertices = model.vertices(alpha[None], beta[None])[0] @ rotation.mT + translation_m
     landmarks_px = project(model.landmarks(vertices[None])[0], crop.camera)
     return FaceFit(model.name, crop, rotation, translation_m, alpha, beta, landmarks_px, math.nan)
@@ -215,9 +209,8 @@ def fit_batch(
     camera: Camera,
     settings: FitSettings = FitSettings(),
     trust: Tensor | None = None,
-    start: FitStart | None = None,
-) -> FitBatch:
-    """Fit B faces, each from `start` or from its landmarks alone, whichever costs less.
+) -> Heads:
+    """Fit B faces, each in a photo of its own, in the space of their camera.
 
     Args:
         model: The face model.
@@ -225,53 +218,165 @@ def fit_batch(
         camera: The crops' camera.
         settings: Weights and steps.
         trust: Weight [B, 68] in 0..1 of each landmark.
-        start: A Geometry Network's predictions [B, ...].
     """
     target_px = torch.from_numpy(np.stack([check_landmarks(face.numpy()) for face in landmarks_px]))
     trust = torch.ones(target_px.shape[:2], dtype=torch.float64) if trust is None else trust.double()
-    problem, begin = fit_problem(model, target_px, camera, settings, trust)
-    state = minimise(problem, begin if start is None else better_start(problem, begin, start), settings.steps)
-    distance_px = residuals(problem, state).difference_px.norm(dim=-1)
-    left, right = OUTER_EYE_CORNERS
-    iod_px = (target_px[:, left] - target_px[:, right]).norm(dim=-1)
-    error_iod = (distance_px * trust).sum(1) / trust.sum(1) / iod_px
+    return fit_heads(model, views_of_photos(target_px, camera, trust), settings)
+
+
+def views_of_photos(target_px: Tensor, camera: Camera, trust: Tensor) -> Views:
+    """One view of each of B heads, which are in the camera's space."""
+    plane = (target_px - torch.tensor([camera.cx_px, camera.cy_px], dtype=torch.float64)) / camera.focal_px
+    count, here = len(plane), torch.eye(3, dtype=torch.float64)
+    return Views(plane, trust, torch.arange(count), here.expand(count, -1, -1), here.new_zeros(count, 3))
+
+
+def fit_heads(model: MorphableModel, views: Views, settings: FitSettings) -> Heads:
+    """Fit B heads to the landmarks of N views, from three pitches, of which the least cost wins."""
+    problem, alone = fit_problem(model, views, settings)
+    state = least_from_pitches(problem, alone, settings.steps)
+    off = (residuals(problem, state).difference.norm(dim=-1) * views.trust).sum(1) / views.trust.sum(1)
     coefficients = state.coordinates @ problem.basis.spread.mT
     alpha, beta = coefficients[:, : len(model.identity)], coefficients[:, len(model.identity) :]
-    return FitBatch(state.rotation, state.translation_m, alpha, beta, error_iod)
+    return Heads(state.rotation, state.translation_m, alpha, beta, off)
 
 
-def fit_problem(
-    model: MorphableModel, target_px: Tensor, camera: Camera, settings: FitSettings, trust: Tensor
-) -> tuple[Problem, FitState]:
-    """Pose the problem of landmarks, and the start that they alone give.
+def fit_problem(model: MorphableModel, views: Views, settings: FitSettings) -> tuple[Problem, FitState]:
+    """Pose the problem of N views, and place the head of each by its landmarks alone [N]."""
+    basis = fit_basis(model, settings)
+    alone, scale = weak_perspective(basis, views)
+    noise = torch.full((68,), settings.noise_inner, dtype=torch.float64)  # of the inter-ocular distance
+    noise[list(CONTOUR)] = settings.noise_contour
+    inverse_noise = views.trust.sqrt() / (noise * (IOD_M * scale)[:, None])
+    return Problem(basis, views, inverse_noise, settings.huber), alone
+
+
+def fit_views(
+    model: MorphableModel, cameras: Sequence[PosedCamera], landmarks_px: Sequence[np.ndarray | None]
+) -> tuple[Heads, np.ndarray]:
+    """Fit one head in the world to landmarks [68, 2] in the pixels of W calibrated cameras.
+
+    A camera without a face has None. Landmarks that the other cameras contradict (`LOST_IOD`) are left out.
+    Returns the head, and for each camera the mean distance [W] of its trusted landmarks over the inter-ocular
+    distance of a frontal face, NaN without landmarks. Raises InputError where no camera has landmarks.
+    """
+    views = [(index, cameras[index], px) for index, px in enumerate(landmarks_px) if px is not None]
+    if not views:
+        raise InputError("no camera shows a face; give frames from the front of the subject")
+    while True:
+        head = _head_in_world(model, [(camera, px) for _, camera, px in views])
+        turn = torch.stack([camera.rotation for _, camera, _ in views])
+        shift_m = torch.stack([camera.translation_m for _, camera, _ in views])
+        depth_m = eyes_depth_m(turn @ head.rotation, turn @ head.translation_m[0] + shift_m)
+        off_iod = (head.off * depth_m / IOD_M).round(decimals=DECIMALS).tolist()
+        limit = max(LOST_IOD, min(off_iod))
+        kept = [view for view, off in zip(views, off_iod, strict=True) if off <= limit]
+        if len(kept) == len(views):
+            errors_iod = np.full(len(cameras), np.nan)
+            errors_iod[[index for index, *_ in views]] = off_iod
+            return head, errors_iod
+        views = kept
+
+
+def _head_in_world(model: MorphableModel, seen: Sequence[tuple[PosedCamera, np.ndarray]]) -> Heads:
+    """Fit one head in the first camera's space, so that the fit does not depend on the world's axes."""
+    plane = torch.stack([camera.to_plane(torch.from_numpy(check_landmarks(px))) for camera, px in seen])
+    crops = [from_landmarks(px, CROP_PX) for _, px in seen]
+    trust = [
+        trust_inside(crop.to_crop(px), crop, camera.height_px, camera.width_px)
+        for crop, (camera, px) in zip(crops, seen, strict=True)
+    ]
+    first = seen[0][0]
+    turn = torch.stack([camera.rotation for camera, _ in seen]) @ first.rotation.mT
+    shift_m = torch.stack([camera.translation_m for camera, _ in seen]) - turn @ first.translation_m
+    of_one = torch.zeros(len(seen), dtype=torch.int64)
+    views = Views(plane, torch.from_numpy(np.stack(trust)), of_one, turn, shift_m)
+    head = fit_heads(model, views, FitSettings())
+    rotation = first.rotation.mT @ head.rotation
+    translation_m = (head.translation_m - first.translation_m) @ first.rotation
+    return Heads(
+        rotation.round(decimals=DECIMALS + 1),
+        translation_m.round(decimals=DECIMALS),
+        head.alpha.round(decimals=DECIMALS),
+        head.beta.round(decimals=DECIMALS),
+        head.off,
+    )
+
+
+def eyes_depth_m(rotation: Tensor, translation_m: Tensor) -> Tensor:
+    """The depth of the eyes along the camera's axis [...] for poses [..., 3, 3] and [..., 3]."""
+    eyes = torch.from_numpy(LANDMARKS_M[list(OUTER_EYE_CORNERS)].mean(0))
+    return -(rotation @ eyes + translation_m)[..., 2]
+
+
+def fit_in_crop(
+    model: MorphableModel,
+    head: Heads,
+    camera: PosedCamera,
+    landmarks_px: np.ndarray | None,
+    error_iod: float,
+    crop_px: int | None,
+) -> tuple[FaceFit, float]:
+    """Pose the head in the fixed camera of its crop from a camera's image; keep identity and expression.
+
+    The crop follows the fitted landmarks. The pose brings the vertices that face the camera as close as
+    possible to their pixels in the true camera. The second result is the mean distance that remains, over the
+    inter-ocular distance.
 
     Args:
         model: The face model.
-        target_px: Landmarks [B, 68, 2] in the camera's pixels.
-        camera: The crops' camera.
-        settings: Weights and steps.
-        trust: Weight [B, 68] in 0..1 of each landmark.
+        head: That of `fit_views`.
+        camera: The true camera.
+        landmarks_px: [68, 2] in its image; without them the fit stores the fitted landmarks.
+        error_iod: Error of the joint fit in this camera, over the inter-ocular distance.
+        crop_px: Side of the crop; None: `CROP_PX`, or less where the camera's image has fewer pixels there.
+
+    Raises:
+        InputError: The camera sees the head from behind.
     """
-    basis = fit_basis(model, settings)
-    state, scale = weak_perspective(basis, target_px, camera)
-    noise_px = landmark_noise(settings) * (IOD_M * scale)[:, None]  # [B, 68]
-    return Problem(basis, target_px, camera, trust.sqrt() / noise_px, settings.huber), state
-
-
-def landmark_noise(settings: FitSettings) -> Tensor:
-    """The standard deviation of each landmark [68] as a share of the inter-ocular distance."""
-    noise = torch.full((68,), settings.noise_inner, dtype=torch.float64)
-    noise[list(CONTOUR)] = settings.noise_contour
-    return noise
+    vertices_world = head.vertices(model)[0]
+    fitted_px = camera.project(model.landmarks(vertices_world[None])[0]).numpy()
+    crop = from_landmarks(fitted_px, crop_px or CROP_PX)
+    places = {key: round(getattr(crop, key), DECIMALS) for key in ("x0_px", "y0_px", "side_px")}
+    crop = replace(crop, **places)
+    if crop_px is None:
+        own_px = int(crop.side_px) // CROP_STEP_PX * CROP_STEP_PX
+        crop = replace(crop, size_px=min(crop.size_px, max(own_px, CROP_STEP_PX)))
+    in_camera = vertices_world @ camera.rotation.mT + camera.translation_m
+    triangles = grid_triangles()
+    facing = torch.unique(triangles[front_facing(in_camera, triangles)])
+    if len(facing) < _LEAST_FACING * len(in_camera):
+        raise InputError("a camera sees the head from behind")
+    ids = facing[::_CROP_STRIDE]
+    target_px = torch.from_numpy(crop.to_crop(camera.project(vertices_world[ids]).numpy()))
+    points = (vertices_world[ids] - head.translation_m) @ head.rotation[0]
+    rigid = FitBasis(points, points.new_zeros(*points.shape, 0), points.new_zeros(0, 0), points[:0])
+    even = torch.ones_like(target_px[None, :, 0])
+    views = views_of_photos(target_px[None], crop.camera, even)
+    problem = Problem(rigid, views, even, _NO_OUTLIER)
+    pose = least_from_pitches(problem, weak_perspective(rigid, views)[0], FitSettings().steps)
+    off = residuals(problem, pose).difference.norm(dim=-1).mean()
+    seen_px = np.round(fitted_px, DECIMALS) if landmarks_px is None else landmarks_px
+    fit = FaceFit(
+        model=model.name,
+        crop=crop,
+        rotation=pose.rotation[0].round(decimals=DECIMALS + 1).float(),
+        translation_m=pose.translation_m[0].round(decimals=DECIMALS).float(),
+        alpha=head.alpha[0].float(),
+        beta=head.beta[0].float(),
+        landmarks_px=torch.from_numpy(crop.to_crop(seen_px)).float(),
+        error_iod=error_iod,
+    )
+    return fit, float(off * eyes_depth_m(pose.rotation[0], pose.translation_m[0]) / IOD_M)
 
 
 @lru_cache(maxsize=4)
 def fit_basis(model: MorphableModel, settings: FitSettings) -> FitBasis:
     """The model at the points of a fit, with the settings' priors; cached by model and settings."""
-    corners, weights = fit_points()
+    corners, weights = locate(np.concatenate([LANDMARK_UV[len(CONTOUR) :], band_uv().reshape(-1, 2)]))
     modes, spread = _principal_modes(model, settings, corners, weights.double())
     mean = (model.mean[corners].double() * weights[..., None].double()).sum(1)
-    ends_m = mean[INNER_COUNT:].reshape(CONTOUR_RAYS, POINTS_PER_RAY, 3)[:, -1]
+    ends_m = mean[68 - len(CONTOUR) :].reshape(CONTOUR_RAYS, POINTS_PER_RAY, 3)[:, -1]
     nose_m = mean[[landmark - len(CONTOUR) for landmark in NOSE]].mean(0)
     outward = (ends_m - nose_m) * torch.tensor([1.0, 1.0, 0.0])
     return FitBasis(mean, modes, spread, outward / outward.norm(dim=-1, keepdim=True))
@@ -289,72 +394,6 @@ def _principal_modes(
     turned = whitened @ turn
     visible = turned.norm(dim=1).amax(0) > _INVISIBLE_M
     return turned[..., visible], stds[:, None] * turn[:, visible]
-
-
-def better_start(problem: Problem, begin: FitState, start: FitStart) -> FitState:
-    """Choose for each face the state of least cost among `begin` and the two of `start_states`.
-
-    Landmarks determine the pose better than a network does, and the network determines the shape better.
-    """
-    for state in start_states(problem, start):
-        cheaper = total_cost(problem, state) < total_cost(problem, begin)  # False for NaN
-        begin = state.where(cheaper & (state.translation_m[:, 2] < 0), begin)
-    return begin
-
-
-def start_states(problem: Problem, start: FitStart) -> tuple[FitState, FitState]:
-    """The state closest to `start`, and the same shape in the pose that the inner landmarks give."""
-    state, basis = seeded_state(problem.basis, start), problem.basis
-    offset = state.coordinates @ basis.modes[:INNER_COUNT].flatten(0, 1).mT
-    points = basis.mean[:INNER_COUNT] + offset.reshape(len(offset), INNER_COUNT, 3)
-    inner_px = problem.target_px[:, -INNER_COUNT:]
-    pose = pose_from_landmarks(points, inner_px, problem.camera, state.rotation, state.translation_m)
-    return state, FitState(*pose, state.coordinates)
-
-
-def seeded_state(basis: FitBasis, start: FitStart) -> FitState:
-    """The state closest to `start` in the basis of any face model."""
-    wanted = _points_camera(start).nan_to_num()
-    rotation, translation = start.rotation.double().nan_to_num(), start.translation_m.double().nan_to_num()
-    by_parameters = torch.cat(
-        [-skew_matrix(basis.mean), torch.eye(3).expand(len(basis.mean), 3, 3), basis.modes], -1
-    )
-    weights = _weights(len(basis.mean))[:, None]
-    flat = (by_parameters * weights[..., None]).flatten(0, 1)
-    prior = torch.ones(flat.shape[1], dtype=flat.dtype)
-    prior[:6] = 0
-    factor = torch.linalg.cholesky(flat.mT @ flat + prior.diag())
-    coordinates = torch.zeros(len(wanted), flat.shape[1] - 6, dtype=flat.dtype)
-    for _ in range(_SEED_ROUNDS):
-        points = basis.mean + (coordinates @ basis.modes.flatten(0, 1).mT).reshape(len(wanted), -1, 3)
-        off = (wanted - translation[:, None]) @ rotation - points  # head frame
-        right = (off * weights).flatten(1) @ flat
-        right[:, 6:] -= coordinates
-        step = torch.cholesky_solve(right.mT, factor).mT
-        translation = translation + (rotation @ step[:, 3:6, None])[..., 0]
-        rotation = rotation @ so3_exp(step[:, :3])
-        coordinates = coordinates + step[:, 6:]
-    return FitState(rotation, translation, coordinates)
-
-
-def _weights(count: int) -> Tensor:
-    """Weights [N] of `count` points in 1 / m; all contour points together count as the inner ones do."""
-    weights = torch.full((count,), (INNER_COUNT / (count - INNER_COUNT)) ** 0.5, dtype=torch.float64)
-    weights[:INNER_COUNT] = 1
-    return weights / _NOISE_M
-
-
-def _points_camera(start: FitStart) -> Tensor:
-    """The points of `fit_points` [B, N, 3] on the start's heads, camera space, float64."""
-    model, (corners, weights) = start.model or load_face_model(), fit_points()
-    mean, identity, expression = (
-        (basis[..., corners, :].double() * weights[..., None].double()).sum(-2)
-        for basis in (model.mean, model.identity, model.expression)
-    )
-    alpha, beta = start.alpha.double(), start.beta.double()
-    offset = torch.einsum("bk,knc->bnc", alpha, identity[: alpha.shape[1]])
-    offset = offset + torch.einsum("bk,knc->bnc", beta, expression[: beta.shape[1]])
-    return (mean + offset) @ start.rotation.double().mT + start.translation_m.double()[:, None]
 
 
 def trust_inside(landmarks_px: np.ndarray, crop: Crop, height_px: int, width_px: int) -> np.ndarray:

@@ -29,13 +29,12 @@ _BRIGHTEST = 4.0  # standard deviations from a crop's mean at which its square r
 
 @dataclass(frozen=True)
 class GeometryNetworkSettings:
-    """Form, coefficients, the translation (m, camera space) at outputs of zero, and the face model's name."""
+    """Form, coefficients of the built-in face model, and the translation (m) at outputs of zero."""
 
     form: GeometryForm = "default"
     identity: Coefficients = 40
     expression: Coefficients = 29
     mean_translation_m: tuple[float, float, Annotated[float, Field(gt=-100, lt=0)]] = (0.0, 0.0, -1.1)
-    face_model: Annotated[str, Field(max_length=200)] = "builtin"
 
 
 class GeometryEstimate(NamedTuple):
@@ -43,7 +42,7 @@ class GeometryEstimate(NamedTuple):
 
     rotation: Tensor  # [B, 3, 3] head_to_camera
     translation_m: Tensor  # [B, 3]
-    alpha: Tensor  # [B, Ki] identity coefficients of the network's face model
+    alpha: Tensor  # [B, Ki] identity coefficients of the built-in face model
     beta: Tensor  # [B, Ke] its expression coefficients
 
 

@@ -29,6 +29,9 @@ class Camera:
     cy_px: float
 
 
+PLANE = Camera(1.0, 0, 0, 0.0, 0.0)  # focal length 1, origin on the axis: the same image for every camera
+
+
 def crop_camera(side_px: int) -> Camera:
     """Return the camera of a face crop: focal length 4 x the side, centred principal point."""
     return Camera(CROP_FOCAL_PER_SIDE * side_px, side_px, side_px, side_px / 2, side_px / 2)
@@ -39,6 +42,29 @@ def project(points_camera: Tensor, camera: Camera) -> Tensor:
     x, y, z = points_camera.unbind(-1)
     scale = camera.focal_px / -z
     return torch.stack([camera.cx_px + scale * x, camera.cy_px - scale * y], -1)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedCamera:
+    """A calibrated pinhole camera in the world, which is in metres and right-handed; float64."""
+
+    focal_px: tuple[float, float]  # along x and along y
+    centre_px: tuple[float, float]
+    width_px: int
+    height_px: int
+    rotation: Tensor  # [3, 3] world to camera
+    translation_m: Tensor  # [3] world to camera
+
+    def project(self, points_world: Tensor) -> Tensor:
+        """Project world points [..., 3] to the image's pixels [..., 2], float64."""
+        points_camera = points_world.double() @ self.rotation.mT + self.translation_m
+        focal, centre = torch.tensor([self.focal_px, self.centre_px], dtype=torch.float64)
+        return project(points_camera, PLANE) * focal + centre
+
+    def to_plane(self, px: Tensor) -> Tensor:
+        """Convert pixels [..., 2] to the image of `PLANE`."""
+        focal, centre = torch.tensor([self.focal_px, self.centre_px], dtype=torch.float64)
+        return (px - centre) / focal
 
 
 def pixel_rays(px: Tensor, camera: Camera) -> Tensor:

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
-from facerf_cli.face.fit import FitStart, Geometry, fit_landmarks, regressed_fit, trust_inside
+from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.morphable import BUILTIN
 from facerf_cli.image.colour import without_fireflies
+from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.relighting.models import Models, Sides
@@ -57,7 +58,7 @@ def fit_photo(
     cropped = without_fireflies(crop.apply(photo))
     in_crop = crop.to_crop(landmarks_px)
     trust = trust_inside(in_crop, crop, *photo.shape[:2])
-    fit = fit_landmarks(models.face, in_crop, crop, trust=trust, start=regress_head(models, cropped))
+    fit = fit_landmarks(models.face, in_crop, crop, trust=trust)
     return Head(cropped, fit, unwrap_face(models.face, fit, cropped, sides.texture, photo.shape))
 
 
@@ -65,7 +66,8 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
     """Crop a photo [H, W, 3] around a detector's box, regress the head, unwrap the face.
 
     One forward pass of the Geometry Network gives pose and shape (paper, 'Network Architecture'); there are
-    no landmarks. Raises InputError where the face lies outside the photo.
+    no landmarks. Raises InputError where the face lies outside the photo, UsageError for a face model that is
+    not the network's.
     """
     sides = sides or models.sides()
     crop = from_box(box_px, sides.crop_px)
@@ -75,17 +77,16 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
 
 
 @torch.no_grad()
-def regress_head(models: Models, cropped: np.ndarray) -> FitStart:
+def regress_head(models: Models, cropped: np.ndarray) -> GeometryEstimate:
     """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network.
 
-    Raises InputError where its coefficients are of a face model that is not at hand.
+    Raises UsageError for a face model that is not the network's.
     """
     network: Any = models.networks.geometry
-    name = network.settings.face_model
-    if name not in (BUILTIN, models.face.name):
-        raise InputError(
-            f"the Geometry Network regresses heads of the face model {name}; give that with --face-model"
+    if models.face.name != BUILTIN:
+        raise UsageError(
+            f"face model {models.face.name!r}: geometry 'network' regresses heads of the built-in one; "
+            "use that, or geometry 'landmarks'"
         )
     image = torch.from_numpy(cropped).permute(2, 0, 1)[None].to(models.device)
-    found = (tensor.cpu() for tensor in network(image))
-    return FitStart(*found, model=None if name == BUILTIN else models.face)
+    return GeometryEstimate(*(tensor.cpu() for tensor in network(image)))

@@ -142,8 +142,6 @@ def _check_parsing(path: Path, network: ParsingNetwork) -> None:
 def _check_geometry(path: Path, network: GeometryNetwork) -> None:
     """Raise InputError where a Geometry Network regresses more coefficients than the built-in model has."""
     model, settings = load_face_model(BUILTIN), network.settings
-    if settings.face_model != BUILTIN:
-        return
     if settings.identity > len(model.identity) or settings.expression > len(model.expression):
         raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
 

@@ -2,7 +2,7 @@
 
 The estimated head's landmarks are compared with the true ones in the image, as in the paper's landmark loss.
 Contour landmarks do not slide, for here hidden ones are known, too. The targets of pose and coefficients are
-those of the fit to the same landmarks, for the network's estimate is where that fit starts.
+those of the fit to the same landmarks.
 """
 
 from dataclasses import dataclass

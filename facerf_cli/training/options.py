@@ -53,8 +53,8 @@ class TrainOptions:
         synthhuman: Train on images of SynthHuman, too: by their alpha in the stage parsing, their normals in
             the stage portrait.
         heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
-        fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint, the one whose
-            coefficients the Geometry Network learns.
+        fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint it needs
+            --geometry landmarks.
         heads: Bake so many synthetic heads.
         views: Fit so many views of each head.
         bank: Keep baked heads in this folder.

@@ -176,7 +176,7 @@ class _TrainedStage:
         images = folder / "pictures"
         add_head_images(folder / "heads", images, sizes.images, options.jobs, options.settings.seed)
         faces = RenderedFaces(images, provenance)
-        network = self.make.geometry(faces.mean_translation_m(), load_face_model())
+        network = self.make.geometry(faces.mean_translation_m())
         settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
         return self._kind(GeometryObjective)(faces, network, settings)
 
@@ -191,9 +191,9 @@ class _TrainedStage:
             partial(require_crops, dataset, dataset.crop_px, side),
         )
         reflectance, geometry = self.make.reflectance(side), None  # heads are fitted to landmarks
-        model = load_face_model(options.fit_with)  # of the Geometry Network, whatever fitted the dataset
+        model = load_face_model(options.fit_with)  # whatever fitted the dataset
         if options.geometry == "network":
-            geometry = self.make.geometry(mean_translation_m(dataset), model)
+            geometry = self.make.geometry(mean_translation_m(dataset))
         photos = None
         if options.photos:
             items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)

@@ -11,10 +11,8 @@ from facerf_cli.dataset.cost import cost_of_textures, in_words
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.textures import model_of
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.checkpoint import form_of, new_network
-from facerf_cli.network.geometry import GeometryNetworkSettings
 from facerf_cli.network.vgg import load_vgg
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.bank.heads import HeadBakeSettings
@@ -109,8 +107,7 @@ class StageNetworks:
             side = self.joint_side if stage == "joint" else self.texture_side
             found["reflectance"] = self.reflectance(side)
         if stage == "geometry" or (stage == "joint" and options.geometry == "network"):
-            model = load_face_model(options.fit_with) if stage == "joint" else load_face_model()
-            found["geometry"] = self.geometry((0.0, 0.0, -1.0), model)
+            found["geometry"] = self.geometry((0.0, 0.0, -1.0))
         return found or {name: self.network(name)}
 
     def frozen_appearance(self, side: int) -> Any:
@@ -169,24 +166,11 @@ class StageNetworks:
                 f"--without-normals: the form {form} has no setting normals; leave it out"
             ) from None
 
-    def geometry(self, mean_translation_m: tuple[float, float, float], model: MorphableModel) -> Any:
-        """The Geometry Network; with --mean-face of the pose alone (paper, 'Ablative Study').
-
-        Raises InputError for one of --start-from whose coefficients are another model's.
-        """
-        form, most = "paper" if self.options.preset == "paper" else "default", GeometryNetworkSettings()
-        shapes = {
-            "identity": min(most.identity, len(model.identity)),
-            "expression": min(most.expression, len(model.expression)),
-        }
-        if self.options.mean_face:
-            shapes = dict.fromkeys(shapes, 0)
-        settings = {"mean_translation_m": mean_translation_m, "face_model": model.name, **shapes}
-        network = self.network("geometry", form, **settings)
-        if network.settings.face_model != model.name:
-            trained = f"its Geometry Network was trained with the face model {network.settings.face_model}"
-            raise InputError(f"{self.options.start_from}: {trained}, not {model.name}; give --fit-with")
-        return network
+    def geometry(self, mean_translation_m: tuple[float, float, float]) -> Any:
+        """The Geometry Network; with --mean-face of the pose alone (paper, 'Ablative Study')."""
+        form = "paper" if self.options.preset == "paper" else "default"
+        shapes = {"identity": 0, "expression": 0} if self.options.mean_face else {}
+        return self.network("geometry", form, mean_translation_m=mean_translation_m, **shapes)
 
 
 def say_cost(options: TrainOptions, make: StageNetworks) -> None:

@@ -18,7 +18,7 @@ from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
 MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
 _TURNED_AWAY_DEG, _MOST_ROLL_DEG = 90.0, 180.0
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
-FITTING = frozenset({"parsing", "geometry"})  # networks that find and fit faces
+FITTING = frozenset({"parsing"})  # networks that find faces for a fit
 # Networks of the reflectance models.
 NETWORKS = {
     "field": frozenset({"reflectance"}),

@@ -12,7 +12,7 @@ from skimage.metrics import peak_signal_noise_ratio
 
 from facerf_cli.face.crop import from_box
 from facerf_cli.face.fit import FaceFit, load_fit
-from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
 from facerf_cli.main import main
@@ -159,6 +159,11 @@ def is_regressed(output: Path) -> bool:
     return row["quality"] == "unknown" and "error_iod" not in row
 
 
+def networks_of(output: Path) -> set[str]:
+    """The networks that served a run, by its report."""
+    return set(json.loads((output / "report.jsonl").read_text())["networks"])
+
+
 def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
     assert fit(tmp_path, "--geometry", "network") == 0
     found = load_fit(tmp_path / "astronaut_fit.npz")
@@ -171,7 +176,17 @@ def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:
     torch.testing.assert_close(found.rotation, estimate.rotation[0])
     torch.testing.assert_close(found.translation_m, estimate.translation_m[0])
     torch.testing.assert_close(found.alpha[: estimate.alpha.shape[1]], estimate.alpha[0])
-    assert is_regressed(tmp_path)
+    assert is_regressed(tmp_path) and "geometry" in networks_of(tmp_path)
+
+
+def test_no_other_run_loads_that_network_and_it_serves_no_other_face_model(
+    tmp_path: Path, fitted: Path, capsys: Capture
+) -> None:
+    assert "geometry" not in networks_of(fitted)
+    save_face_model(tmp_path / "mine.npz", replace(load_face_model(), name="mine"))
+    assert fit(tmp_path / "out", "--geometry", "network", "--face-model", str(tmp_path / "mine.npz")) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "mine.npz" in said and "give --geometry landmarks" in said
 
 
 def test_a_checkpoint_of_both_networks_regresses_by_default(tmp_path: Path) -> None:
@@ -191,7 +206,8 @@ def test_a_checkpoint_that_expects_nonsense_is_refused(
 ) -> None:
     tensors, metadata = load_checkpoint(SHIPPED["reflectance"])
     save_checkpoint(tmp_path / "wrong.safetensors", tensors, metadata | wrong)
-    assert fit(tmp_path / "out", "--checkpoint", str(tmp_path / "wrong.safetensors")) == 1
+    wrong_file = str(tmp_path / "wrong.safetensors")
+    assert fit(tmp_path / "out", "--geometry", "network", "--checkpoint", wrong_file) == 1
     (line,) = [x for x in capsys.readouterr().err.splitlines() if "invalid" in x]
     assert next(iter(wrong)) in line and "train it again" in line
 

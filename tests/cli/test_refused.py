@@ -191,6 +191,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--dataset d --mean-face": "--mean-face: the dataset is fitted already",
         "--without-normals --start-from f": "--without-normals: --start-from fixes",
         "--stage joint --dataset d --geometry landmarks --photos p": "--photos: is for the Geometry Network",
+        "--stage joint --dataset d --fit-with m.npz": "--fit-with: ... give --geometry landmarks",
         "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
         "--preset paper --dataset d --vgg-weights v --appearance-features a": "takes the place of",
         "--preset paper --dataset data": "--vgg-weights imagenet ... --light-features FILE ... --crop 512",

@@ -239,7 +239,7 @@ def require_served(tmp_path: Path, name: str, shipped: tuple[list[str], np.ndarr
     path = tmp_path / "run/best.safetensors"
     assert row["networks"].pop(name) == {"file": str(path), "sha256": file_sha256(path)}
     assert row["networks"].pop("mediapipe")["file"] == "mediapipe.safetensors"
-    assert set(row["networks"]) == {"reflectance", "geometry", "parsing", "portrait"} - {name}
+    assert set(row["networks"]) == {"reflectance", "parsing", "portrait"} - {name}
     assert all(served["file"] == SHIPPED[other].name for other, served in row["networks"].items())
 
 

@@ -95,7 +95,6 @@ def test_every_network_comes_back_with_its_settings_and_weights(name: str, tmp_p
             (name, [{key: value} for value in NONSENSE])
             for name in NETWORKS
             for key in vars(NETWORKS[name][1])
-            if key != "face_model"  # a name
         ),
         *((name, [change]) for name, change in CHANGES),
     ],

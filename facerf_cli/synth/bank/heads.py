@@ -206,9 +206,9 @@ def build_views(
     fits = fit_batch(fitted_with, landmarks, crop_camera(settings.crop_px))
     triangles, identity = grid_triangles(), texel_centres_uv(side).permute(2, 0, 1)
     views = []
-    for photo, fitted_camera in zip(photos, fits.vertices_camera(fitted_with), strict=True):
+    for photo, fitted_camera in zip(photos, fits.vertices(fitted_with).float(), strict=True):
         image, camera = _uv_image(photo), crop_camera(settings.crop_px)
-        texture, visible = unwrap(image, fitted_camera.float(), triangles, camera, side)
+        texture, visible = unwrap(image, fitted_camera, triangles, camera, side)
         on_face = texture[2].clamp_min(1e-6)
         seen = visible * (texture[2] > _LEAST_COVER)
         offset = (texture[:2] / on_face - identity) * (seen > 0)
@@ -218,7 +218,7 @@ def build_views(
                 "rotation": photo.rotation,
                 "warp": warp.half(),
                 "visible": (seen * 255).round().byte(),
-                "normals": normal_map(fitted_camera.float(), triangles, side).half(),
+                "normals": normal_map(fitted_camera, triangles, side).half(),
             }
         )
     return {name: torch.stack([view[name] for view in views]) for name in views[0]}
