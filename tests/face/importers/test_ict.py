@@ -1,6 +1,5 @@
 """ICT-FaceKit at the door: the carried mean against the original, and archives that are not what they say."""
 
-import hashlib
 import io
 import tarfile
 import zipfile
@@ -13,16 +12,8 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers import ict as ict_module
 from facerf_cli.face.importers.find_landmarks import landmarks_of, rigid_alignment
-from facerf_cli.face.importers.ict import (
-    ICT_FACEKIT,
-    LANDMARK_IDS,
-    VERTICES,
-    cached_face_model,
-    fetch_face_model,
-    ict_content_sha256,
-)
+from facerf_cli.face.importers.ict import LANDMARK_IDS, VERTICES
 from facerf_cli.face.importers.resample import import_face_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model, save_face_model
@@ -210,46 +201,3 @@ HOSTILE = {
 def test_what_is_not_ict_facekit_is_refused_in_one_line(case: str, tmp_path: Path):
     make, message = HOSTILE[case]
     refused(InputError, f"{tmp_path} ... {message}", import_face_model, "ict-facekit", make(tmp_path))
-
-
-CONTENTS = {"generic_neutral_mesh": b"v 1 2 3\n" * 4000, "jawOpen": b"v 3 2 1\n" * 4000}
-
-
-def published(path: Path, contents: dict[str, bytes] = CONTENTS, level: int = 9, prefix: str = "a") -> Path:
-    """A .tar.gz as GitHub packs a commit: the same files, other bytes from one day to another."""
-    with tarfile.open(path, "w:gz", compresslevel=level) as tar:
-        for name, data in {f"FaceXModel/{stem}.obj": text for stem, text in contents.items()}.items():
-            entry = tarfile.TarInfo(f"{prefix}/{name}")
-            entry.size = len(data)
-            tar.addfile(entry, io.BytesIO(data))
-    return path
-
-
-def test_the_digest_is_that_of_the_contents_however_they_are_packed(tmp_path: Path) -> None:
-    lines = [f"{hashlib.sha256(text).hexdigest()}  {stem}.obj\n" for stem, text in sorted(CONTENTS.items())]
-    expected = hashlib.sha256("".join(lines).encode()).hexdigest()
-    for number, packing in enumerate(({}, {"level": 1}, {"prefix": "ICT-FaceKit-master"})):
-        assert ict_content_sha256(published(tmp_path / f"{number}.tar.gz", **packing)) == expected
-    others = (
-        {**CONTENTS, "jawOpen": b"v 3 2 0\n" * 4000},
-        {**CONTENTS, "jawLeft": b"v 3 2 1\n"},
-        {"generic_neutral_mesh": CONTENTS["jawOpen"], "jawOpen": CONTENTS["generic_neutral_mesh"]},
-    )
-    for contents in others:
-        assert ict_content_sha256(published(tmp_path / "other.tar.gz", contents)) != expected
-    assert ict_content_sha256(cut(tarred(tmp_path / "cut.tar.gz", "w:gz", noise(200_000)))) == ""
-
-
-def test_it_is_fetched_into_the_cache_and_verified_by_its_contents(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ict_module, "cache_folder", lambda: tmp_path)
-    asked = []
-    monkeypatch.setattr(ict_module, "fetch", lambda *given: asked.append(given) or Path("there"))
-    assert cached_face_model("ict-facekit") is None and fetch_face_model("ict-facekit") == Path("there")
-    file, instead, folder = asked[0]
-    assert (file, folder) == (ICT_FACEKIT, tmp_path / "face-models")
-    assert "facerf face-model import ict-facekit" in instead and file.digest is ict_content_sha256
-    folder.mkdir()
-    (folder / file.name).write_bytes(b"")
-    assert cached_face_model("ict-facekit") == folder / file.name
