@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.source import SourceHead, SourceModel
-from facerf_cli.face.morphable import EXPRESSION_STD, HEAD_PARTS
+from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.morphable import EXPRESSION_STD
 from facerf_cli.run.logs import one_line
 
 _IDS = (
@@ -25,12 +25,6 @@ _IDS = (
 LANDMARK_IDS = np.array(_IDS.split(), dtype=np.int64)  # from its README
 VERTICES = 26719
 _SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
-_PARTS = {  # first and last vertex; an eyeball is its sclera, which covers the iris and bulges as a cornea
-    "skin": ((0, 11247),),
-    "mouth": ((11248, 13293), (14062, 17038)),  # socket; gums and tongue
-    "teeth": ((17039, 21450),),
-    "eye": ((21451, 22220), (23021, 23790)),
-}
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
 
@@ -69,18 +63,7 @@ def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
         expression_names=tuple(expressions),
         triangles=triangles[outer[triangles].all(1)],
         known=dict(enumerate(mean[LANDMARK_IDS])),
-        head=_head(triangles),
     )
-
-
-def _head(triangles: np.ndarray) -> SourceHead:
-    """Skin, mouth, teeth and eyeballs, without the eyes' sockets and the film in front of the eyes."""
-    part = np.full(VERTICES, 255, np.uint8)
-    for name, spans in _PARTS.items():
-        for first, last in spans:
-            part[first : last + 1] = HEAD_PARTS.index(name)
-    eyes = tuple(np.arange(first, last + 1) for first, last in _PARTS["eye"])
-    return SourceHead(triangles[(part[triangles] < 255).all(1)], part, eyes)
 
 
 def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
