@@ -30,8 +30,8 @@ from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap
 from facerf_cli.synth import path_tracer, renderer
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
-from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
+from facerf_cli.synth.head.shell import shell_head
 from facerf_cli.synth.path_tracer import PathSettings
 from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.views import StageCamera
@@ -126,7 +126,8 @@ def render_both(
     times: dict[str, list[float]],
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Render diffuse images [L, 3, H, W] of each camera by both renderers; their seconds go into `times`."""
-    head = build_head(model, alpha, torch.zeros(len(model.expression)))
+    beta = torch.zeros(1, len(model.expression))
+    head = shell_head(model.vertices(alpha[None], beta)[0], gaze_deg=(0.0, 0.0), subdivisions=1)
     wanted = seen_vertices(head, cameras)
     bake = BakeSettings(light_radius_deg=0, bounce_samples=64 if settings.bounces else 0)
     started = time.perf_counter()

@@ -59,7 +59,7 @@ _LINES = {
     },
     "Look after facerf": {
         "doctor": "Show what is installed, and what is missing.",
-        "face-model": "Import, fetch, list and show face models.",
+        "face-model": "Import other face models.",
     },
 }
 VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}

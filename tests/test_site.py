@@ -27,9 +27,9 @@ def test_links_lead_to_pages_or_to_the_repository(uri: str, link: str, becomes: 
 
 def test_a_verb_has_a_page_of_its_manual_and_of_its_own_verbs() -> None:
     page = "\n".join(pages._manual("face-model"))
-    assert page.startswith("# facerf face-model\n") and "\n## facerf face-model fetch\n" in page
-    assert "`KIND <ict-facekit>`\n:   ict" in page and "\\-" not in page
-    assert "```sh\nfacerf face-model list\n" in page
+    assert page.startswith("# facerf face-model\n") and "\n## facerf face-model import\n" in page
+    assert "`-o, --output FILE.npz`\n:   File to write" in page and "\\-" not in page
+    assert "```sh\nfacerf face-model import " in page
     assert "relight-dataset" not in "\n".join(pages._manual("relight"))
 
 

@@ -64,18 +64,9 @@ facerf evaluate cases dataset/ --split all --every 10 -o cases/
 facerf evaluate compare cases/ --reflectance field --method theirs=renders/ -o report/
 facerf evaluate compare cases/ --against mine.safetensors --form my_lab.networks:Net -o report/
 facerf evaluate compare truth/ --method mine/ --method theirs/ --masks masks/ -o report/
-facerf face-model fetch ict-facekit
-facerf face-model fetch ict-facekit -v
-facerf face-model fetch ict-facekit -q
 facerf face-model import ict-facekit ICT-FaceKit.zip -o ict.npz
 facerf face-model import flame flame.pkl --landmarks embedding.npy -o flame.npz
 facerf face-model import basel-2019 model2019_bfm.h5 -o basel.npz
-facerf face-model list
-facerf face-model list -v
-facerf face-model list -q
-facerf face-model show
-facerf face-model show builtin -o mean.png
-facerf face-model show ict.npz -o ict.png
 """
 
 

@@ -1,4 +1,4 @@
-"""`facerf face-model`: fetch, import, list and show morphable face models."""
+"""`facerf face-model import`: import a published morphable face model."""
 
 import logging
 from pathlib import Path
@@ -9,14 +9,12 @@ import typer
 from facerf_cli.batch.inputs import refuse_read
 from facerf_cli.cli.brief import Verbs
 from facerf_cli.errors import UsageError
-from facerf_cli.run.logs import LOGGER_NAME, json_line
+from facerf_cli.run.logs import LOGGER_NAME
 
-_IMAGES = (".png", ".jpg", ".jpeg")
 log = logging.getLogger(LOGGER_NAME)
-app = typer.Typer(cls=Verbs, add_completion=False, help="Import, fetch, list and show morphable face models.")
+app = typer.Typer(cls=Verbs, add_completion=False, help="Import morphable face models.")
 
 Kind = Literal["ict-facekit", "flame", "basel-2009", "basel-2017", "basel-2019"]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 
 
 @app.callback()
@@ -53,7 +51,7 @@ def import_model(
             show_default="published landmarks, the others by the shape of the face",
         ),
     ] = None,
-    overwrite: Overwrite = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
     """Import a published morphable model as a file for --face-model.
 
@@ -63,10 +61,15 @@ def import_model(
     if output.suffix != ".npz":
         raise UsageError(f"-o {output}: not a face model; give a file that ends in .npz")
     refuse_read([output], [path for path in (source, landmarks) if path])
-    _refuse_existing(output, overwrite)
-    from facerf_cli.face.model_files import import_to
+    if output.exists() and not overwrite:
+        raise UsageError(f"{output}: the file exists; give --overwrite to replace it")
+    from facerf_cli.face.importers.resample import import_face_model
+    from facerf_cli.face.morphable import save_face_model
+    from facerf_cli.files.atomic import atomic_path
 
-    model = import_to(output, kind, source, landmarks)
+    model = import_face_model(kind, source, landmarks)
+    with atomic_path(output) as temporary:
+        save_face_model(temporary, model)
     log.info(
         "%s: %d identity and %d expression shapes (%s)",
         model.name,
@@ -75,69 +78,3 @@ def import_model(
         model.licence,
     )
     print(output)
-
-
-@app.command("fetch")
-def fetch_model(
-    kind: Annotated[Literal["ict-facekit"], typer.Argument(metavar="KIND", help="ict-facekit")],
-) -> None:
-    """Fetch a public morphable model into the cache, for `facerf face-model import`.
-
-    A broken download continues where it stopped, and its content is verified. The other models come only from
-    their authors, who require an agreement.
-    """
-    from facerf_cli.face.importers.ict import fetch_face_model
-
-    path = fetch_face_model(kind)
-    log.info("import it with: facerf face-model import %s %s -o %s.npz", kind, path, kind)
-    print(path)
-
-
-@app.command("list")
-def list_models(
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object a line instead.")] = False,
-) -> None:
-    """List the built-in face model, the imported ones in the working folder and those to fetch."""
-    from facerf_cli.face.model_files import list_rows
-
-    rows = list_rows()
-    if as_json:
-        for row in rows:
-            print(json_line(row))
-        return
-    table = [[str(row[key]) for key in ("model", "name", "shapes", "licence")] for row in rows]
-    widths = [max(len(line[column]) for line in table) for column in range(3)]
-    for line in table:
-        cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=False)]
-        print("  ".join([*cells, line[3]]).rstrip())
-
-
-@app.command("show")
-def show_model(
-    model: Annotated[
-        str, typer.Argument(metavar="MODEL", help="builtin, or a file of `face-model import`.")
-    ] = "builtin",
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="IMAGE", help="Draw the mean from eight sides: .png or .jpg.",
-            show_default=False,
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
-) -> None:  # fmt: skip
-    """Show a face model's licence, unit, sizes, shapes and landmarks, and draw it with -o."""
-    if output is not None and output.suffix.lower() not in _IMAGES:
-        raise UsageError(f"-o {output}: not an image; give a file that ends in {', '.join(_IMAGES)}")
-    if output is not None:
-        refuse_read([output], [Path(model)])
-        _refuse_existing(output, overwrite)
-    from facerf_cli.face.model_files import show
-
-    show(model, output)
-
-
-def _refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raise UsageError for an existing file without --overwrite."""
-    if path.exists() and not overwrite:
-        raise UsageError(f"{path}: the file exists; give --overwrite to replace it")

@@ -1,16 +1,10 @@
-"""Morphable models on the canonical topology (paper, 'Reflectance Field Representation'), and their files.
-
-The canonical mesh of `face.topology` ends at the forehead, the cheeks and the chin and is flat over eyes and
-mouth. A synthetic light stage also needs ears, a skull, eyeballs and teeth: a model can have a whole head in
-its authors' topology, driven by the same coefficients.
-"""
+"""Morphable models on the canonical topology (paper, 'Reflectance Field Representation'), and their files."""
 
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,49 +16,10 @@ from facerf_cli.run.logs import one_line
 
 BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
-HEAD_PARTS = ("skin", "eye", "mouth", "teeth")  # values of HeadModel.part, by index
 EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means, in imported models
-# Types of a head's arrays in a face model's file, under names that begin with `_HEAD_PREFIX`.
-_HEAD_TYPES = {
-    "mean": np.float32,
-    "identity": np.float16,
-    "expression": np.float16,
-    "triangles": np.int32,
-    "part": np.uint8,
-    "uv": np.float32,
-}
-_HEAD_PREFIX = "head_"
-_MAX_VERTICES, _MAX_TRIANGLES = 60_000, 120_000  # of a head
 _MAX_COEFFICIENTS = 500
 _MAX_LETTERS = 2000  # of a name or a licence
 MAX_ARRAYS, _MAX_BYTES = 64, 1 << 30  # of a file
-
-
-@dataclass(frozen=True, eq=False)
-class HeadModel:
-    """A linear model of a whole head; metres, head frame, bases scaled like those of the canonical mesh.
-
-    mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3] float32; triangles [F, 3] int64, counter-clockwise
-    seen from outside; part [N] uint8, an index into `HEAD_PARTS`; a triangle has the largest part of its
-    corners. uv [N, 2]: skin has the (u, v) of `face.topology`, continued on all sides, with a jump of u by a
-    full turn at the back of the head; an eye has the unit disc about its gaze axis (radius 1 at 90 degrees).
-    """
-
-    mean: Tensor
-    identity: Tensor
-    expression: Tensor
-    triangles: Tensor
-    part: Tensor
-    uv: Tensor
-
-    def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
-        """The vertices mean + M_id alpha + M_exp beta [N, 3] for alpha [Ki] and beta [Ke]."""
-        offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)
-        return self.mean + offset.view(-1, 3)
-
-    def to(self, device: torch.device | str) -> "HeadModel":
-        """The same model with its arrays on `device`."""
-        return replace(self, **{key: getattr(self, key).to(device) for key in _HEAD_TYPES})
 
 
 @dataclass(frozen=True, eq=False)  # caches compare models by identity
@@ -72,7 +27,7 @@ class MorphableModel:
     """A linear face model; lengths in metres, head frame, bases scaled by their standard deviations.
 
     mean [V, 3], identity [Ki, V, 3], expression [Ke, V, 3]; every coefficient has a standard normal prior
-    and zeros give the neutral mean. `head` is the whole head in the authors' topology, if they publish one.
+    and zeros give the neutral mean.
     """
 
     name: str
@@ -81,7 +36,6 @@ class MorphableModel:
     identity: Tensor
     expression: Tensor
     expression_names: tuple[str, ...]
-    head: HeadModel | None = None
 
     @property
     def stamp(self) -> dict[str, str]:
@@ -111,14 +65,12 @@ class MorphableModel:
             identity=self.identity[:1] * 0,
             expression=self.expression[:1] * 0,
             expression_names=self.expression_names[:1],
-            head=None,
         )
 
     def to(self, device: torch.device | str) -> "MorphableModel":
         """The same model with its arrays on `device`."""
         mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))
-        head = self.head and self.head.to(device)
-        return replace(self, mean=mean, identity=identity, expression=expression, head=head)
+        return replace(self, mean=mean, identity=identity, expression=expression)
 
 
 def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
@@ -157,34 +109,11 @@ def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> MorphableModel
         raise InputError(
             f"{path}: it has another UV layout; import the face model again with this version of facerf"
         )
-    mean, identity, expression = _shapes(arrays, "", GRID * GRID)
+    mean = floats(arrays, "mean", (GRID * GRID, 3))
+    identity, expression = (floats(arrays, key, (None, GRID * GRID, 3)) for key in ("identity", "expression"))
     names = tuple(str(name) for name in arrays["expression_names"])
     name, licence = (_printable(arrays[key]) for key in ("name", "licence"))
-    head = _head(arrays, len(identity), len(expression)) if _HEAD_PREFIX + "mean" in arrays else None
-    return MorphableModel(name, licence, mean, identity, expression, names, head)
-
-
-def _head(arrays: Mapping[str, np.ndarray], identities: int, expressions: int) -> HeadModel:
-    vertices, faces = (len(arrays[_HEAD_PREFIX + key]) for key in ("mean", "triangles"))
-    if not 3 <= vertices <= _MAX_VERTICES or not 1 <= faces <= _MAX_TRIANGLES:
-        raise ValueError(f"its head has {vertices} vertices and {faces} triangles")
-    mean, identity, expression = _shapes(arrays, _HEAD_PREFIX, vertices, identities, expressions)
-    triangles = _indices(arrays, "triangles", (faces, 3), vertices).long()
-    part = _indices(arrays, "part", (vertices,), len(HEAD_PARTS)).byte()
-    return HeadModel(mean, identity, expression, triangles, part, floats(arrays, "head_uv", (vertices, 2)))
-
-
-def _shapes(
-    arrays: Mapping[str, np.ndarray],
-    prefix: str,
-    vertices: int,
-    identities: int | None = None,
-    expressions: int | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean [N, 3] and shapes [Ki, N, 3] and [Ke, N, 3] of a file's arrays."""
-    mean = floats(arrays, prefix + "mean", (vertices, 3))
-    identity = floats(arrays, prefix + "identity", (identities, vertices, 3))
-    return mean, identity, floats(arrays, prefix + "expression", (expressions, vertices, 3))
+    return MorphableModel(name, licence, mean, identity, expression, names)
 
 
 def floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
@@ -197,14 +126,6 @@ def floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, 
     if not tensor.isfinite().all():
         raise ValueError(f"{key} holds values that are not finite")
     return tensor
-
-
-def _indices(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int, ...], count: int) -> Tensor:
-    """An array of a head's indices below `count`; raises ValueError for anything else."""
-    array = arrays[_HEAD_PREFIX + key]
-    if array.shape != shape or array.dtype.kind not in "iu" or array.min() < 0 or array.max() >= count:
-        raise ValueError(f"{_HEAD_PREFIX}{key} is not of shape {shape}, or holds indices out of range")
-    return torch.from_numpy(array)
 
 
 def _printable(array: np.ndarray) -> str:
@@ -240,10 +161,6 @@ def _require_size(path: Path, most_bytes: int) -> None:
 
 def save_face_model(path: Path, model: MorphableModel) -> None:
     """Write a model as .npz without pickles; bases in half precision (steps below 0.02 mm)."""
-    head: dict[str, Any] = {}
-    if model.head is not None:
-        for key, kind in _HEAD_TYPES.items():
-            head[_HEAD_PREFIX + key] = getattr(model.head, key).numpy().astype(kind)
     with path.open("wb") as file:
         np.savez_compressed(
             file,
@@ -254,5 +171,4 @@ def save_face_model(path: Path, model: MorphableModel) -> None:
             identity=model.identity.numpy().astype(np.float16),
             expression=model.expression.numpy().astype(np.float16),
             expression_names=np.array(model.expression_names, dtype=np.str_),
-            **head,
         )

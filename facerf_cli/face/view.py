@@ -1,9 +1,8 @@
 """A fitted face rendered by a camera: (u, v), normal and position of each pixel, and a soft mask.
 
-Also drawings for visual checks: a fit over its photo, and a face model shaded as clay from eight sides.
+Also a drawing for visual checks: a fit over its photo.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +13,11 @@ from torch import Tensor
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
-from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel
+from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import CONTOUR, grid_triangles, grid_uv, region_mask
 from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.image.strips import Window, strips
-from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pose_to_rotation, project
+from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, smoothstep, vertex_normals
 
@@ -31,20 +30,6 @@ _SHADE, _LINE = 0.35, 0.5  # opacity of the shaded mesh and of its wires
 _WIRE_COLOUR = np.array([0.1, 0.5, 1.0], np.float32)
 _TARGET_COLOUR, _FITTED_COLOUR = (0.05, 1.0, 0.1), (1.0, 0.25, 0.0)
 _DOT = 1 / 160  # radius over the crop's side
-_POSES, _COLUMNS = 8, 4
-_FACE_SPAN_DEG = 80.0  # a face without a whole head is turned this far to either side
-_OVERSAMPLE = 3
-_FOCAL_PER_SIDE = 4.0
-_FILL = 0.9  # share of a cell that the model's bounding sphere fills
-_LIGHT = F.normalize(torch.tensor([-0.5, 0.6, 0.8]), dim=0)
-_AMBIENT, _DIFFUSE = 0.12, 0.75
-_BACKGROUND = 0.02
-_COLOURS = {
-    "skin": (0.62, 0.55, 0.50),
-    "eye": (0.8, 0.8, 0.8),
-    "mouth": (0.4, 0.16, 0.15),
-    "teeth": (0.7,) * 3,
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,47 +170,3 @@ def _dots(image: np.ndarray, points_px: np.ndarray, colour: tuple[float, ...], r
         rows, columns = (np.arange(size) + PIXEL_CENTRE for size in patch.shape[:2])
         distance = np.hypot(columns[None, :] + left - x, rows[:, None] + top - y)
         patch += np.clip(radius_px + 0.5 - distance, 0, 1)[..., None] * (np.array(colour) - patch)
-
-
-def draw_turntable(model: MorphableModel, cell_px: int = 256) -> np.ndarray:
-    """Draw the mean from eight sides, linear Rec.709 [2 cell_px, 4 cell_px, 3]: the head, or the face alone.
-
-    A head makes a full turn, a face turns from one profile to the other; light comes from the upper left.
-    """
-    import trimesh  # takes as long as the rest of a relight's imports
-
-    if model.head is None:
-        angles = np.linspace(-_FACE_SPAN_DEG, _FACE_SPAN_DEG, _POSES)
-        vertices, triangles = model.mean, grid_triangles()
-        colours = torch.tensor(_COLOURS["skin"]).expand(len(vertices), 3)
-    else:
-        angles = np.arange(_POSES) * 360 / _POSES
-        vertices, triangles = model.head.mean, model.head.triangles
-        colours = torch.tensor([_COLOURS[part] for part in HEAD_PARTS])[model.head.part.long()]
-    vertices = vertices - (vertices.amin(0) + vertices.amax(0)) / 2
-    mesh = trimesh.Trimesh(vertices.numpy(), triangles.numpy(), process=False)
-    normals = torch.from_numpy(np.array(mesh.vertex_normals, np.float32))
-    cells = [_draw(vertices, triangles, normals, colours, float(angle), cell_px) for angle in angles]
-    rows = [np.concatenate(cells[at : at + _COLUMNS], 1) for at in range(0, _POSES, _COLUMNS)]
-    return np.concatenate(rows)
-
-
-def _draw(
-    vertices: Tensor, triangles: Tensor, normals: Tensor, colours: Tensor, yaw_deg: float, cell_px: int
-) -> np.ndarray:
-    """Draw one cell [cell_px, cell_px, 3], each pixel the mean of `_OVERSAMPLE`^2 samples."""
-    side_px = cell_px * _OVERSAMPLE
-    camera = Camera(_FOCAL_PER_SIDE * side_px, side_px, side_px, side_px / 2, side_px / 2)
-    head_to_camera = pose_to_rotation(yaw_deg, 0, 0)
-    radius_m = float(vertices.norm(dim=-1).max())
-    # Rays along a sphere's outline are tangent to it: sin of the half angle, not tan.
-    away_m = radius_m / math.sin(math.atan(_FILL / (2 * _FOCAL_PER_SIDE)))
-    posed = vertices @ head_to_camera.T - torch.tensor([0, 0, away_m])
-    fragments = rasterize(posed, triangles, camera)
-    normal = F.normalize(interpolate(normals, triangles, fragments), dim=-1)
-    facing = normal @ (_LIGHT @ head_to_camera)  # the light stays with the camera
-    shade = _AMBIENT + _DIFFUSE * facing.clamp(min=0)
-    image = interpolate(colours, triangles, fragments) * shade[..., None]
-    image = torch.where(fragments.covered[..., None], image, torch.tensor(_BACKGROUND))
-    blocks = image.reshape(cell_px, _OVERSAMPLE, cell_px, _OVERSAMPLE, 3)
-    return blocks.mean((1, 3)).numpy()

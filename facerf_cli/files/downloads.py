@@ -9,7 +9,6 @@ import os
 import ssl
 import time
 import urllib.request
-from collections.abc import Callable
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -37,16 +36,11 @@ log = logging.getLogger(LOGGER_NAME)
 
 @dataclass(frozen=True)
 class PublishedFile:
-    """A file on a server, and the digest that verifies it.
-
-    `digest` computes the digest of a downloaded file. GitHub packs an archive differently from time to time,
-    so an archive's digest is computed from its contents (for a damaged archive it may return any other text).
-    """
+    """A file on a server, and the digest that verifies it."""
 
     url: str
     sha256: str  # 64 hex digits
     size_limit: int  # bytes; more are refused
-    digest: Callable[[Path], str] = file_sha256
 
     @property
     def name(self) -> str:
@@ -188,7 +182,7 @@ def opener_of(url: str) -> urllib.request.OpenerDirector:
 
 
 def _is_whole(published: PublishedFile, path: Path) -> bool:
-    return path.is_file() and published.digest(path) == published.sha256
+    return path.is_file() and file_sha256(path) == published.sha256
 
 
 def _size(path: Path) -> int:

@@ -274,7 +274,7 @@ class OnePerson:
         self._alpha, self._size_px, self._crop_px = alpha, size_px, crop_px
         mean = model.vertices(alpha[None], torch.zeros(1, len(model.expression)))[0]
         self._name = model.name
-        self._model = replace(model, name="one person", mean=mean, identity=model.identity[:0], head=None)
+        self._model = replace(model, name="one person", mean=mean, identity=model.identity[:0])
 
     def fit(self, landmarks_px: np.ndarray) -> FaceFit:
         """Fit pose and expression to landmarks [68, 2] of a frame."""

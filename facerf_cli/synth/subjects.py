@@ -15,8 +15,8 @@ from facerf_cli.synth.head.body import chin_height_m, draw_body
 from facerf_cli.synth.head.glasses import draw_glasses
 from facerf_cli.synth.head.hair import draw_hair, grow_beard, grow_lashes
 from facerf_cli.synth.head.hair_styles import scalp_cover
-from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh, joined
+from facerf_cli.synth.head.shell import shell_head
 from facerf_cli.synth.head.worn import Headwear, draw_earrings, draw_hand, draw_headwear, draw_microphone
 from facerf_cli.synth.random_fields import Random, generators
 from facerf_cli.synth.views import more_landmarks
@@ -57,8 +57,8 @@ def draw_subject(model: MorphableModel, index: int, seed: int, size_px: int, arm
     pose_deg = random.normal(0, _POSE_STD_DEG)
     side = _canvas_side(size_px)
     appearance = draw_appearance(side, generator)
-    bare = build_head(model, alpha, beta, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
     face_vertices = model.vertices(alpha[None], beta[None])[0]
+    bare = shell_head(face_vertices, (float(gaze[0]), float(gaze[1])), _subdivisions(size_px))
     landmarks_m = model.landmarks(face_vertices[None])[0].numpy()
     edge_m = _BODY_EDGE_M if size_px > _SMALL_PX else 3 * _BODY_EDGE_M
     dressed, garment = draw_body(bare, random, edge_m, arms)

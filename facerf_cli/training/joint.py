@@ -97,7 +97,7 @@ def leading(model: MorphableModel, identities: int, expressions: int) -> Morphab
     """Keep the leading shapes of a model, as many as a Geometry Network has coefficients."""
     identity, expression = model.identity[:identities], model.expression[:expressions]
     names = model.expression_names[:expressions]
-    return replace(model, identity=identity, expression=expression, expression_names=names, head=None)
+    return replace(model, identity=identity, expression=expression, expression_names=names)
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,6 @@ def test_a_file_that_is_read_is_no_output(
         ("relight me.png --light-from other.png -o . --name other", "other.png"),
         ("segment me.png mattes/me_person.png -o mattes", "mattes/me_person.png"),
         ("face-model import flame model.npz -o model.npz --overwrite", "model.npz"),
-        ("face-model show me.png -o me.png --overwrite", "me.png"),
     ],
 )
 def test_an_output_in_a_folder_is_no_input(folder: Path, line: str, planned: str, capsys: Said) -> None:

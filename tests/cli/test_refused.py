@@ -210,8 +210,6 @@ WRONG: dict[str, dict[str, str]] = {
         "import ict-facekit nowhere": "--output",
         "import": "KIND",
         "": "Missing command",
-        "fetch flame": "flame",
-        "show -o a.exr": "ends in .png",
     },
     "evaluate": {
         "olat data --preset paper --every 2": "exclude each other",
@@ -268,7 +266,6 @@ FAILING: dict[str, dict[str, str]] = {
         "import flame nowhere.pkl -o m.npz": "nowhere.pkl: no such file; give FLAME's .pkl",
         "import basel-2009 nowhere.mat -o m.npz": "01_MorphableModel.mat",
         "import basel-2009 a.mat -o m.npz --landmarks a.npy": "a .txt of 68 vertex",
-        "show nowhere.npz": "nowhere.npz: no such face model",
     },
     "evaluate": {
         "reconstruction a.jpg --facts who.csv": "astronot is no photo of this run; give names such as a",

@@ -8,9 +8,8 @@ import torch
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.synth.appearance.materials import Appearance
-from facerf_cli.synth.bank.heads import mean_coefficients
-from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
+from facerf_cli.synth.head.shell import shell_head
 from facerf_cli.synth.views import more_landmarks, stage_cameras, truth_of
 from tests.synth.shapes import appearance, ball, camera, material
 
@@ -66,8 +65,7 @@ def test_layers_of_all_classes_are_those_of_geometry_in_camera_space() -> None:
 def test_irises_follow_the_gaze_and_ears_have_ends() -> None:
     model = load_face_model()
     ahead, aside = (
-        more_landmarks(build_head(model, *mean_coefficients(model), gaze, subdivisions=0))
-        for gaze in ((0.0, 0.0), (20.0, 0.0))
+        more_landmarks(shell_head(model.mean, gaze, subdivisions=0)) for gaze in ((0.0, 0.0), (20.0, 0.0))
     )
     for side, sign in (("left", -1), ("right", 1)):
         iris = ahead[f"{side} iris"]

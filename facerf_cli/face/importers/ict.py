@@ -1,10 +1,8 @@
 """ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020).
 
-It is read from `FaceXModel/*.obj` in a folder, a .zip or a .tar, and fetched from GitHub: its MIT licence
-needs no agreement.
+It is read from `FaceXModel/*.obj` in a folder, a .zip or a .tar.
 """
 
-import hashlib
 import re
 import tarfile
 import zipfile
@@ -14,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.source import SourceHead, SourceModel
-from facerf_cli.face.morphable import EXPRESSION_STD, HEAD_PARTS
-from facerf_cli.files.downloads import PublishedFile, cache_folder, fetch
+from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.morphable import EXPRESSION_STD
 from facerf_cli.run.logs import one_line
 
 _IDS = (
@@ -28,15 +25,8 @@ _IDS = (
 LANDMARK_IDS = np.array(_IDS.split(), dtype=np.int64)  # from its README
 VERTICES = 26719
 _SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
-_PARTS = {  # first and last vertex; an eyeball is its sclera, which covers the iris and bulges as a cornea
-    "skin": ((0, 11247),),
-    "mouth": ((11248, 13293), (14062, 17038)),  # socket; gums and tongue
-    "teeth": ((17039, 21450),),
-    "eye": ((21451, 22220), (23021, 23790)),
-}
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
-_ICT_COMMIT = "da5f95a607f5e6b37755b38d3385d7f2853732e5"
 
 
 def read_ict_facekit(path: Path) -> SourceModel:
@@ -55,7 +45,7 @@ def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
     identities = sorted(stem for stem in raw if re.fullmatch(r"identity\d+", stem))
     expressions = sorted(set(raw) - set(identities))
     if not identities or not expressions:
-        raise InputError(f"{path}: identity or expression shapes are missing; fetch ICT-FaceKit again")
+        raise InputError(f"{path}: identity or expression shapes are missing; download ICT-FaceKit again")
 
     def offsets(stems: list[str]) -> np.ndarray:
         return np.stack([_obj_vertices(path, stem, raw[stem]) - mean for stem in stems])
@@ -73,18 +63,7 @@ def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
         expression_names=tuple(expressions),
         triangles=triangles[outer[triangles].all(1)],
         known=dict(enumerate(mean[LANDMARK_IDS])),
-        head=_head(triangles),
     )
-
-
-def _head(triangles: np.ndarray) -> SourceHead:
-    """Skin, mouth, teeth and eyeballs, without the eyes' sockets and the film in front of the eyes."""
-    part = np.full(VERTICES, 255, np.uint8)
-    for name, spans in _PARTS.items():
-        for first, last in spans:
-            part[first : last + 1] = HEAD_PARTS.index(name)
-    eyes = tuple(np.arange(first, last + 1) for first, last in _PARTS["eye"])
-    return SourceHead(triangles[(part[triangles] < 255).all(1)], part, eyes)
 
 
 def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
@@ -93,10 +72,10 @@ def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
     try:
         vertices_cm = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), -1)[:, :3]
     except ValueError:
-        raise InputError(f"{path}: {stem}.obj is damaged; fetch ICT-FaceKit again") from None
+        raise InputError(f"{path}: {stem}.obj is damaged; download ICT-FaceKit again") from None
     if vertices_cm.shape != (VERTICES, 3) or not np.isfinite(vertices_cm).all():
         raise InputError(
-            f"{path}: {stem}.obj has {len(lines)} vertices, not {VERTICES}; fetch ICT-FaceKit again"
+            f"{path}: {stem}.obj has {len(lines)} vertices, not {VERTICES}; download ICT-FaceKit again"
         )
     return vertices_cm / 100
 
@@ -112,7 +91,7 @@ def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
     except ValueError:
         triangles = []
     if not triangles or not 0 <= np.min(triangles) <= np.max(triangles) < VERTICES:
-        raise InputError(f"{path}: the neutral mesh's faces are damaged; fetch ICT-FaceKit again")
+        raise InputError(f"{path}: the neutral mesh's faces are damaged; download ICT-FaceKit again")
     return np.array(triangles)
 
 
@@ -125,13 +104,13 @@ def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
                 text = read(_MAX_OBJ_BYTES + 1)
                 total += len(text)
                 if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
-                    raise InputError(f"{path}: {name} is too large; fetch ICT-FaceKit again")
+                    raise InputError(f"{path}: {name} is too large; download ICT-FaceKit again")
                 yield found[1], text
     except InputError:
         raise
     except Exception as error:  # whatever damage makes a reader of archives raise
         reason = one_line(str(error) or type(error).__name__)
-        raise InputError(f"{path}: cannot be read ({reason}); fetch ICT-FaceKit again") from None
+        raise InputError(f"{path}: cannot be read ({reason}); download ICT-FaceKit again") from None
 
 
 def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
@@ -154,39 +133,3 @@ def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
     else:
         wrong = "" if path.exists() else "no such file; "
         raise InputError(f"{path}: {wrong}give the ICT-FaceKit folder, or its .zip or .tar archive")
-
-
-def ict_content_sha256(path: Path) -> str:
-    """The digest of `sha256sum *.obj | LC_ALL=C sort -k2 | sha256sum` in FaceXModel; '' if damaged."""
-    try:
-        digests = {f"{stem}.obj": hashlib.sha256(text).hexdigest() for stem, text in _objs(path)}
-    except InputError:
-        return ""
-    lines = "".join(f"{digests[name]}  {name}\n" for name in sorted(digests))
-    return hashlib.sha256(lines.encode()).hexdigest()
-
-
-# GitHub may repack a commit's archive, which changes its bytes; the .obj files inside stay the same, so the
-# digest is that of the files.
-ICT_FACEKIT = PublishedFile(
-    f"https://github.com/ICT-VGL/ICT-FaceKit/archive/{_ICT_COMMIT}/ICT-FaceKit-{_ICT_COMMIT}.tar.gz",
-    "76eafb7253344ed6dc7f6d92c6f409868f854b029d5a68a2f4e3583c5bc1ebeb",
-    512 << 20,
-    ict_content_sha256,
-)
-PUBLISHED = {"ict-facekit": ICT_FACEKIT}
-
-
-def fetch_face_model(kind: str) -> Path:
-    """The archive of a public model in the user's cache; it is fetched if missing."""
-    return fetch(PUBLISHED[kind], f"`facerf face-model import {kind}` a copy that you have", _folder())
-
-
-def cached_face_model(kind: str) -> Path | None:
-    """The archive of a public model in the user's cache if a file has its name; the file is not read."""
-    path = _folder() / PUBLISHED[kind].name
-    return path if path.is_file() else None
-
-
-def _folder() -> Path:
-    return cache_folder() / "face-models"

@@ -1,7 +1,6 @@
 """Import of a published face model: from its publisher's topology to the canonical grid.
 
-The model's landmarks warp the grid in UV space, and rays through the warped grid find its surface. A whole
-head stays in its publisher's topology, in the head frame, with (u, v) that match the canonical grid.
+The model's landmarks warp the grid in UV space, and rays through the warped grid find its surface.
 """
 
 from pathlib import Path
@@ -19,8 +18,8 @@ from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
 from facerf_cli.face.importers.find_landmarks import landmarks_of, nearest_on_mesh, rigid_alignment
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit
-from facerf_cli.face.importers.source import SourceHead, SourceModel
-from facerf_cli.face.morphable import HEAD_PARTS, HeadModel, MorphableModel, load_face_model
+from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import (
     GRID,
     LANDMARK_UV,
@@ -28,7 +27,6 @@ from facerf_cli.face.topology import (
     OUTER_EYE_CORNERS,
     cylinder_rays,
     cylinder_uv,
-    grid_triangles,
     grid_uv,
     landmark_weights,
 )
@@ -40,7 +38,6 @@ _HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # a length outside these ranges is
 _SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
 _PULL_M = 0.005  # radius around a landmark in which the grid is pulled onto it
 _LEAST_COVERED = 0.75  # share of the grid that a model's surface must cover
-_LIMBUS_M, _LIMBUS_DEG = 0.006, 29.0  # an iris's radius, and its angle in eye textures
 
 
 def import_face_model(kind: str, path: Path, landmarks: Path | None = None) -> MorphableModel:
@@ -113,17 +110,13 @@ def resample_model(source: SourceModel) -> MorphableModel:
         return torch.stack([resampled(shape @ rotation.T) for shape in basis])
 
     has_expressions = len(source.expression) > 0
-    on_grid = resampled(mean, builtin.mean.double().numpy())
     return MorphableModel(
         name=source.name,
         licence=source.licence + ("" if has_expressions else f"; expressions: {builtin.licence}"),
-        mean=on_grid,
+        mean=resampled(mean, builtin.mean.double().numpy()),
         identity=resampled_basis(source.identity),
         expression=resampled_basis(source.expression) if has_expressions else builtin.expression,
         expression_names=source.expression_names if has_expressions else builtin.expression_names,
-        head=None
-        if source.head is None
-        else _head_model(source, source.head, on_grid.numpy(), rotation, translation),
     )
 
 
@@ -136,7 +129,7 @@ def _require_size(what: str, length_m: float, between_m: tuple[float, float]) ->
 def _beyond(covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The border [V] of the covered vertices [V], and weights [M, B] from its vertices to the uncovered ones.
 
-    Inverse distance weights, as in `skin_uv`: exact at the border, smooth beyond.
+    Inverse distance weights: exact at the border, smooth beyond.
     """
     border = covered & binary_dilation(~covered.reshape(GRID, GRID)).ravel()
     grid = grid_uv().double().numpy()
@@ -193,74 +186,3 @@ def _pulled(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
     kernel = np.exp(-((cdist(reached, reached) / _PULL_M) ** 2))
     strength = np.linalg.solve(kernel + 1e-3 * np.eye(len(reached)), landmarks - reached)
     return points + np.exp(-((cdist(points, reached) / _PULL_M) ** 2)) @ strength
-
-
-def _head_model(
-    source: SourceModel,
-    head: SourceHead,
-    canonical: np.ndarray,
-    rotation: np.ndarray,
-    translation: np.ndarray,
-) -> HeadModel:
-    """The source's head in the head frame, with (u, v) of skin by the canonical mean [V, 3]."""
-    mean = source.mean @ rotation.T + translation
-    uv = cylinder_uv(mean)
-    skin = np.flatnonzero(head.part == HEAD_PARTS.index("skin"))
-    uv[skin] = skin_uv(mean[skin], canonical)
-    for eye in head.eyes:
-        uv[eye] = _eye_uv(mean[eye])
-    used, triangles = np.unique(head.triangles, return_inverse=True)
-
-    def kept(field: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(field[..., used, :].astype(np.float32))
-
-    return HeadModel(
-        mean=kept(mean),
-        identity=kept(source.identity @ rotation.T),
-        expression=kept(source.expression @ rotation.T),
-        triangles=torch.from_numpy(triangles.reshape(-1, 3)),
-        part=torch.from_numpy(head.part[used]),
-        uv=kept(uv),
-    )
-
-
-def skin_uv(points: np.ndarray, canonical: np.ndarray) -> np.ndarray:
-    """The (u, v) [N, 2] of skin: that of the nearest point of the canonical mean, outside it the cylinder's.
-
-    The cylinder's (u, v) is corrected by its interpolated error at the border, so that there is no jump.
-    """
-    grid = grid_uv().double().numpy()
-    mesh = trimesh.Trimesh(canonical, grid_triangles().numpy(), process=False)
-    nearest, faces = nearest_on_mesh(mesh, points)
-    weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], nearest)
-    inner = (weights[..., None] * grid[mesh.faces[faces]]).sum(1)
-    formula = cylinder_uv(points)
-    inside = ((inner > 1e-3) & (inner < 1 - 1e-3) & (np.abs(formula - 0.5) < 0.7)).all(-1)
-    border = ((grid == 0) | (grid == 1)).any(-1)
-    at = cylinder_uv(canonical[border])
-    pull = 1 / (cdist(formula, at) ** 4 + 1e-12)  # inverse distance: exact at the border, smooth beyond
-    beyond = formula + (pull @ (grid[border] - at)) / pull.sum(-1, keepdims=True)
-    return np.where(inside[:, None], inner, beyond)
-
-
-def _eye_uv(points: np.ndarray) -> np.ndarray:
-    """The (u, v) [N, 2] of an eyeball: direction and angle about the axis through its cornea, as a disc.
-
-    Angles are scaled so that an iris of radius `_LIMBUS_M` has the same place in eyeballs of any size.
-    """
-    centre = (points.min(0) + points.max(0)) / 2
-    offset = points - centre
-    radius = np.linalg.norm(offset, axis=-1)
-    axis = offset[radius > np.percentile(radius[offset[:, 2] > 0], 90)]
-    axis = axis[axis[:, 2] > 0].mean(0)
-    axis /= np.linalg.norm(axis)
-    along = offset @ axis
-    side = np.cross([0.0, 1, 0], axis)
-    side /= np.linalg.norm(side)
-    across = np.stack([offset @ side, -(offset @ np.cross(axis, side))], -1)
-    lateral = np.linalg.norm(across, axis=-1)
-    angle_deg = np.degrees(np.arctan2(lateral, along))
-    front = np.argsort(angle_deg)[: len(points) // 2]
-    limbus_deg = np.interp(_LIMBUS_M, lateral[front], angle_deg[front])
-    stretched = np.minimum(angle_deg * _LIMBUS_DEG / limbus_deg, 90)
-    return 0.5 + 0.5 * across / np.maximum(lateral, 1e-9)[:, None] * (stretched / 90)[:, None]

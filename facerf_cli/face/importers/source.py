@@ -8,19 +8,6 @@ _MAX_VERTICES, _MAX_TRIANGLES = 120_000, 240_000
 
 
 @dataclass(frozen=True)
-class SourceHead:
-    """The part of a model's mesh that is its whole head.
-
-    triangles [F, 3] of the source's vertex ids; part [N] uint8, an index into `HEAD_PARTS`; eyes: the vertex
-    ids of each eyeball, a closed surface whose cornea points along the gaze.
-    """
-
-    triangles: np.ndarray
-    part: np.ndarray
-    eyes: tuple[np.ndarray, ...]
-
-
-@dataclass(frozen=True)
 class SourceModel:
     """A morphable model in its own topology: metres, y up, z out of the face; bases in standard deviations.
 
@@ -36,7 +23,6 @@ class SourceModel:
     expression_names: tuple[str, ...]
     triangles: np.ndarray
     known: dict[int, np.ndarray] = field(default_factory=dict)
-    head: SourceHead | None = None
 
 
 def require_mesh(mean: np.ndarray, triangles: np.ndarray) -> None:

@@ -22,7 +22,6 @@ from scipy.sparse import coo_matrix, csr_matrix
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, LANDMARK_UV, TOP_M, inside_mm
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.raster.texture import vertex_normals
-from facerf_cli.synth.head.cranium import average_head_mm
 from facerf_cli.synth.random_fields import Random
 
 # Parts of a mesh, in the order of their indices, and the class that all of a part has by default.
@@ -189,8 +188,6 @@ def arc_lengths(points: np.ndarray) -> np.ndarray:
 # It follows the jaw to the lobe of the ear, then the nape below the hair.
 _JAW_DEG = (0, 15, 27, 38, 50, 65, 80, 95, 110, 180)
 _JAW_M = (-0.0755, -0.072, -0.064, -0.053, -0.046, -0.042, -0.041, -0.046, -0.05, -0.058)
-# The ear on the mean head juts out from it, between these azimuths and heights.
-_EAR_DEG, _EAR_M, _EAR_OUT_MM = (66.0, 125.0), (-0.045, 0.06), 4.0
 _MARGIN_UV = 0.02  # around the landmarks, within which features of the face are looked for
 
 
@@ -200,7 +197,7 @@ def part_class(part: str) -> int:
 
 
 def skin_classes(uv: np.ndarray) -> np.ndarray:
-    """Classes [V] uint8 of skin at (u, v) [V, 2] of the continued UV map; ears: see `ears_of`."""
+    """Compute the classes [V] uint8 of skin, other than ears, at (u, v) [V, 2] of the continued UV map."""
     classes = np.full(len(uv), class_index("skin"), np.uint8)
     azimuth_deg, height_m = (uv[:, 0] - 0.5) * 2 * HALF_ANGLE_DEG, TOP_M - uv[:, 1] * (TOP_M - BOTTOM_M)
     classes[height_m < np.interp(np.abs(azimuth_deg), _JAW_DEG, _JAW_M)] = class_index("neck")
@@ -211,20 +208,6 @@ def skin_classes(uv: np.ndarray) -> np.ndarray:
     classes[central[inside_mm("brows", left) > 0]] = class_index("brows")
     classes[central[inside_mm("lips", uv[central]) > 0]] = class_index("lips")
     return classes
-
-
-def ears_of(mean_m: np.ndarray) -> np.ndarray:
-    """[V] bool: the ears of a mean head [V, 3], where it juts out."""
-    azimuth_deg, height_m = np.degrees(np.arctan2(mean_m[:, 0], mean_m[:, 2])), mean_m[:, 1]
-    around = np.abs(azimuth_deg)
-    near = (around > _EAR_DEG[0]) & (around < _EAR_DEG[1])
-    near &= (height_m > _EAR_M[0]) & (height_m < _EAR_M[1])
-    smooth = average_head_mm(
-        0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG), (TOP_M - height_m) / (TOP_M - BOTTOM_M)
-    )
-    out_mm = 1000 * np.hypot(mean_m[:, 0], mean_m[:, 2]) - np.hypot(smooth[:, 0], smooth[:, 2])
-    found: np.ndarray = near & (out_mm > _EAR_OUT_MM)
-    return found
 
 
 def loop_step(triangles: np.ndarray, count: int) -> tuple[csr_matrix, np.ndarray]:
@@ -279,14 +262,6 @@ def _old_vertices(
         (rim[:, 0], rim[:, 1], np.where(rim_valence[rim[:, 0]] == 2, 1 / 8, 0.0)),
         (every, every, own),
     ]
-
-
-def quartered(uv: np.ndarray) -> np.ndarray:
-    """Corners [4 F, 3, 2] of the four triangles that `loop_step` makes of each triangle, in its order."""
-    a, b, c = uv[:, 0], uv[:, 1], uv[:, 2]
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    corners = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1)
-    return corners.reshape(-1, 3, 2)
 
 
 _AZIMUTHS = 96

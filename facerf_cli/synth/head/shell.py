@@ -1,4 +1,4 @@
-"""A whole head around the face of any face model, for models that have no head: shell, ears and eyeballs.
+"""A whole bare head around the face of any face model: shell, ears, eyeballs, mouth and teeth.
 
 The surface of the face is sampled finely and continued over skull, sides and neck (`cranium.py`). Where eyes
 and mouth are open, they are cut out between the lids and between the lips (`openings.py`) and filled. The ear

@@ -1,6 +1,5 @@
 """ICT-FaceKit at the door: the carried mean against the original, and archives that are not what they say."""
 
-import hashlib
 import io
 import tarfile
 import zipfile
@@ -13,20 +12,12 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers import ict as ict_module
 from facerf_cli.face.importers.find_landmarks import landmarks_of, rigid_alignment
-from facerf_cli.face.importers.ict import (
-    ICT_FACEKIT,
-    LANDMARK_IDS,
-    VERTICES,
-    cached_face_model,
-    fetch_face_model,
-    ict_content_sha256,
-)
+from facerf_cli.face.importers.ict import LANDMARK_IDS, VERTICES
 from facerf_cli.face.importers.resample import import_face_model
 from facerf_cli.face.importers.source import SourceModel
-from facerf_cli.face.morphable import HEAD_PARTS, MorphableModel, load_face_model, save_face_model
-from facerf_cli.face.topology import GRID, LANDMARK_UV, LANDMARKS_M, grid_triangles, landmark_weights
+from facerf_cli.face.morphable import MorphableModel, load_face_model, save_face_model
+from facerf_cli.face.topology import GRID, LANDMARKS_M, grid_triangles, landmark_weights
 from tests.refusals import refused
 
 NEUTRAL = "ICT-FaceKit-master/FaceXModel/generic_neutral_mesh.obj"
@@ -60,16 +51,12 @@ def test_the_mean_lies_on_the_original_surface(ict):
     assert np.percentile(off_mm, 99) < 0.3
 
 
-def test_landmarks_and_what_is_painted_at_them_stay_where_they_were(ict):
+def test_landmarks_stay_where_they_were(ict):
     source, model = ict
     found = model.landmarks(model.mean[None])[0].numpy()
     off_mm = 1000 * np.linalg.norm(found - aligned(source, landmarks_of(source)), axis=-1)
     assert off_mm.max() < 0.6  # asked for: 1.5; the inner corners of the mouth hide from the rays
     assert off_mm.mean() < 0.15
-    found = cKDTree(model.head.mean.numpy()).query(aligned(source, landmarks_of(source)))
-    assert found[0].max() < 1e-6
-    off_mm = np.abs(model.head.uv.numpy()[found[1]] - LANDMARK_UV) * 174  # the grid's height in mm
-    assert off_mm.max() < 1.0 and off_mm.mean() < 0.3
 
 
 def test_shapes_move_the_landmarks_as_they_did(ict):
@@ -90,52 +77,8 @@ def test_a_carried_model_survives_its_file(ict, tmp_path):
     again = load_face_model(tmp_path / "ict.npz")
     assert again.name == "ict-facekit" and again.mean.shape == (GRID * GRID, 3)
     assert (again.identity - ict[1].identity).abs().max() < 2e-5
-    assert (again.head.expression - ict[1].head.expression).abs().max() < 2e-5
-    for key in ("mean", "triangles", "part", "uv"):
-        assert torch.equal(getattr(again.head, key), getattr(ict[1].head, key))
-
-
-def test_the_head_has_all_its_parts_where_they_belong(ict):
-    source, model = ict
-    head = model.head
-    landmarks = aligned(source, landmarks_of(source))
-    centre = {name: head.mean[head.part == index].mean(0).numpy() for index, name in enumerate(HEAD_PARTS)}
-    assert (head.part == 1).sum() == 2 * 770
-    assert abs(centre["eye"][1] - landmarks[36:48, 1].mean()) < 0.004
-    assert abs(centre["teeth"][1] - landmarks[48:, 1].mean()) < 0.006
-    skin = head.mean[head.part == 0]
-    assert skin[:, 1].max() > 0.13 and skin[:, 2].min() < -0.07  # crown and back of the head
-    assert len(head.triangles.unique()) == len(head.mean)
-
-
-def test_uv_continues_around_the_head_without_a_jump(ict):
-    head = ict[1].head
-    skin = head.triangles[(head.part[head.triangles] == 0).all(-1)].numpy()
-    uv, points = head.uv.numpy(), head.mean.numpy()
-    assert uv[head.part == 0].min() < -0.5 and uv[head.part == 0].max() > 1.5
-    sides = np.stack([skin, np.roll(skin, 1, 1)], -1)[(np.abs(uv[skin] - 0.5) > 0.49).any((1, 2))]
-    (a, b), (from_uv, to_uv) = (np.moveaxis(field[sides], 2, 0) for field in (points, uv))
-    away = np.hypot(a[..., 0], a[..., 2]) > 0.05  # from the axis: at the crown u changes within a point
-    front = (np.abs(from_uv[..., 0] - 0.5) < 1.3) & away  # of the seam at the back of the head
-    slope = np.linalg.norm(from_uv - to_uv, axis=-1) / np.linalg.norm(a - b, axis=-1)
-    assert slope[front].max() < 2 / 0.174  # twice that of a grid of 174 mm
-
-
-def test_an_iris_has_its_place_in_the_texture_of_the_eye(ict):
-    head = ict[1].head
-    for side in (-1, 1):
-        ball = (head.part == 1) & (head.mean[:, 0] * side > 0)
-        points, uv = head.mean[ball].numpy(), head.uv[ball].numpy() - 0.5
-        apex = np.linalg.norm(uv, axis=-1).argmin()
-        assert points[apex, 2] > points[:, 2].max() - 0.001
-        front = points[:, 2] > np.median(points[:, 2])
-        lateral = np.linalg.norm((points - points[apex])[:, :2], axis=-1)
-        rim = front & (np.abs(lateral - 0.006) < 0.0006)
-        assert np.abs(np.linalg.norm(uv[rim], axis=-1) * 180 - 29).max() < 6
-        right = uv[rim, 0] > 0.1
-        assert (points[rim][right, 0] > points[apex, 0]).all()
-        below = uv[rim, 1] > 0.1
-        assert (points[rim][below, 1] < points[apex, 1]).all()
+    assert (again.expression - ict[1].expression).abs().max() < 2e-5
+    assert torch.equal(again.mean, ict[1].mean)
 
 
 def zipped(path: Path, **members: bytes) -> Path:
@@ -210,46 +153,3 @@ HOSTILE = {
 def test_what_is_not_ict_facekit_is_refused_in_one_line(case: str, tmp_path: Path):
     make, message = HOSTILE[case]
     refused(InputError, f"{tmp_path} ... {message}", import_face_model, "ict-facekit", make(tmp_path))
-
-
-CONTENTS = {"generic_neutral_mesh": b"v 1 2 3\n" * 4000, "jawOpen": b"v 3 2 1\n" * 4000}
-
-
-def published(path: Path, contents: dict[str, bytes] = CONTENTS, level: int = 9, prefix: str = "a") -> Path:
-    """A .tar.gz as GitHub packs a commit: the same files, other bytes from one day to another."""
-    with tarfile.open(path, "w:gz", compresslevel=level) as tar:
-        for name, data in {f"FaceXModel/{stem}.obj": text for stem, text in contents.items()}.items():
-            entry = tarfile.TarInfo(f"{prefix}/{name}")
-            entry.size = len(data)
-            tar.addfile(entry, io.BytesIO(data))
-    return path
-
-
-def test_the_digest_is_that_of_the_contents_however_they_are_packed(tmp_path: Path) -> None:
-    lines = [f"{hashlib.sha256(text).hexdigest()}  {stem}.obj\n" for stem, text in sorted(CONTENTS.items())]
-    expected = hashlib.sha256("".join(lines).encode()).hexdigest()
-    for number, packing in enumerate(({}, {"level": 1}, {"prefix": "ICT-FaceKit-master"})):
-        assert ict_content_sha256(published(tmp_path / f"{number}.tar.gz", **packing)) == expected
-    others = (
-        {**CONTENTS, "jawOpen": b"v 3 2 0\n" * 4000},
-        {**CONTENTS, "jawLeft": b"v 3 2 1\n"},
-        {"generic_neutral_mesh": CONTENTS["jawOpen"], "jawOpen": CONTENTS["generic_neutral_mesh"]},
-    )
-    for contents in others:
-        assert ict_content_sha256(published(tmp_path / "other.tar.gz", contents)) != expected
-    assert ict_content_sha256(cut(tarred(tmp_path / "cut.tar.gz", "w:gz", noise(200_000)))) == ""
-
-
-def test_it_is_fetched_into_the_cache_and_verified_by_its_contents(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ict_module, "cache_folder", lambda: tmp_path)
-    asked = []
-    monkeypatch.setattr(ict_module, "fetch", lambda *given: asked.append(given) or Path("there"))
-    assert cached_face_model("ict-facekit") is None and fetch_face_model("ict-facekit") == Path("there")
-    file, instead, folder = asked[0]
-    assert (file, folder) == (ICT_FACEKIT, tmp_path / "face-models")
-    assert "facerf face-model import ict-facekit" in instead and file.digest is ict_content_sha256
-    folder.mkdir()
-    (folder / file.name).write_bytes(b"")
-    assert cached_face_model("ict-facekit") == folder / file.name

@@ -1,9 +1,8 @@
 import pytest
 
 from facerf_cli.face.morphable import MorphableModel, load_face_model
-from facerf_cli.synth.bank.heads import mean_coefficients
-from facerf_cli.synth.head.heads import build_head
 from facerf_cli.synth.head.mesh import HeadMesh
+from facerf_cli.synth.head.shell import shell_head
 
 
 @pytest.fixture(scope="session")
@@ -13,4 +12,4 @@ def model() -> MorphableModel:
 
 @pytest.fixture(scope="session")
 def head(model: MorphableModel) -> HeadMesh:
-    return build_head(model, *mean_coefficients(model))
+    return shell_head(model.mean, gaze_deg=(0.0, 0.0), subdivisions=1)
