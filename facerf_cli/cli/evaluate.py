@@ -169,7 +169,7 @@ def cases(
     photo: Annotated[PhotoOptions, Only("face_model")],
     options: Annotated[
         EvaluateOptions,
-        Only("output", *_BATCH[2:], "split", "every", "pairs", "same_pose", "preset", "keep_eyes"),
+        Only("output", *_BATCH[2:], "split", "every", "same_pose", "preset", "keep_eyes"),
     ],
 ) -> None:
     """Freeze pairs of a dataset as cases that any method can render, for `evaluate compare`.

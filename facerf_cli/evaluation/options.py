@@ -106,7 +106,6 @@ class EvaluateOptions(BatchOptions):
     Attributes:
         split: Measure this split of DATASET; all if no network was trained on it.
         every: Measure every Nth pair of DATASET's split only.
-        pairs: Freeze the pairs of a list, the pairs.json that an earlier version wrote.
         same_pose: Take the pairs alone whose target camera is that of the source.
         joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
             instead of each image alone.
@@ -132,7 +131,6 @@ class EvaluateOptions(BatchOptions):
 
     split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA, everyday=True)
     every: int = option(1, metavar="N", least=1, panel=DATA)
-    pairs: Path | None = option(None, metavar="FILE", shown_default="those of the split", panel=DATA)
     same_pose: bool = option(False, flags=("--same-pose",), panel=DATA)
     joint_fit: bool = option(False, panel=DATA)
     photos: bool = option(False, in_recipe=False, flags=("--photos",), panel=DATA)
@@ -215,8 +213,6 @@ class EvaluateOptions(BatchOptions):
                 "--preset and --every exclude each other: a preset has a fixed number of images; leave one "
                 "out"
             )
-        if self.pairs and (self.preset or self.every > 1):
-            raise UsageError("--pairs: is a list of its own; leave --preset and --every out")
 
 
 @dataclass(frozen=True)

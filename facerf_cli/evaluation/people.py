@@ -187,7 +187,6 @@ class DatasetPerson:
     name: str
     reading: Reading | None = None  # until it is compared
     groups: Sequence[Sequence[Pair]] = ()
-    listed: bool = False  # by an old list, whose sources are rendered from their recipes
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
@@ -247,7 +246,7 @@ class DatasetPerson:
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
         path = image_path(self.dataset, *pair.key)
-        if path.is_file() and not self.listed:
+        if path.is_file():
             return read_image(path).pixels
         return render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
 

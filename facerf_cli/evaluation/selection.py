@@ -7,18 +7,16 @@ import logging
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TypeVar
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
 from facerf_cli.dataset.dataset import Dataset, read_dataset
-from facerf_cli.dataset.pairs import Pair, check_pair, pairs_path, read_pairs
+from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.folders import read_facts
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions
 from facerf_cli.evaluation.people import DatasetPerson, PhotoFaces
-from facerf_cli.files.documents import Document, checked, read_document
 from facerf_cli.run.logs import LOGGER_NAME
 
 PairsByPerson = Mapping[str, Sequence[Pair]]
@@ -35,20 +33,15 @@ def choose_people(
     options: EvaluateOptions,
     inputs: Sequence[str],
 ) -> Chosen:
-    """Choose groups of pairs of the people of a dataset; the pairs of an old list, if one is given."""
+    """Choose groups of pairs of the people of a dataset."""
     assert options.dataset is not None
     dataset = read_dataset(options.dataset)
-    if options.pairs:
-        groups: Groups = read_list(options.pairs, dataset)
-    else:
-        groups = choose(pairs_of_split(dataset, options), options)
+    groups = choose(pairs_of_split(dataset, options), options)
     items = {
-        options.item(options.dataset / "olat" / name, name): DatasetPerson(
-            dataset, name, groups=groups[name], listed=options.pairs is not None
-        )
+        options.item(options.dataset / "olat" / name, name): DatasetPerson(dataset, name, groups=groups[name])
         for name in sorted(groups)
     }
-    files = options.dataset / "dataset.json", options.pairs or pairs_path(dataset)
+    files = options.dataset / "dataset.json", pairs_path(dataset)
     return Chosen(items, files, sum(map(len, groups.values())))
 
 
@@ -172,35 +165,6 @@ def _up_to(paper: int, found: int, what: str) -> int:
     if found < paper:
         log.warning("%d %s are measured, all there are; the paper measured %d", found, what, paper)
     return min(paper, found)
-
-
-class _PairList(Document):
-    format: Literal["facerf-pairs-1"]
-    groups: list[list[dict[str, Any]]]
-
-
-def read_list(path: Path, dataset: Dataset) -> dict[str, list[tuple[Pair, ...]]]:
-    """Read the pairs of a list of an earlier version; a map that has moved may lie next to it.
-
-    Raises InputError where a pair's person, camera or light is not the dataset's, or in another split.
-    """
-    log.warning("%s: lists of pairs are read for this version only; publish the folder of cases", path)
-    content = read_document(path, _PairList, "give the pairs.json of an earlier version of facerf evaluate")
-    groups: dict[str, list[tuple[Pair, ...]]] = {}
-    for row in (row for group in content.groups for row in group):
-        pair = checked(Pair, row, f"{path}: groups")
-        try:
-            check_pair(dataset, pair)
-        except (KeyError, ValueError) as error:
-            raise InputError(
-                f"{path}: {pair.subject}/{pair.index:05d} does not fit {dataset.folder} ({error}); prepare "
-                "it with the people, splits, cameras and lights of the list"
-            ) from None
-        near = path.parent / Path(pair.envmap).name
-        if near.is_file() and not Path(pair.envmap).is_file():
-            pair = replace(pair, envmap=str(near))
-        groups.setdefault(pair.subject, []).append((pair,))
-    return groups
 
 
 def couples_of_photos(inputs: Sequence[str], output: Path) -> Iterator[tuple[str, tuple[Item, Item]]]:

@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -197,30 +197,6 @@ def test_one_table_of_facerf_an_own_network_and_a_folder(
     assert "Reflectance Network of own" in (out / "report.html").read_text()
     assert run("olat", folder, "-o", out, "--form", "no_such:Class") == 2
     assert "--form no_such:Class" in capsys.readouterr().err
-
-
-def test_an_old_list_of_pairs_is_frozen_on_a_dataset_of_other_pairs(
-    folder: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
-) -> None:
-    monkeypatch.setattr(cases, "find_faces", lambda *given: [])
-    pairs = [pair for pair in read_pairs(read_dataset(folder)) if pair.split == "test"][:2]
-    old = {"format": "facerf-pairs-1", "groups": [[asdict(pair)] for pair in pairs]}
-    listed, bare = tmp_path / "pairs.json", tmp_path / "bare"
-    listed.write_text(json.dumps(old))
-    shutil.copytree(folder, bare, ignore=shutil.ignore_patterns("relit"))
-    own = ["--envmaps", "procedural:3", "--per-subject", "6", "--seed", "9"]  # other pairs, same numbers
-    assert main(["relight-dataset", str(bare), *own]) == 0
-    assert run("cases", bare, "-o", tmp_path / "cases", "--pairs", listed) == 0
-    assert "are read for this version only" in capsys.readouterr().err
-    for pair in pairs:
-        places = folder / "relit", tmp_path / "cases/source"
-        before, after = (read_image(p / f"{pair.subject}/{pair.index:05d}.exr").pixels for p in places)
-        np.testing.assert_array_equal(before, after)
-    for key, value in (("target_camera", "C9"), ("split", "train"), ("subject", "../x")):
-        wrong = {"groups": [[asdict(pairs[0]) | {key: value}]]}
-        listed.write_text(json.dumps(old | wrong))
-        assert run("cases", bare, "-o", tmp_path / "w", "--pairs", listed) == 1
-        assert "does not fit" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -213,7 +213,6 @@ WRONG: dict[str, dict[str, str]] = {
     },
     "evaluate": {
         "olat data --preset paper --every 2": "exclude each other",
-        "cases data --pairs x.json --every 2": "--pairs: is a list of its own",
         "olat data --split validation": "no pairs in the split validation",
         "olat data --reflectance phong": "give portrait, field, diffuse-sh",
         "olat data --reflectance prt --network-alone": "is for the field",
