@@ -75,6 +75,7 @@ departure() {  # NAME OPTIONS...: a step from the paper's form to the shipped on
     $train -o "$run/$1" --resume --workers 0 "${length[@]}" "${@:2}"
     facerf --checkpoint "$run/$1" evaluate olat "$run/dataset" --network-alone --every 20 -o "$run/tables/$1"
     [ -z "${YALE:-}" ] || facerf --checkpoint "$run/$1" evaluate yale-b "$YALE" --shifts "$SHIFTS" --network-alone \
+        --reflectance field \
         ${SUBJECTS:+--subjects "$SUBJECTS"} -o "$run/tables/$1-yale-b"
 }
 heads=(--heads-from "${HEADS:-builtin}" --heads 60 --bank "$run/bank")

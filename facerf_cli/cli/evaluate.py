@@ -10,7 +10,7 @@ import typer
 from facerf_cli.cli.brief import Verbs
 from facerf_cli.cli.options import is_default, refuse_given, with_groups
 from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.options import EvaluateOptions, has_own_field_alone
+from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.option import Only, Without
 from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptions
 
@@ -152,11 +152,10 @@ def yale_b(
     Sources are an image under one flash and four soft lights summed from the subject's own images; targets
     are single flashes and four environments. Lights are given, not estimated. Images are read as linear, as
     measured, relit as by `facerf relight`, and compared inside one ellipse, open eyes included. Cases are
-    SUBJECT/SOURCE/LIGHT. An own Reflectance Network is measured alone; with --reflectance portrait its row
-    names both networks. The rows of other methods were published for the same images. The database is for
-    research and never trained on.
+    SUBJECT/SOURCE/LIGHT. To measure a Reflectance Network of your own without the shipped Portrait Network,
+    pass --reflectance field. The database is for research and never trained on.
     """
-    if is_default(context, "reflectance") and not has_own_field_alone(photo.settings.checkpoints):
+    if is_default(context, "reflectance"):
         options = replace(options, reflectance=("portrait",))
     options = replace(options, network_alone=field.network_alone)
     _evaluate(context, "yale-b", options, photo, [str(folder)])

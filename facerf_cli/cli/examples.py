@@ -57,7 +57,7 @@ facerf evaluate geometry photos/ --face-model ict.npz -o report/
 facerf evaluate geometry dataset/ -o report/
 facerf evaluate yale-b CroppedYale/ -o report/
 facerf evaluate yale-b CroppedYale/ --jobs 2 -o report/
-facerf evaluate yale-b CroppedYale/ --checkpoint run/ -o report/
+facerf evaluate yale-b CroppedYale/ --checkpoint run/ --reflectance field -o report/
 facerf evaluate cases dataset/ -o cases/
 facerf evaluate cases dataset/ --same-pose -o cases/
 facerf evaluate cases dataset/ --split all --every 10 -o cases/

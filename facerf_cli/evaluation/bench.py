@@ -8,15 +8,14 @@ from pathlib import Path
 from facerf_cli.batch.inputs import Item
 from facerf_cli.evaluation.folders import case_of, read_facts
 from facerf_cli.evaluation.measure import Case
-from facerf_cli.evaluation.options import EvaluateOptions, portrait_name
+from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.evaluation.people import Bench, Method, Portrait, Reading
-from facerf_cli.network.files import checkpoint_file, serving_files, title_of
-from facerf_cli.network.stored_graph import ASSET
+from facerf_cli.network.files import checkpoint_file
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.photo_light import Estimator
 from facerf_cli.work.light_of_photo import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
-from facerf_cli.work.photos import fit_faces, load_models_once, networks_of_geometry, read_photo
+from facerf_cli.work.photos import fit_faces, load_models_once, read_photo
 
 
 @cache
@@ -40,8 +39,7 @@ def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
         features = feature_network(light)[0]
     estimator = Estimator(options.non_negative, features)
     make = partial(Method, network_alone=options.network_alone, estimator=estimator)
-    names = {"portrait": portrait_name(photo.settings.checkpoints)}
-    methods = [make(names.get(kind, kind), kind, models) for kind in options.reflectance]
+    methods = [make(kind, kind, models) for kind in options.reflectance]
     for one in options.against:
         other = _load(one.path, photo)
         other.networks.load(("reflectance",))  # fails before anything is measured
@@ -77,24 +75,3 @@ def networks_used(options: EvaluateOptions) -> Collection[str]:
         return {"parsing"} if options.measures.face_distance or options.dataset else ()
     refined = options.refine == "features" and options.measures.vgg_weights is None
     return networks_of(options.reflectance) | ({"light_features"} if refined else set())
-
-
-def networks_named(options: EvaluateOptions, photo: PhotoOptions) -> dict[str, Path]:
-    """The file of each network that takes part, by title; those that one method alone uses name it."""
-    uses = networks_used(options)
-    if not uses:
-        return {}
-    regressing = () if options.joint_fit else networks_of_geometry(photo)
-    uses = {*uses, *regressing}
-    files = serving_files(photo.settings.checkpoints)
-    named = {title_of(name): path for name, path in files.items() if name in uses}
-    others = {one.name: one.path for one in options.against}
-    if options.mean_checkpoint is not None:
-        others["the mean face"] = options.mean_checkpoint
-    for method, path in others.items():
-        by = serving_files((checkpoint_file(path),))
-        own = {
-            name for name in (*networks_of(("field",)), *regressing) if by[name] != named.get(title_of(name))
-        }
-        named |= {f"{title_of(name)} of {method}": by[name] for name in sorted(own)}
-    return named | {"networks of MediaPipe": ASSET}

@@ -11,7 +11,6 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
-from facerf_cli.network.files import SHIPPED, serving_files
 from facerf_cli.option import DATA, MEASURES, METHODS, option
 
 Space = Literal["linear", "display"]
@@ -27,24 +26,6 @@ def name_of(path: Path) -> str:
     if path.is_dir():
         return path.name
     return path.parent.name if path.stem in ("best", "last") else path.stem
-
-
-def portrait_name(checkpoints: Sequence[Path]) -> str:
-    """The name of the portrait field's method.
-
-    It is `portrait`; or FIELD+PORTRAIT, the names of both networks' files, if one ships and one is the
-    user's.
-    """
-    files = serving_files(checkpoints)
-    own = [files[name] != SHIPPED[name] for name in ("reflectance", "portrait")]
-    both = name_of(files["reflectance"]), name_of(files["portrait"])
-    return "portrait" if own[0] == own[1] else "+".join(both)
-
-
-def has_own_field_alone(checkpoints: Sequence[Path]) -> bool:
-    """True if the user's files serve the Reflectance Network, and the Portrait Network is the shipped one."""
-    files = serving_files(checkpoints)
-    return files["reflectance"] != SHIPPED["reflectance"] and files["portrait"] == SHIPPED["portrait"]
 
 
 @dataclass(frozen=True)
@@ -154,7 +135,7 @@ class EvaluateOptions(BatchOptions):
     reflectance: tuple[RelightKind, ...] = option(
         ("field",),
         metavar="KIND",
-        shown_default="field; of compare none; of yale-b portrait, or field for an own field's --checkpoint",
+        shown_default="field; of compare none; of yale-b portrait",
         typed=list[str] | None,
         parse=_parse_kinds,
         panel=METHODS,

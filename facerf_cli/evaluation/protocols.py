@@ -27,7 +27,6 @@ from facerf_cli.evaluation.selection import choose_couples, choose_people, choos
 from facerf_cli.evaluation.summary import Layout
 from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS, choose_subjects, compare_subject
 
-_PUBLISHED_SUBJECTS = 21  # of Extended Yale B
 MakeBench = Callable[[], Bench]  # when a protocol needs it: it loads networks
 
 
@@ -123,14 +122,9 @@ def _yale_b_notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
     if database.shifts:
         yield "Images are aligned to their subject's frontal one by the given shifts."
     else:
-        yield "Images are not aligned (no --shifts); the published figures are of aligned ones."
+        yield "Images are not aligned (no --shifts)."
     marked, known = sum(map(len, database.marked.values())), len(database.left_out)
     yield f"Left out of all subjects there: {marked} images marked as damaged, {known} known to be."
-    yield (
-        f"Published rows are of the same images, aligned, of {_PUBLISHED_SUBJECTS} subjects, by the "
-        f"benchmark that they come from; here are {len(subjects)}. The quotient image knows more than one "
-        "photo: other subjects under the same flashes."
-    )
     if settings := sorted(subjects & set(SETTINGS_SUBJECTS)):
         yield f"Settings were chosen on {', '.join(settings)}."
 

@@ -127,7 +127,7 @@ def cases_to_show(rows: Sequence[Row], metric: str, among: Collection[str], most
 def page(summary: Summary, run: Mapping[str, Any], rows: Sequence[Row], strips: Sequence[Strip]) -> str:
     """Write the report: the tables, and the strips that were kept. Equal figures give equal bytes.
 
-    `run` has `facerf`, the version; `command`; `networks`, file and SHA-256 of each by title; other facts.
+    `run` has `facerf`, the version; `command`; other facts.
     """
     strip_of = {strip.case: strip for strip in strips}
     shown = cases_to_show(rows, summary.metrics[0], strip_of)

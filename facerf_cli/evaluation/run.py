@@ -16,7 +16,7 @@ from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, keyed, rec
 from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.bench import bench_of, networks_named, networks_used
+from facerf_cli.evaluation.bench import bench_of, networks_used
 from facerf_cli.evaluation.folders import CASES, LIGHT, MASK, SOURCE, TRUTH, write_cases
 from facerf_cli.evaluation.measure import Case, Comparison, Row, measure, perceptual_metric
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions, name_of
@@ -33,12 +33,11 @@ from facerf_cli.evaluation.report import (
     read_figures,
     write_figures,
 )
-from facerf_cli.evaluation.summary import print_tables, published, summarise
+from facerf_cli.evaluation.summary import print_tables, summarise
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import json_text
 from facerf_cli.files.write import write_exr
 from facerf_cli.network.files import serving_files
-from facerf_cli.relighting.models import described_file
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import face_model, prepare_photos
@@ -227,21 +226,17 @@ class Evaluation(Job):
                 "%s lists %d cases; docs/evaluation.md says what a method renders", folder / CASES, len(rows)
             )
             return
-        ablation = (f"{self.protocol.name} --against",) if options.against else ()
         layout = replace(
             layout,
             title=layout.title.format(truth=name_of(options.truth) if options.truth else ""),
             metrics=self.metrics,
-            published=published(self.protocol.name, *ablation),
             notes=tuple(self.protocol.notes(options, self.chosen)),
         )
         summary = summarise(layout, rows)
         spaces = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}
-        networks = networks_named(options, self.photo)
         run: dict[str, Any] = {
             "facerf": __version__,
             "command": shlex.join(["facerf", *sys.argv[1:]]),
-            "networks": {title: described_file(path) for title, path in networks.items()},
             "values compared": spaces[options.measures.space],
         }
         if options.ours:
@@ -255,7 +250,7 @@ class Evaluation(Job):
         for name, text in texts.items():
             with atomic_path(folder / name) as temporary:
                 temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
-        print_tables(summary, run["networks"])
+        print_tables(summary)
         if not all(row.person for row in rows):
             log.info("who is in which image is not known: no intervals; give --facts, a CSV with name,person")
         log.info(

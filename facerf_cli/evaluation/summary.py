@@ -1,12 +1,10 @@
 """The tables of a run from its rows: each method over all images and by every fact, and against the first."""
 
-import csv
 import math
 import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -19,25 +17,12 @@ from facerf_cli.image.metrics import Interval, mean_interval
 from facerf_cli.run.logs import counted
 
 ALL = "all images"
-_DIGITS = 12  # of a digest
 _MOST_VALUES = 12  # of a fact that breaks tables down, where the protocol names none
 _PIPED_WIDTH = 100  # columns of text where standard output is no terminal
 _ANGLES = {
     "turn": "turn: the angle between the poses of the head in source and target.",
     "angle": "angle: the angle between the light and the camera's axis.",
 }
-
-
-PublishedFigure = Mapping[str, str]  # a row of published.csv, for orientation; '' where it says nothing
-
-
-def published(*protocols: str) -> tuple[PublishedFigure, ...]:
-    """Read the figures that are shown with those of protocols, from published.csv.
-
-    `mean` and `sd` are over images, as published; `fact` and `value` name the group that they are shown with.
-    """
-    with Path(__file__).with_name("published.csv").open(encoding="utf-8") as stream:
-        return tuple(row for row in csv.DictReader(stream) if row.pop("protocol") in protocols)
 
 
 @dataclass(frozen=True)
@@ -52,7 +37,6 @@ class Layout:
     title: str
     metrics: tuple[str, ...] = ("si_mse",)
     by: tuple[str, ...] = ()
-    published: tuple[PublishedFigure, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -109,10 +93,7 @@ class Summary:
         return names if len(self.methods) > 1 else names[:7]
 
     def table(self, metric: str) -> list[list[str]]:
-        """The rows of a metric: of each group the methods, then published figures, which have no n.
-
-        The first metric is broken down by facts.
-        """
+        """The rows of a metric: the methods of each group; only the first metric is broken down by facts."""
         rows = []
         for group in self.groups if metric == self.shown[0] else self.groups[:1]:
             title = f"{group.fact}: {group.value}" if group.fact else ALL
@@ -120,18 +101,7 @@ class Summary:
                 words = cell_words(cell, METRICS[metric].digits)
                 rows.append([title, method, str(cell.interval.images), *words][: len(self.columns)])
                 title = ""
-            key = metric, group.fact, group.value
-            for one in self.layout.published:
-                if (one["metric"], one["fact"], one["value"]) == key:
-                    rows.append([f"published, {one['source']}", one["method"], "", one["mean"], one["sd"]])
         return rows
-
-    @property
-    def notes(self) -> list[str]:
-        """The lines below the tables."""
-        measured_on = dict.fromkeys(f"{one['source']}: {one['data']}" for one in self.layout.published)
-        published = [f"Published figures. {'. '.join(measured_on)}."] if measured_on else []
-        return [*published, *self.layout.notes]
 
     def as_dict(self) -> dict[str, Any]:
         """Return all tables for JSON."""
@@ -152,10 +122,6 @@ class Summary:
                     },
                 }
                 for group in self.groups
-            ],
-            "published": [
-                {**one, "mean": float(one["mean"]), "sd": float(one["sd"]) if one["sd"] else None}
-                for one in self.layout.published
             ],
         }
 
@@ -247,11 +213,8 @@ def _won(metric: str, differences: Sequence[float]) -> float:
     return sum(won) / len(won) if won else math.nan
 
 
-def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) -> None:
-    """Print a table for each of the layout's metrics to standard output; plain text if it is piped.
-
-    `networks` has the file and SHA-256 of each network, by title.
-    """
+def print_tables(summary: Summary) -> None:
+    """Print a table for each of the layout's metrics to standard output; plain text if it is piped."""
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
     plain = not terminal or console.width <= _PIPED_WIDTH  # rules take columns that a narrow terminal lacks
@@ -272,11 +235,8 @@ def print_tables(summary: Summary, networks: Mapping[str, Mapping[str, str]]) ->
         for row in summary.table(metric):
             table.add_row(*map(Text, row))
         console.print(table)
-    for note in summary.notes:
+    for note in summary.layout.notes:
         console.print(Text(note))
-    if networks:
-        named = [f"{title} {one['file']} {one['sha256'][:_DIGITS]}" for title, one in networks.items()]
-        console.print(Text(f"Networks, with the first digits of SHA-256: {'; '.join(named)}."))
 
 
 def cell_words(cell: Cell, digits: int) -> list[str]:

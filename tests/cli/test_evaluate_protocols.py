@@ -194,7 +194,6 @@ def test_one_table_of_facerf_an_own_network_and_a_folder(
     found = json.loads((out / "summary.json").read_text())
     assert found["methods"] == ["field", "own", "mean"] and found["pictures"] == len(listed)
     assert {group["fact"] for group in found["groups"]} >= {"pose", "turn", "angle", "tone"}
-    assert "Reflectance Network of own" in (out / "report.html").read_text()
     assert run("olat", folder, "-o", out, "--form", "no_such:Class") == 2
     assert "--form no_such:Class" in capsys.readouterr().err
 

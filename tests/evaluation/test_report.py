@@ -58,7 +58,7 @@ def written(found: list[Row], kept: int | None = None, text: str = "ours") -> st
     """The page of rows whose first cases have strips; `text` is a name and a note."""
     strips = [Strip(row.case, (text,), (1.0,), True, (392, 392), "anBlZw==") for row in found[:kept]]
     summary = summarise(replace(LAYOUT, title=text, notes=(text,), by=("pose", text)), found)
-    run = {"facerf": "1.2.3", "command": text, "networks": {text: {"file": "x", "sha256": "abc"}}, text: text}
+    run = {"facerf": "1.2.3", "command": text, text: text}
     return page(summary, run, found, strips)
 
 

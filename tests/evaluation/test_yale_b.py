@@ -18,7 +18,6 @@ from facerf_cli.evaluation import people, yale_b
 from facerf_cli.evaluation.measure import measure
 from facerf_cli.evaluation.options import Measures
 from facerf_cli.evaluation.people import Bench, Method, Reading
-from facerf_cli.evaluation.summary import published
 from facerf_cli.evaluation.yale_b import (
     Relighting,
     YaleSubject,
@@ -121,20 +120,6 @@ class TooBright:
     def images(self, photo: np.ndarray, face: Face, lights: Lights, target: Any) -> list[np.ndarray]:
         assert face.landmarks_px.shape == (68, 2)
         return [2 * photo] * len(lights.weights)
-
-
-def test_published_rows_are_the_readmes(reference: tuple[ModuleType, ModuleType]) -> None:
-    lines = (BENCH / "README.md").read_text().splitlines()
-    table = [[cell.strip() for cell in line.split("|")[2:-1]] for line in lines if line.startswith("| ")][1:]
-    figures = [
-        [float(number) for cell in row for number in cell.replace("·", "/").split("/")] for row in table
-    ]
-    ours = published("yale-b")
-    for method in dict.fromkeys(row["method"] for row in ours):
-        assert [float(row["mean"]) for row in ours if row["method"] == method] in figures, method
-    quotient = [row for row in ours if row["method"] == "quotient image"]
-    assert len(ours) == 11 * 4 and len(quotient) == 11
-    assert all(row["data"] == "same images, 21 people, given more data" for row in quotient)
 
 
 @pytest.fixture

@@ -13,13 +13,11 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions
 from facerf_cli.evaluation.protocols import Protocol
 from facerf_cli.evaluation.run import Evaluation
-from facerf_cli.evaluation.summary import Layout, published
+from facerf_cli.evaluation.summary import Layout
 from facerf_cli.work.photo_options import PhotoOptions
 
 PEOPLE = ("anna", "bea", "carl")
-LAYOUT = Layout(
-    "Toy <images> & more", ("si_mse", "psnr", "light_error_deg"), ("pose", "angle"), published("olat")
-)
+LAYOUT = Layout("Toy <images> & more", ("si_mse", "psnr", "light_error_deg"), ("pose", "angle"))
 HEIGHT, WIDTH = 36, 48
 NOISE = {"good": 0.02, "bad <i>": 0.1}
 
@@ -53,8 +51,7 @@ def choose(options: EvaluateOptions, inputs: object) -> Chosen:
     return Chosen({})
 
 
-# Its name is that of a protocol with published figures.
-PROTOCOL = Protocol("olat", choose, compare, LAYOUT, notes)
+PROTOCOL = Protocol("toy", choose, compare, LAYOUT, notes)
 
 
 def comparison(person: str, number: int) -> Comparison:
