@@ -6,7 +6,6 @@ in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a
 import. A test checks it.
 """
 
-import atexit
 import io
 import logging
 import math
@@ -15,10 +14,9 @@ import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
@@ -30,7 +28,7 @@ from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
-from facerf_cli.run.stopping import end_again, end_on_signals
+from facerf_cli.run.stopping import end_again, end_on_signals, leave
 from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 
 # The help's panels, which say what one wants to do, and a line for each verb, in the order of a user's day.
@@ -290,7 +288,7 @@ def run() -> None:
         code = main(sys.argv[1:])
     except SystemExit as stop:  # of a signal; the interpreter's own end would name what libraries hold
         code = stop.code if isinstance(stop.code, int) else 1
-    _leave(code)
+    leave(code)
 
 
 def _prepare_streams() -> None:
@@ -300,15 +298,6 @@ def _prepare_streams() -> None:
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
         if isinstance(stream := getattr(sys, name), io.TextIOWrapper):
             stream.reconfigure(encoding=sys.getfilesystemencoding(), errors="surrogateescape")
-
-
-def _leave(code: int) -> NoReturn:
-    """End the process without taking torch's modules apart, which takes it half a second."""
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # `main` has said that it cannot be written
-            stream.flush()
-    os._exit(code)
 
 
 def main(arguments: Sequence[str]) -> int:

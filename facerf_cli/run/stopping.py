@@ -7,13 +7,14 @@ A library may also catch the exit and continue with half of its work (`except Ba
 writer of OBJ does): `end_again` raises it once more, before an output gets its name and after an item.
 """
 
+import atexit
 import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -46,6 +47,15 @@ def end_again() -> None:
     """Raise the exit of a signal again if there was one and the process still runs."""
     if _ended_by:
         _raise_exit(_ended_by[0])
+
+
+def leave(code: int) -> NoReturn:
+    """End the process without unloading libraries: torch takes half a second, nanobind reports leaks."""
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # the caller has reported that it cannot be written
+            stream.flush()
+    os._exit(code)
 
 
 def clean_by(cleaner: Callable[[], None]) -> None:

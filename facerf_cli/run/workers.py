@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, log_to_queue
 from facerf_cli.run.machine import processors
-from facerf_cli.run.stopping import end_on_signals
+from facerf_cli.run.stopping import end_on_signals, leave
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -148,14 +148,18 @@ def _serve(pipe: Any, level: int, threads: int) -> None:
     end_on_signals(_PATIENCE_S, interrupts=False)
     wire = _Wire(pipe)
     log_to_queue(wire, level)
-    with suppress(EOFError, BrokenPipeError):  # the parent has ended
-        wire.send("ready", None)
-        work = pipe.recv()
-        while (wrapped := pipe.recv()) is not None:
-            try:
-                wire.send("result", work(wrapped[0]))
-            except Exception as error:
-                wire.send("raised", error)
+    try:
+        with suppress(EOFError, BrokenPipeError):  # the parent has ended
+            wire.send("ready", None)
+            work = pipe.recv()
+            while (wrapped := pipe.recv()) is not None:
+                try:
+                    wire.send("result", work(wrapped[0]))
+                except Exception as error:
+                    wire.send("raised", error)
+        leave(0)
+    except SystemExit as stop:  # of a signal
+        leave(stop.code if isinstance(stop.code, int) else 1)
 
 
 class _Wire:

@@ -1,5 +1,6 @@
 """Processes that work for `--jobs`: what one that dies costs, what they say, and how they end."""
 
+import ctypes
 import logging
 import os
 import signal
@@ -8,6 +9,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from OpenImageIO import ImageSpec
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging
@@ -21,6 +23,8 @@ def work(item: str) -> str:
         os.kill(os.getpid(), signal.SIGKILL)
     if item == "raise":
         raise ValueError(item)
+    if item == "library":
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(ImageSpec()))  # reported where the interpreter ends
     if item.startswith("slow"):
         time.sleep(0.5)
     if item.startswith("/"):
@@ -64,6 +68,11 @@ def test_who_stops_listening_ends_the_workers(tmp_path: Path) -> None:
         time.sleep(0.01)
     results.close()
     assert not (tmp_path / "b").exists(), "SIGTERM unwinds; SIGKILL would leave it"
+
+
+def test_workers_end_without_what_libraries_say_at_their_end(capfd: pytest.CaptureFixture) -> None:
+    assert list(run("library", "b")) == ["LIBRARY", "B"]
+    assert "leaked" not in capfd.readouterr().err
 
 
 def _refuse(pipe: object, level: int, threads: int) -> None:
