@@ -8,11 +8,21 @@ from typing import Annotated
 import typer
 
 from facerf_cli.cli.brief import Verbs
-from facerf_cli.cli.options import is_default, refuse_given, with_groups
+from facerf_cli.cli.options import refuse_given, with_groups
 from facerf_cli.errors import UsageError
-from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.options import (
+    CasesOptions,
+    CompareOptions,
+    EvaluateOptions,
+    FaceOptions,
+    GeometryOptions,
+    OlatOptions,
+    ReconstructionOptions,
+    TransferOptions,
+    YaleOptions,
+)
 from facerf_cli.option import Only, Without
-from facerf_cli.work.photo_options import FieldOptions, PhotoOptions, SolveOptions
+from facerf_cli.work.photo_options import PhotoOptions
 
 app = typer.Typer(
     cls=Verbs,
@@ -21,10 +31,9 @@ app = typer.Typer(
 )
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
-_BATCH = ("output", "measures", "overwrite", "dry_run", "jobs", "shard", "ray")
 _MADE_BY_FIELD = ("network_alone", "held_to_photo", "mean_checkpoint")
 _PAIRS = ("split", "every", "joint_fit")
-_METHODS = ("reflectance", "against", "pictures", "keep_eyes", "preset")
+_OF_PHOTOS = ("face", "landmarks", "colourspace", "layer", "facts")
 
 DatasetArgument = Annotated[
     Path,
@@ -49,8 +58,7 @@ def olat(
     dataset: DatasetArgument,
     *,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
-    field: FieldOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS)],
+    options: OlatOptions,
 ) -> None:
     """Predict single lights of held-out people from images in natural light (the paper's Table 1).
 
@@ -62,8 +70,7 @@ def olat(
     source's own texture under the cosine of the light: the least that a method must beat. A second
     checkpoint, --against without_normals.safetensors, gives the paper's Table 3.
     """
-    options = replace(options, dataset=dataset, network_alone=field.network_alone)
-    _evaluate(context, "olat", options, photo)
+    _evaluate(context, "olat", replace(options, dataset=dataset), photo)
 
 
 def reconstruction(
@@ -71,8 +78,7 @@ def reconstruction(
     inputs: PhotosOrDatasetArgument,
     *,
     photo: Annotated[PhotoOptions, Without("texture_side", "person")],
-    solve: SolveOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS, "facts")],
+    options: ReconstructionOptions,
 ) -> None:
     """Explain photos by reflectance and light, and render them again (the paper's Table 2).
 
@@ -81,8 +87,7 @@ def reconstruction(
     makes: that would be exact by construction. Of a DATASET the sources of its pairs are measured; its true
     light is known, so light_error_deg is the angle between the brightest single lights.
     """
-    options = replace(options, dataset=_only_dataset(inputs), **vars(solve))
-    _evaluate(context, "reconstruction", options, photo, inputs)
+    _evaluate(context, "reconstruction", replace(options, dataset=_only_dataset(inputs)), photo, inputs)
 
 
 def transfer(
@@ -98,8 +103,7 @@ def transfer(
     ],
     *,
     photo: Annotated[PhotoOptions, Without("texture_side", "face", "person")],
-    solve: SolveOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS, *_METHODS, "photos", "held_to_photo")],
+    options: TransferOptions,
 ) -> None:
     """Exchange the reflectances of two images of a person (the paper's Table 2).
 
@@ -110,7 +114,7 @@ def transfer(
     dataset = None if options.photos else _only_dataset(inputs)
     if dataset is None and not options.photos:
         raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
-    options = replace(options, dataset=dataset, network_alone=not options.held_to_photo, **vars(solve))
+    options = replace(options, dataset=dataset, network_alone=not options.held_to_photo)
     _evaluate(context, "transfer", options, photo, inputs)
 
 
@@ -119,16 +123,14 @@ def geometry(
     inputs: PhotosOrDatasetArgument,
     *,
     photo: Annotated[PhotoOptions, Without("texture_side", "person")],
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_PAIRS[:2], *_METHODS, "facts", "mean_checkpoint")],
+    options: GeometryOptions,
 ) -> None:
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
     Both are fitted to the same landmarks of one image, or with --geometry network regressed from the same
     crop, and compared where both show the face. The paper trained networks with the mean face: give them as
-    --mean-checkpoint. --against does not apply.
+    --mean-checkpoint.
     """
-    if options.against:
-        raise UsageError("--against: does not apply to geometry; give --checkpoint and --mean-checkpoint")
     _evaluate(context, "geometry", replace(options, dataset=_only_dataset(inputs)), photo, inputs)
 
 
@@ -144,8 +146,7 @@ def yale_b(
     ],
     *,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
-    field: FieldOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH, *_METHODS[:3], "shifts", "subjects", "room")],
+    options: YaleOptions,
 ) -> None:
     """Relight real people to real point lights and compare with their photos under these.
 
@@ -155,9 +156,6 @@ def yale_b(
     SUBJECT/SOURCE/LIGHT. To measure a Reflectance Network of your own without the shipped Portrait Network,
     pass --reflectance field. The database is for research and never trained on.
     """
-    if is_default(context, "reflectance"):
-        options = replace(options, reflectance=("portrait",))
-    options = replace(options, network_alone=field.network_alone)
     _evaluate(context, "yale-b", options, photo, [str(folder)])
 
 
@@ -166,10 +164,7 @@ def cases(
     dataset: DatasetArgument,
     *,
     photo: Annotated[PhotoOptions, Only("face_model")],
-    options: Annotated[
-        EvaluateOptions,
-        Only("output", *_BATCH[2:], "split", "every", "same_pose", "preset", "keep_eyes"),
-    ],
+    options: CasesOptions,
 ) -> None:
     """Freeze pairs of a dataset as cases that any method can render, for `evaluate compare`.
 
@@ -178,7 +173,7 @@ def cases(
     and lights in numbers; DIR/light has each light as a lat-long map. Sources in which no face is found are
     named and left out. docs/evaluation.md says what a method has to render.
     """
-    _evaluate(context, "cases", replace(options, dataset=dataset, reflectance=(), joint_fit=True), photo)
+    _evaluate(context, "cases", replace(options, dataset=dataset), photo)
 
 
 def compare(
@@ -193,8 +188,7 @@ def compare(
     ],
     *,
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
-    field: FieldOptions,
-    options: Annotated[EvaluateOptions, Only(*_BATCH, "reflectance", "against", "methods", "masks", "facts")],
+    options: CompareOptions,
 ) -> None:
     """Compare any number of methods on frozen cases: folders of images, and facerf's own.
 
@@ -204,10 +198,7 @@ def compare(
     method. A missing, an additional or a differently sized image is an error: no table is made of what is
     left.
     """
-    if is_default(context, "reflectance"):
-        options = replace(options, reflectance=())
-    options = replace(options, truth=truth, network_alone=field.network_alone)
-    _evaluate(context, "compare", options, photo)
+    _evaluate(context, "compare", replace(options, truth=truth), photo)
 
 
 for _protocol in (olat, reconstruction, transfer, geometry, yale_b, cases, compare):
@@ -224,11 +215,9 @@ def _evaluate(
     """Run a protocol and exit; raises UsageError for options that would fail every item, or do nothing."""
     options.check()
     photo.check()
-    if options.dataset is None:
-        refuse_given(context, _PAIRS, "is for a prepared dataset; leave it out here")
-    else:
-        of_photos = ("face", "landmarks", "colourspace", "layer", "facts")
-        refuse_given(context, of_photos, "is for photos; leave it out here")
+    if isinstance(options, FaceOptions):
+        names, what = (_PAIRS, "a prepared dataset") if options.dataset is None else (_OF_PHOTOS, "photos")
+        refuse_given(context, names, f"is for {what}; leave it out here")
     if not options.has_field:
         why = "is for the field; give --reflectance field too, or leave it out"
         refuse_given(context, _MADE_BY_FIELD, why)

@@ -22,7 +22,7 @@ from pathlib import Path
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case
-from facerf_cli.evaluation.options import Chosen, EvaluateOptions
+from facerf_cli.evaluation.options import Chosen, CompareOptions
 from facerf_cli.files.arrays import read_array
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.read import LinearImage, read_image
@@ -47,29 +47,25 @@ class CaseFiles:
     source: Path | None
 
 
-def choose_cases(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+def choose_cases(options: CompareOptions, inputs: Sequence[str]) -> Chosen:
     """Choose all cases of a folder with the images of each method, in parts."""
     cases = match_cases(options)
     size = math.ceil(len(cases) / _PARTS)
     parts = [cases[start : start + size] for start in range(0, len(cases), size)]
-    assert options.truth is not None
     return Chosen({options.item(options.truth, f"part-{n:02d}"): part for n, part in enumerate(parts)})
 
 
-def match_cases(options: EvaluateOptions) -> list[CaseFiles]:
+def match_cases(options: CompareOptions) -> list[CaseFiles]:
     """Match the images of folders with their truths, sorted by name.
 
     Raises UsageError for folders that cannot be used, InputError for names that do not match: it names the
     first few and counts all.
     """
     root = options.truth
-    assert root is not None
     frozen = (root / CASES).is_file()
     truths, facts = (root / TRUTH, options.facts or root / CASES) if frozen else (root, options.facts)
     mask = root / MASK if frozen and options.masks is None else options.masks
     methods = {one.name: one.path for one in options.methods}
-    if not options.names:
-        raise UsageError("compare: no method; give --method NAME=FOLDER, or --reflectance field")
     given = [truths, *([mask] if mask else []), *methods.values()]
     resolved = [folder.resolve() for folder in given]
     if again := [folder for folder in given if resolved.count(folder.resolve()) > 1]:

@@ -1,8 +1,10 @@
 """Faces that protocols measure, and the methods that relight them: people of a dataset, and photos."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +16,9 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.dataset.dataset import Dataset
 from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, pair_weights, render_source, weights_path
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.folders import case_of, read_facts
 from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
 from facerf_cli.face.head import Head, unwrap_face
@@ -25,16 +29,20 @@ from facerf_cli.image.metrics import tone_of
 from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
+from facerf_cli.network.files import checkpoint_file
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face, NoFaceError, find_faces
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.relighting.heads import head_of
-from facerf_cli.relighting.models import Models, Sides
+from facerf_cli.relighting.models import Models, Sides, load_models
 from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, explain
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.work.light_of_photo import feature_network
+from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
+from facerf_cli.work.photos import fit_faces, load_models_once, read_photo
 
 _MASK_SIDE = 256  # texels of the masks
 log = logging.getLogger(LOGGER_NAME)
@@ -322,3 +330,62 @@ class PhotoFaces:
 
 def _name(pair: Pair) -> str:
     return f"{pair.subject}/{pair.index:05d}"
+
+
+@cache
+def bench_of(options: EvaluateOptions, photo: PhotoOptions) -> Bench:
+    """The methods, in the order of their names, and how faces are read, once a process.
+
+    Faces are read as the first method's networks expect, where the options do not say.
+    """
+    models, methods = load_models_once(photo), methods_of(options, photo)
+    geometry = None if options.joint_fit else photo.geometry or models.default_geometry
+    reading = Reading(models.networks.people, models.sides(photo.texture_side), geometry, options.keep_eyes)
+    mean = _load(options.mean_checkpoint, photo) if options.mean_checkpoint else None
+    return Bench(models, reading, methods, mean, partial(_faces_of, options, photo, reading))
+
+
+def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
+    """The methods, in the order of their names."""
+    models, features = load_models_once(photo), None
+    if options.refine == "features":
+        light = LightOptions(photo=photo, vgg_weights=options.measures.vgg_weights)
+        features = feature_network(light)[0]
+    estimator = Estimator(options.non_negative, features)
+    make = partial(Method, network_alone=options.network_alone, estimator=estimator)
+    methods = [make(kind, kind, models) for kind in options.reflectance]
+    for one in options.against:
+        other = _load(one.path, photo)
+        other.networks.load(("reflectance",))  # fails before anything is measured
+        methods.append(make(one.name, "field", other))
+    return methods
+
+
+def _load(path: Path, photo: PhotoOptions) -> Models:
+    """The models of another checkpoint."""
+    return load_models((checkpoint_file(path),), photo.face_model, load_models_once(photo).device, photo.form)
+
+
+def _faces_of(
+    options: EvaluateOptions, photo: PhotoOptions, reading: Reading, item: Item
+) -> Iterator[Portrait]:
+    """Yield the chosen faces of a photo."""
+    image = read_photo(item, photo)
+    for face in fit_faces(item, image, photo):
+        case = case_of(f"{item.name}{face.tag}", _described(options.facts))
+        case = replace(case, facts={"quality": face.fit.quality, **case.facts})
+        yield Portrait(str(item.input_path), case, image, face.found, reading)
+
+
+@cache
+def _described(facts: Path | None) -> Mapping[str, Case]:
+    """The rows of --facts by name, once a process."""
+    return {} if facts is None else read_facts(facts)
+
+
+def networks_used(options: EvaluateOptions) -> Collection[str]:
+    """Names of the networks that the options of the field's methods use; those of faces always."""
+    if not options.ours:
+        return {"parsing"} if options.measures.face_distance or options.dataset else ()
+    refined = options.refine == "features" and options.measures.vgg_weights is None
+    return networks_of(options.reflectance) | ({"light_features"} if refined else set())

@@ -16,11 +16,10 @@ from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, keyed, rec
 from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.bench import bench_of, networks_used
 from facerf_cli.evaluation.folders import CASES, LIGHT, MASK, SOURCE, TRUTH, write_cases
 from facerf_cli.evaluation.measure import Case, Comparison, Row, measure, perceptual_metric
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions, name_of
-from facerf_cli.evaluation.people import Bench
+from facerf_cli.evaluation.people import bench_of, networks_used
 from facerf_cli.evaluation.protocols import Protocol
 from facerf_cli.evaluation.report import (
     FORMAT,
@@ -74,10 +73,6 @@ class Evaluation(Job):
         more = ("face_distance",) if self.options.measures.face_distance else ()
         return tuple(dict.fromkeys((*own, *more)))
 
-    def bench(self) -> Bench:
-        """The methods, and how faces are read."""
-        return bench_of(self.options, self.photo)
-
     def run(self) -> int:
         """Measure the items and write their tables; return the exit code, 0 done, 1 some failed."""
         items, options = list(self.chosen.items), self.options
@@ -110,7 +105,7 @@ class Evaluation(Job):
             prepare_photos(self.photo, uses, with_networks=not dry_run)
         if not dry_run:
             if uses:  # what would fail each item fails before anything is measured
-                self.bench()
+                bench_of(self.options, self.photo)
             if measures.vgg_weights is not None:
                 device = torch_device(self.photo.settings)
                 perceptual_metric(measures.lpips, measures.vgg_weights, device)
@@ -153,7 +148,8 @@ class Evaluation(Job):
         strips: dict[str, Strip] = {}
         metric, measures = self.metrics[0], self.options.measures
         scaled = metric.startswith("si_") and measures.space == "linear"
-        for own in self.protocol.compare(self.options, self.bench, self.chosen.items[item]):
+        bench = bench_of(self.options, self.photo)
+        for own in self.protocol.compare(self.options, bench, self.chosen.items[item]):
             case = own.case
             if self.kept is not None:
                 images += self._keep_images(own, self.kept)
@@ -228,7 +224,7 @@ class Evaluation(Job):
             return
         layout = replace(
             layout,
-            title=layout.title.format(truth=name_of(options.truth) if options.truth else ""),
+            title=layout.title.format(truth=name_of(options.truth)),
             metrics=self.metrics,
             notes=tuple(self.protocol.notes(options, self.chosen)),
         )

@@ -15,7 +15,7 @@ from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.folders import read_facts
-from facerf_cli.evaluation.options import Chosen, EvaluateOptions
+from facerf_cli.evaluation.options import Chosen, FaceOptions
 from facerf_cli.evaluation.people import DatasetPerson, PhotoFaces
 from facerf_cli.run.logs import LOGGER_NAME
 
@@ -29,9 +29,7 @@ _PAPER_PHOTOS, _PAPER_COUPLES, _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT = 130,
 
 
 def choose_people(
-    choose: Callable[[PairsByPerson, EvaluateOptions], Groups],
-    options: EvaluateOptions,
-    inputs: Sequence[str],
+    choose: Callable[[PairsByPerson, FaceOptions], Groups], options: FaceOptions, inputs: Sequence[str]
 ) -> Chosen:
     """Choose groups of pairs of the people of a dataset."""
     assert options.dataset is not None
@@ -45,7 +43,7 @@ def choose_people(
     return Chosen(items, files, sum(map(len, groups.values())))
 
 
-def choose_sources(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+def choose_sources(options: FaceOptions, inputs: Sequence[str]) -> Chosen:
     """Choose sources of a dataset, or photos: all, or up to the paper's number."""
     if options.dataset:
         return choose_people(source_pairs, options, inputs)
@@ -60,7 +58,7 @@ def choose_sources(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
     return Chosen({photo: PhotoFaces((photo,)) for photo in photos[:most]})
 
 
-def choose_couples(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+def choose_couples(options: FaceOptions, inputs: Sequence[str]) -> Chosen:
     """Choose couples of sources of a dataset, or of photos: all, or up to the paper's number."""
     if options.dataset:
         return choose_people(couple_pairs, options, inputs)
@@ -77,7 +75,7 @@ def choose_couples(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
     return Chosen(items, tuple(couple.items[1].input_path for couple in items.values()))
 
 
-def pairs_of_split(dataset: Dataset, options: EvaluateOptions) -> dict[str, list[Pair]]:
+def pairs_of_split(dataset: Dataset, options: FaceOptions) -> dict[str, list[Pair]]:
     """The pairs of a split, or of all, by person; raises UsageError if there are none."""
     pairs: dict[str, list[Pair]] = {}
     for pair in read_pairs(dataset):
@@ -92,7 +90,7 @@ def pairs_of_split(dataset: Dataset, options: EvaluateOptions) -> dict[str, list
     return pairs
 
 
-def source_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
+def source_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
     """Choose every Nth pair of a dataset, or as many sources as the paper measured, evenly over people."""
     if options.preset:
         chosen = evenly(pairs, _PAPER_PHOTOS, "sources")
@@ -102,7 +100,7 @@ def source_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
     return {name: [(pair,) for pair in members] for name, members in chosen.items() if members}
 
 
-def olat_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
+def olat_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
     """Choose every Nth pair, or up to the paper's number of pairs and of maps, evenly over people."""
     if not options.preset:
         return source_pairs(pairs, options)
@@ -123,7 +121,7 @@ def olat_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
     return {name: [(pair,) for pair in members] for name, members in in_order.items() if members}
 
 
-def couple_pairs(pairs: PairsByPerson, options: EvaluateOptions) -> Groups:
+def couple_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
     """Choose every Nth couple of each person, or up to the paper's number evenly over people."""
     couples = {name: members for name, own in pairs.items() if (members := couples_of(own))}
     if not couples:

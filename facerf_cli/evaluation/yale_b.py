@@ -18,7 +18,7 @@ import torch
 from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX, Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.options import Chosen, EvaluateOptions
+from facerf_cli.evaluation.options import Chosen, YaleOptions
 from facerf_cli.evaluation.people import Bench
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.sphere import azel_to_direction
@@ -166,7 +166,7 @@ def face_mask() -> np.ndarray:
     return ((x - 84) / 70) ** 2 + ((y - 98) / 88) ** 2 <= 1
 
 
-def choose_subjects(options: EvaluateOptions, inputs: Sequence[str]) -> Chosen:
+def choose_subjects(options: YaleOptions, inputs: Sequence[str]) -> Chosen:
     """Choose subjects of a folder of the database, all if none are named."""
     database = read_yale_b(Path(inputs[0]), None if options.shifts is None else read_shifts(options.shifts))
     if unknown := sorted(set(options.subjects) - set(database.subjects)):

@@ -17,10 +17,10 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import read_pairs
-from facerf_cli.evaluation import bench, cases, people
-from facerf_cli.evaluation.bench import bench_of, methods_of
+from facerf_cli.evaluation import comparisons, people
 from facerf_cli.evaluation.folders import read_facts
 from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.people import bench_of, methods_of
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -59,7 +59,7 @@ def doubles(monkeypatch: Patch) -> None:
     def load(options: EvaluateOptions, photo: PhotoOptions) -> tuple[Double, ...]:
         return (Double("field", models=load_models_once(photo)),)
 
-    monkeypatch.setattr(bench, "methods_of", load)
+    monkeypatch.setattr(people, "methods_of", load)
 
 
 def run(protocol: str, *words: str | Path) -> int:
@@ -173,7 +173,7 @@ def test_one_table_of_facerf_an_own_network_and_a_folder(
     write_own_package(tmp_path / "site", monkeypatch)
     face = load_fit(read_dataset(folder).fit_path("0001", "C0")).landmarks_px.double().numpy()
     monkeypatch.setattr(people, "find_faces", lambda *_: [face_at(face)])
-    monkeypatch.setattr(cases, "find_faces", lambda *_: [face_at(face)])
+    monkeypatch.setattr(comparisons, "find_faces", lambda *_: [face_at(face)])
     frozen, theirs, out = (tmp_path / name for name in ("cases", "theirs", "out"))
     assert run("cases", folder, "-o", frozen, "--every", "4") == 0
     listed = read_facts(frozen / "cases.csv")

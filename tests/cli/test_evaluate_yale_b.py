@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from facerf_cli.capture.yale_b import Flash
-from facerf_cli.evaluation import bench as making
 from facerf_cli.evaluation import people, run, yale_b
 from facerf_cli.evaluation.measure import SOURCE
 from facerf_cli.evaluation.people import Bench, Reading
@@ -80,7 +79,7 @@ def test_yale_b_measures_the_portrait_field_unless_another_is_chosen(
     mine.mkdir()
     save_toy_checkpoint(mine / "best.safetensors")
     models: Any = FaceModelOnly(load_face_model("builtin"))
-    named = making.methods_of
+    named = people.methods_of
 
     def toys(*options: Any) -> Bench:
         return bench(*(Lambert(method.name, models=models) for method in named(*options)))

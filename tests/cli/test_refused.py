@@ -219,7 +219,7 @@ WRONG: dict[str, dict[str, str]] = {
         "olat data --against none.safetensors": "no such file",
         "olat data --against field.safetensors": "two methods have the name 'field'",
         "geometry data a.jpg": "one dataset among several inputs",
-        "geometry a.jpg --against a.jpg": "--mean-checkpoint",
+        "geometry a.jpg --against a.jpg": "--against",
         "geometry a.jpg --every 2": "--every is for a prepared dataset",
         "geometry data --facts who.csv": "--facts is for photos",
         "reconstruction a.jpg --every 1": "--every is for a prepared dataset",

@@ -1,16 +1,17 @@
 """Folders are matched by name, whole: nothing is left out, and nothing of another size compared."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation.cases import compare_images
+from facerf_cli.evaluation.comparisons import compare_images
 from facerf_cli.evaluation.folders import CaseFiles, case_of, match_cases, write_cases
 from facerf_cli.evaluation.measure import Case, Comparison, measure
-from facerf_cli.evaluation.options import EvaluateOptions, Measures, NamedPath
+from facerf_cli.evaluation.options import CompareOptions, Measures, NamedPath
 from facerf_cli.files.write import write_exr
 from facerf_cli.image.colour import srgb_to_linear
 from tests.refusals import refused
@@ -27,11 +28,12 @@ def image(name: str) -> np.ndarray:
 
 def match(methods: list[Path], truth: Path, **more: Path) -> list[CaseFiles]:
     folders = tuple(NamedPath(folder.name, folder) for folder in methods)
-    return match_cases(EvaluateOptions(OUT, reflectance=(), methods=folders, truth=truth, **more))
+    return match_cases(CompareOptions(OUT, methods=folders, truth=truth, **more))
 
 
 def compare(files: CaseFiles) -> Comparison:
-    (found,) = compare_images(EvaluateOptions(OUT, reflectance=()), pytest.fail, [files])
+    no_bench: Any = None  # folders are compared without networks
+    (found,) = compare_images(CompareOptions(OUT), no_bench, [files])
     return found
 
 
@@ -69,7 +71,6 @@ def test_an_image_is_no_person_and_folders_that_are_none_are_refused(truths: Pat
     for predictions, words in (
         ([ours, truths.parent / "empty"], "no images"),
         ([truths], "given twice"),
-        ([], "no method; give --method"),
     ):
         refused(UsageError, words, match, predictions, truths)
 

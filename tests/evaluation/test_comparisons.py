@@ -15,8 +15,7 @@ import torch
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import Pair, image_path, read_pairs, weights_path
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.evaluation import cases, people
-from facerf_cli.evaluation.cases import freeze, rendered
+from facerf_cli.evaluation import comparisons, people
 from facerf_cli.evaluation.comparisons import (
     COMPOSITE,
     FULL,
@@ -26,13 +25,15 @@ from facerf_cli.evaluation.comparisons import (
     angle_of,
     brightest,
     compare_olats,
+    freeze,
     reconstruct,
     reconstruct_with_mean,
+    rendered,
     transfer,
     turn_class,
 )
 from facerf_cli.evaluation.measure import Case, Comparison
-from facerf_cli.evaluation.options import EvaluateOptions
+from facerf_cli.evaluation.options import FaceOptions
 from facerf_cli.evaluation.people import Bench, DatasetPerson, Reading
 from facerf_cli.evaluation.selection import couples_of, evenly, olat_pairs
 from facerf_cli.face.crop import from_landmarks
@@ -76,7 +77,7 @@ def pair(index: int, source: str, target: str, light: int, envmap: str = "a") ->
     return Pair("0000", index, "test", source, envmap, 0.0, 0, target, light)
 
 
-PAPER = EvaluateOptions(Path("out"), preset="paper")
+PAPER = FaceOptions(Path("out"), preset="paper")
 FACE_ONLY = FaceModelOnly(load_face_model())
 
 
@@ -285,7 +286,7 @@ def test_a_case_is_the_stacks_image_and_facerf_renders_it_in_its_frame(
     dataset: Dataset, monkeypatch: Patch, camera: str
 ) -> None:
     """By a reflectance that changes nothing: the photo in its pose, in another the albedo at the face."""
-    monkeypatch.setattr(cases, "find_faces", lambda *given: [])
+    monkeypatch.setattr(comparisons, "find_faces", lambda *given: [])
     person = person_of(dataset)
     asked = pair(0, "C0", camera, side_light(person, camera))
     (case,) = replace(person, groups=[(asked,)]).compared(freeze, bench(person))
