@@ -20,7 +20,7 @@ from facerf_cli.evaluation.folders import CASES, LIGHT, MASK, SOURCE, TRUTH, wri
 from facerf_cli.evaluation.measure import Case, Comparison, Row, measure, perceptual_metric
 from facerf_cli.evaluation.options import Chosen, EvaluateOptions, name_of
 from facerf_cli.evaluation.people import bench_of, networks_used
-from facerf_cli.evaluation.protocols import Protocol
+from facerf_cli.evaluation.protocols import Protocol, notes
 from facerf_cli.evaluation.report import (
     FORMAT,
     ItemFigures,
@@ -226,7 +226,7 @@ class Evaluation(Job):
             layout,
             title=layout.title.format(truth=name_of(options.truth)),
             metrics=self.metrics,
-            notes=tuple(self.protocol.notes(options, self.chosen)),
+            notes=tuple(notes(options, self.chosen)),
         )
         summary = summarise(layout, rows)
         spaces = {"linear": "scene-linear Rec.709", "display": "encoded by sRGB"}

@@ -50,7 +50,7 @@ def test_tables_of_two_people(folder: Path, tmp_path: Path, capsys: Said) -> Non
     out = tmp_path / "out"
     assert main(["evaluate", "yale-b", str(folder), "-o", str(out), "--pictures"]) == 0
     said = capsys.readouterr().out
-    assert "of 2 people" in said and "no --shifts" in said
+    assert "of 2 people" in said and "not aligned" in said
     with (out / "images.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     # yaleB05 lacks one flash, which is known to be damaged: from the front, and from the soft light

@@ -43,15 +43,11 @@ def compare(options: EvaluateOptions, bench: object, content: tuple[Toy, Item]) 
         yield comparison(item.name, number)
 
 
-def notes(options: EvaluateOptions, chosen: Chosen) -> list[str]:
-    return ["A note with a <b>tag</b>."]
-
-
 def choose(options: EvaluateOptions, inputs: object) -> Chosen:
     return Chosen({})
 
 
-PROTOCOL = Protocol("toy", choose, compare, LAYOUT, notes)
+PROTOCOL = Protocol("toy", choose, compare, LAYOUT)
 
 
 def comparison(person: str, number: int) -> Comparison:
