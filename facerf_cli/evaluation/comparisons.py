@@ -226,7 +226,7 @@ def freeze(faces: Sequence[Portrait], bench: Bench) -> Iterator[Comparison]:
     (face,) = faces
     assert face.origin is not None
     person, pair = face.origin
-    find_faces(bench.reading.people, face.photo.pixels, face.name)
+    find_faces(bench.models.networks.people, face.photo.pixels, face.name)
     target, light, truth = target_of(face)
     view = target.by(bench.models)
     crop = fit_from_arrays(person.header(pair.target_camera).fit).crop
@@ -259,7 +259,7 @@ def compare_images(
             mask = np.ones(truth.pixels.shape[:2], np.float32)
         landmarks_px = None
         if options.measures.face_distance:  # InputError where no face is found
-            faces = find_faces(bench.reading.people, truth.pixels, str(files.truth))
+            faces = find_faces(bench.models.networks.people, truth.pixels, str(files.truth))
             landmarks_px = faces[0].landmarks_px
         source = None if files.source is None else read_pixels(files.source).pixels
         predictions = rendered(files.case, source, bench) if options.ours else {}
@@ -280,7 +280,7 @@ def rendered(case: Case, source: np.ndarray | None, bench: Bench) -> dict[str, n
     azimuth_deg, elevation_deg, *turn_deg = (float(case.facts[name]) for name in _LIGHT + _TURN)
     lights = Lights.each(azel_to_direction(azimuth_deg, elevation_deg)[None])
     frame = Crop(0.0, 0.0, float(source.shape[1]), source.shape[1])
-    face = bench.reading.find(source, case.name)
+    face = bench.find(source, case.name)
     images = {}
     for method, head in bench.heads(source, face):
         target = Target()

@@ -30,7 +30,6 @@ from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.files import checkpoint_file
-from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face, NoFaceError, find_faces
 from facerf_cli.raster.rasterize import interpolate, rasterize
@@ -84,22 +83,36 @@ class Method:
 
 
 @dataclass(frozen=True, eq=False)
-class Reading:
-    """Settings of finding, fitting and comparing faces.
+class Bench:
+    """The means of a run: its methods, and how faces are found, fitted and compared.
 
     Each image is a separate photo, whose face is found, and fitted or regressed as `geometry` says. With
     `geometry` None heads are those that were fitted to all calibrated cameras of a person at once. Eyes are
-    left out unless `keep_eyes`, since the field of open eyes is not learnt (paper, 'Results').
+    left out unless `keep_eyes`, since the field of open eyes is not learnt (paper, 'Results'). `mean` has the
+    networks that were trained with the mean face.
     """
 
-    people: PeopleNetworks
+    models: Models
     sides: Sides
     geometry: Geometry | None = None
     keep_eyes: bool = False
+    methods: Sequence[Method] = ()
+    mean: Models | None = None
+    photo: PhotoOptions | None = None  # of photos, not of a dataset
+    described: Mapping[str, Case] = field(default_factory=dict)  # the rows of --facts
 
     def find(self, image: np.ndarray, name: str) -> Face:
         """The largest face in an image; InputError where none is found."""
-        return find_faces(self.people, image, name)[0]
+        return find_faces(self.models.networks.people, image, name)[0]
+
+    def heads(self, photo: np.ndarray, face: Face) -> Iterator[tuple[Method, Head]]:
+        """Yield each method with its head of a face; methods over the same networks share the fit."""
+        heads: dict[int, Head] = {}
+        for method in self.methods:
+            key = id(method.models)
+            if key not in heads:
+                heads[key] = head_of(method.models, photo, face, self.geometry)
+            yield method, heads[key]
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,18 +151,18 @@ class Portrait:
     case: Case
     photo: LinearImage
     face: Face | FaceFit
-    reading: Reading
+    bench: Bench
     origin: "tuple[DatasetPerson, Pair] | None" = None
     _views: dict[int, tuple[Models, HeadView]] = field(default_factory=dict)
 
     def by(self, models: Models) -> HeadView:
         """The portrait by a method's models; InputError where nothing of the face is visible."""
         if id(models) not in self._views:
-            image, face, sides = self.photo.pixels, self.face, self.reading.sides
+            image, face, sides = self.photo.pixels, self.face, self.bench.sides
             if isinstance(face, FaceFit):
                 head = Head(image, face, unwrap_face(models.face, face, image, sides.texture, image.shape))
             else:
-                head = head_of(models, image, face, self.reading.geometry, sides)
+                head = head_of(models, image, face, self.bench.geometry, sides)
             view = self._view(models, head, head.fit)
             masked = head.without(models.face, self._inside(head.fit.crop))
             self._views[id(models)] = models, replace(view, head=masked)
@@ -166,7 +179,7 @@ class Portrait:
         fragments = rasterize(vertices, grid_triangles(), fit.camera)
         uv = interpolate(grid_uv(), grid_triangles(), fragments)
         mask = interior_mask(vertices, fragments, uv, _MASK_SIDE)[0]
-        if not self.reading.keep_eyes:
+        if not self.bench.keep_eyes:
             mask = mask * (1 - sample_texture(region_mask("eyes", _MASK_SIDE)[None], uv)[..., 0])
         inside = mask.numpy() * self._inside(fit.crop)
         if not inside.max() > 0:
@@ -193,22 +206,22 @@ class DatasetPerson:
 
     dataset: Dataset
     name: str
-    reading: Reading | None = None  # until it is compared
+    bench: Bench | None = None  # until it is compared
     groups: Sequence[Sequence[Pair]] = ()
     _lit: dict[str, Portrait] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
-    def compared(self, compare: "Compare", bench: "Bench") -> Iterator[Comparison]:
+    def compared(self, compare: "Compare", bench: Bench) -> Iterator[Comparison]:
         """Compare each group; one in one of whose images no face is found is named and left out.
 
         Raises UsageError where the joint fits are of another face model.
         """
-        if bench.reading.geometry is None and bench.models.face.name != self.dataset.face_model:
+        if bench.geometry is None and bench.models.face.name != self.dataset.face_model:
             raise UsageError(
                 f"{self.dataset.folder}: its joint fits are of {self.dataset.face_model}; give it as "
                 "--face-model"
             )
-        person = replace(self, reading=bench.reading)
+        person = replace(self, bench=bench)
         for pairs in self.groups:
             try:
                 found = list(compare([person.portrait(pair) for pair in pairs], bench))
@@ -238,18 +251,18 @@ class DatasetPerson:
 
     def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
         header = self.header(camera)
-        assert self.reading is not None
+        assert self.bench is not None
         face: Face | FaceFit
-        if self.reading.geometry is None:
+        if self.bench.geometry is None:
             fit = fit_from_arrays(header.fit)
             side_px = fit.crop.size_px  # the crop's pixels are the photo's
             face = replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px))
         else:
             try:
-                face = self.reading.find(image, name)
+                face = self.bench.find(image, name)
             except InputError as error:
                 raise NoFaceError(str(error)) from None
-        return Portrait(name, Case(name, self.name), LinearImage(image, header.seen), face, self.reading)
+        return Portrait(name, Case(name, self.name), LinearImage(image, header.seen), face, self.bench)
 
     def source(self, pair: Pair) -> np.ndarray:
         """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
@@ -291,26 +304,6 @@ class DatasetPerson:
         return float(value)
 
 
-@dataclass(frozen=True, eq=False)
-class Bench:
-    """The means of a run: its methods, the networks trained with the mean face, the reading of faces."""
-
-    models: Models
-    reading: Reading
-    methods: Sequence[Method] = ()
-    mean: Models | None = None
-    faces_of: Callable[[Item], Iterable[Portrait]] = lambda _: ()
-
-    def heads(self, photo: np.ndarray, face: Face) -> Iterator[tuple[Method, Head]]:
-        """Yield each method with its head of a face; methods over the same networks share the fit."""
-        heads: dict[int, Head] = {}
-        for method in self.methods:
-            key = id(method.models)
-            if key not in heads:
-                heads[key] = head_of(method.models, photo, face, self.reading.geometry)
-            yield method, heads[key]
-
-
 Compare = Callable[[Sequence[Portrait], Bench], Iterable[Comparison]]
 
 
@@ -323,9 +316,18 @@ class PhotoFaces:
 
     def compared(self, compare: Compare, bench: Bench) -> Iterator[Comparison]:
         """Compare each face, or the faces of both."""
-        for faces in zip(*map(bench.faces_of, self.items), strict=False):
-            cases = [replace(face.case, person=self.person or face.case.person) for face in faces]
-            yield from compare([replace(f, case=c) for f, c in zip(faces, cases, strict=True)], bench)
+        for faces in zip(*(self.faces(item, bench) for item in self.items), strict=False):
+            yield from compare(faces, bench)
+
+    def faces(self, item: Item, bench: Bench) -> Iterator[Portrait]:
+        """Yield the chosen faces of a photo."""
+        assert bench.photo is not None
+        image = read_photo(item, bench.photo)
+        for face in fit_faces(item, image, bench.photo):
+            case = case_of(f"{item.name}{face.tag}", bench.described)
+            facts = {"quality": face.fit.quality, **case.facts}
+            case = replace(case, person=self.person or case.person, facts=facts)
+            yield Portrait(str(item.input_path), case, image, face.found, bench)
 
 
 def _name(pair: Pair) -> str:
@@ -340,9 +342,10 @@ def bench_of(options: EvaluateOptions, photo: PhotoOptions) -> Bench:
     """
     models, methods = load_models_once(photo), methods_of(options, photo)
     geometry = None if options.joint_fit else photo.geometry or models.default_geometry
-    reading = Reading(models.networks.people, models.sides(photo.texture_side), geometry, options.keep_eyes)
     mean = _load(options.mean_checkpoint, photo) if options.mean_checkpoint else None
-    return Bench(models, reading, methods, mean, partial(_faces_of, options, photo, reading))
+    described = {} if options.facts is None else read_facts(options.facts)
+    sides = models.sides(photo.texture_side)
+    return Bench(models, sides, geometry, options.keep_eyes, methods, mean, photo, described)
 
 
 def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
@@ -364,23 +367,6 @@ def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
 def _load(path: Path, photo: PhotoOptions) -> Models:
     """The models of another checkpoint."""
     return load_models((checkpoint_file(path),), photo.face_model, load_models_once(photo).device, photo.form)
-
-
-def _faces_of(
-    options: EvaluateOptions, photo: PhotoOptions, reading: Reading, item: Item
-) -> Iterator[Portrait]:
-    """Yield the chosen faces of a photo."""
-    image = read_photo(item, photo)
-    for face in fit_faces(item, image, photo):
-        case = case_of(f"{item.name}{face.tag}", _described(options.facts))
-        case = replace(case, facts={"quality": face.fit.quality, **case.facts})
-        yield Portrait(str(item.input_path), case, image, face.found, reading)
-
-
-@cache
-def _described(facts: Path | None) -> Mapping[str, Case]:
-    """The rows of --facts by name, once a process."""
-    return {} if facts is None else read_facts(facts)
 
 
 def networks_used(options: EvaluateOptions) -> Collection[str]:

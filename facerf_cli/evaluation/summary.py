@@ -19,10 +19,6 @@ from facerf_cli.run.logs import counted
 ALL = "all images"
 _MOST_VALUES = 12  # of a fact that breaks tables down, where the protocol names none
 _PIPED_WIDTH = 100  # columns of text where standard output is no terminal
-_ANGLES = {
-    "turn": "turn: the angle between the poses of the head in source and target.",
-    "angle": "angle: the angle between the light and the camera's axis.",
-}
 
 
 @dataclass(frozen=True)
@@ -158,16 +154,13 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for value in sorted(by_value, key=natural):
             groups.append(CaseGroup(fact, value, _cells(by_value[value], methods, narrow)))
     cases, persons = {row.case for row in rows}, {row.person for row in rows}
-    facts = {group.fact for group in groups}.intersection(
-        name.removesuffix("_deg") for row in rows for name in row.facts if name.endswith("_deg")
-    )
-    notes = [words for fact, words in _ANGLES.items() if fact in facts]
+    notes = layout.notes
     if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
-        notes.append(
+        notes += (
             f"Of {counted(len(dark), 'image')} the truth is near black (root mean square below "
-            f"{NEAR_BLACK}): left out of Si-MSE."
+            f"{NEAR_BLACK}): left out of Si-MSE.",
         )
-    layout = replace(layout, notes=(*layout.notes, *notes))
+    layout = replace(layout, notes=notes)
     return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
 
 

@@ -185,8 +185,8 @@ def compare_subject(database: YaleB, name: str, bench: Bench, room: float = 0.0)
     """
     subject = YaleSubject(database, name)
     relightings = list(subject.relightings())
-    face = bench.reading.find(_rgb(subject.image("frontal")), str(database.folder / name))
-    places_px = None if bench.reading.geometry == "network" else face.landmarks_px
+    face = bench.find(_rgb(subject.image("frontal")), str(database.folder / name))
+    places_px = None if bench.geometry == "network" else face.landmarks_px
     for source in dict.fromkeys(one.source for one in relightings):
         of_source = [one for one in relightings if one.source == source]
         photo = _rgb(subject.image(source))

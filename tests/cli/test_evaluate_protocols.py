@@ -20,7 +20,7 @@ from facerf_cli.dataset.pairs import read_pairs
 from facerf_cli.evaluation import comparisons, people
 from facerf_cli.evaluation.folders import read_facts
 from facerf_cli.evaluation.options import EvaluateOptions
-from facerf_cli.evaluation.people import bench_of, methods_of
+from facerf_cli.evaluation.people import PhotoFaces, bench_of, methods_of
 from facerf_cli.face.fit import load_fit
 from facerf_cli.face.head import Head
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -110,7 +110,7 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(tmp_path: Path, capsys: 
     Image.fromarray(np.dstack([photo, shown])).save(path)
     photo_options = PhotoOptions(Settings(device="cpu"))
     made, models = bench_of(EvaluateOptions(tmp_path), photo_options), load_models_once(photo_options)
-    whole, half = (next(iter(made.faces_of(Item(x, x, x.stem)))) for x in (PHOTO, path))
+    whole, half = (next(PhotoFaces(()).faces(Item(x, x, x.stem), made)) for x in (PHOTO, path))
     seen, part = whole.by(models), half.by(models)
     crop = part.fit.crop
     column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]

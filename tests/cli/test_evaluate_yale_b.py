@@ -11,10 +11,10 @@ import pytest
 from facerf_cli.capture.yale_b import Flash
 from facerf_cli.evaluation import people, run, yale_b
 from facerf_cli.evaluation.measure import SOURCE
-from facerf_cli.evaluation.people import Bench, Reading
+from facerf_cli.evaluation.people import Bench
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.main import main
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
+from facerf_cli.relighting.models import Sides
 from tests.capture.yale_fixture import write_pgm, write_yale_b
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
@@ -24,8 +24,7 @@ FEW = (Flash(0, 0), Flash(-25, 0), Flash(35, 40), Flash(-110, 15))
 
 
 def bench(*methods: Any) -> Bench:
-    reading = Reading(SHIPPED_NETWORKS.people, Sides(256, 512), "landmarks")
-    return Bench(methods[0].models, reading, methods)
+    return Bench(methods[0].models, Sides(256, 512), "landmarks", methods=methods)
 
 
 @pytest.fixture

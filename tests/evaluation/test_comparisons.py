@@ -34,7 +34,7 @@ from facerf_cli.evaluation.comparisons import (
 )
 from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import FaceOptions
-from facerf_cli.evaluation.people import Bench, DatasetPerson, Reading
+from facerf_cli.evaluation.people import Bench, DatasetPerson
 from facerf_cli.evaluation.selection import couples_of, evenly, olat_pairs
 from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
@@ -47,7 +47,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.raster.camera import pose_to_rotation
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides
+from facerf_cli.relighting.models import Sides
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.evaluation.method_doubles import BRIGHTEST, Double, FaceModelOnly, PersonOfAlbedo
 from tests.kinds import Folders, Log, Patch
@@ -69,8 +69,8 @@ def person_of(dataset: Dataset, geometry: Geometry | None = None) -> PersonOfAlb
     return PersonOfAlbedo(dataset, "0000", reading(geometry))
 
 
-def reading(geometry: Geometry | None = None, crop_px: int = 96) -> Reading:
-    return Reading(SHIPPED_NETWORKS.people, Sides(128, crop_px), geometry)
+def reading(geometry: Geometry | None = None, crop_px: int = 96) -> Bench:
+    return Bench(FACE_ONLY, Sides(128, crop_px), geometry)  # type: ignore[arg-type]
 
 
 def pair(index: int, source: str, target: str, light: int, envmap: str = "a") -> Pair:
@@ -92,8 +92,8 @@ def olats(person: DatasetPerson, pairs: list[Pair], methods: list[Double]) -> It
 
 
 def bench(person: DatasetPerson, *methods: Double) -> Bench:
-    assert person.reading is not None
-    return Bench(FACE_ONLY, person.reading, methods)  # type: ignore[arg-type]
+    assert person.bench is not None
+    return replace(person.bench, methods=methods)
 
 
 def side_light(person: DatasetPerson, camera: str) -> int:
@@ -318,7 +318,7 @@ def test_joint_fits_of_another_face_model_are_refused(person: DatasetPerson, dat
 def test_open_eyes_are_left_out_unless_they_are_kept(person: DatasetPerson) -> None:
     lit = person.lit("C0")
     view = lit.by(FACE_ONLY)
-    kept = replace(lit, reading=replace(lit.reading, keep_eyes=True), _views={}).by(FACE_ONLY)
+    kept = replace(lit, bench=replace(lit.bench, keep_eyes=True), _views={}).by(FACE_ONLY)
     eyes = view.region("eyes") > 0.9
     assert eyes.sum() > 10 and view.mask[eyes].max() < 0.11
     assert kept.mask[eyes].min() > 0.5 and (kept.mask >= view.mask).all()

@@ -85,12 +85,6 @@ def test_without_people_there_are_no_intervals_and_values_that_are_none_are_coun
     assert summarise(LAYOUT, rows()).layout == LAYOUT
 
 
-def test_tables_say_which_angle_a_turn_is() -> None:
-    facts = {"turn": "none", "angle": "0 to 30 deg", "turn_deg": 0.2}
-    summary = summarise(Layout("Toy"), [replace(row, facts=facts) for row in rows()])
-    assert summary.layout.notes == ("turn: the angle between the poses of the head in source and target.",)
-
-
 def test_text_breaks_the_tables_down_and_numbers_do_not() -> None:
     summary = summarise(Layout("Toy", ("si_mse",), ("pose", "not there")), rows())
     assert [(group.fact, group.value) for group in summary.groups] == [

@@ -17,7 +17,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people, yale_b
 from facerf_cli.evaluation.measure import measure
 from facerf_cli.evaluation.options import Measures
-from facerf_cli.evaluation.people import Bench, Method, Reading
+from facerf_cli.evaluation.people import Bench, Method
 from facerf_cli.evaluation.yale_b import (
     Relighting,
     YaleSubject,
@@ -31,14 +31,14 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.heads import fit_photo, head_of
-from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
+from facerf_cli.relighting.models import Sides, load_models
 from facerf_cli.relighting.reflectance import reflectance_of
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
 
 BENCH = SHARED / "bench" / "yale_b"
-READING = Reading(SHIPPED_NETWORKS.people, Sides(256, 512), "landmarks")
+SIDES = Sides(256, 512)
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +97,13 @@ def test_images_are_the_benchmarks(databases: tuple[YaleB, Any], subject: str) -
 
 
 def test_scores_are_the_benchmarks(
-    databases: tuple[YaleB, Any], reference: tuple[ModuleType, ModuleType], monkeypatch: pytest.MonkeyPatch
+    databases: tuple[YaleB, Any], reference: tuple[ModuleType, ModuleType]
 ) -> None:
-    bright: Any = SimpleNamespace(reading=READING, heads=lambda photo, face: [(TooBright(), face)])
-    monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
+    bright: Any = SimpleNamespace(
+        geometry="landmarks",
+        find=lambda image, name: someone(),
+        heads=lambda photo, face: [(TooBright(), face)],
+    )
     comparisons = list(compare_subject(databases[0], "yaleB05", bright))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
@@ -140,7 +143,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
     models: Any = FaceModelOnly(load_face_model("builtin"))
     methods: Any = [Lambert("a", models=models), Lambert("b", models=models)]
-    comparisons = list(compare_subject(small, "yaleB07", Bench(models, READING, methods)))
+    comparisons = list(compare_subject(small, "yaleB07", Bench(models, SIDES, "landmarks", methods=methods)))
     columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
     assert columns == {"frontal": 6, "soft": 2, "environment": 1} and fits["fitted"] == 2  # one a source
     for comparison in comparisons:
@@ -155,7 +158,9 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
     one = Relighting("frontal", "frontal", "A-070E+00")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (in_room,) = compare_subject(small, "yaleB07", Bench(models, READING, methods[:1]), room=0.5)
+    (in_room,) = compare_subject(
+        small, "yaleB07", Bench(models, SIDES, "landmarks", methods=methods[:1]), room=0.5
+    )
     lighter = in_room.predictions["a"][110, 84]
     np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
@@ -164,7 +169,7 @@ def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
     with pytest.raises(InputError, match=r"yaleB07: no undamaged image under A\+000E\+00"):
-        list(compare_subject(read_yale_b(folder), "yaleB07", Bench(load_models(), READING)))
+        list(compare_subject(read_yale_b(folder), "yaleB07", Bench(load_models(), SIDES, "landmarks")))
 
 
 def test_environments_come_from_their_side(small: YaleB) -> None:
@@ -188,7 +193,7 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
     one = Relighting("environment", "win_left", "env_two_side")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
     method = Method("a", "diffuse-sh", models, network_alone=False)
-    (comparison,) = compare_subject(small, "yaleB07", Bench(models, READING, [method]))
+    (comparison,) = compare_subject(small, "yaleB07", Bench(models, SIDES, "landmarks", methods=[method]))
     weights = torch.from_numpy(subject.weights(one.light)).float()[:, None].expand(-1, 3)
     expected = person.image(RigLight(directions, weights)).pixels.mean(-1).clip(0)
     np.testing.assert_allclose(comparison.predictions["a"][..., 1], expected, rtol=1e-4, atol=1e-5)
