@@ -1,6 +1,6 @@
 """Confidence in a person of a photo: facts that cost little to measure, and words for them.
 
-Facts of the face need its view and the photo; those of the matte need what each network saw. A fact becomes a
+Facts of the face need its view and the photo; that of the matte needs what each network saw. A fact becomes a
 factor in 0..1 by its scale in `SCALES`; the product of the factors is the score.
 """
 
@@ -10,12 +10,11 @@ from itertools import combinations
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 
 from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.portrait.parse import SquareView, covering
-from facerf_cli.portrait.people import HeadPlace, PersonShares
+from facerf_cli.portrait.people import HeadPlace
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
 Word = Literal["sure", "unsure", "doubtful"]
@@ -25,7 +24,6 @@ _LOSES = 0.9  # a factor below it is named as a reason
 _GRID = 64  # samples along a side of the square around a face
 _ON_LINE = 1e-12  # of what is rounded, in sides of the square squared
 _WHITE = 0.95  # of the brightest value of a photo, from which on a channel is clipped
-_AROUND_PX = (2, 6)  # of a small image: how far from a person its neighbours are looked for
 _NEAR = 1.5  # heights of the head from its middle, where all networks know a person well
 
 
@@ -44,31 +42,25 @@ class Scale:
 
 # Set on the scenes of SETTING in benchmarks/confidence.py, which says how often the words are right.
 SCALES = {
-    # Landmarks: presence of a head to the Parsing Network; median of their expected errors, in extents;
-    # distance of the mesh from that of the mirrored photo, in extents: .007 to .012 where all is well.
-    "faint": Scale(0.3, 0.95, "perhaps no face"),
+    # Landmarks: median of their expected errors, in extents; distance of the mesh from that of the mirrored
+    # photo, in extents: .007 to .012 where all is well.
     "unclear": Scale(0.05, 0.018, "unclear features"),
     "unsteady": Scale(0.04, 0.018, "unsure features"),
-    # Extent of the face in pixels; its sharpness (`sharpness_of`); eyes' distance over the extent; turn of
-    # the fitted head in degrees, of which 45 are supported.
+    # Extent of the face in pixels; its sharpness (`sharpness_of`); distance of the eyes' outer corners over
+    # the extent, which is .45 at 45 degrees of yaw, of which more is not supported, and .25 at 67.
     "small": Scale(20.0, 44.0),
     "blurred": Scale(0.1, 0.18),
-    "profile": Scale(0.15, 0.4),
-    "turned": Scale(75.0, 45.0, "turned away"),
+    "turned": Scale(0.25, 0.45, "turned away"),
     # Share of the face that something covers, that lies beyond the frame, that is clipped in two channels;
     # number of its levels of green.
     "covered": Scale(0.4, 0.1),
     "cropped": Scale(0.5, 0.2),
     "overexposed": Scale(1.0, 0.6),
     "dark": Scale(4.0, 14.0),
-    # Matte: overlap of what the networks see of a person around the head; share of the outline behind which
-    # another person begins; share of the person that is not joined to the face.
+    # Matte: overlap of what the networks see of a person around the head. Given matte: share of the face that
+    # it shows.
     "disputed": Scale(0.8, 0.9, "unclear outline"),
-    "crowded": Scale(0.6, 0.25, "others close by"),
-    "severed": Scale(0.5, 0.2, "parts apart from the face"),
-    # Given matte: share of the face that it shows; gain of its overlap if it were inverted or turned.
     "masked": Scale(0.2, 0.7, "the matte covers the face"),
-    "misplaced": Scale(0.12, 0.03, "the matte fits another place"),
 }
 
 
@@ -105,12 +97,11 @@ def face_facts(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     left, right = view.landmarks_px[list(OUTER_EYE_CORNERS)]
     extent_px = max(view.extent_px, 1e-6)
     return {
-        "faint": view.presence,
         "unclear": view.relative_error,
         "unsteady": view.unsteadiness,
         "small": extent_px,
         "blurred": view.sharpness,
-        "profile": float(np.linalg.norm(right - left)) / extent_px,
+        "turned": float(np.linalg.norm(right - left)) / extent_px,
         **_facts_of_pixels(view, photo),
     }
 
@@ -146,33 +137,14 @@ def _facts_of_pixels(view: SquareView, photo: np.ndarray) -> dict[str, float]:
 
 
 def matte_facts(
-    shares: PersonShares, parsed: np.ndarray, matte: np.ndarray, head: HeadPlace
+    anybody: np.ndarray, parsed: np.ndarray, matte: np.ndarray, head: HeadPlace
 ) -> dict[str, float]:
-    """Measure a matte [h, w] against what was seen: `parsed` [h, w] is the Parsing Network's share."""
-    person = matte > 0.5
+    """Measure a matte [h, w] against the shares [h, w] of people that the person and Parsing Networks see."""
     near = head.distance(matte.shape) < _NEAR
-    lost = (shares.person > 0.5) & ~person
-    next_to, beyond = (binary_dilation(person, iterations=reach) for reach in _AROUND_PX)
-    around = beyond & ~next_to
-    pairs = combinations((shares.anybody[near], parsed[near], matte[near]), 2)
-    return {
-        "disputed": min(overlap(*pair) for pair in pairs),
-        "crowded": float((shares.anybody[around] > 0.5).sum() / max(around.sum(), 1)),
-        "severed": float(lost.sum() / max(person.sum(), 1)),
-    }
+    pairs = combinations((anybody[near], parsed[near], matte[near]), 2)
+    return {"disputed": min(overlap(*pair) for pair in pairs)}
 
 
 def overlap(one: np.ndarray, other: np.ndarray) -> float:
     """Divide what two shares [...] have in common by what either has."""
     return float(np.minimum(one, other).sum() / max(float(np.maximum(one, other).sum()), 1e-6))
-
-
-def touched_sides(matte: np.ndarray) -> dict[str, list[float]]:
-    """The sides of the frame that the person of a matte [H, W] touches: from where to where, in sides."""
-    sides = {"left": matte[:, 0], "top": matte[0], "right": matte[:, -1], "bottom": matte[-1]}
-    found = {}
-    for name, values in sides.items():
-        at = np.flatnonzero(values > 0.5)
-        if len(at):
-            found[name] = [round(float(end) / len(values), 3) for end in (at[0], at[-1] + 1)]
-    return found

@@ -104,4 +104,4 @@ def given_matte_facts(view: SquareView, matte: np.ndarray) -> dict[str, float]:
         raise InputError(
             "the matte leaves out the face; use one that is white on this person, or choose another by --face"
         )
-    return {"masked": shown, "misplaced": best - fits}
+    return {"masked": shown}

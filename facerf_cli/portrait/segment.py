@@ -111,7 +111,7 @@ def segment(
     found = segmentation_of(classes, image_srgb, landmarks_px)
     places = _places((small.shape[1], small.shape[2]), found.matte.shape).astype(int)
     small_matte = found.matte[places[..., 1], places[..., 0]]
-    return replace(found, facts=matte_facts(shares, 1 - classes[0].numpy(), small_matte, head))
+    return replace(found, facts=matte_facts(shares.anybody, 1 - classes[0].numpy(), small_matte, head))
 
 
 def seen_classes(

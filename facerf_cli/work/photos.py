@@ -15,8 +15,7 @@ import torch
 from facerf_cli.batch.inputs import Item, companions
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import from_landmarks
-from facerf_cli.face.fit import FaceFit, fit_landmarks, trust_inside
+from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
@@ -26,12 +25,7 @@ from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
 from facerf_cli.network.files import read_metadata, serving_files
 from facerf_cli.person import find_faces
-from facerf_cli.portrait.confidence import (
-    SCALES,
-    confidence_of,
-    face_facts,
-    touched_sides,
-)
+from facerf_cli.portrait.confidence import SCALES, confidence_of, face_facts
 from facerf_cli.portrait.find import Face, face_with
 from facerf_cli.portrait.given import given_matte_facts
 from facerf_cli.portrait.given_normals import unit_normals
@@ -75,29 +69,25 @@ class PhotoFace:
     name: str
     found: Face
     facts: dict[str, float] = field(default_factory=dict)
-    touches: dict[str, list[float]] = field(default_factory=dict)
     number: int = 0  # from the left
 
     def see(self, segmentation: Segmentation) -> None:
-        """Add the facts of its person's matte, and where that touches the frame."""
+        """Add the facts of its person's matte."""
         if self.facts:
             self.facts.update(segmentation.facts)
-            self.touches.update(touched_sides(segmentation.matte))
 
     def rated(self, quiet: bool = False) -> dict[str, Any]:
         """Rate the face for the report, and unless `quiet` in a line."""
         if not self.facts:
             return {}
         confidence = confidence_of(self.facts)
-        touches = [f"touches the frame: {', '.join(self.touches)}"] if self.touches else []
-        why = ", ".join([*(SCALES[name].said or name for name in confidence.reasons), *touches])
+        why = ", ".join(SCALES[name].said or name for name in confidence.reasons)
         if not quiet:
             log.info(
                 "%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else ""
             )
         factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
-        rated = {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
-        return rated | ({"touches_frame": self.touches} if self.touches else {})
+        return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,19 +244,17 @@ def find_people(
 def facts_of_face(
     item: Item, face: Face, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
 ) -> dict[str, float]:
-    """Measure a face in a photo [H, W, 3], its turn by the face model, and its matte [H, W] if that is given.
+    """Measure a face in a photo [H, W, 3], and its matte [H, W] if that is given.
 
     Raises InputError for a matte that does not show it.
     """
     if (view := face.view) is None:
         return {}
-    crop = from_landmarks(view.landmarks_px[:68], load_models_once(options).sides().crop_px)
-    in_crop = crop.to_crop(view.landmarks_px[:68])
-    trust = trust_inside(in_crop, crop, *photo.shape[:2])
-    fit = fit_landmarks(face_model(options), in_crop, crop, trust=trust)
-    facts = face_facts(view, photo) | {"turned": abs(rotation_to_pose(fit.rotation)[0])}
+    facts = face_facts(view, photo)
+    if matte is None:
+        return facts
     with naming(matte_path(item, options)):
-        return facts if matte is None else facts | given_matte_facts(view, matte)
+        return facts | given_matte_facts(view, matte)
 
 
 def fit_facts(fit: FaceFit) -> dict[str, Any]:

@@ -19,20 +19,15 @@ def places() -> tuple[torch.Tensor, torch.Tensor]:
     return x, y
 
 
-def seen_of(square: Square, regions: dict[str, torch.Tensor], presence: float = 1.0) -> SquareView:
+def seen_of(square: Square, regions: dict[str, torch.Tensor]) -> SquareView:
     """A view that gives each region [S, S] bool its class, later ones over earlier, on background."""
     label = torch.zeros(SIDE, SIDE, dtype=torch.long)
     for name, inside in regions.items():
         label[inside] = class_index(name)
     classes = torch.nn.functional.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
     landmarks = square.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (LANDMARKS, 2)))
-    return SquareView(
-        square,
-        classes.clamp_min(1e-30).log()[None],
-        landmarks,
-        np.full(LANDMARKS, 0.01 * square.side_px),
-        presence,
-    )
+    error_px = np.full(LANDMARKS, 0.01 * square.side_px)
+    return SquareView(square, classes.clamp_min(1e-30).log()[None], landmarks, error_px, presence=1.0)
 
 
 class _White(torch.nn.Module):

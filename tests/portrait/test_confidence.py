@@ -13,17 +13,16 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import LANDMARKS_M
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.portrait.confidence import (
-    SCALES,
     Confidence,
     confidence_of,
     face_facts,
     in_hull,
     matte_facts,
-    touched_sides,
 )
 from facerf_cli.portrait.find import detect_faces
 from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
-from facerf_cli.portrait.people import HeadPlace, PersonShares
+from facerf_cli.portrait.people import HeadPlace
+from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of
 
@@ -34,18 +33,14 @@ PHOTO = np.random.default_rng(0).uniform(0, 1, (SIDE_PX, SIDE_PX + 50, 3)).astyp
 
 
 def view_of_face(
-    size_px: float = 200.0,
-    error: float = 0.01,
-    turned: float = 1.0,
-    covered: bool = False,
-    presence: float = 1.0,
+    size_px: float = 200.0, error: float = 0.01, yaw_deg: float = 0.0, covered: bool = False
 ) -> SquareView:
-    """A view of a face seen well, but for what a test changes; `turned` narrows it."""
+    """A view of a face seen well, but for what a test changes."""
     everywhere = torch.ones_like(places()[0], dtype=torch.bool)
     middle_px = np.array([SIDE_PX / 2, SIDE_PX / 2])
     square = Square(*middle_px, 1.7 * size_px)
-    seen = seen_of(square, {"hand" if covered else "skin": everywhere}, presence)
-    flat = LANDMARKS_M[:, :2] * [turned, -1]
+    seen = seen_of(square, {"hand" if covered else "skin": everywhere})
+    flat = (LANDMARKS_M @ pose_to_rotation(yaw_deg, 0, 0).numpy().T)[:, :2] * [1, -1]
     points = np.zeros((LANDMARKS, 2))
     points[:68] = size_px * (flat - flat.mean(0)) / np.ptp(flat, axis=0).max() + middle_px
     return replace(seen, landmarks_px=points, error_px=np.full(LANDMARKS, error * size_px))
@@ -54,12 +49,12 @@ def view_of_face(
 def test_a_good_face_is_sure_and_one_turned_too_far_doubtful() -> None:
     confidence = confidence_of(face_facts(view_of_face(), PHOTO))
     assert confidence.word == "sure" and confidence.score > 0.9 and not confidence.reasons
-    assert SCALES["turned"].factor(45) == 1
-    assert confidence_of({"turned": 72.0}).word == "doubtful"
+    words = [confidence_of(face_facts(view_of_face(yaw_deg=yaw), PHOTO)).word for yaw in (45, -57, 72)]
+    assert words == ["sure", "unsure", "doubtful"]
     words = [Confidence({"small": value}).word for value in (0.9, 0.5, 0.2)]
     assert words == ["sure", "unsure", "doubtful"]
-    both = Confidence({"small": 0.5, "profile": 0.4, "dark": 1.0})
-    assert both.score == pytest.approx(0.2) and both.reasons == ["profile", "small"]
+    both = Confidence({"small": 0.5, "turned": 0.4, "dark": 1.0})
+    assert both.score == pytest.approx(0.2) and both.reasons == ["turned", "small"]
     photo = 0.5 + PHOTO
     photo[:20] = 100  # a window
     assert face_facts(view_of_face(), photo)["overexposed"] == 0
@@ -70,8 +65,7 @@ def test_a_good_face_is_sure_and_one_turned_too_far_doubtful() -> None:
     [
         ("small", view_of_face(size_px=24)),
         ("unclear", view_of_face(error=0.05)),
-        ("faint", view_of_face(presence=0.3)),
-        ("profile", view_of_face(turned=0.2)),
+        ("turned", view_of_face(yaw_deg=80)),
         ("covered", view_of_face(covered=True)),
         ("blurred", replace(view_of_face(), sharpness=0.11)),
         ("unsteady", replace(view_of_face(), unsteadiness=0.08)),
@@ -101,24 +95,16 @@ def disc(x: float, y: float, radius: float) -> np.ndarray:
     return (np.hypot(right - x, down - y) < radius).astype(np.float32)
 
 
-def test_what_spoils_a_matte_is_measured_and_the_frame_touched_where_the_person_ends() -> None:
-    person = disc(100, 70, 40)
-    assert matte_facts(PersonShares(person, person), person, person, HEAD) == {
-        "disputed": 1,
-        "crowded": 0,
-        "severed": 0,
-    }
-    person, other, arm = disc(100, 70, 40), disc(160, 70, 35), disc(20, 100, 15)
-    crowded = matte_facts(PersonShares(person, np.maximum(person, other)), person, person, HEAD)
-    assert crowded["crowded"] > 0.15 and crowded["disputed"] < 0.9
-    disputed = matte_facts(PersonShares(person, person), disc(100, 70, 25), person, HEAD)
-    assert disputed["disputed"] < 0.5
-    severed = matte_facts(PersonShares(person + arm, person + arm), person, person, HEAD)
-    assert severed["severed"] == pytest.approx(arm.sum() / person.sum())
-    person = np.zeros((50, 80))
-    person[20:, 30:60] = 1
-    person[40:, :60] = 1
-    assert touched_sides(person) == {"left": [0.8, 1.0], "bottom": [0.0, 0.75]}
+def test_a_matte_is_disputed_where_a_network_sees_another_person_or_less_of_this_one() -> None:
+    person, small = disc(100, 70, 40), disc(100, 70, 25)
+    assert matte_facts(person, person, person, HEAD) == {"disputed": 1}
+    others = np.maximum(person, disc(160, 70, 35))
+    assert matte_facts(others, person, person, HEAD)["disputed"] < 0.9
+    far = np.maximum(person, disc(210, 140, 8))
+    assert matte_facts(far, person, person, HEAD) == {"disputed": 1}
+    share = pytest.approx(small.sum() / person.sum())
+    assert matte_facts(person, small, person, HEAD) == {"disputed": share}
+    assert matte_facts(person, person, small, HEAD) == {"disputed": share}
 
 
 def facts_in(photo_srgb: np.ndarray) -> dict[str, float]:
