@@ -6,7 +6,7 @@
 set -euo pipefail
 archive=$1 run=$2 time=${3:-2h}
 mkdir -p "$run"
-[ -f "$run/ict.npz" ] || facerf face-model import ict-facekit "$archive" -o "$run/ict.npz"
+[ -f "$run/ict.npz" ] || facerf face-model import "$archive" -o "$run/ict.npz"
 heads=(--heads-from "$run/ict.npz" --heads 400 --bank "$run/bank")
 facerf train -o "$run/reflectance" --resume "${heads[@]}" --max-time "$time"
 facerf train -o "$run/both" --resume --stage geometry "${heads[@]}" --batch 24 --max-time 20m \

@@ -10,7 +10,7 @@ archive=$1 run=$2 first=${3:-120m} second=${4:-180m}
 export OMP_NUM_THREADS=2
 export MALLOC_MMAP_THRESHOLD_=1073741824 MALLOC_TRIM_THRESHOLD_=4294967296  # else much of the time is the kernel's
 mkdir -p "$run"
-[ -f "$run/ict.npz" ] || facerf face-model import ict-facekit "$archive" -o "$run/ict.npz"
+[ -f "$run/ict.npz" ] || facerf face-model import "$archive" -o "$run/ict.npz"
 people=(--stage portrait --heads-from "builtin,$run/ict.npz" --heads "${PEOPLE:-340}" --bank "$run/bank" -j 2 --workers 1)
 facerf train "${people[@]}" --seed 16 --max-time "$first" --validate-every 250 --resume -o "$run/first"
 facerf train "${people[@]}" --seed 17 --max-time "$second" --validate-every 500 --resume -o "$run/portrait" \

@@ -77,7 +77,7 @@ def ict_source(shared_data: Path) -> SourceModel:
                 raw[Path(member.name).stem] = tar.extractfile(member).read()
                 if len(raw) == len(wanted):
                     break
-    return ict_source_of(archive, raw)
+    return ict_source_of(raw)
 
 
 @pytest.fixture(scope="session")

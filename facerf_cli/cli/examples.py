@@ -64,9 +64,9 @@ facerf evaluate cases dataset/ --split all --every 10 -o cases/
 facerf evaluate compare cases/ --reflectance field --method theirs=renders/ -o report/
 facerf evaluate compare cases/ --against mine.safetensors --form my_lab.networks:Net -o report/
 facerf evaluate compare truth/ --method mine/ --method theirs/ --masks masks/ -o report/
-facerf face-model import ict-facekit ICT-FaceKit.zip -o ict.npz
-facerf face-model import flame flame.pkl --landmarks embedding.npy -o flame.npz
-facerf face-model import basel-2019 model2019_bfm.h5 -o basel.npz
+facerf face-model import ICT-FaceKit.zip -o ict.npz
+facerf face-model import flame.pkl --landmarks embedding.npy -o flame.npz
+facerf face-model import model2019_bfm.h5 -o basel.npz
 """
 
 

@@ -2,7 +2,7 @@
 
 import logging
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -14,8 +14,6 @@ from facerf_cli.run.logs import LOGGER_NAME
 log = logging.getLogger(LOGGER_NAME)
 app = typer.Typer(cls=Verbs, add_completion=False, help="Import morphable face models.")
 
-Kind = Literal["ict-facekit", "flame", "basel-2009", "basel-2017", "basel-2019"]
-
 
 @app.callback()
 def _group() -> None:
@@ -24,15 +22,12 @@ def _group() -> None:
 
 @app.command("import")
 def import_model(
-    kind: Annotated[
-        Kind, typer.Argument(metavar="KIND", help="ict-facekit, flame, basel-2009, basel-2017 or basel-2019.")
-    ],
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="PATH",
-            help="Model as published: ICT-FaceKit's folder, .zip or .tar; FLAME's .pkl or .npz; Basel's "
-            "01_MorphableModel.mat (2009) or .h5 (2017, 2019).",
+            metavar="FILE",
+            help="Model as published: ICT-FaceKit's folder, .zip or .tar; FLAME's .pkl or .npz; Basel's .mat "
+            "(2009) or .h5 (2017, 2019).",
         ),
     ],
     output: Annotated[
@@ -46,9 +41,8 @@ def import_model(
         typer.Option(
             "--landmarks",
             metavar="FILE",
-            help="Positions of the 68 landmarks: FLAME's landmark embedding (.npy, .npz, .pkl), or a .txt of "
-            "68 vertex numbers from 0.",
-            show_default="published landmarks, the others by the shape of the face",
+            help="FLAME's landmark embedding (.npy, .npz or .pkl).",
+            show_default="landmark_embedding.npy beside the model",
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
@@ -67,7 +61,7 @@ def import_model(
     from facerf_cli.face.morphable import save_face_model
     from facerf_cli.files.atomic import atomic_path
 
-    model = import_face_model(kind, source, landmarks)
+    model = import_face_model(source, landmarks)
     with atomic_path(output) as temporary:
         save_face_model(temporary, model)
     log.info(

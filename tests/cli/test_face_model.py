@@ -22,7 +22,7 @@ def imported(monkeypatch: Patch) -> MorphableModel:
 def test_an_imported_model_can_be_loaded_and_replaces_nothing_unasked(
     imported: MorphableModel, tmp_path: Path, capsys: Said
 ) -> None:
-    line, target = ["face-model", "import", "ict-facekit", "anything", "-o"], tmp_path / "new" / "model.npz"
+    line, target = ["face-model", "import", "anything", "-o"], tmp_path / "new" / "model.npz"
     assert main([*line, str(target)]) == 0
     out, err = capsys.readouterr()
     assert out == f"{target}\n" and imported.licence in err

@@ -73,7 +73,7 @@ def test_a_file_that_is_read_is_no_output(
         ("relight me.png --light 60,30 --person mattes -o mattes --name {stem}", "mattes/me.png"),
         ("relight me.png --light-from other.png -o . --name other", "other.png"),
         ("segment me.png mattes/me_person.png -o mattes", "mattes/me_person.png"),
-        ("face-model import flame model.npz -o model.npz --overwrite", "model.npz"),
+        ("face-model import model.npz -o model.npz --overwrite", "model.npz"),
     ],
 )
 def test_an_output_in_a_folder_is_no_input(folder: Path, line: str, planned: str, capsys: Said) -> None:

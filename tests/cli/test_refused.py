@@ -205,10 +205,9 @@ WRONG: dict[str, dict[str, str]] = {
         },
     },
     "face-model": {
-        "import ict-facekit nowhere -o m.zip": "ends in .npz",
-        "import basel nowhere -o m.npz": "basel",
-        "import ict-facekit nowhere": "--output",
-        "import": "KIND",
+        "import nowhere -o m.zip": "ends in .npz",
+        "import nowhere": "--output",
+        "import": "FILE",
         "": "Missing command",
     },
     "evaluate": {
@@ -261,10 +260,10 @@ FAILING: dict[str, dict[str, str]] = {
         "--dataset one": "one/dataset.json: no such file",
     },
     "face-model": {
-        "import ict-facekit nowhere -o m.npz": "nowhere: no such file; give the ICT-FaceKit",
-        "import flame nowhere.pkl -o m.npz": "nowhere.pkl: no such file; give FLAME's .pkl",
-        "import basel-2009 nowhere.mat -o m.npz": "01_MorphableModel.mat",
-        "import basel-2009 a.mat -o m.npz --landmarks a.npy": "a .txt of 68 vertex",
+        "import nowhere -o m.npz": "nowhere: no such file; give ICT-FaceKit",
+        "import nowhere.pkl -o m.npz": "nowhere.pkl: no such file; give FLAME's .pkl",
+        "import nowhere.mat -o m.npz": "01_MorphableModel.mat",
+        "import a.mat -o m.npz --landmarks a.npy": "a.npy: --landmarks is for FLAME",
     },
     "evaluate": {
         "reconstruction a.jpg --facts who.csv": "astronot is no photo of this run; give names such as a",

@@ -1,7 +1,4 @@
-"""ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020).
-
-It is read from `FaceXModel/*.obj` in a folder, a .zip or a .tar.
-"""
+"""ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020)."""
 
 import re
 import tarfile
@@ -11,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from facerf_cli.errors import InputError
-from facerf_cli.face.importers.source import SourceModel
+from facerf_cli.face.importers.source import SourceModel, refusal
 from facerf_cli.face.morphable import EXPRESSION_STD
-from facerf_cli.run.logs import one_line
+from facerf_cli.files.texts import require_regular
 
 _IDS = (
     "1225 1888 1052 367 1719 1722 2199 1447 966 3661 4390 3927 3924 2608 3272 4088 3443 "
@@ -23,37 +19,30 @@ _IDS = (
     "0 4275 6200 6213 6346 6461 5518 5957 5841 5702 5711 5533 6216 6207 6470 5517 5966"
 )
 LANDMARK_IDS = np.array(_IDS.split(), dtype=np.int64)  # from its README
-VERTICES = 26719
-_SKIN = (slice(0, 11248), slice(21451, 24591))  # face, head and neck; eyeballs
+VERTICES, _NEUTRAL = 26719, "generic_neutral_mesh"
+_SKIN = np.r_[0:11248, 21451:24591]  # face, head and neck; eyeballs
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
 _MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
 
 
 def read_ict_facekit(path: Path) -> SourceModel:
     """Read ICT-FaceKit's folder, .zip or .tar; raises InputError for anything else."""
-    return ict_source(path, dict(_objs(path)))
+    with refusal(path, "ICT-FaceKit"):
+        return ict_source(dict(_objs(path)))
 
 
-def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
+def ict_source(raw: dict[str, bytes]) -> SourceModel:
     """The model of the .obj files' contents by stem; their centimetres become metres."""
-    neutral = raw.pop("generic_neutral_mesh", None)
-    if neutral is None:
-        raise InputError(
-            f"{path}: no FaceXModel/generic_neutral_mesh.obj; give ICT-FaceKit's folder or archive"
-        )
-    mean = _obj_vertices(path, "generic_neutral_mesh", neutral)
     identities = sorted(stem for stem in raw if re.fullmatch(r"identity\d+", stem))
-    expressions = sorted(set(raw) - set(identities))
-    if not identities or not expressions:
-        raise InputError(f"{path}: identity or expression shapes are missing; download ICT-FaceKit again")
+    expressions = sorted(raw.keys() - {*identities, _NEUTRAL})
+    if _NEUTRAL not in raw or not identities or not expressions:
+        raise ValueError("it lacks files of FaceXModel: the neutral mesh, identities or expressions")
+    mean = _vertices(_NEUTRAL, raw[_NEUTRAL])
 
     def offsets(stems: list[str]) -> np.ndarray:
-        return np.stack([_obj_vertices(path, stem, raw[stem]) - mean for stem in stems])
+        return np.stack([_vertices(stem, raw[stem]) - mean for stem in stems])
 
-    triangles = _obj_triangles(path, neutral)
-    outer = np.zeros(VERTICES, bool)
-    for part in _SKIN:
-        outer[part] = True
+    triangles = _triangles(raw[_NEUTRAL])
     return SourceModel(
         name="ict-facekit",
         licence=_LICENCE,
@@ -61,56 +50,40 @@ def ict_source(path: Path, raw: dict[str, bytes]) -> SourceModel:
         identity=offsets(identities),
         expression=offsets(expressions) * EXPRESSION_STD,
         expression_names=tuple(expressions),
-        triangles=triangles[outer[triangles].all(1)],
+        triangles=triangles[np.isin(triangles, _SKIN).all(1)],
         known=dict(enumerate(mean[LANDMARK_IDS])),
     )
 
 
-def _obj_vertices(path: Path, stem: str, text: bytes) -> np.ndarray:
+def _vertices(stem: str, text: bytes) -> np.ndarray:
     """The vertices [N, 3] of an .obj in metres."""
     lines = [line[2:] for line in text.splitlines() if line.startswith(b"v ")]
-    try:
-        vertices_cm = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), -1)[:, :3]
-    except ValueError:
-        raise InputError(f"{path}: {stem}.obj is damaged; download ICT-FaceKit again") from None
+    vertices_cm = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), -1)[:, :3]
     if vertices_cm.shape != (VERTICES, 3) or not np.isfinite(vertices_cm).all():
-        raise InputError(
-            f"{path}: {stem}.obj has {len(lines)} vertices, not {VERTICES}; download ICT-FaceKit again"
-        )
+        raise ValueError(f"{stem}.obj has {len(lines)} vertices, not {VERTICES}, or some are not finite")
     return vertices_cm / 100
 
 
-def _obj_triangles(path: Path, text: bytes) -> np.ndarray:
+def _triangles(text: bytes) -> np.ndarray:
     """The triangles [F, 3] of the neutral mesh's polygons."""
     triangles = []
-    try:
-        for line in text.splitlines():
-            if line.startswith(b"f "):
-                corners = [int(token.split(b"/")[0]) - 1 for token in line.split()[1:]]
-                triangles += [(corners[0], *corners[k : k + 2]) for k in range(1, len(corners) - 1)]
-    except ValueError:
-        triangles = []
-    if not triangles or not 0 <= np.min(triangles) <= np.max(triangles) < VERTICES:
-        raise InputError(f"{path}: the neutral mesh's faces are damaged; download ICT-FaceKit again")
+    for line in text.splitlines():
+        if line.startswith(b"f "):
+            corners = [int(token.split(b"/")[0]) - 1 for token in line.split()[1:]]
+            triangles += [(corners[0], *corners[k : k + 2]) for k in range(1, len(corners) - 1)]
     return np.array(triangles)
 
 
 def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Iterate over the stems and contents of the .obj files; raises InputError for damaged or large ones."""
+    """Iterate over the stems and contents of the .obj files; raises ValueError for too large ones."""
     total = 0
-    try:
-        for name, read in _members(path):
-            if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
-                text = read(_MAX_OBJ_BYTES + 1)
-                total += len(text)
-                if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
-                    raise InputError(f"{path}: {name} is too large; download ICT-FaceKit again")
-                yield found[1], text
-    except InputError:
-        raise
-    except Exception as error:  # whatever damage makes a reader of archives raise
-        reason = one_line(str(error) or type(error).__name__)
-        raise InputError(f"{path}: cannot be read ({reason}); download ICT-FaceKit again") from None
+    for name, read in _members(path):
+        if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
+            text = read(_MAX_OBJ_BYTES + 1)
+            total += len(text)
+            if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
+                raise ValueError(f"{name} is too large")
+            yield found[1], text
 
 
 def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
@@ -124,12 +97,12 @@ def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
             for name in archive.namelist():
                 with archive.open(name) as member:
                     yield name, member.read
-    elif path.is_file() and tarfile.is_tarfile(path):
+    else:
+        require_regular(
+            path, "give ICT-FaceKit's folder, .zip or .tar, FLAME's .pkl or .npz, or Basel's .mat or .h5"
+        )
         # One pass: seeking in a compressed tar decompresses it again for each of its 150 files.
         with tarfile.open(path, "r|*") as tar:
             for entry in tar:
                 if entry.isfile() and (content := tar.extractfile(entry)):
                     yield entry.name, content.read
-    else:
-        wrong = "" if path.exists() else "no such file; "
-        raise InputError(f"{path}: {wrong}give the ICT-FaceKit folder, or its .zip or .tar archive")

@@ -11,11 +11,11 @@ import trimesh
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import binary_dilation, median_filter
 from scipy.sparse import csr_matrix
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.importers.basel import read_basel_2009, read_basel_2017
-from facerf_cli.face.importers.find_landmarks import landmarks_of, nearest_on_mesh, rigid_alignment
+from facerf_cli.face.importers.basel import read_basel
 from facerf_cli.face.importers.flame import read_flame
 from facerf_cli.face.importers.ict import read_ict_facekit
 from facerf_cli.face.importers.source import SourceModel
@@ -30,56 +30,34 @@ from facerf_cli.face.topology import (
     grid_uv,
     landmark_weights,
 )
-from facerf_cli.files.texts import read_bytes, text_of
-from facerf_cli.run.logs import one_line
 
-_MAX_LETTERS = 10_000  # of a list of vertex numbers
 _HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # a length outside these ranges is in another unit
 _SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
+_CANDIDATES = 12  # the nearest point is searched in this many triangles, those with the nearest centres
 _PULL_M = 0.005  # radius around a landmark in which the grid is pulled onto it
+_FEWEST_LANDMARKS = 12  # that place the grid
 _LEAST_COVERED = 0.75  # share of the grid that a model's surface must cover
 
 
-def import_face_model(kind: str, path: Path, landmarks: Path | None = None) -> MorphableModel:
-    """Import the model in `path`, of one of the kinds of `facerf face-model import`.
+def import_face_model(path: Path, landmarks: Path | None = None) -> MorphableModel:
+    """Import a published model: FLAME from .pkl or .npz, Basel from .mat or .h5, ICT-FaceKit otherwise.
 
-    `landmarks` is an embedding for FLAME, or for any kind a .txt of 68 vertex numbers from 0. Raises
-    InputError for files that cannot be imported.
+    `landmarks` is FLAME's landmark embedding. Raises InputError for files that cannot be imported.
     """
-    source = _read(kind, path, landmarks)
+    source = _read(path, landmarks)
     try:
         return resample_model(source)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _read(kind: str, path: Path, landmarks: Path | None) -> SourceModel:
-    listed = landmarks is not None and landmarks.suffix == ".txt"
-    if kind == "flame":
-        source = read_flame(path, None if listed else landmarks)
-    elif landmarks is not None and not listed:
-        raise InputError(f"{landmarks}: not for {kind}; give the landmarks as a .txt of 68 vertex numbers")
-    elif kind == "basel-2009":
-        source = read_basel_2009(path)
-    elif kind in ("basel-2017", "basel-2019"):
-        source = read_basel_2017(path, kind)
-    else:
-        source = read_ict_facekit(path)
-    if landmarks is not None and listed:
-        source.known.update(_listed(landmarks, source.mean))
-    return source
-
-
-def _listed(path: Path, mean: np.ndarray) -> dict[int, np.ndarray]:
-    """The landmarks on a mean [N, 3] by number, from a text file of 68 vertex numbers."""
-    advice = "give a .txt of 68 vertex numbers"
-    try:
-        numbers = [int(word) for word in text_of(read_bytes(path, _MAX_LETTERS, advice)).split()]
-    except ValueError as error:
-        raise InputError(f"{path}: cannot be read ({one_line(str(error))}); {advice}") from None
-    if len(numbers) != 68 or not 0 <= min(numbers) <= max(numbers) < len(mean):
-        raise InputError(f"{path}: holds {len(numbers)} numbers; give 68 from 0 to {len(mean) - 1}")
-    return dict(enumerate(mean[numbers]))
+def _read(path: Path, landmarks: Path | None) -> SourceModel:
+    suffix = path.suffix.lower()
+    if suffix in (".pkl", ".npz"):
+        return read_flame(path, landmarks)
+    if landmarks is not None:
+        raise InputError(f"{landmarks}: --landmarks is for FLAME, and {path} is not; remove it")
+    return read_basel(path) if suffix in (".mat", ".h5") else read_ict_facekit(path)
 
 
 def resample_model(source: SourceModel) -> MorphableModel:
@@ -87,16 +65,23 @@ def resample_model(source: SourceModel) -> MorphableModel:
 
     A model without expressions gets those of the built-in model, which has the same vertices. A surface that
     ends inside the grid, such as Basel's face12, continues as the built-in face and moves like its border.
-    Raises InputError for a mean in another unit or without a face.
+    Raises InputError for a mean in another unit, and for a model that names too few landmarks.
     """
     side_m = float(np.ptp(source.mean[np.unique(source.triangles)], 0).max())
     _require_size("its mean's largest side", side_m, _HEAD_M)
-    landmarks = landmarks_of(source)
-    eyes_m = float(np.linalg.norm(landmarks[OUTER_EYE_CORNERS[0]] - landmarks[OUTER_EYE_CORNERS[1]]))
+    known = source.known
+    if len(known) < _FEWEST_LANDMARKS or not known.keys() >= set(OUTER_EYE_CORNERS):
+        raise InputError(
+            f"it names {len(known)} of the landmarks, too few; give the file as it was published"
+        )
+    eyes_m = float(np.linalg.norm(known[OUTER_EYE_CORNERS[0]] - known[OUTER_EYE_CORNERS[1]]))
     _require_size("the distance of its eyes' outer corners", eyes_m, _EYES_M)
-    rotation, translation = rigid_alignment(landmarks, LANDMARKS_M)
+    numbers = sorted(known)
+    landmarks = np.stack([known[number] for number in numbers])
+    rotation, translation = rigid_alignment(landmarks, LANDMARKS_M[numbers])
     mean = source.mean @ rotation.T + translation
-    corners, weights, covered = register(mean, source.triangles, landmarks @ rotation.T + translation)
+    moved = landmarks @ rotation.T + translation
+    corners, weights, covered = register(mean, source.triangles, moved, numbers)
     rows = np.arange(0, corners.size + 1, 3)
     onto_grid = csr_matrix((weights.ravel(), corners.ravel(), rows), (len(corners), len(mean)))
     builtin, (border, weights_beyond) = load_face_model(), _beyond(covered)
@@ -138,18 +123,19 @@ def _beyond(covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def register(
-    mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray
+    mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray, numbers: list[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Place the canonical vertices on a mesh: vertex ids and barycentric weights [V, 3], and a mask [V].
 
-    A thin-plate spline of the landmarks' [68, 3] displacements from their canonical (u, v) warps the grid.
-    The mask is true where the mesh covers a vertex.
+    A thin-plate spline of the displacements of the landmarks [K, 3] of these numbers [K] from their canonical
+    (u, v) warps the grid. The mask is true where the mesh covers a vertex.
     """
-    warp = RBFInterpolator(LANDMARK_UV, cylinder_uv(landmarks) - LANDMARK_UV, kernel="thin_plate_spline")
+    canonical = LANDMARK_UV[numbers]
+    warp = RBFInterpolator(canonical, cylinder_uv(landmarks) - canonical, kernel="thin_plate_spline")
     uv = grid_uv().double().numpy()
     mesh = trimesh.Trimesh(mean, triangles, process=False)
     points, covered = _cast(mesh, *cylinder_rays(uv + warp(uv)))
-    points, faces = nearest_on_mesh(mesh, _pulled(points, landmarks))
+    points, faces = nearest_on_mesh(mesh, _pulled(points, landmarks, numbers))
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[faces], points)
     weights = np.clip(weights, 0, None)
     return triangles[faces], weights / weights.sum(-1, keepdims=True), covered
@@ -176,13 +162,33 @@ def _cast(
     return ends, np.isfinite(travelled)
 
 
-def _pulled(points: np.ndarray, landmarks: np.ndarray) -> np.ndarray:
-    """Move points [V, 3] near the landmarks so that the grid's landmarks lie on the model's [68, 3].
+def _pulled(points: np.ndarray, landmarks: np.ndarray, numbers: list[int]) -> np.ndarray:
+    """Move points [V, 3] near the landmarks so that the grid's landmarks lie on the model's [K, 3].
 
     Rays miss landmarks that are hidden from them, such as the inner corners of the mouth behind the lips.
     """
-    corners, weights = (tensor.numpy() for tensor in landmark_weights())
+    corners, weights = (tensor.numpy()[numbers] for tensor in landmark_weights())
     reached = (points[corners] * weights[..., None]).sum(1)
     kernel = np.exp(-((cdist(reached, reached) / _PULL_M) ** 2))
     strength = np.linalg.solve(kernel + 1e-3 * np.eye(len(reached)), landmarks - reached)
     return points + np.exp(-((cdist(points, reached) / _PULL_M) ** 2)) @ strength
+
+
+def nearest_on_mesh(mesh: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The points [N, 3] of a mesh nearest to `points` [N, 3], and their faces [N]."""
+    _, nearby = cKDTree(mesh.triangles_center).query(points, _CANDIDATES)
+    closest = np.stack(
+        [trimesh.triangles.closest_point(mesh.triangles[faces], points) for faces in nearby.T]
+    )  # [candidates, N, 3]
+    best = np.linalg.norm(closest - points, axis=-1).argmin(0)
+    rows = np.arange(len(points))
+    return closest[best, rows], nearby[rows, best]
+
+
+def rigid_alignment(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and translation [3] that bring points [N, 3] nearest to `onto` [N, 3] (Kabsch)."""
+    centre, target = points.mean(0), onto.mean(0)
+    u, _, vt = np.linalg.svd((points - centre).T @ (onto - target))
+    flip = np.diag([1, 1, np.sign(np.linalg.det(vt.T @ u.T))])
+    rotation = vt.T @ flip @ u.T
+    return rotation, target - rotation @ centre

@@ -1,10 +1,16 @@
-"""A face model in its publisher's topology."""
+"""A face model in its publisher's topology, and checks of the arrays in its file."""
 
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
-_MAX_VERTICES, _MAX_TRIANGLES = 120_000, 240_000
+from facerf_cli.errors import FacerfError, InputError
+from facerf_cli.run.logs import one_line
+
+_MAX_VERTICES, _MAX_TRIANGLES, _MAX_SHAPES = 120_000, 240_000, 500
 
 
 @dataclass(frozen=True)
@@ -12,7 +18,8 @@ class SourceModel:
     """A morphable model in its own topology: metres, y up, z out of the face; bases in standard deviations.
 
     mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface; known: the
-    points on the mean of those of the 68 landmarks that the publisher names, by number.
+    points on the mean of those of the 68 landmarks that the publisher names, by number. Raises ValueError for
+    arrays that do not fit each other or are too large.
     """
 
     name: str
@@ -24,14 +31,38 @@ class SourceModel:
     triangles: np.ndarray
     known: dict[int, np.ndarray] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        sizes = len(self.mean), len(self.triangles), len(self.identity), len(self.expression)
+        limits = _MAX_VERTICES, _MAX_TRIANGLES, _MAX_SHAPES, _MAX_SHAPES
+        if min(sizes[:3]) < 1 or any(size > limit for size, limit in zip(sizes, limits, strict=True)):
+            raise ValueError("it has {} vertices, {} triangles and {} + {} shapes".format(*sizes))
+        if not self.identity.shape[1:] == self.expression.shape[1:] == self.mean.shape:
+            raise ValueError(f"its shapes are not of the {len(self.mean)} vertices of its mean")
+        if self.triangles.min() < 0 or self.triangles.max() >= len(self.mean):
+            raise ValueError("its triangles name vertices that it does not have")
 
-def require_mesh(mean: np.ndarray, triangles: np.ndarray) -> None:
-    """Raise ValueError unless mean [N, 3] is finite and triangles [F, 3] name its vertices."""
-    if mean.ndim != 2 or mean.shape[1] != 3 or not 100 <= len(mean) <= _MAX_VERTICES:
-        raise ValueError(f"its mean has shape {list(mean.shape)}, not [N, 3]")
-    if not np.isfinite(mean).all():
-        raise ValueError("its mean holds values that are not finite")
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or not 1 <= len(triangles) <= _MAX_TRIANGLES:
-        raise ValueError(f"its triangles have shape {list(triangles.shape)}, not [F, 3]")
-    if triangles.min() < 0 or triangles.max() >= len(mean):
-        raise ValueError("its triangles name vertices that it does not have")
+
+@contextmanager
+def refusal(path: Path, published: str) -> Iterator[None]:
+    """Turn what a damaged file raises into an InputError in one line; `published` names the right file."""
+    try:
+        yield
+    except FacerfError:
+        raise
+    except Exception as error:  # whatever damage makes readers of archives and arrays raise
+        reason = one_line(str(error) or type(error).__name__)[:160]
+        raise InputError(f"{path}: not {published} ({reason}); download it again") from None
+
+
+def numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+    """An array of a file by name; raises ValueError where it is missing, of another shape, or not finite."""
+    if name not in arrays:
+        raise ValueError(f"it lacks {name}")
+    array = np.asarray(arrays[name])
+    expected = [size if wanted is None else wanted for size, wanted in zip(array.shape, shape, strict=False)]
+    if array.dtype.kind not in "fiu" or array.ndim != len(shape) or list(array.shape) != expected:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} is {array.dtype} of shape {list(array.shape)}, not numbers [{wanted}]")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds values that are not finite")
+    return array

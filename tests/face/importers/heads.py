@@ -10,7 +10,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.face.importers.find_landmarks import nearest_on_mesh, rigid_alignment
+from facerf_cli.face.importers.resample import nearest_on_mesh, rigid_alignment
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import LANDMARK_UV, grid_triangles, locate
 

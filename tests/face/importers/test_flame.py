@@ -16,12 +16,10 @@ from scipy import sparse
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.importers import flame
-from facerf_cli.face.importers.find_landmarks import landmarks_of, nearest_on_mesh, rigid_alignment
 from facerf_cli.face.importers.flame import read_flame
-from facerf_cli.face.importers.resample import import_face_model, resample_model
+from facerf_cli.face.importers.resample import import_face_model, nearest_on_mesh, resample_model
 from facerf_cli.face.importers.source import SourceModel
 from facerf_cli.face.morphable import load_face_model, save_face_model
-from facerf_cli.face.topology import LANDMARKS_M
 from tests.face.importers.heads import Head, arrays_here, head, off_mm
 from tests.files.pickled import chumpy, python_2, saved_object
 from tests.refusals import refused
@@ -73,6 +71,7 @@ def pkl(face: Head, tmp_path_factory: pytest.TempPathFactory) -> Path:
             for key, value in tables(face).items()
         }
         path.write_bytes(python_2(made))
+    beside(face, path.parent)
     return path
 
 
@@ -109,6 +108,13 @@ def deca(face: Head) -> bytes:
     )
 
 
+def beside(face: Head, folder: Path) -> Path:
+    """DECA's embedding in the folder of a model."""
+    path = folder / "landmark_embedding.npy"
+    path.write_bytes(deca(face))
+    return path
+
+
 def test_its_arrays_are_read_in_metres_and_deviations(source: SourceModel, face: Head) -> None:
     assert source.name == "flame" and "Max-Planck" in source.licence
     np.testing.assert_allclose(source.mean, face.mean)
@@ -137,14 +143,11 @@ def test_a_correction_goes_by_the_entries_of_the_jaw_s_turn(face: Head, tmp_path
     path = tmp_path / "flame.npz"
     np.savez(path, **{key: made[key] for key in ("v_template", "f", "posedirs", "weights")},
              shapedirs=made["shapedirs"], J_regressor=made["J_regressor"].toarray())  # fmt: skip
-    opened = read_flame(path).expression[1]
+    opened = read_flame(path, beside(face, tmp_path)).expression[1]
     assert opened[7, 1] == pytest.approx(-2 * np.sin(0.1), rel=1e-5) and np.count_nonzero(opened) == 1
 
 
 def test_an_import_reproduces_the_mesh(source: SourceModel, face: Head, tmp_path: Path) -> None:
-    found = landmarks_of(source)
-    off = 1000 * np.linalg.norm(found - face.landmarks, axis=-1)
-    assert off.mean() < 0.8 and off.max() < 2.0  # without an embedding
     model = resample_model(replace(source, identity=source.identity[:2]))
     assert np.sqrt((off_mm(model, face) ** 2).mean()) < 0.5
     assert model.identity.shape[0] == 2 and model.expression.shape[0] == 5
@@ -159,9 +162,9 @@ def bare(face: Head, first: int = 0) -> dict[str, np.ndarray]:
 
 
 EMBEDDINGS = {
-    "landmark_embedding.npy": (deca, 68),
-    "flame_static_embedding.pkl": (lambda face: python_2(bare(face, 17)), 51),
-    "flame_static_embedding_68.npz": (lambda face: npz(bare(face)), 68),
+    "landmark_embedding.npy": lambda face: deca(face),
+    "flame_static_embedding.pkl": lambda face: python_2(bare(face)),
+    "flame_static_embedding_68.npz": lambda face: npz(bare(face)),
 }
 
 
@@ -174,13 +177,11 @@ def npz(arrays: dict[str, np.ndarray]) -> bytes:
 @pytest.mark.usefixtures("here")
 @pytest.mark.parametrize("name", EMBEDDINGS)
 def test_embeddings_place_the_landmarks(face: Head, tmp_path: Path, name: str) -> None:
-    make, count = EMBEDDINGS[name]
     model, path = tmp_path / "generic_model.pkl", tmp_path / name
     model.write_bytes(pickle.dumps(changed(face)))
-    path.write_bytes(make(face))
-    by_itself = name == "landmark_embedding.npy"
-    found = read_flame(tmp_path if by_itself else model, None if by_itself else path).known
-    assert len(found) == count
+    path.write_bytes(EMBEDDINGS[name](face))
+    found = read_flame(model, None if name == "landmark_embedding.npy" else path).known
+    assert sorted(found) == list(range(68))
     off = [1000 * np.linalg.norm(point - face.landmarks[number]) for number, point in found.items()]
     assert max(off) < 1.0 and np.mean(off) < 0.25  # as near as 5023 vertices come
 
@@ -188,7 +189,7 @@ def test_embeddings_place_the_landmarks(face: Head, tmp_path: Path, name: str) -
 def test_a_table_of_arrays_is_as_good_as_a_pickle(face: Head, source: SourceModel, tmp_path: Path) -> None:
     made = tables(face)
     np.savez(tmp_path / "flame.npz", v_template=made["v_template"], f=made["f"], shapedirs=made["shapedirs"])
-    again = read_flame(tmp_path)
+    again = read_flame(tmp_path / "flame.npz", beside(face, tmp_path))
     np.testing.assert_array_equal(again.mean, source.mean)
     np.testing.assert_array_equal(again.identity, source.identity)
     assert len(again.expression) == 2  # no skeleton, no jaw
@@ -196,6 +197,7 @@ def test_a_table_of_arrays_is_as_good_as_a_pickle(face: Head, source: SourceMode
 
 @pytest.mark.usefixtures("here")
 def test_a_jaw_is_opened_by_expressions_and_an_open_licence_is_kept(face: Head, tmp_path: Path) -> None:
+    beside(face, tmp_path)
     path = tmp_path / "flame2023_no_jaw.pkl"
     path.write_bytes(pickle.dumps(tables(face, 301)))
     assert read_flame(path).expression_names == ("expression_000",)
@@ -220,10 +222,10 @@ class Calls:
 
 
 BROKEN: dict[str, tuple[Callable[[Head], Any], str]] = {
-    "no mean": (lambda face: changed(face, v_template=None), "it lacks 'v_template'"),
+    "no mean": (lambda face: changed(face, v_template=None), "it lacks v_template"),
     "shapes of another mesh": (lambda face: changed(face, shapedirs=np.zeros((9, 3, 2))), "shape [9, 3"),
-    "too many": (lambda face: changed(face, shapedirs=np.zeros((5023, 3, 501), "f2")), "shapedirs has"),
-    "text for numbers": (lambda face: changed(face, shapedirs="many"), "shapedirs has shape [0]"),
+    "too many": (lambda face: changed(face, shapedirs=np.zeros((5023, 3, 801), "f2")), "300 + 50"),
+    "text for numbers": (lambda face: changed(face, shapedirs="many"), "shapedirs is float64 of shape [0]"),
     "not finite": (lambda face: changed(face, v_template=face.mean * np.nan), "not finite"),
     "triangles beyond": (lambda face: changed(face, f=np.array([[0, 1, 9999]])), "does not have"),
     "another skeleton": (lambda face: changed(face, weights=np.zeros((5023, 9))), "shape [5023, 9]"),
@@ -239,15 +241,14 @@ def test_what_is_not_flame_is_refused_in_one_line(face: Head, tmp_path: Path, ca
     make, message = BROKEN[case]
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps(make(face), 2))
-    refused(InputError, f"{path} ... {message}", import_face_model, "flame", path)
+    beside(face, tmp_path)
+    refused(InputError, f"{path} ... {message}", import_face_model, path)
 
 
-def test_what_is_no_file_of_it_says_what_to_give(tmp_path: Path) -> None:
-    refused(InputError, "give FLAME's .pkl", read_flame, tmp_path / "a.obj")
-    refused(InputError, "by name (here: none)", read_flame, tmp_path)
-    for name in ("flame2023.pkl", "flame2023_no_jaw.pkl", "landmark_embedding.npy", "FLAME_masks.pkl"):
-        (tmp_path / name).write_bytes(b"")
-    refused(InputError, "here: flame2023.pkl, flame2023_no_jaw.pkl)", read_flame, tmp_path)
+def test_a_model_without_its_embedding_says_what_to_give(face: Head, tmp_path: Path) -> None:
+    np.savez(tmp_path / "flame.npz", **{key: changed(face)[key] for key in ("v_template", "f", "shapedirs")})
+    refused(InputError, "give FLAME's landmark embedding as --landmarks", read_flame, tmp_path / "flame.npz")
+    refused(InputError, "no such file; give FLAME's .pkl", read_flame, tmp_path / "a.pkl")
 
 
 def points(count: int, face: int, weight: float) -> dict[str, np.ndarray]:
@@ -255,10 +256,10 @@ def points(count: int, face: int, weight: float) -> dict[str, np.ndarray]:
 
 
 EMBEDDED = {
-    "of another mesh": (points(51, 99999, 1 / 3), "another mesh"),
-    "no weights": (points(51, 0, 0), "another mesh"),
-    "a few points": (points(5, 0, 1 / 3), "5 points"),
-    "other keys": ({"a": np.zeros(3)}, "none of full_lmk_faces_idx"),
+    "of another mesh": (points(68, 99999, 1 / 3), "another mesh"),
+    "no weights": (points(68, 0, 0), "another mesh"),
+    "the inner points": (points(51, 0, 1 / 3), "shape [51], not numbers [68]"),
+    "other keys": ({"a": np.zeros(3)}, "it lacks lmk_face_idx"),
 }
 
 
@@ -275,20 +276,3 @@ def test_a_wrong_embedding_is_refused_in_one_line(face: Head, tmp_path: Path, ca
         path = tmp_path / name
         path.write_bytes(data)
         refused(InputError, f"{path} ... {message}", read_flame, tmp_path / "flame.pkl", path)
-
-
-@pytest.mark.usefixtures("here")
-def test_a_list_of_vertices_places_the_landmarks_of_any_model(face: Head, tmp_path: Path) -> None:
-    nearest = [int(np.linalg.norm(face.mean - point, axis=-1).argmin()) for point in face.landmarks]
-    pkl, listed = tmp_path / "flame.pkl", tmp_path / "vertices.txt"
-    pkl.write_bytes(pickle.dumps(changed(face)))
-    listed.write_text("\n".join(map(str, nearest)))
-    model = import_face_model("flame", pkl, listed)
-    found = model.landmarks(model.mean[None])[0].numpy()
-    rotation, translation = rigid_alignment(face.mean[nearest], LANDMARKS_M)
-    off = found - face.mean[nearest] @ rotation.T - translation
-    assert 1000 * np.linalg.norm(off, axis=-1).mean() < 0.3
-    words = {"1 2 3": "holds 3 numbers", "99999 " * 68: "68 from 0 to 5022", "a": "cannot be read"}
-    for text, message in words.items():
-        listed.write_text(text)
-        refused(InputError, message, import_face_model, "flame", pkl, listed)
