@@ -35,7 +35,7 @@ from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.face_in_photo import FaceInPhoto
+from facerf_cli.relighting.face_alone import FaceAlone, FaceInPhoto
 from facerf_cli.relighting.heads import fit_photo
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
@@ -114,7 +114,9 @@ def estimates(
     photo = read_image(path).pixels
     landmarks_px = find_faces(SHIPPED_NETWORKS.people, photo, str(path))[0].landmarks_px
     head = fit_photo(models, photo, landmarks_px)
-    people = PeopleInPhoto([FaceInPhoto(models.face, photo, head, reflectance_of(models, head))])
+    size_px = photo.shape[0], photo.shape[1]
+    face = FaceAlone(models.face, head, reflectance_of(models, head), photo_px=size_px)
+    people = PeopleInPhoto([FaceInPhoto(face, photo, np.ones(size_px, np.float32))])
     weights = torch.stack([light.weights for light in lights])
     for light, (relit,) in zip(lights, people.relit(Lights(RIG, weights)), strict=True):
         face = replace(head.face, texture=relit.texture)

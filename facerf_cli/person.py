@@ -40,8 +40,7 @@ from facerf_cli.portrait.given_normals import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
 from facerf_cli.relighting import White
-from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
-from facerf_cli.relighting.face_in_photo import FaceInPhoto
+from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone, FaceInPhoto
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
@@ -106,8 +105,8 @@ def fit(
         landmarks_px: The face's 68 landmarks [68, 2] in the photo's pixels, in place of the detector's.
         geometry: "landmarks", or "network": the Geometry Network regresses the head, without landmarks; by
             default as the networks were trained.
-        reflectance: "portrait" relights the whole person, "field" the face and what is around it by the
-            face's light; "diffuse-sh", "specular-sh", "prt" are the paper's baselines.
+        reflectance: "portrait" relights the whole person, "field" the face alone; "diffuse-sh",
+            "specular-sh", "prt" are the paper's baselines, which relight the face, too.
         network_alone: Leave out the correction by which the photo's own light gives the photo back.
         matte: The person's share [H, W] of the photo, in place of the networks'.
         texture_side: Side of the face's texture in texels; by default that of the networks' training.
@@ -349,7 +348,9 @@ class Person(PersonOrGroup):
             matte = matte if part is None else (matte * part).astype(np.float32, copy=False)
         if isinstance(self.reflectance, PortraitField):
             return PersonInPhoto(self.models.face, self.photo, self.head, self.reflectance, matte)
-        return FaceInPhoto(self.models.face, self.photo, self.head, self.reflectance, matte)
+        size_px = self.photo.shape[0], self.photo.shape[1]
+        face = FaceAlone(self.models.face, self.head, self.reflectance, photo_px=size_px)
+        return FaceInPhoto(face, self.photo, matte)
 
     def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:
         """The person under one light (paper, 'Relighting')."""

@@ -1,6 +1,9 @@
-"""A face alone, by its relit texture, in the pose of its photo or another (paper, 'Relighting')."""
+"""A face by its relit texture: alone, in the pose of its photo or another, or in its photo.
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+See the paper, 'Relighting'.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -18,7 +21,9 @@ from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Window
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.field import Field, near_texture, weighted_sums
+from facerf_cli.portrait.matte import PersonColours
+from facerf_cli.relighting.detail import FaceDetail
+from facerf_cli.relighting.field import near_texture
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 
 FACE_LAYERS = ("normal", "position", "depth", "uv", "face")
@@ -73,10 +78,16 @@ class FaceAlone(Relightable):
         return self.head.face.texture.nbytes
 
     def relit(self, lights: Lights) -> Iterator[Relit]:
-        """Relight the face by each sum of lights."""
+        """Relight the face by each sum of lights (paper, 'Relighting')."""
         assert self.reflectance is not None
         turn = None if self.fit is None else self.head.fit.turn_to(self.fit.rotation)
-        return relit_faces(self.reflectance, lights, self.vertices_m, self.head, turn)
+        side, near = self.head.face.texture.shape[-1], lights.around(self.vertices_m.mean(0))
+        textures = self.reflectance.relit(lights.directions, lights.weights, turn)
+        extra = [near_texture(self.reflectance, points, self.vertices_m, side, turn) for points, _ in near]
+        for number, (own, texture) in enumerate(zip(lights.owns, textures, strict=True)):
+            for one, (_, rgb) in zip(extra, near, strict=True):
+                texture = texture + rgb[number][:, None, None] * one
+            yield Relit(texture, own=own)
 
     def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
         """What gives rows of the image, not multiplied by the mask, of lights over black, and of layers."""
@@ -97,56 +108,54 @@ class FaceAlone(Relightable):
         return found
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the face's texture."""
-        return exposure_of_face(self.head, relit, rule)
+        """The exposure in EV, by a rule, of the relit texture over that of the photo."""
+        own = torch.zeros(3) if relit.own is None else relit.own.detach()
+        source = self.head.face.texture
+        textures = relit.texture + own[:, None, None] * source, source
+        lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
+        seen = self.head.face.visible.numpy()
+        return chosen_exposure_ev(rule, lit, plate, seen, seen)
 
 
-def relit_faces(
-    reflectance: Reflectance,
-    lights: Lights,
-    vertices_m: Tensor,
-    head: Head,
-    turn: Tensor | None = None,
-    changes: Callable[[Tensor], Tensor] | None = None,
-) -> Iterator[Relit]:
-    """Relight a face by sums of lights (paper, 'Relighting').
+class FaceInPhoto:
+    """A face in its photo [H, W, 3], with the photo's detail, blended in by its mask.
 
-    Args:
-        reflectance: Textures of the face under far lights.
-        lights: M sums of far and near lights, camera space.
-        vertices_m: The mesh [V, 3] as shown, camera space.
-        head: The head in its photo.
-        turn: Rotation [3, 3] from the photo's pose to that shown.
-        changes: Gives of textures [L, 3, T, T] the change of light around the face [L, 3, s, s]. Of the
-            field, which is linear in light, it is summed over the lights; the models that the paper compares
-            with are not linear where they are clamped.
+    So a person is relit whose reflectance is the face's alone: the paper's field, and the models that it is
+    compared with. `matte` [H, W] is the person's share.
     """
-    side, near = head.face.texture.shape[-1], lights.around(vertices_m.mean(0))
-    found: Iterable[tuple[Tensor, Tensor | None]]
-    if changes and isinstance(reflectance, Field):
-        olats = reflectance.olats(lights.directions, turn)
-        found = zip(*weighted_sums(olats, lights.weights, lambda olats: olats, changes), strict=True)
-    else:
-        textures = reflectance.relit(lights.directions, lights.weights, turn)
-        found = ((x, changes(x[None])[0] if changes else None) for x in textures)
-    extra = [near_texture(reflectance, points, vertices_m, side, turn) for points, _ in near]
-    around = [changes(one[None])[0] if changes else None for one in extra]
-    for number, (own, (texture, change)) in enumerate(zip(lights.owns, found, strict=True)):
-        for one, of_one, (_, rgb) in zip(extra, around, near, strict=True):
-            weight = rgb[number][:, None, None]
-            texture = texture + weight * one
-            change = None if change is None or of_one is None else change + weight * of_one
-        yield Relit(texture, change, own=own)
 
+    def __init__(self, face: FaceAlone, photo: np.ndarray, matte: np.ndarray) -> None:
+        self.size_px, self.view, self.nbytes = face.size_px, face.view, face.nbytes
+        self.relit, self.exposure_ev = face.relit, face.exposure_ev
+        self.photo, self.own = photo, PersonColours(photo, matte)
+        self.matte = np.minimum(matte, face.matte)
+        self._detail = FaceDetail(face.head.face, face.view)
 
-def exposure_of_face(head: Head, relit: Relit, rule: ExposureRule) -> float:
-    """The exposure in EV, by a rule, of a relit texture, over that of the photo."""
-    own = torch.zeros(3) if relit.own is None else relit.own.detach()
-    source = head.face.texture
-    textures = relit.texture + own[:, None, None] * source, source
-    lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
-    seen = head.face.visible.numpy()
-    return chosen_exposure_ev(rule, lit, plate, seen, seen)
+    def share(self, rows: slice) -> np.ndarray:
+        """Share [h, W] of the face in rows of the photo."""
+        return self.matte[rows]
+
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Relit, Sequence[str]]:
+        """Compute all that does not depend on rows; raises UsageError for layers of whole people."""
+        require_face_layers(layers)
+        return self._detail.ready(relit.texture), relit, layers
+
+    def render(
+        self, window: Window, own: np.ndarray, lights: Sequence[tuple[Tensor, Relit, Sequence[str]]]
+    ) -> Iterator[dict[str, np.ndarray]]:
+        """Yield rows of the photo, whose person has its `own` colours [h, W, 3], under each light.
+
+        "rgb" [h, W, 3] is the face; others are the light's layers.
+        """
+        part = window.common(self.view.window)
+        lit = self._detail.over(part, own[part.inside(window)])
+        for maps, relit, layers in lights:
+            image = {"rgb": window.framed(lit(maps), part)}
+            if relit.own is not None and relit.own.any():
+                image["rgb"] = image["rgb"] + relit.own.detach().numpy() * own
+            for name in layers:
+                image |= face_layer(self.view, name, window)
+            yield image
 
 
 def require_face_layers(names: Sequence[str]) -> None:

@@ -1,7 +1,7 @@
 """The neural reflectance field of one face: its texture under any light, far or near, and any sum."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -179,24 +179,15 @@ def balance_of(white: White, shown: Iterable[tuple[FaceTexture, Tensor]]) -> Bal
 def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
     """Sum OLATs [L, 3, ...], given in batches, by rgb weights [M, L, 3]: [M, 3, ...] (paper, 'Relighting').
 
-    Textures are summed before they are rendered, since a render costs more.
+    Textures are summed before they are rendered, since a render costs more; the batches are never all held.
     """
-    return weighted_sums(batches, weights, lambda olats: olats)[0]
-
-
-def weighted_sums(
-    batches: Iterable[Tensor], weights: Tensor, *parts: Callable[[Tensor], Tensor]
-) -> list[Tensor]:
-    """`weighted_sum` of several functions of the same OLATs; the batches are never all held at once."""
-    totals, done = [torch.zeros(()) for _ in parts], 0
+    total, done = torch.zeros(()), 0
     for olats in batches:
         some = weights[:, done : done + len(olats)]
-        for number, part in enumerate(parts):
-            values = part(olats)
-            flat = torch.einsum("mlc,lcn->mcn", some, values.flatten(2))
-            totals[number] = totals[number] + flat.view(*flat.shape[:2], *values.shape[2:])
+        flat = torch.einsum("mlc,lcn->mcn", some, olats.flatten(2))
+        total = total + flat.view(*flat.shape[:2], *olats.shape[2:])
         done += len(olats)
-    return totals
+    return total
 
 
 _APART_DEG, _MOST_STEPS = 10.0, 3  # of the grid, and steps from its middle; wider patches have wider steps

@@ -14,7 +14,7 @@ import numpy as np
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Window, in_strips
 from facerf_cli.light.studio_points import Lights
-from facerf_cli.relighting.face_in_photo import FaceInPhoto
+from facerf_cli.relighting.face_alone import FaceInPhoto
 from facerf_cli.relighting.person_in_photo import COLOURS, PersonInPhoto
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 
@@ -86,37 +86,39 @@ class PeopleInPhoto(Relightable):
     def _render(
         self, request: RenderRequest, ready: Sequence[Sequence[Any]], rows: slice
     ) -> dict[str, np.ndarray]:
-        window, (numbers, shares, owns) = Window(rows, slice(0, self.size_px[1])), self._present(rows)
+        window, (numbers, shares) = Window(rows, slice(0, self.size_px[1])), self._present(rows)
+        owns = [self.people[number].own[rows] for number in numbers]
         images = [
             self.people[number].render(window, own, ready[number])
             for number, own in zip(numbers, owns, strict=True)
         ]
-        found: dict[str, np.ndarray] = {}
+        under_each, found = zip(*images, strict=True), dict[str, np.ndarray]()
         if request.image is not None:
-            each = [next(one) for one in images]
+            each = next(under_each)
             found["rgb"] = self._image(request, shares, owns, [one["rgb"] for one in each], rows)
             found |= _layers(shares, each)
-        for name in request.lights:
-            found[name] = _over(shares, [next(one)["rgb"] for one in images])
+        for name, each in zip(request.lights, under_each, strict=True):
+            found[name] = _over(shares, [one["rgb"] for one in each])
         return request.wrapped(found, rows)
 
-    def _present(self, rows: slice) -> tuple[list[int], Shares, list[np.ndarray]]:
-        """Numbers of the people in some rows, the share [h, W, 1] of each, and its own colours [h, W, 3].
+    def _present(self, rows: slice) -> tuple[list[int], Shares]:
+        """Numbers of the people in some rows, of a crowd few, and the share [h, W, 1] of each.
 
-        They are the first, all of which is relit, and of a crowd few others.
+        All of the first is relit.
         """
         numbers, shares = [0], [self.people[0].matte[rows][..., None]]
         for number, person in enumerate(self.people[1:], 1):
             if (share := person.share(rows)).any():
                 numbers.append(number)
                 shares.append(share[..., None])
-        return numbers, shares, [self.people[number].own[rows] for number in numbers]
+        return numbers, shares
 
     def _shares(self, rows: slice) -> dict[str, np.ndarray]:
         return {"alpha": _alpha(self._present(rows)[1])[..., 0]}
 
     def _as_photographed(self, rows: slice) -> dict[str, np.ndarray]:
-        return {"own": _over(*self._present(rows)[1:])}
+        numbers, shares = self._present(rows)
+        return {"own": _over(shares, [self.people[number].own[rows] for number in numbers])}
 
     def _image(
         self,

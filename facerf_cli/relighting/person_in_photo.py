@@ -103,7 +103,7 @@ class PersonInPhoto:
         mirrored = field.views[0].mirrored(lights, middle_m)
         blended = field.blended(textures, lit[0])
         every = [
-            Relit(blended[at], None, tuple(view[at] for view in lit), mirrored[at], mouths[at])
+            Relit(blended[at], tuple(view[at] for view in lit), mirrored[at], mouths[at])
             for at in range(len(blended))
         ]
         shadows: dict[tuple[bool, int], CastShadow] = {}
@@ -201,13 +201,14 @@ class PersonInPhoto:
             face, share = self._detail.over(part, own[at]), self._face_share(part)[..., None]
 
         def lit(light: PersonLight) -> dict[str, np.ndarray]:
-            *narrower, found = (
-                view(light.views[number]) for view, (number, *_) in zip(views, parts, strict=True)
-            )
-            for one, (_, place, weight) in zip(narrower[::-1], parts[-2::-1], strict=True):
-                for name, values in one.items():
-                    below = found[name][place.inside(among)]
-                    below += weight[..., None] * (values - below)
+            found: dict[str, np.ndarray] = {}
+            for view, (number, place, weight) in zip(views[::-1], parts[::-1], strict=True):
+                for name, values in view(light.views[number]).items():
+                    if name in found:
+                        below = found[name][place.inside(among)]
+                        below += weight[..., None] * (values - below)
+                    else:  # the widest
+                        found[name] = values
             person = found["rgb"]
             if on_face:  # the field of the face knows no hair around it
                 person[at] += share * (face(light.face) - person[at])

@@ -24,7 +24,6 @@ class Relit:
 
     Attributes:
         texture: The face [3, T, T].
-        change: Of a `FaceInPhoto` the change of light around the face [3, s, s].
         views: Of a `PersonInPhoto` its light in each square.
         mirrored: Of a `PersonInPhoto` what its eyes mirror [N, 3, s, s].
         mouth: Of a `PersonInPhoto` the face [3, T, T] in what falls into its mouth.
@@ -33,7 +32,6 @@ class Relit:
     """
 
     texture: Tensor
-    change: Tensor | None = None
     views: tuple[PortraitLight, ...] = ()
     mirrored: Tensor | None = None
     mouth: Tensor | None = None
@@ -43,8 +41,7 @@ class Relit:
     @property
     def tensors(self) -> list[Tensor]:
         """Texture and light of the views, in which images are linear."""
-        around = [] if self.change is None else [self.change]
-        return [self.texture, *around, *(maps for view in self.views for maps in view.tensors)]
+        return [self.texture, *(maps for view in self.views for maps in view.tensors)]
 
 
 @dataclass(frozen=True, eq=False)

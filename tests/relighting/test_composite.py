@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_d
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
 from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
 from facerf_cli.relighting.detail import FaceDetail
-from facerf_cli.relighting.face_in_photo import FaceInPhoto, Surround
+from facerf_cli.relighting.face_alone import FaceAlone, FaceInPhoto
 from facerf_cli.relighting.people_in_photo import Background, PeopleInPhoto
 from facerf_cli.relighting.relightable import Relit, RelitImage
 
@@ -88,11 +87,12 @@ def in_photo(
     photo: np.ndarray, source: Tensor, seen: Tensor, matte: np.ndarray | None = None, crop: Crop = CROP
 ) -> FaceInPhoto:
     """The scene's face in a photo, whose textures are given."""
-    model = load_face_model("builtin")
+    model, size_px = load_face_model("builtin"), (photo.shape[0], photo.shape[1])
     shape = 0 * model.identity[:, 0, 0], 0 * model.expression[:, 0, 0]
     fit = FaceFit(model.name, crop, ROTATION, TRANSLATION_M, *shape, torch.zeros(1), 0.0)
-    unknown: Any = None
-    return FaceInPhoto(model, photo, Head(photo, fit, FaceTexture(source, seen, source)), unknown, matte)
+    head = Head(photo, fit, FaceTexture(source, seen, source))
+    whole = np.ones(size_px, np.float32) if matte is None else matte
+    return FaceInPhoto(FaceAlone(model, head, photo_px=size_px), photo, whole)
 
 
 def compose(
@@ -104,8 +104,7 @@ def compose(
     crop: Crop = CROP,
 ) -> np.ndarray:
     """The photo with the scene's face relit."""
-    face = in_photo(photo, source, seen, matte, crop)
-    return PeopleInPhoto([face]).image([Relit(relit, face.surround.changes(relit[None])[0])]).pixels
+    return PeopleInPhoto([in_photo(photo, source, seen, matte, crop)]).image([Relit(relit)]).pixels
 
 
 def detailed(face: FaceTexture, screen: FaceView, photo: np.ndarray, texture: Tensor) -> np.ndarray:
@@ -120,8 +119,13 @@ def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     return float(10 * np.log10(truth[mask].max() ** 2 / error))
 
 
+def share() -> np.ndarray:
+    """The face's mask [H, W] in the photo."""
+    return view().full(view().mask)
+
+
 def inside_face() -> np.ndarray:
-    return view().full(view().mask) > 0.5
+    return share() > 0.99
 
 
 def test_own_light_gives_the_photo_back_and_eyes_keep_their_detail() -> None:
@@ -145,81 +149,43 @@ def test_own_light_gives_the_photo_back_and_eyes_keep_their_detail() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.01, 1.0, 300.0])
-def test_brightness_of_the_light_scales_the_image(gain: float) -> None:
-    photo, source, seen = unwrapped()
-    relit = scene().lit(OTHER)
-    once = compose(photo, source, relit, seen)
-    scaled = compose(photo, source, gain * relit, seen)
+def test_brightness_of_the_light_scales_the_face(gain: float) -> None:
+    people, relit = PeopleInPhoto([in_photo(*unwrapped())]), scene().lit(OTHER)
+    once, scaled = (people.light_layer([Relit(texture)]) for texture in (relit, gain * relit))
     np.testing.assert_allclose(scaled, gain * once, rtol=2e-3, atol=1e-4 * gain)
+
+
+HALF = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)  # whose right part is the person
+HALF[:, 200:] = 1
 
 
 def in_half(background: Background, ev: float, behind: np.ndarray | None = None) -> RelitImage:
     """The image with its right half cut out as the person."""
-    photo, source, seen = unwrapped()
-    matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
-    matte[:, 200:] = 1
-    face, relit = in_photo(photo, source, seen, matte), scene().lit(OTHER)
-    lit = [Relit(relit, face.surround.changes(relit[None])[0])]
-    return PeopleInPhoto([face], background).image(lit, ev, behind)
+    lit = [Relit(scene().lit(OTHER))]
+    return PeopleInPhoto([in_photo(*unwrapped(), HALF)], background).image(lit, ev, behind)
 
 
-def test_the_photos_background_looks_as_it_was_and_a_matte_says_what_may_change() -> None:
+def test_what_is_not_the_face_stays_the_photo_and_a_matte_says_what_may_change() -> None:
+    """The face over black is in all images; the photo, or another image, shows by the rest of its share."""
     photo, _, _ = unwrapped()
+    face = share() * HALF
+    of_face, rest = face[..., None], 1 - face[..., None]
+    people = PeopleInPhoto([in_photo(*unwrapped(), HALF)])
+    lit = people.light_layer([Relit(scene().lit(OTHER))])
+    assert (face > 0.99).any() and abs(lit - of_face * photo)[face > 0.99].mean() > 0.1
     for ev in (0.0, 2.0):
         image = in_half("photo", ev)
-        np.testing.assert_allclose(image.pixels[:, :200] * 2**ev, photo[:, :200], rtol=1e-6)
-        np.testing.assert_allclose(image.pixels[:, 200:], in_half("photo", 0.0).pixels[:, 200:], atol=1e-5)
-    person = in_half("photo", 0.0).pixels[:, 200:]
+        assert image.alpha is None
+        np.testing.assert_allclose(image.pixels, lit + rest * photo * 2**-ev, atol=1e-5)
+        np.testing.assert_allclose((image.pixels * 2**ev)[face == 0], photo[face == 0], rtol=1e-6)
     nothing = in_half("none", 0.0)
     assert nothing.alpha is not None
-    np.testing.assert_array_equal(nothing.alpha[:, :200], 0)
-    np.testing.assert_allclose(nothing.pixels[:, 200:], person, atol=1e-5)
+    np.testing.assert_array_equal(nothing.alpha, face)
+    np.testing.assert_allclose(nothing.pixels * of_face, lit, atol=1e-5)
     behind = np.full((HEIGHT_PX, WIDTH_PX, 3), 0.3, np.float32)
     given = in_half("given", 3.0, behind)
     assert given.alpha is None
-    np.testing.assert_array_equal(given.pixels[:, :200], behind[:, :200])
-    np.testing.assert_allclose(given.pixels[:, 200:], person, atol=1e-5)
-    photo, source, seen = unwrapped()
-    matte = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
-    matte[:, 200:] = 1
-    result = compose(photo, source, scene().lit(OTHER), seen, matte)
-    whole = compose(photo, source, scene().lit(OTHER), seen)
-    np.testing.assert_array_equal(result[:, :200], photo[:, :200])
-    np.testing.assert_allclose(result[:, 200:], whole[:, 200:], atol=1e-5)
-
-
-def test_no_border_shows_where_the_surroundings_are_skin() -> None:
-    """A wall that goes on in the face's own colour: the change across the mask's border is smooth."""
-    _, source, seen = unwrapped()
-    flat = np.full((HEIGHT_PX, WIDTH_PX, 3), 0.5, np.float32)
-    grey = torch.full_like(source, 0.5)
-    cosine = torch.einsum(
-        "c,cij->ij", azel_to_direction(20.0, 15.0), normal_map(scene().vertices, grid_triangles(), TEXTURE)
-    )
-    relit = grey * cosine.clamp(min=0)
-    border = (view().full(view().mask) > 0.01) & (view().full(view().mask) < 0.5)
-
-    def steps(result: np.ndarray) -> float:
-        return float(np.percentile(np.hypot(*np.gradient(result[..., 1]))[border], 99))
-
-    followed = compose(flat, grey, relit, seen)
-    kept = np.where(view().full(view().mask)[..., None] > 0.25, followed, flat)
-    assert steps(followed) < 0.5 * steps(kept)
-
-
-def test_a_bright_rim_does_not_glow_beside_the_face() -> None:
-    """The change around the head stays within a twelfth and 1.6 times the mean change of its light."""
-    _, source, _ = unwrapped()
-    model = load_face_model("builtin")
-    vertices = model.mean @ ROTATION.T + TRANSLATION_M
-    surround = Surround(vertices, CROP, source, WIDTH_PX)
-    rim = torch.zeros_like(source)
-    rim[..., : TEXTURE // 6] = 9.0
-    changes = surround.changes(torch.stack([rim, source]))
-    mean = changes[0, :, :1, :1]  # far from the face all follows the mean
-    assert (changes[0] <= 1.601 * mean).all() and (changes[0] >= mean / 12.01).all()
-    assert (changes[0] > 1.5 * mean).any() and (changes[0] < mean / 4).any()
-    torch.testing.assert_close(changes[1], torch.ones_like(changes[1]), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(given.pixels, lit + rest * behind, atol=1e-5)
 
 
 def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:
@@ -262,7 +228,7 @@ def test_own_light_returns_the_photo_and_light_is_never_negative() -> None:
 
 
 def test_the_mask_lies_on_the_face_that_both_cameras_see() -> None:
-    mask = view().full(view().mask)
+    mask = share()
     covered = view().full(view().coverage) > 0
     assert (mask[~covered] == 0).all()
     steps = np.hypot(*np.gradient(mask))
