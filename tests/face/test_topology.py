@@ -1,9 +1,7 @@
 """Regions lie at their landmarks and cover UV space once; the interior and the outline face the camera."""
 
-import numpy as np
 import pytest
 import torch
-from scipy.interpolate import CubicSpline
 
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import (
@@ -12,7 +10,6 @@ from facerf_cli.face.topology import (
     LANDMARK_UV,
     REGIONS,
     contour_rays,
-    cubic_spline,
     grid_triangles,
     grid_uv,
     interior_mask,
@@ -122,11 +119,3 @@ def test_outlines_are_the_furthest_of_each_ray_also_of_turned_faces() -> None:
     outline = px[silhouette_ids(px[None], rotation[None])[0]]
     cheek = contour_rays()[-40:-24].flatten()  # of the far side
     assert px[cheek, 0].max() <= outline[-40:-24, 0].max() + 0.5
-
-
-@pytest.mark.parametrize("count", [4, 5, 17])
-def test_an_outline_is_the_spline_of_scipy(count: int) -> None:
-    points = np.cumsum(np.random.default_rng(count).random((count, 2)), 0)
-    length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=-1))])
-    at = np.interp(np.linspace(0, count - 1, 6 * count - 5), np.arange(count), length)
-    np.testing.assert_allclose(cubic_spline(points), CubicSpline(length, points)(at), atol=1e-12)
