@@ -83,13 +83,12 @@ class Enlarged:
         if light.slopes is not None:
             slopes = self._filled(self._edges.filled(light.slopes))
             maps["slopes"] = self._view.exposure.repeat_interleave(3, 0) * slopes
-        whole = light.whole if layers else light
         for name in layers:
             if name == "specular":
-                shown = whole.highlights.clamp_min(0) * self._view.exposure
+                shown = light.whole.highlights.clamp_min(0) * self._view.exposure
                 maps[name] = self._filled(self._edges.filled(shown))
             elif name == "shadow":
-                maps[name] = self._filled(self._edges.filled(whole.reached))
+                maps[name] = self._filled(self._edges.filled(light.reached))
             else:
                 maps[name] = self._normals if name == "normal" else self._fixed_maps[:3]
         return maps
@@ -117,10 +116,10 @@ class Enlarged:
                 found["behind"] = (albedo * shading + detail * highlights) * brightness
             if own is not None and finer is not None:
                 found["change"] = _change(maps, grid, finer) / own
-            for name in maps.keys() & VIEW_LAYERS:
-                found[name] = _enlarged(maps[name], grid)
             if "albedo" in maps:
                 found["albedo"] = albedo * self._view.exposure
+            for name in maps.keys() & {"normal", "shadow", "specular"}:
+                found[name] = _enlarged(maps[name], grid)
             if "normal" in maps and finer is not None:
                 found["normal"] = found["normal"] + finer
             return {name: _by_pixel(values) for name, values in found.items()}

@@ -128,7 +128,7 @@ class FaceInPhoto:
         self.size_px, self.view, self.nbytes = face.size_px, face.view, face.nbytes
         self.relit, self.exposure_ev = face.relit, face.exposure_ev
         self.photo, self.own = photo, PersonColours(photo, matte)
-        self.matte = np.minimum(matte, face.matte)
+        self.matte = matte * face.matte
         self._detail = FaceDetail(face.head.face, face.view)
 
     def share(self, rows: slice) -> np.ndarray:
