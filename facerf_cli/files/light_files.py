@@ -1,6 +1,6 @@
 """Lights on disk: JSON of a rig's weights and spherical harmonics, and environment maps.
 
-A JSON light is written by `facerf estimate-light` and `convert-light`; any image can be an environment map.
+`facerf estimate-light` writes a JSON light; any image can be an environment map.
 """
 
 import json
@@ -22,8 +22,8 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, LINEAR_BYTES, LinearImage, read_image
 from facerf_cli.light.envmap import check_envmap
-from facerf_cli.light.forms import LightForms
-from facerf_cli.light.sh import CONVENTION
+from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.sh import CONVENTION, positive_latlong
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME
@@ -35,12 +35,13 @@ AXES = "camera: x to the picture's right, y up, z toward the camera; directions 
 UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
 _LIMIT_BYTES = 4 << 20
 _MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441  # 441: spherical harmonics of order 20
+_JSON_ROWS = 256  # of the map that a JSON light is converted to
 _LARGEST = 1e30  # magnitude of a number; its square still fits double precision
 _GPANO = (
     "FullPanoHeight FullPanoWidth CroppedAreaImageHeight CroppedAreaImageWidth CroppedAreaTop CroppedAreaLeft"
 )
 _LENGTH_TOLERANCE = 1e-2  # a direction's length may differ from 1 by this, since other programs round
-_ADVICE = "give a .json that estimate-light or convert-light wrote"
+_ADVICE = "give a .json that estimate-light wrote"
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,15 +218,11 @@ def _in_sphere(path: Path | str, image: LinearImage) -> np.ndarray:
 
 @lru_cache(maxsize=2)  # converting a rig takes seconds, and relight reads the same light several times
 def _latlong(path: Path) -> Tensor:
-    return read_light_file(path)[0].latlong()
-
-
-def read_light_file(path: Path) -> tuple[LightForms, Mapping[str, str | int | float]]:
-    """Read a JSON light's rig, or its coefficients if it has no rig; and its provenance."""
+    """Convert a JSON light's rig, or its coefficients if it has no rig, to a map."""
     record = read_light(path)
     if len(record.directions):
-        return LightForms(rig=RigLight(record.directions, record.weights)), record.attributes
+        return rig_to_latlong(RigLight(record.directions, record.weights), _JSON_ROWS)
     assert record.sh is not None
     if record.sh.convention != CONVENTION:
         raise InputError(f"{path}: spherical harmonics of another convention; convert them to: {CONVENTION}")
-    return LightForms(coefficients=record.sh.coefficients), record.attributes
+    return positive_latlong(record.sh.coefficients, _JSON_ROWS)

@@ -126,3 +126,9 @@ def test_a_part_that_lies_outside_its_sphere_is_refused(tmp_path: Path) -> None:
         refused(InputError, "a.jpg: its GPano", read_map_file, pano(tmp_path / "a.jpg", levels, full, start))
     with pytest.raises(InputError, match=r"a\.jpg: a part of a sphere .* needs .* GB of memory"):
         read_map_file(pano(tmp_path / "a.jpg", levels, (1 << 20, 1 << 21), (0, 0)))
+
+
+def test_coefficients_of_another_convention_are_no_map(tmp_path: Path) -> None:
+    nothing = torch.zeros(0, 3)
+    write_light(tmp_path / "a.json", LightRecord(nothing, nothing, sh=make_light().sh))
+    refused(InputError, "another convention", read_map_file, tmp_path / "a.json")
