@@ -119,7 +119,7 @@ OPTIONS = {
 }
 # Text that looks like options more often than any text does.
 LIKELY = st.lists(
-    st.sampled_from(["1", "-", ".", ",", ";", ":", "e9", "az", "=", "el", "at", "inf", "nan", "/", "٣", "0"]),
+    st.sampled_from(["1", "-", ".", ",", ";", ":", "e9", "from", "=", "at", "inf", "nan", "/", "٣", "0"]),
     max_size=12,
 ).map("".join)
 

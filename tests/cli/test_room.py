@@ -23,7 +23,7 @@ from tests.exr_layers import exr_layers
 from tests.kinds import Said
 from tests.refusals import refused
 
-KEY, RIM = "name=key;az=40;el=20;kelvin=3200", "name=rim;az=160;stops=-1;rgb=0.5,1,1"
+KEY, RIM = "name=key;from=40,20;kelvin=3200", "name=rim;from=160,0;stops=-1;rgb=0.5,1,1"
 
 
 @pytest.fixture
@@ -80,7 +80,7 @@ def test_none_leaves_the_lights_and_a_rooms_light_is_a_share_of_their_sum() -> N
     (setup,) = setups_of([KEY, RIM])
     assert in_room(setup, "none", False) == setup == with_room(setup)
     assert in_room(setup, "0", False) == setup
-    red, near = "name=a;az=90;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
+    red, near = "name=a;from=90,0;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
     (setup,) = setups_of([red, near])
     lit = with_room(in_room(setup, "0.1", False))
     assert lit.names == ("a", "b", "room") and lit.lights[:2] == setup.lights

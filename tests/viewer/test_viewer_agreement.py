@@ -221,7 +221,7 @@ def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -
     assert "--light own -o out" in images[OWN].command
     assert "--envmap envmap=maps/00000_sun.exr --light own -o out" in images[f"{OWN}&env=sun"].command
     assert "--light 'own;stops=-1' --exposure 1 " in images[DIMMED].command
-    assert "--light rim=-150,15,2,2,2 --light own -o out" in images[RIM].command
+    assert "--light name=rim;from=-150,15;rgb=2,2,2 --light own -o out" in images[RIM].command
 
 
 def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path) -> None:
