@@ -223,7 +223,7 @@ def _channels(
 
 def _robust(
     channels: Sequence[_Channel],
-    gains: Sequence[float],
+    gains: Sequence[float] | np.ndarray,
     hold: np.ndarray,
     wanted: np.ndarray,
     rounds: int = _ROUNDS,

@@ -481,7 +481,7 @@ def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
         [[2, 2, 2], [0, 0, 0]],
     ]
     assert len(lights.directions) == 1 and lights.weights.sum((1, 2)).tolist() == [0, 0, 3]
-    assert [light.at_m for light in lights[1:2].near] == [(0, 0, 2)]
+    assert [light.at_m for light in lights.some(slice(1, 2)).near] == [(0, 0, 2)]
     alone = lights_over_rig(setups[:1], "150", "cell")
     assert len(alone.directions) == 1 and alone.weights.abs().max() == 0  # a dark one, since models want one
 
