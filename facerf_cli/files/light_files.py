@@ -45,25 +45,18 @@ _ADVICE = "give a .json that estimate-light wrote"
 
 
 @dataclass(frozen=True, eq=False)
-class Harmonics:
-    """Spherical-harmonic coefficients [(order + 1)^2, 3], and their convention in words."""
-
-    coefficients: Tensor
-    convention: str
-
-
-@dataclass(frozen=True, eq=False)
 class LightRecord:
-    """The contents of a JSON light: directions and weights [L, 3] of a rig, or coefficients, or both.
+    """The contents of a JSON light: directions and weights [L, 3] of a rig, or coefficients `sh`, or both.
 
-    Without a rig, `directions` and `weights` have no rows. `rig` describes the directions in words;
-    `attributes` are the provenance (`logs.Provenance.attributes`) and how the light was estimated.
+    Coefficients [(order + 1)^2, 3] are those of `light.sh`. Without a rig, `directions` and `weights` have no
+    rows. `rig` describes the directions in words; `attributes` are the provenance
+    (`logs.Provenance.attributes`) and how the light was estimated.
     """
 
     directions: Tensor
     weights: Tensor
     rig: str = ""
-    sh: Harmonics | None = None
+    sh: Tensor | None = None
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
 
 
@@ -73,9 +66,8 @@ def write_light(path: Path, record: LightRecord) -> None:
     if len(record.directions):
         fields |= {"rig": record.rig, "directions": record.directions, "weights": record.weights}
     if record.sh is not None:
-        order = math.isqrt(len(record.sh.coefficients)) - 1
-        convention = {"order": order, "convention": record.sh.convention}
-        fields["sh"] = convention | {"coefficients": record.sh.coefficients}
+        order = math.isqrt(len(record.sh)) - 1
+        fields["sh"] = {"order": order, "convention": CONVENTION, "coefficients": record.sh}
     fields["provenance"] = dict(record.attributes)
     with atomic_path(path) as temporary:
         temporary.write_text(_text_of(fields, "") + "\n", encoding="utf-8")
@@ -130,9 +122,15 @@ _Rows = Annotated[np.ndarray, PlainValidator(partial(_rows, _MOST_LIGHTS))]
 _Coefficients = Annotated[np.ndarray, PlainValidator(partial(_rows, _MOST_COEFFICIENTS))]
 
 
+def _ours(convention: str) -> str:
+    if convention != CONVENTION:
+        raise ValueError(f"another convention; convert the coefficients to: {CONVENTION}")
+    return convention
+
+
 class _HarmonicsEntry(Document):
     coefficients: Annotated[_Coefficients, AfterValidator(_whole_orders)]
-    convention: str = ""
+    convention: Annotated[str, AfterValidator(_ours)]
 
 
 class _LightDocument(Document):
@@ -165,7 +163,7 @@ def read_light(path: Path) -> LightRecord:
         torch.from_numpy(none if light.directions is None else light.directions),
         torch.from_numpy(none if light.weights is None else light.weights),
         light.rig,
-        Harmonics(torch.from_numpy(light.sh.coefficients), light.sh.convention) if light.sh else None,
+        torch.from_numpy(light.sh.coefficients) if light.sh else None,
         {name: value for name, value in light.provenance.items() if _is_attribute(value)},
     )
 
@@ -223,6 +221,4 @@ def _latlong(path: Path) -> Tensor:
     if len(record.directions):
         return rig_to_latlong(RigLight(record.directions, record.weights), _JSON_ROWS)
     assert record.sh is not None
-    if record.sh.convention != CONVENTION:
-        raise InputError(f"{path}: spherical harmonics of another convention; convert them to: {CONVENTION}")
-    return positive_latlong(record.sh.coefficients, _JSON_ROWS)
+    return positive_latlong(record.sh, _JSON_ROWS)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_light_list, read_rig, read_text
@@ -31,6 +31,7 @@ OWN, EVEN = "own", "even"
 _DISTANCE_M = (0.15, 1e4)  # of a near light
 
 
+Sampling = Literal["cell", "smooth", "paper"]  # how lights of a rig sample a map
 Triple = tuple[float, float, float]
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.envmap import MapKeys, check_envmap, envmap_weights, without_keys
+from facerf_cli.light.envmap import NO_KEYS, check_envmap, envmap_weights, turned, without_keys
 from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import KeyLight, PointLights, far_samples, has_edges
@@ -88,9 +88,9 @@ class Light:
         """
         linear = linear_pixels("map", envmap)
         check_envmap(linear)
-        found = without_keys(linear) if keys else MapKeys.none(linear)
-        directions, suns = rig_directions(lights), found.turned(rotate_deg)
-        weights = torch.cat([envmap_weights(found.rest, directions, rotate_deg), suns.weights])
+        rest, found = without_keys(linear) if keys else (linear, NO_KEYS)
+        directions, suns = rig_directions(lights), turned(found, rotate_deg)
+        weights = torch.cat([envmap_weights(rest, directions, rotate_deg), suns.weights])
         return Light(
             torch.cat([directions, suns.directions]).numpy(),
             weights if isinstance(envmap, Tensor) else weights.numpy(),
@@ -149,6 +149,8 @@ class Light:
     def _tensors(self) -> tuple[Tensor, Tensor]:
         """Directions and weights as float32 tensors on the CPU; raises ValueError for what is no light."""
         directions, weights = unit_directions(self.directions), as_tensor(self.weights)
+        if weights.ndim != 2:
+            raise ValueError(f"weights have shape {list(weights.shape)}, not [L, 3]")
         if not weights.isfinite().all():
             raise ValueError("weights are not all finite")
         return directions, weights

@@ -13,12 +13,12 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.light.entries import MapSource, StudioLight
-from facerf_cli.light.envmap import MapKeys, lights_around, rotated_weights, without_keys
+from facerf_cli.light.entries import MapSource, Sampling, StudioLight
+from facerf_cli.light.envmap import NO_KEYS, lights_around, rotated_weights, turned, without_keys
 from facerf_cli.light.light import Light
 from facerf_cli.light.studio_points import far_samples, intensity_of, is_narrow, rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, step
-from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight
 from facerf_cli.work.photo_options import LightOptions
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map
@@ -212,13 +212,14 @@ def _map_weights(
     for source, group in groupby(maps, lambda one: one[1].envmap):
         rows, lights = zip(*group, strict=True)
         assert source is not None
-        found = (without_keys if with_keys else MapKeys.none)(read_map(source))
+        envmap = read_map(source)
+        rest, suns = without_keys(envmap) if with_keys else (envmap, NO_KEYS)
         for row, light in zip(rows, lights, strict=True):
-            turned = found.turned(light.rotate_deg)
-            rgb = turned.weights * intensity_of(light)
-            keys += [(row, *key) for key in zip(turned.directions[:, None], rgb[:, None], strict=True)]
+            key_light = turned(suns, light.rotate_deg)
+            rgb = key_light.weights * intensity_of(light)
+            keys += [(row, *key) for key in zip(key_light.directions[:, None], rgb[:, None], strict=True)]
         angles = [light.rotate_deg for light in lights]
-        of_map = rotated_weights(found.rest, directions, angles, sampling)
+        of_map = rotated_weights(rest, directions, angles, sampling)
         colours = torch.stack([intensity_of(light) for light in lights])
         weights.index_add_(0, torch.tensor(rows), of_map * colours[:, None])
     return weights, keys

@@ -11,10 +11,9 @@ import torch
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
-from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
 from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.main import main, repeat_options
@@ -58,8 +57,7 @@ def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.L
     lamp = (rig @ azel_to_direction(60, 30)).clamp_min(0)[:, None] ** 20
     weights = 0.01 + lamp * torch.tensor([1, 0.8, 0.6])
     write_light(tmp_path / "a_light.json", LightRecord(rig, weights))
-    harmonics = Harmonics(torch.ones(9, 3), CONVENTION)
-    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=harmonics))
+    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=torch.ones(9, 3)))
     (tmp_path / "c.json").write_text("{}")
     given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
     setups = readable(collect_setups(LightSources(envmap=given, rotate="90"), tmp_path / "out"))
