@@ -317,9 +317,10 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     if len(given) < len(keys):
         twice = min(key for key in given if keys.count(key) > 1)
         raise UsageError(f"{where} {twice} is given twice; a light has one, give --light again")
-    if wrong := [value for key, value in pairs if key not in keys and not _is_place(value)]:
+    if wrong := [pair for pair in pairs if pair[0] not in keys and not _is_place(pair[1])]:
+        part = "=".join(filter(None, wrong[0]))
         known = f"AZ,EL, a rig file (.toml) or one of {', '.join((*preset_names(), *WORDS))}"
-        raise UsageError(f"{where} {wrong[0]!r}: no such light; give {known}; keys are {', '.join(KEYS)}")
+        raise UsageError(f"{where} {part!r}: no such light or key; give {known}; keys are {', '.join(KEYS)}")
     if places and given and len(places) + len(given.keys() & _PLACES.keys()) > 1:
         raise UsageError(f"{where} keys are of one light; give each light a --light of its own")
     places = places or [(None, None)]

@@ -60,7 +60,7 @@ WRONG: dict[str, dict[str, str]] = {
     },
     "relight a.jpg": {
         "": "no light given; add --envmap, --light",
-        "--light 1": "'1': no such light; give AZ,EL",
+        "--light 1": "'1': no such light or key; give AZ,EL",
         "--light key=1,2 --light key=3,4": "'key': give each light a name of its own",
         "--light own --pose 10,0,0": "--light own",
         "--light own --composite face": "--light own",

@@ -394,7 +394,7 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
 @pytest.mark.parametrize(
     "entry, said",
     [
-        ("at=0,0,1;colour=red", "'red': no such light; ... keys are at, from"),
+        ("at=0,0,1;colour=red", "'colour=red': no such light or key ... keys are at, from"),
         ("at=0,0", "at '0,0': give X,Y,Z"),
         ("at=0,0,0.1", "at '0,0,0.1': the distance from the face is out of range; give 0.15"),
         ("at=0,0,1;from=0,0", "give one of at=X,Y,Z"),
@@ -416,9 +416,9 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
         ("from=20,0;face=1.5", "face '1.5': give the number of one"),
         ("name=;at=0,0,1", "'': give each light a name of its own"),
         ("=40,20", "'': give each light a name"),
-        ("rembrant", "no such light; give AZ,EL, a rig file (.toml) or one of beauty, "),
-        ("key=rembrant", "'rembrant': no such light"),
-        ("key=40,20;colour=red", "'red': no such light"),
+        ("rembrant", "no such light or key; give AZ,EL, a rig file (.toml) or one of beauty, "),
+        ("key=rembrant", "'key=rembrant': no such light or key"),
+        ("key=40,20;colour=red", "'colour=red': no such light or key"),
         ("key=40,20,stops=-1", "give ; between keys"),
         ("key=40,20;at=0,0,3", "keys are of one light; give each light a --light of its own"),
         ("a=40,20;b=left;stops=1", "keys are of one light"),
