@@ -29,9 +29,9 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
 from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.envmap import rotated_weights
+from facerf_cli.light.light import Light
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, azel_to_direction, brightest_direction, rig_directions
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
@@ -118,7 +118,7 @@ def estimates(
     face = FaceAlone(models.face, head, reflectance_of(models, head), photo_px=size_px)
     people = PeopleInPhoto([FaceInPhoto(face, photo, np.ones(size_px, np.float32))])
     weights = torch.stack([light.weights for light in lights])
-    for light, (relit,) in zip(lights, people.relit(Lights(RIG, weights)), strict=True):
+    for light, (relit,) in zip(lights, people.relit(Light(RIG, weights)), strict=True):
         face = replace(head.face, texture=relit.texture)
         for method, found in by_both(models, replace(head, face=face), features):
             yield light, ("texture", method, found)

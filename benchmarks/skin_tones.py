@@ -17,8 +17,8 @@ import torch
 from _common import arguments, required
 
 from facerf_cli.image.colour import ExposureRule, luminance
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.person import Target, fit
 from facerf_cli.portrait.classes import class_index
@@ -93,7 +93,7 @@ def measured(
     person = fit(models, photo, white=None, face=find_faces(models.networks.people, photo, "the photo")[0])
     composition = person.composed(Target(background="none"))
     shown = {}
-    lit = composition.relit(Lights(rig, torch.cat([lamp, natural[1:]])))
+    lit = composition.relit(Light(rig, torch.cat([lamp, natural[1:]])))
     for light, relit in zip(("lamp", "daylight"), lit, strict=True):
         face = tones(composition.image(relit).pixels, skin)
         for rule in RULES:

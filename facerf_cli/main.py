@@ -44,8 +44,7 @@ _LINES = {
         "segment": "Cut people out: matte, hair, skin, clothes; landmarks.",
         "fit-geometry": "Fit a 3D face: mesh, texture, normals.",
     },
-    "Make and convert light": {
-        "convert-light": "Convert lights for other programs.",
+    "Make light": {
         "envmap": "Draw environment maps: skies, rooms, studios, streets.",
     },
     "Train and evaluate": {

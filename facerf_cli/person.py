@@ -29,10 +29,9 @@ from facerf_cli.light.light import (
     check_kind,
     directions_of,
     linear_pixels,
-    sums_of,
+    stacked,
 )
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.portrait import find
 from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import Face, face_with
@@ -293,7 +292,7 @@ class Person(PersonOrGroup):
             if isinstance(field, Field):
                 textures = torch.cat(list(field.olats(directions, turn)))
             else:
-                each = Lights.each(directions)
+                each = Light.each(directions)
                 textures = field.relit(each.directions, each.weights, turn)
         return self._out(textures.permute(0, 2, 3, 1).contiguous(), *given)
 
@@ -355,7 +354,7 @@ class Person(PersonOrGroup):
     def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:
         """The person under one light (paper, 'Relighting')."""
         subject = self.composed(target)
-        return subject.image(next(subject.relit(Lights.of_rig(light))))
+        return subject.image(next(subject.relit(Light(light.directions, light.weights[None]))))
 
     @property
     def even(self) -> Light:
@@ -458,7 +457,7 @@ class Person(PersonOrGroup):
         assert isinstance(face, FaceAlone)
         view = face.view
         for part in batches(len(lights), face.nbytes):
-            for one in face.relit(sums_of(lights[part])):
+            for one in face.relit(stacked(lights[part])):
                 image = torch.zeros(*face.size_px, 4)
                 image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
                 arrays = face.rendered(RenderRequest(one, layers=layers))
@@ -498,7 +497,7 @@ class Person(PersonOrGroup):
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
         people = self._group.composed_once
         with torch.no_grad():
-            relit = next(people.relit(Lights.each(torch.tensor([[0.0, 0.0, 1.0]]))))
+            relit = next(people.relit(Light.each(torch.tensor([[0.0, 0.0, 1.0]]))))
             return self._out(people.rendered(RenderRequest(relit, layers=[name]))[name])
 
     @property
@@ -579,7 +578,7 @@ class Group(PersonOrGroup):
         if straight := isinstance(background, str) and background == "none":
             people = replace(people, background="none")
         for part in batches(len(lights), people.nbytes):
-            for one in people.relit(sums_of(lights[part])):
+            for one in people.relit(stacked(lights[part])):
                 arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
                 image = torch.from_numpy(arrays.pop("rgb"))
                 if straight:
@@ -597,7 +596,7 @@ def olat_images(subject: Relightable, directions: Tensor) -> Iterator[np.ndarray
 
 def _under_each(subject: Relightable, directions: Tensor) -> np.ndarray:
     images = np.empty((len(directions), *subject.size_px, 3), np.float32)
-    lights = {str(number): one for number, one in enumerate(subject.relit(Lights.each(directions)))}
+    lights = {str(number): one for number, one in enumerate(subject.relit(Light.each(directions)))}
     subject.rendered(RenderRequest(lights=lights), lambda number, shape: images[int(number)])
     return images
 

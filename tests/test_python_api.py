@@ -234,6 +234,7 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
     [
         (facerf.Light(np.ones((2, 3)), np.ones((2, 3))), "length 1"),
         (facerf.Light(np.eye(3), np.full((3, 3), np.nan)), "not all finite"),
+        (facerf.Light(np.eye(3), np.ones((2, 3, 3))), "not [L, 3]"),
     ],
 )
 def test_lights_that_are_none(person: facerf.Person, light: facerf.Light, said: str) -> None:

@@ -22,9 +22,6 @@ facerf segment photos/ --jobs 4 -o cut/
 facerf fit-geometry me.jpg -o me.glb
 facerf fit-geometry me.jpg --face-model ict.npz -o fit/
 facerf fit-geometry photos/ --landmarks points/ -o fit/
-facerf convert-light sky.exr --to blender -o sky_blender.exr
-facerf convert-light skies/ --to blender --to mitsuba -o lights/
-facerf convert-light light.json --to latlong --width 1024 -o lights/
 facerf envmap -o maps/
 facerf envmap --count 20 -o maps/
 facerf envmap --kind sun --seed 3 -o maps/

@@ -33,8 +33,8 @@ from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.metrics import light_error_deg, tone_drift_deg
 from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Target
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
@@ -63,7 +63,7 @@ def compare_olats(faces: Sequence[Portrait], bench: Bench) -> Iterator[Compariso
     """A source: each method's image under the target's light next to the stack's own, unclipped."""
     (face,) = faces
     methods, (target, light, truth) = bench.methods, target_of(face)
-    lights, same = Lights.each(light[None]), target is face
+    lights, same = Light.each(light[None]), target is face
     predictions, views = {}, []
     for method in methods:
         view = target.pose_of(face.by(method.models), method.models)
@@ -278,7 +278,7 @@ def rendered(case: Case, source: np.ndarray | None, bench: Bench) -> dict[str, n
             f"{case.name}: has no source, pose and light; give a folder of `facerf evaluate cases`"
         )
     azimuth_deg, elevation_deg, *turn_deg = (float(case.facts[name]) for name in _LIGHT + _TURN)
-    lights = Lights.each(azel_to_direction(azimuth_deg, elevation_deg)[None])
+    lights = Light.each(azel_to_direction(azimuth_deg, elevation_deg)[None])
     frame = Crop(0.0, 0.0, float(source.shape[1]), source.shape[1])
     face = bench.find(source, case.name)
     images = {}

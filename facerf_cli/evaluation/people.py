@@ -27,8 +27,8 @@ from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.metrics import tone_of
 from facerf_cli.image.skin import skin_albedo
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.files import checkpoint_file
 from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face, NoFaceError, find_faces
@@ -73,7 +73,7 @@ class Method:
         return Person(self.models, None, head, reflectance).image(light, Target(fit, "face")).pixels
 
     def images(
-        self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
+        self, photo: np.ndarray | None, head: Head, lights: Light, target: Target
     ) -> Iterator[np.ndarray]:
         """Yield an image under each weighted sum of lights; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)

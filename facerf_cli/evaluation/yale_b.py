@@ -21,8 +21,9 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import Chosen, YaleOptions
 from facerf_cli.evaluation.people import Bench
 from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import Lights, far_samples
+from facerf_cli.light.studio_points import far_samples
 from facerf_cli.person import Target
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
@@ -213,7 +214,7 @@ def _rgb(grey: np.ndarray) -> np.ndarray:
     return np.repeat(grey[..., None], 3, -1).astype(np.float32)
 
 
-def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float) -> Lights:
+def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float) -> Light:
     """A sum of flashes for each target, with the room's share of each."""
     weights = torch.from_numpy(np.stack([subject.weights(one.light) for one in relightings])).float()
     used = weights.sum(0) > 0
@@ -223,4 +224,4 @@ def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float
         around, share = far_samples(StudioLight())
         directions = torch.cat([directions, around])
         weights = torch.cat([weights, room * share * weights.sum(1, keepdim=True)], 1)
-    return Lights(directions, weights[..., None].expand(-1, -1, 3))
+    return Light(directions, weights[..., None].expand(-1, -1, 3))

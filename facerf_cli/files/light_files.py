@@ -1,6 +1,6 @@
 """Lights on disk: JSON of a rig's weights and spherical harmonics, and environment maps.
 
-A JSON light is written by `facerf estimate-light` and `convert-light`; any image can be an environment map.
+`facerf estimate-light` writes a JSON light; any image can be an environment map.
 """
 
 import json
@@ -22,8 +22,8 @@ from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, LINEAR_BYTES, LinearImage, read_image
 from facerf_cli.light.envmap import check_envmap
-from facerf_cli.light.forms import LightForms
-from facerf_cli.light.sh import CONVENTION
+from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.sh import CONVENTION, positive_latlong
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME
@@ -35,34 +35,28 @@ AXES = "camera: x to the picture's right, y up, z toward the camera; directions 
 UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
 _LIMIT_BYTES = 4 << 20
 _MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441  # 441: spherical harmonics of order 20
+_JSON_ROWS = 256  # of the map that a JSON light is converted to
 _LARGEST = 1e30  # magnitude of a number; its square still fits double precision
 _GPANO = (
     "FullPanoHeight FullPanoWidth CroppedAreaImageHeight CroppedAreaImageWidth CroppedAreaTop CroppedAreaLeft"
 )
 _LENGTH_TOLERANCE = 1e-2  # a direction's length may differ from 1 by this, since other programs round
-_ADVICE = "give a .json that estimate-light or convert-light wrote"
-
-
-@dataclass(frozen=True, eq=False)
-class Harmonics:
-    """Spherical-harmonic coefficients [(order + 1)^2, 3], and their convention in words."""
-
-    coefficients: Tensor
-    convention: str
+_ADVICE = "give a .json that estimate-light wrote"
 
 
 @dataclass(frozen=True, eq=False)
 class LightRecord:
-    """The contents of a JSON light: directions and weights [L, 3] of a rig, or coefficients, or both.
+    """The contents of a JSON light: directions and weights [L, 3] of a rig, or coefficients `sh`, or both.
 
-    Without a rig, `directions` and `weights` have no rows. `rig` describes the directions in words;
-    `attributes` are the provenance (`logs.Provenance.attributes`) and how the light was estimated.
+    Coefficients [(order + 1)^2, 3] are those of `light.sh`. Without a rig, `directions` and `weights` have no
+    rows. `rig` describes the directions in words; `attributes` are the provenance
+    (`logs.Provenance.attributes`) and how the light was estimated.
     """
 
     directions: Tensor
     weights: Tensor
     rig: str = ""
-    sh: Harmonics | None = None
+    sh: Tensor | None = None
     attributes: Mapping[str, str | int | float] = field(default_factory=dict)
 
 
@@ -72,9 +66,8 @@ def write_light(path: Path, record: LightRecord) -> None:
     if len(record.directions):
         fields |= {"rig": record.rig, "directions": record.directions, "weights": record.weights}
     if record.sh is not None:
-        order = math.isqrt(len(record.sh.coefficients)) - 1
-        convention = {"order": order, "convention": record.sh.convention}
-        fields["sh"] = convention | {"coefficients": record.sh.coefficients}
+        order = math.isqrt(len(record.sh)) - 1
+        fields["sh"] = {"order": order, "convention": CONVENTION, "coefficients": record.sh}
     fields["provenance"] = dict(record.attributes)
     with atomic_path(path) as temporary:
         temporary.write_text(_text_of(fields, "") + "\n", encoding="utf-8")
@@ -129,9 +122,15 @@ _Rows = Annotated[np.ndarray, PlainValidator(partial(_rows, _MOST_LIGHTS))]
 _Coefficients = Annotated[np.ndarray, PlainValidator(partial(_rows, _MOST_COEFFICIENTS))]
 
 
+def _ours(convention: str) -> str:
+    if convention != CONVENTION:
+        raise ValueError(f"another convention; convert the coefficients to: {CONVENTION}")
+    return convention
+
+
 class _HarmonicsEntry(Document):
     coefficients: Annotated[_Coefficients, AfterValidator(_whole_orders)]
-    convention: str = ""
+    convention: Annotated[str, AfterValidator(_ours)]
 
 
 class _LightDocument(Document):
@@ -164,7 +163,7 @@ def read_light(path: Path) -> LightRecord:
         torch.from_numpy(none if light.directions is None else light.directions),
         torch.from_numpy(none if light.weights is None else light.weights),
         light.rig,
-        Harmonics(torch.from_numpy(light.sh.coefficients), light.sh.convention) if light.sh else None,
+        torch.from_numpy(light.sh.coefficients) if light.sh else None,
         {name: value for name, value in light.provenance.items() if _is_attribute(value)},
     )
 
@@ -217,15 +216,9 @@ def _in_sphere(path: Path | str, image: LinearImage) -> np.ndarray:
 
 @lru_cache(maxsize=2)  # converting a rig takes seconds, and relight reads the same light several times
 def _latlong(path: Path) -> Tensor:
-    return read_light_file(path)[0].latlong()
-
-
-def read_light_file(path: Path) -> tuple[LightForms, Mapping[str, str | int | float]]:
-    """Read a JSON light's rig, or its coefficients if it has no rig; and its provenance."""
+    """Convert a JSON light's rig, or its coefficients if it has no rig, to a map."""
     record = read_light(path)
     if len(record.directions):
-        return LightForms(rig=RigLight(record.directions, record.weights)), record.attributes
+        return rig_to_latlong(RigLight(record.directions, record.weights), _JSON_ROWS)
     assert record.sh is not None
-    if record.sh.convention != CONVENTION:
-        raise InputError(f"{path}: spherical harmonics of another convention; convert them to: {CONVENTION}")
-    return LightForms(coefficients=record.sh.coefficients), record.attributes
+    return positive_latlong(record.sh, _JSON_ROWS)

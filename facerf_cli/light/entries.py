@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_light_list, read_rig, read_text
@@ -22,24 +22,16 @@ _DIRECTIONS_HELP = (
     "pass a number, 'az,el;az,el;...' in degrees, or a file with az,el, x y z or name x y z on each line"
 )
 _MOST_DIGITS = 9  # of a count; Python refuses to read thousands
-_FORMS = ("AZ,EL", "AZ,EL,STRENGTH", "AZ,EL,R,G,B")
+_FORMS = ("AZ,EL", "AZ,EL,STRENGTH")
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _RIGS = Path(__file__).parents[1] / "assets" / "rigs"
 ROOM_BEFORE_BRIGHT, ROOM_BEFORE_DARK = 0.06, 0.03  # of lights: what a room sends back, by the background
 # Words, and by default names, of lights by the photo: its own, and even light as bright.
 OWN, EVEN = "own", "even"
-_PLACES = ({"at"}, {"from"}, {"az", "el"}, {"map"})  # keys of which a light has those of one
-# Keys of one kind of light.
-_NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=, az=, el=)", "maps (map=)"
-_OF_KIND = {"size": _NEAR, "spot": _NEAR, "size_deg": _FAR, "rotate": _MAP}
-KEYS = ("at", "from", "az", "el", "map", "rgb", "kelvin", "stops", *_OF_KIND, "face")
-_NO_PLACES = ("name", "map", "kelvin", "stops", *_OF_KIND, "face")  # whose values are no directions
-# Limits of values.
-_KELVIN, _STOPS, _DISTANCE_M = (1667.0, 25000.0), (-20.0, 20.0), (0.15, 1e4)
-_SIZE_M, _SIZE_DEG, _SPOT_DEG, _RGB = (0.0, 10.0), (0.0, 120.0), (1.0, 170.0), (0.0, 1e6)
-_TURN_DEG, _FACE = (-3600.0, 3600.0), (0.0, 99.0)
+_DISTANCE_M = (0.15, 1e4)  # of a near light
 
 
+Sampling = Literal["cell", "smooth", "paper"]  # how lights of a rig sample a map
 Triple = tuple[float, float, float]
 
 
@@ -187,46 +179,65 @@ class LitImage:
     is_shared: bool = False  # by all lights that have names
 
 
-def light_by_keys(
-    given: Mapping[str, str], where: str, name: str | None, place: str | None = None
-) -> LitImage:
-    """Check the settings of a light and make it; raises UsageError that begins with `where`.
+class _Key(NamedTuple):
+    """A key that has numbers: their form and limits, the field that it sets, and the kind of its lights."""
 
-    Its `place` may be given without a key: a direction, a word, a preset or a rig file.
+    form: str
+    limits: tuple[float, float]
+    field: str
+    kind: str = ""  # '': all
+
+
+_NEAR, _FAR, _MAP = "near lights (at=)", "far lights (from=AZ,EL)", "maps (map=)"
+_PLACES = {"at": _NEAR, "from": _FAR, "map": _MAP}  # keys of which a light has one, and what they make it
+_NUMBERS = {
+    "rgb": _Key("R,G,B", (0.0, 1e6), "rgb"),
+    "kelvin": _Key("KELVIN", (1667.0, 25000.0), "kelvin"),
+    "stops": _Key("STOPS", (-20.0, 20.0), "stops"),
+    "size": _Key("METRES", (0.0, 10.0), "size_m", _NEAR),
+    "spot": _Key("DEG", (1.0, 170.0), "spot_deg", _NEAR),
+    "size_deg": _Key("DEG", (0.0, 120.0), "size_deg", _FAR),
+    "rotate": _Key("DEG", (-3600.0, 3600.0), "rotate_deg", _MAP),
+    "face": _Key("NUMBER", (0.0, 99.0), "face"),
+}
+KEYS = (*_PLACES, *_NUMBERS)
+_REMOVED = ("az", "el")
+
+
+def light_by_keys(
+    given: Mapping[str, str], where: str, name: str | None, rig: LitImage | None = None
+) -> LitImage:
+    """Make a light of its settings, or change all lights of a rig by them.
+
+    Raises UsageError that begins with `where` for wrong settings.
     """
+    if given.keys() & set(_REMOVED):
+        azimuth, elevation = (given.get(key, "0") for key in _REMOVED)
+        raise UsageError(f"{where} az and el: no such keys; use from={azimuth},{elevation}")
     if wrong := [key for key in given if key not in KEYS]:
         raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
-    if (place is not None) + sum(bool(given.keys() & keys) for keys in _PLACES) != 1:
-        one = "AZ,EL, " if place is not None else ""
-        raise UsageError(
-            f"{where} {_typed(given)}: give one of {one}at=X,Y,Z, from=AZ,EL, map=FILE, or az and el"
-        )
-    placed = _by_key(given, where) if place is None else _placed(place, where)
+    typed = repr(";".join(f"{key}={value}" for key, value in given.items()))
+    places = [key for key in _PLACES if key in given]
+    if len(places) + (rig is not None) != 1:
+        raise UsageError(f"{where} {typed}: give one of at=X,Y,Z, from=AZ,EL and map=FILE")
+    placed = rig or _placed(places[0], given[places[0]], where)
     first = placed.frames[0][0]
-    kind = "" if placed.names else _NEAR if first.at_m else _MAP if first.envmap else _FAR
-    if "size_deg" in given and (first.is_around or first.own):
-        whose = "the photo's own light" if first.own else "a light from all around"
-        raise UsageError(f"{where} {_typed(given)}: {whose} has no size; leave size_deg out")
-    if wrong := [key for key in given if _OF_KIND.get(key, kind) != kind]:
-        raise UsageError(f"{where} {_typed(given)}: {wrong[0]} is of {_OF_KIND[wrong[0]]}; leave it out")
-
-    def number(key: str, form: str, limits: tuple[float, float]) -> float | None:
-        return _numbers(given[key], form, limits, f"{where} {key}")[0] if key in given else None
-
-    face = number("face", "NUMBER", _FACE)
-    if face is not None and not face.is_integer():
+    kind = "" if rig or first.is_around or first.own else _PLACES[places[0]]
+    numeric = {key: form for key, form in _NUMBERS.items() if key in given}
+    if wrong := [key for key, form in numeric.items() if form.kind not in ("", kind)]:
+        raise UsageError(f"{where} {typed}: {wrong[0]} is of {numeric[wrong[0]].kind}; leave it out")
+    settings: dict[str, Any] = {}
+    for key, form in numeric.items():
+        values = numbers(given[key], (form.form,), f"{where} {key}")
+        if not all(form.limits[0] <= value <= form.limits[1] for value in values):
+            limits = f"{form.limits[0]:g} to {form.limits[1]:g}"
+            raise UsageError(f"{where} {key} {given[key]!r}: out of range; give {limits}")
+        settings[form.field] = values if key == "rgb" else values[0]
+    if not settings.get("face", 0.0).is_integer():
         raise UsageError(f"{where} face {given['face']!r}: give the number of one; 0 is on the left")
-    red, green, blue = _numbers(given.get("rgb", "1,1,1"), "R,G,B", _RGB, f"{where} rgb")
-    stops = number("stops", "STOPS", _STOPS) or 0.0
-    settings: dict[str, Any] = {
-        "kelvin": number("kelvin", "KELVIN", _KELVIN),
-        "size_m": number("size", "METRES", _SIZE_M),
-        "size_deg": number("size_deg", "DEG", _SIZE_DEG),
-        "spot_deg": number("spot", "DEG", _SPOT_DEG),
-        "rotate_deg": number("rotate", "DEG", _TURN_DEG),
-        "face": None if face is None else int(face),
-    }
-    settings = {key: value for key, value in settings.items() if value is not None}
+    if "face" in settings:
+        settings["face"] = int(settings["face"])
+    (red, green, blue), stops = settings.pop("rgb", (1.0, 1.0, 1.0)), settings.pop("stops", 0.0)
 
     def lit(light: StudioLight) -> StudioLight:
         rgb = (light.rgb[0] * red, light.rgb[1] * green, light.rgb[2] * blue)
@@ -239,74 +250,43 @@ def light_by_keys(
     return LitImage(frames, placed.is_numbered, names, name)
 
 
-def _by_key(given: Mapping[str, str], where: str) -> LitImage:
-    """The light of rgb 1 at the place that keys give."""
-    if "map" in given:
-        return LitImage(((StudioLight(envmap=Path(given["map"])),),))
-    if "at" in given:
-        return LitImage(((StudioLight(at_m=_place(given["at"], where)),),))
-    if "from" in given:
-        return LitImage(((_far(given["from"], ("AZ,EL",), f"{where} from"),),))
-    sweeps = any(is_sweep(given.get(key, "")) for key in ("az", "el"))
-    return LitImage(tuple((StudioLight(pair),) for pair in _directions(given, where)), sweeps)
-
-
-def _placed(text: str, where: str) -> LitImage:
-    """The lights of a direction, a word, a preset or a rig file."""
-    if (path := _rig_path(text)) is not None:
-        return _rig(path)
-    light = _far(text, _FORMS, where)
-    name = text if text in WORDS else "_".join(f"{float(value):g}" for value in text.split(","))
-    return LitImage(((light,),), name=name)
-
-
-def _far(text: str, forms: tuple[str, ...], option: str) -> StudioLight:
-    """Parse a direction, with its strength or colour, or a word."""
-    if text in WORDS:
-        return WORDS[text]
-    if _NAME.fullmatch(text):
-        raise UsageError(f"{option} {text!r}: give AZ,EL or one of {', '.join(WORDS)}")
-    azimuth, elevation, *colour = azel(text, forms, option)
-    red, green, blue = (3 * (colour or [1.0]))[:3]
-    return StudioLight((azimuth, elevation), rgb=(red, green, blue))
-
-
-def _typed(given: Mapping[str, str]) -> str:
-    return repr(";".join(f"{key}={value}" for key, value in given.items()))
-
-
-def _numbers(text: str, form: str, limits: tuple[float, float], option: str) -> list[float]:
-    values = numbers(text, (form,), option)
-    if not all(limits[0] <= value <= limits[1] for value in values):
-        raise UsageError(f"{option} {text!r}: out of range; give {limits[0]:g} to {limits[1]:g}")
-    return values
-
-
-def _place(text: str, where: str) -> tuple[float, float, float]:
+def _placed(key: str, text: str, where: str) -> LitImage:
+    """The light at the place that a key gives."""
+    if key == "from":
+        return _far(text, f"{where} from")
+    if key == "map":
+        return LitImage(((StudioLight(envmap=Path(text)),),))
     x, y, z = numbers(text, ("X,Y,Z",), f"{where} at")
     if not _DISTANCE_M[0] <= (x * x + y * y + z * z) ** 0.5 <= _DISTANCE_M[1]:
         raise UsageError(
             f"{where} at {text!r}: the distance from the face is out of range; give {_DISTANCE_M[0]:g} to "
             f"{_DISTANCE_M[1]:g} metres"
         )
-    return x, y, z
+    return LitImage(((StudioLight(at_m=(x, y, z)),),))
 
 
-def _directions(given: Mapping[str, str], where: str) -> list[tuple[float, float]]:
-    """Azimuth and elevation by `az` and `el`, of each frame where they sweep."""
-    azimuths, elevations = (_angles(given.get(key, "0"), f"{where} {key}") for key in ("az", "el"))
-    count = max(len(azimuths), len(elevations))
-    if min(len(azimuths), len(elevations)) not in (1, count):
-        raise UsageError(f"{where} {_typed(given)}: az and el sweep in another number of frames; give one N")
-    pairs = [(azimuths[k % len(azimuths)], elevations[k % len(elevations)]) for k in range(count)]
-    for pair in pairs:
-        azel(f"{pair[0]},{pair[1]}", ("AZ,EL",), where)
-    return pairs
-
-
-def _angles(text: str, option: str) -> list[float]:
-    """Parse `DEG`, or `FROM:TO:N` to N angles."""
-    return sweep(text, option) if is_sweep(text) else numbers(text, ("DEG or FROM:TO:N",), option)
+def _far(text: str, where: str) -> LitImage:
+    """Parse a word, or a direction with its strength; its angles may sweep, in the same number of frames."""
+    if text in WORDS:
+        return LitImage(((WORDS[text],),), name=text)
+    if _NAME.fullmatch(text):
+        raise UsageError(f"{where} {text!r}: give AZ,EL or one of {', '.join(WORDS)}")
+    parts = text.split(",")
+    if len(parts) == 5:
+        light = f"{','.join(parts[:2])};rgb={','.join(parts[2:])}"
+        raise UsageError(f"{where} {text!r}: a colour has a key of its own; use {light}")
+    angles = [sweep(part, where) if is_sweep(part) else [part] for part in parts[:2]]
+    count = max(map(len, angles))
+    if min(map(len, angles)) not in (1, count):
+        raise UsageError(f"{where} {text!r}: azimuth and elevation sweep in different frames; give one N")
+    frames = []
+    for number in range(count):
+        pair = [str(values[number % len(values)]) for values in angles]
+        values = azel(",".join([*pair, *parts[2:]]), _FORMS, where)
+        red, green, blue = 3 * (values[2:] or [1.0])
+        frames.append((StudioLight((values[0], values[1]), rgb=(red, green, blue)),))
+    name = "_".join(part if is_sweep(part) else f"{float(part):g}" for part in parts)
+    return LitImage(tuple(frames), is_sweep(text), name=name.replace(":", "_"))
 
 
 def lit_images(entries: Sequence[str], maps: Sequence[LitImage] = ()) -> list[LitImage]:
@@ -331,22 +311,18 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     Returns the lights and the name of their image; None where they have names, and share one with others.
     """
     where, pairs = f"--light {text!r}:", _pairs(text)
-    keys = [key for key, _ in pairs if key in ("name", *KEYS)]
+    keys = [key for key, _ in pairs if key in ("name", *KEYS, *_REMOVED)]
     given = {key: value for key, value in pairs if key is not None and key in keys}
     places: list[tuple[str | None, str | None]] = [pair for pair in pairs if pair[0] not in keys]
     if len(given) < len(keys):
         twice = min(key for key in given if keys.count(key) > 1)
         raise UsageError(f"{where} {twice} is given twice; a light has one, give --light again")
-    by_key = given.keys() & {key for some in _PLACES for key in some}
-    first, value = pairs[0]
-    if first in _NO_PLACES and not places and not by_key - {first} and _is_place(value):
-        raise UsageError(f"{where} {first} is a key; give another name, as in {first}_light={value}")
-    if wrong := [
-        key for key, value in pairs[not by_key :] if key not in (None, *keys) and not _is_place(value)
-    ]:
-        raise UsageError(f"{where} {wrong[0]!r}: no such key; give {', '.join(KEYS)}")
-    if given and len(places) > 1:
-        raise UsageError(f"{where} {min(given)} is of one light; give each light a --light of its own")
+    if wrong := [pair for pair in pairs if pair[0] not in keys and not _is_place(pair[1])]:
+        part = "=".join(filter(None, wrong[0]))
+        known = f"AZ,EL, a rig file (.toml) or one of {', '.join((*preset_names(), *WORDS))}"
+        raise UsageError(f"{where} {part!r}: no such light or key; give {known}; keys are {', '.join(KEYS)}")
+    if places and given and len(places) + len(given.keys() & _PLACES.keys()) > 1:
+        raise UsageError(f"{where} keys are of one light; give each light a --light of its own")
     places = places or [(None, None)]
     if "name" in given:
         if places[0][0] is not None:
@@ -356,7 +332,7 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
         (word if name is None and (word := place or given.get("from")) in (OWN, EVEN) else name, place)
         for name, place in places
     ]
-    lights = [light_by_keys(given, "--light", *place) for place in places]
+    lights = [_light(given, name, place) for name, place in places]
     if len({bool(light.names) for light in lights}) > 1:
         raise UsageError(f"{where} some lights have names; give each one, as in key=40,20, or none")
     if any(name is not None for name, _ in places):
@@ -366,20 +342,28 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     return lights, lights[0].name if lights[0].names else "light_" + "+".join(one.name for one in lights)
 
 
+def _light(given: Mapping[str, str], name: str | None, place: str | None) -> LitImage:
+    """A light of an entry; a place without a key is a rig file, a preset, or that of `from`."""
+    if place is None:
+        return light_by_keys(given, "--light", name)
+    if (path := _rig_path(place)) is not None:
+        return light_by_keys(given, "--light", name, _rig(path))
+    return light_by_keys({"from": place, **given}, "--light", name)
+
+
 def _pairs(text: str) -> list[tuple[str | None, str]]:
     """Split an entry into keys or names, None where a part has none, and values."""
     if text.endswith(".toml") and os.path.isfile(text):  # whose path may hold = and ;
         return [(None, text)]
     parts = [part.partition("=") for part in text.split(";") if part.strip()] or [("", "", "")]
     if any("=" in value for *_, value in parts):
-        raise UsageError(f"--light {text!r}: give ; between keys, as in 'az=60;el=10'")
+        raise UsageError(f"--light {text!r}: give ; between keys, as in 'from=60,10;stops=1'")
     return [(key.strip(), value.strip()) if equals else (None, key.strip()) for key, equals, value in parts]
 
 
 def _is_place(value: str) -> bool:
-    """True for what looks like a direction, a word, a preset or a rig file, and not for a map."""
-    known = value in WORDS or value in preset_names() or value.endswith(".toml")
-    return known or ("," in value and not value.lower().endswith((".exr", ".hdr", ".json")))
+    """True for what looks like a direction, a word, a preset or a rig file."""
+    return "," in value or value in WORDS or value in preset_names() or value.endswith(".toml")
 
 
 @cache
@@ -390,32 +374,25 @@ def preset_names() -> tuple[str, ...]:
 
 def _rig_path(text: str) -> Path | None:
     """The file of a rig or preset; None for directions."""
-    if text.endswith(".toml"):
-        if not os.path.isfile(text):
-            raise UsageError(f"--light {text}: no such rig file; give one that exists")
-        return Path(text)
     if text in preset_names():
         return _RIGS / f"{text}.toml"
-    if _NAME.fullmatch(text) and text not in WORDS:
-        known = ", ".join((*preset_names(), *WORDS))
-        raise UsageError(f"--light {text}: no such preset; give AZ,EL, a rig file (.toml) or one of {known}")
-    return None
+    if not text.endswith(".toml"):
+        return None
+    if not os.path.isfile(text):
+        raise UsageError(f"--light {text}: no such rig file; give one that exists")
+    return Path(text)
 
 
 def _rig(path: Path) -> LitImage:
-    """The lights of a rig file, whose image has its name."""
-    tables = read_rig(path)
+    """The lights of a rig file, whose image has its name; paths of maps begin at the file's folder."""
+    lights = []
     try:
-        lights = [_light_of_rig(path, name, table) for name, table in tables.items()]
+        for name, table in read_rig(path).items():
+            beside = {"map": str(path.parent / table["map"])} if "map" in table else {}
+            lights.append(light_by_keys({**table, **beside}, f"{path}: {name}:", name))
         return _together(path.stem, lights, f"{path}:")
     except UsageError as error:  # of a value: the file is at fault, not the command line
         raise InputError(str(error)) from None
-
-
-def _light_of_rig(path: Path, name: str, table: Mapping[str, str]) -> LitImage:
-    """A light of a rig file, whose map's path begins at the file's folder."""
-    beside = {"map": str(path.parent / table["map"])} if "map" in table else {}
-    return light_by_keys({**table, **beside}, f"{path}: {name}:", name)
 
 
 def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:

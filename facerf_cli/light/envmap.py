@@ -12,7 +12,7 @@ It shines from its middle as one single light.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,9 +23,9 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Resized, in_strips
+from facerf_cli.light.entries import Sampling
 from facerf_cli.light.sphere import RigLight, direction_to_uv, latlong_directions, latlong_solid_angles
 
-Sampling = Literal["cell", "smooth", "paper"]
 _DIRECTIONS_AT_ONCE = 1 << 12  # that are compared with all triangles of a rig
 _MANY_LIGHTS = 400  # from which on a tree finds the nearest sooner
 _TEXELS_AT_ONCE = 1 << 13  # that are compared with all lights of a rig
@@ -85,10 +85,10 @@ def rotated_weights(
     else:
         index = nearest_light(directions, height, 2 * height).reshape(-1, 1)
         share = torch.ones(index.shape, dtype=torch.float64)
-    rows = _RowIntegrals(envmap, height)
+    rows = _row_integrals(envmap, height)
     found = []
     for rotation_deg in rotations_deg:
-        power = rows.rotated(2 * height, rotation_deg).reshape(-1, 3) / math.pi
+        power = _texels_of_rows(rows, 2 * height, rotation_deg).reshape(-1, 3) / math.pi
         weights = torch.zeros(len(directions), 3, dtype=torch.float64)
         for light, part in zip(index.unbind(1), share.unbind(1), strict=True):
             weights = weights.index_add(0, light, part[:, None] * power)
@@ -120,39 +120,35 @@ def texel_integrals(envmap: Tensor, height: int, width: int, rotate_deg: float =
     `rotate_deg` is added to every azimuth of the map. The integrals are exact for a map that is constant over
     each of its pixels, for any sizes and angle.
     """
-    return _RowIntegrals(envmap, height).rotated(width, rotate_deg)
+    return _texels_of_rows(_row_integrals(envmap, height), width, rotate_deg)
 
 
-class _RowIntegrals:
-    """Integrals of a map over the elevations of `height` rows, cumulative over azimuth."""
+def _row_integrals(envmap: Tensor, height: int) -> Tensor:
+    """Integrals [height, W + 1, 3] of a map over the elevations of rows, cumulative over azimuth."""
+    envmap = torch.as_tensor(envmap)
+    old, new = _row_edges(envmap.shape[0]), _row_edges(height)
+    top, bottom = torch.minimum(new[:-1, None], old[:-1]), torch.maximum(new[1:, None], old[1:])
+    overlap = (top - bottom).clamp(min=0)  # [height, H] of sin(elevation)
+    parts = [
+        torch.einsum("nh,hwc->nwc", overlap, part.double())
+        for part in torch.split(envmap.cpu(), _COLUMNS_AT_ONCE, dim=1)
+    ]
+    up_to = torch.cat(parts, 1).cumsum(1) * (2 * math.pi / envmap.shape[1])
+    return torch.cat([torch.zeros(height, 1, 3, dtype=torch.float64), up_to], 1)
 
-    def __init__(self, envmap: Tensor, height: int) -> None:
-        envmap = torch.as_tensor(envmap)
-        old = _row_edges(envmap.shape[0])
-        new = _row_edges(height)
-        top, bottom = torch.minimum(new[:-1, None], old[:-1]), torch.maximum(new[1:, None], old[1:])
-        overlap = (top - bottom).clamp(min=0)  # [height, H] of sin(elevation)
-        parts = [
-            torch.einsum("nh,hwc->nwc", overlap, part.double())
-            for part in torch.split(envmap.cpu(), _COLUMNS_AT_ONCE, dim=1)
-        ]
-        pixel_azimuth = 2 * math.pi / envmap.shape[1]
-        zero = torch.zeros(height, 1, 3, dtype=torch.float64)
-        up_to = torch.cat(parts, 1).cumsum(1) * pixel_azimuth
-        self._up_to = torch.cat([zero, up_to], 1)  # [height, W + 1, 3]
 
-    def rotated(self, width: int, rotate_deg: float) -> Tensor:
-        """Integrals over `width` texels per row [height, width, 3], `rotate_deg` added to every azimuth."""
-        pixels = self._up_to.shape[1] - 1
-        # u decreases with azimuth, so the content at u comes from further right.
-        u = torch.arange(width + 1, dtype=torch.float64) / width + rotate_deg / 360
-        turns = u.floor()
-        position = (u - turns) * pixels
-        pixel = position.long().clamp(max=pixels - 1)
-        before, after = self._up_to[:, pixel], self._up_to[:, pixel + 1]
-        fraction = (position - pixel)[:, None]
-        edges = before + fraction * (after - before) + turns[:, None] * self._up_to[:, -1:]
-        return edges.diff(dim=1)
+def _texels_of_rows(up_to: Tensor, width: int, rotate_deg: float) -> Tensor:
+    """Integrals over `width` texels per row [height, width, 3], `rotate_deg` added to every azimuth."""
+    pixels = up_to.shape[1] - 1
+    # u decreases with azimuth, so the content at u comes from further right.
+    u = torch.arange(width + 1, dtype=torch.float64) / width + rotate_deg / 360
+    turns = u.floor()
+    position = (u - turns) * pixels
+    pixel = position.long().clamp(max=pixels - 1)
+    before, after = up_to[:, pixel], up_to[:, pixel + 1]
+    fraction = (position - pixel)[:, None]
+    edges = before + fraction * (after - before) + turns[:, None] * up_to[:, -1:]
+    return edges.diff(dim=1)
 
 
 def _row_edges(height: int) -> Tensor:
@@ -305,31 +301,22 @@ class Backdrop:
         return np.asarray(look_up(self._mean, directions.reshape(-1, 3)).view(directions.shape).numpy())
 
 
-class MapKeys(NamedTuple):
-    """A map [H, W, 3] without its keys, and these: unit directions [K, 3] and rgb weights [K, 3]."""
-
-    rest: Tensor
-    directions: Tensor
-    weights: Tensor
-
-    @staticmethod
-    def none(envmap: Tensor) -> "MapKeys":
-        """A map all of which is the rest."""
-        return MapKeys(envmap, torch.zeros(0, 3), torch.zeros(0, 3))
-
-    def turned(self, rotate_deg: float) -> RigLight:
-        """The keys of the map with `rotate_deg` added to every azimuth."""
-        turn = torch.deg2rad(torch.tensor(rotate_deg))
-        x, y, z = self.directions.unbind(1)
-        turned = torch.stack([x * turn.cos() + z * turn.sin(), y, z * turn.cos() - x * turn.sin()], 1)
-        return RigLight(turned, self.weights)
+NO_KEYS = RigLight(torch.zeros(0, 3), torch.zeros(0, 3))
 
 
-def without_keys(envmap: Tensor) -> MapKeys:
-    """Take the keys out of a lat-long map [H, W, 3]; a map without keys stays as it is."""
+def turned(light: RigLight, rotate_deg: float) -> RigLight:
+    """A light with `rotate_deg` added to every azimuth."""
+    turn = torch.deg2rad(torch.tensor(rotate_deg))
+    x, y, z = light.directions.unbind(1)
+    directions = torch.stack([x * turn.cos() + z * turn.sin(), y, z * turn.cos() - x * turn.sin()], 1)
+    return RigLight(directions, light.weights)
+
+
+def without_keys(envmap: Tensor) -> tuple[Tensor, RigLight]:
+    """Take the keys out of a lat-long map [H, W, 3], which stays as it is without any; return both."""
     rows = min(_ROWS, len(envmap))
     if 180 / rows > 2 * _REACH_DEG:  # a texel is no key
-        return MapKeys.none(envmap)
+        return envmap, NO_KEYS
     small = resampled(envmap, rows)
     towards, solid = latlong_directions(rows, 2 * rows), latlong_solid_angles(rows, 2 * rows, torch.float32)
     shown = torch.from_numpy(luminance(small.detach().numpy())).clamp_min(0)
@@ -348,11 +335,11 @@ def without_keys(envmap: Tensor) -> MapKeys:
         keys.append(key)
         left = left * (1 - key)
     if not keys:
-        return MapKeys.none(envmap)
+        return envmap, NO_KEYS
     found = torch.stack(keys)
     middles = torch.einsum("kij,ij,ijc->kc", found, light, towards)
     weights = torch.einsum("kij,ij,ijc->kc", found, solid, small) / torch.pi
-    return MapKeys(small * left[..., None], F.normalize(middles, dim=1), weights)
+    return small * left[..., None], RigLight(F.normalize(middles, dim=1), weights)
 
 
 def _within(towards: Tensor, middle: Tensor, reach_deg: float) -> Tensor:

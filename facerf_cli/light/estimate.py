@@ -112,46 +112,20 @@ def estimate_lamps(olats: Tensor, image: Tensor, lamps: int) -> Tensor:
     squares: clipped, covered and misfitted elements lose weight. The lights after the first `lamps` are the
     light from around; it is as even, and all lights are as much of one colour, as the image allows.
     """
-    count, even = len(olats), np.zeros((len(olats) - lamps, len(olats)))
-    even[:, lamps:] = np.eye(count - lamps) - 1 / (count - lamps)
-    ((lights, target),) = _channels(olats.mean(1, keepdim=True), image.mean(0, keepdim=True))
-    grey = _reweighted(lights, target, _EVEN * even, np.zeros(len(even)))
-    solved = []
-    for own, shown in _channels(olats, image):
-        explained = own @ grey
-        gain = (shown @ explained) / max(explained @ explained, _TINY)
-        solved.append(_reweighted(own, shown, _ONE_COLOUR * np.eye(count), _ONE_COLOUR * gain * grey))
-    return torch.from_numpy(np.stack(solved, -1)).float()
+    count = len(olats)
+    uneven = np.zeros((count - lamps, count))
+    uneven[:, lamps:] = np.eye(count - lamps) - 1 / (count - lamps)
+    mean = _channels(olats.mean(1, keepdim=True), image.mean(0, keepdim=True))
+    grey = _robust(mean, [1.0], _EVEN**2 * uneven.T @ uneven, np.zeros(count))
+    weights = _near_grey(_channels(olats, image), grey, _ONE_COLOUR**2 * np.eye(count))
+    return torch.from_numpy(weights).float()
 
 
 def lamp_error(lamp: Tensor, around: Tensor, image: Tensor) -> float:
     """Root of the mean squared error of an image [N] as a sum of those of a lamp and of light from around."""
-    lights, target = torch.stack([lamp, around], -1).double().numpy(), image.double().numpy()
-    weights = _reweighted(lights, target, np.zeros((0, 2)), np.zeros(0))
-    return float(np.sqrt(np.square(lights @ weights - target).mean()))
-
-
-def _channels(olats: Tensor, image: Tensor) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Lights [N, L] and target [N] of each channel of images [L, C, N] and [C, N]."""
-    return [(a.double().T.numpy(), b.double().numpy()) for a, b in zip(olats.unbind(1), image, strict=True)]
-
-
-def _reweighted(lights: np.ndarray, target: np.ndarray, hold: np.ndarray, held: np.ndarray) -> np.ndarray:
-    """Solve lights [N, L] @ weights = target [N] and hold [H, L] @ weights = held [H] for weights [L] >= 0.
-
-    The latter counts in shares of the target's norm.
-    """
-    if not len(target):  # nothing is visible enough
-        return np.zeros(lights.shape[1])
-    trust, holding = np.ones(len(target)), target @ target * hold.T
-    gram, moment = holding @ hold, holding @ held
-    for _ in range(_ROUNDS):
-        trusted = lights.T * trust
-        weights = least_non_negative(trusted @ lights + gram, trusted @ target + moment)
-        error = np.abs(lights @ weights - target)
-        limit = _OUTLIER * np.median(error) + _TINY
-        trust = np.minimum(1, limit / np.maximum(error, limit))
-    return weights
+    (channel,) = _channels(torch.stack([lamp, around])[:, None], image[None])
+    weights = _robust([channel], [1.0], np.zeros((2, 2)), np.zeros(2))
+    return float(np.sqrt(np.square(channel.lights @ weights - channel.target).mean()))
 
 
 def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:
@@ -161,11 +135,9 @@ def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:
     singular values below `_CONDITION` of the largest are left out, for they are noise of the field (truncated
     singular value decomposition; Hansen, *Rank-deficient and discrete ill-posed problems*, 1998).
     """
-    channels = [
-        np.linalg.lstsq(lights.double().T.numpy(), target.double().numpy(), rcond=_CONDITION)[0]
-        for lights, target in zip(olats.unbind(1), image, strict=True)
-    ]
-    return torch.from_numpy(np.stack(channels, -1)).float()
+    channels = _channels(olats, image)
+    solved = [np.linalg.lstsq(one.lights, one.target, rcond=_CONDITION)[0] for one in channels]
+    return torch.from_numpy(np.stack(solved, -1)).float()
 
 
 def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor) -> Tensor:
@@ -182,15 +154,11 @@ def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, cl
     from_near = _difference_from_neighbours(directions.double().numpy())
     radiance = olats.double().mean((1, 2)).numpy()
     continued = _continuation(from_near, radiance > _REACHES * radiance.max())  # [L, S]
-    channels = [
-        _Channel(lights.double().T.numpy() @ continued, target.double().numpy(), white.numpy())
-        for lights, target, white in zip(olats.unbind(1), image, clipped, strict=True)
-    ]
+    channels = _channels(olats, image, clipped, continued)
     from_near = from_near @ continued
-    grey, colour = _grey_light(channels, from_near)
-    roughness = from_near.T @ from_near
-    own = [channel.near(gain * grey, roughness) for channel, gain in zip(channels, colour, strict=True)]
-    return torch.from_numpy(continued @ np.stack(own, -1)).float()
+    grey = _grey_light(channels, from_near)
+    hold = _SMOOTH_CHANNEL**2 * from_near.T @ from_near + _SHORT_CHANNEL**2 * np.eye(len(grey))
+    return torch.from_numpy(continued @ _near_grey(channels, grey, hold)).float()
 
 
 def _continuation(from_near: np.ndarray, reaches: np.ndarray) -> np.ndarray:
@@ -212,63 +180,92 @@ class _Channel:
     """One colour channel of the images under each light [N, L] and of the photo [N], with trust [N]."""
 
     def __init__(self, lights: np.ndarray, target: np.ndarray, clipped: np.ndarray) -> None:
-        self._lights, self._target, self._clipped = lights, target, clipped
+        self.lights, self.target, self._clipped = lights, target, clipped
         self._trust = np.ones(len(target))  # weight of each squared error
         self.power = float(target @ target)
 
-    def gram(self) -> np.ndarray:
-        return (self._lights.T * self._trust) @ self._lights
-
-    def moment(self) -> np.ndarray:
-        return self._lights.T @ (self._trust * self._target)
+    def normal_equations(self, gain: float) -> tuple[np.ndarray, np.ndarray]:
+        """The Gram matrix [L, L] and moments [L] of the weights that explain this channel, times `gain`."""
+        trusted = gain * self.lights.T * self._trust
+        return gain * trusted @ self.lights, trusted @ self.target
 
     def gain_of(self, weights: np.ndarray) -> float:
         """The factor by which `weights` explain this channel best."""
-        explained = self._lights @ weights
+        explained = self.lights @ weights
         return float(
-            (self._trust * self._target) @ explained / max((self._trust * explained) @ explained, _TINY)
+            (self._trust * self.target) @ explained / max((self._trust * explained) @ explained, _TINY)
         )
 
     def reweight(self, weights: np.ndarray) -> None:
         """Set trust by the errors under the weights (Huber), 0 for clipped texels that are bright enough."""
-        beyond = self._lights @ weights - self._target
+        if not len(self.target):  # nothing is visible enough
+            return
+        beyond = self.lights @ weights - self.target
         error = np.abs(np.where(self._clipped, np.minimum(beyond, 0), beyond))
         typical = error if self._clipped.all() else error[~self._clipped]
         limit = _OUTLIER * np.median(typical) + _TINY
         self._trust = np.minimum(1, limit / np.maximum(error, limit)) * ~(self._clipped & (beyond > 0))
 
-    def near(self, wanted: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        """Weights [L] that explain this channel and differ smoothly from the `wanted` ones."""
-        hold = self.power * (_SMOOTH_CHANNEL**2 * roughness + _SHORT_CHANNEL**2 * np.eye(len(wanted)))
-        for _ in range(_ROUNDS):
-            weights = least_non_negative(self.gram() + hold, self.moment() + hold @ wanted)
-            self.reweight(weights)
-        return weights
+
+def _channels(
+    olats: Tensor, image: Tensor, clipped: Tensor | None = None, unknowns: np.ndarray | None = None
+) -> list[_Channel]:
+    """The channels of images [L, C, N] and [C, N], none of which is clipped by default.
+
+    `unknowns` [L, S] gives the lights' weights from those that are solved for.
+    """
+    white = torch.zeros_like(image, dtype=torch.bool) if clipped is None else clipped
+    lights = [own.double().T.numpy() for own in olats.unbind(1)]
+    lights = lights if unknowns is None else [own @ unknowns for own in lights]
+    targets = image.double().numpy()
+    return [_Channel(*one) for one in zip(lights, targets, white.numpy(), strict=True)]
 
 
-def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the light [S] that all channels share, and its gain in each [3].
+def _robust(
+    channels: Sequence[_Channel],
+    gains: Sequence[float] | np.ndarray,
+    hold: np.ndarray,
+    wanted: np.ndarray,
+    rounds: int = _ROUNDS,
+) -> np.ndarray:
+    """Weights [L] >= 0 that explain each channel when multiplied by its gain, by reweighted least squares.
+
+    They are held near the `wanted` ones: `hold` [L, L] weighs squared differences, as shares of the channels'
+    power. Trust goes on from what it was before.
+    """
+    holding = sum(channel.power for channel in channels) * hold
+    for _ in range(rounds):
+        gram, moment = holding, holding @ wanted
+        for channel, gain in zip(channels, gains, strict=True):
+            own_gram, own_moment = channel.normal_equations(gain)
+            gram, moment = gram + own_gram, moment + own_moment
+        weights = least_non_negative(gram, moment)
+        for channel, gain in zip(channels, gains, strict=True):
+            channel.reweight(gain * weights)
+    return weights
+
+
+def _near_grey(channels: Sequence[_Channel], grey: np.ndarray, hold: np.ndarray) -> np.ndarray:
+    """Weights [L, C] that explain each channel alone and are held near the grey light [L], times its gain."""
+    return np.stack([_robust([one], [1.0], hold, one.gain_of(grey) * grey) for one in channels], -1)
+
+
+def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> np.ndarray:
+    """Estimate the light [S] that all channels share, each times a gain of its own.
 
     The more a light stands out from its neighbours, the less smoothness is demanded of it (Cauchy weights);
     otherwise a lone bright light would be spread over its neighbours.
     """
     lights = from_near.shape[1]
-    power = sum(channel.power for channel in channels)
-    hold = np.ones(len(from_near))
+    grey, smooth = np.zeros(lights), np.ones(len(from_near))
     colour = np.array([channel.gain_of(np.ones(lights)) for channel in channels])
     colour /= max(colour.mean(), _TINY)
     for _ in range(_ROUNDS_GREY):
-        gram = power * (_SMOOTH**2 * (from_near.T * hold) @ from_near + _SHORT**2 * np.eye(lights))
-        moment = np.zeros(lights)
-        for channel, gain in zip(channels, colour, strict=True):
-            gram += gain * gain * channel.gram()
-            moment += gain * channel.moment()
-        grey = least_non_negative(gram, moment)
-        hold = 1 / (1 + (from_near @ grey / max(_STANDS_OUT * grey.mean(), _TINY)) ** 2)
-        for channel, gain in zip(channels, colour, strict=True):
-            channel.reweight(gain * grey)
+        hold = _SMOOTH**2 * (from_near.T * smooth) @ from_near + _SHORT**2 * np.eye(lights)
+        grey = _robust(channels, colour, hold, np.zeros(lights), rounds=1)
+        smooth = 1 / (1 + (from_near @ grey / max(_STANDS_OUT * grey.mean(), _TINY)) ** 2)
         colour = np.array([channel.gain_of(grey) for channel in channels])
-    return grey, colour
+    return grey
 
 
 def least_non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:

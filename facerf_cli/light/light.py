@@ -1,7 +1,8 @@
-"""The light of the Python API, and the arrays that it takes: numpy's or torch's."""
+"""Lights, as the Python API and all renderers take them, and arrays: numpy's or torch's."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,12 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
+from facerf_cli.image.colour import luminance
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.envmap import MapKeys, check_envmap, envmap_weights, without_keys
+from facerf_cli.light.envmap import NO_KEYS, check_envmap, envmap_weights, turned, without_keys
 from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.light.studio_points import Lights, far_samples
+from facerf_cli.light.studio_points import KeyLight, PointLights, far_samples, has_edges
 
 Array = np.ndarray | Tensor
 Rgb = tuple[float, float, float]
@@ -22,23 +24,30 @@ _UNIT = 1e-3  # how far the length of a unit direction may be from 1
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Single lights that shine together: unit directions toward them [L, 3], rgb weights [L, 3].
+    """Lights that shine together: unit directions toward far ones [L, 3], camera space, rgb weights [L, 3].
 
-    Directions are in camera space. Lights add and scale: `2 * key + sum(rims)`. Either may be a tensor, to
-    which gradients then flow. `own_rgb` [3], if not None, is the share of the photo's own light. `keys` are
-    the numbers of lights whose shadows have edges, as those of `Light.single` have.
+    A light of weight 1 gives a white Lambertian surface that faces it radiance 1. Lights add and scale:
+    `2 * key + sum(rims)`. Either array may be a tensor, to which gradients then flow. `own_rgb` [3], if not
+    None, is the share of the photo's own light. `keys` are ranges of the lights: each holds the samples of
+    one whose shadows have edges, as those of `Light.single` have. `near` lights, if any, have rgb weights
+    `near_weights` [J, 3] at the face's centre.
+
+    Renderers take M sums of the same lights in tensors (`stacked`): weights [M, L, 3], own_rgb [M, 3],
+    near_weights [M, J, 3].
     """
 
-    directions: Array
-    weights: Array
-    own_rgb: Array | None = None
-    keys: tuple[int, ...] = ()
+    directions: Any
+    weights: Any
+    own_rgb: Any = None
+    keys: tuple[slice, ...] = ()
+    near: tuple[StudioLight, ...] = ()
+    near_weights: Any = None
     __array_ufunc__ = None  # so that numpy leaves `array * light` to the light
 
     def __post_init__(self) -> None:
         """Raise ValueError for arrays of other shapes."""
         directions, weights = list(np.shape(self.directions)), list(np.shape(self.weights))
-        if directions != weights or directions[1:] != [3]:
+        if directions[1:] != [3] or weights[-2:] != directions or len(weights) > 3:
             shapes = f"shapes {directions} and {weights}; give [L, 3] and [L, 3] (r, g, b of each light)"
             raise ValueError(f"directions and weights have {shapes}")
 
@@ -51,7 +60,7 @@ class Light:
         if not (np.isfinite((azimuth_deg, *rgb)).all() and abs(elevation_deg) <= 90 and min(rgb) >= 0):
             raise ValueError(f"no light from {azimuth_deg}, {elevation_deg} degrees of {rgb}")
         direction = azel_to_direction(azimuth_deg, elevation_deg)
-        return Light(direction.numpy()[None], np.array([rgb], np.float32), keys=(0,))
+        return Light(direction.numpy()[None], np.array([rgb], np.float32), keys=(slice(0, 1),))
 
     @staticmethod
     def around(rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
@@ -66,6 +75,11 @@ class Light:
         return Light(nothing, nothing, rgb if isinstance(rgb, Tensor) else np.array(rgb, np.float32))
 
     @staticmethod
+    def each(directions: Tensor, keys: tuple[slice, ...] = ()) -> "Light":
+        """Each light [L, 3] alone, of rgb 1: L sums."""
+        return Light(directions, torch.eye(len(directions))[..., None].expand(-1, -1, 3), keys=keys)
+
+    @staticmethod
     def from_envmap(envmap: Array, rotate_deg: float = 0.0, lights: int = 150, keys: bool = True) -> "Light":
         """A lat-long map [H, 2 H, 3] as a rig of lights; `rotate_deg` is added to every azimuth.
 
@@ -74,13 +88,13 @@ class Light:
         """
         linear = linear_pixels("map", envmap)
         check_envmap(linear)
-        found = without_keys(linear) if keys else MapKeys.none(linear)
-        directions, suns = rig_directions(lights), found.turned(rotate_deg)
-        weights = torch.cat([envmap_weights(found.rest, directions, rotate_deg), suns.weights])
+        rest, found = without_keys(linear) if keys else (linear, NO_KEYS)
+        directions, suns = rig_directions(lights), turned(found, rotate_deg)
+        weights = torch.cat([envmap_weights(rest, directions, rotate_deg), suns.weights])
         return Light(
             torch.cat([directions, suns.directions]).numpy(),
             weights if isinstance(envmap, Tensor) else weights.numpy(),
-            keys=tuple(range(len(directions), len(weights))),
+            keys=tuple(slice(key, key + 1) for key in range(len(directions), len(weights))),
         )
 
     @staticmethod
@@ -99,17 +113,21 @@ class Light:
             raise UsageError("to_envmap: the photo's own light has no directions; take person.light")
         from facerf_cli.light.forms import rig_to_latlong
 
-        light = self.on_cpu()
-        return rig_to_latlong(RigLight(light.directions.detach(), light.weights.detach()), height).numpy()
+        light = RigLight(*(values.detach() for values in self._tensors()))
+        return rig_to_latlong(light, height).numpy()
 
     def __add__(self, other: "Light") -> "Light":
         if not isinstance(other, Light):
             return NotImplemented
-        directions = _joined(self.directions, other.directions)
-        one, two = self.own_rgb, other.own_rgb
-        own = two if one is None else one if two is None else one + two
-        keys = (*self.keys, *(len(self.directions) + key for key in other.keys))
-        return Light(directions, _joined(self.weights, other.weights), own, keys)
+        first = len(self.directions)
+        return Light(
+            _joined(self.directions, other.directions),
+            _joined(self.weights, other.weights),
+            _either(self.own_rgb, other.own_rgb, lambda one, two: one + two),
+            self.keys + tuple(slice(first + key.start, first + key.stop) for key in other.keys),
+            self.near + other.near,
+            _either(self.near_weights, other.near_weights, _joined),
+        )
 
     def __radd__(self, other: int) -> "Light":
         return self if other == 0 else NotImplemented  # where `sum` begins
@@ -117,21 +135,93 @@ class Light:
     def __mul__(self, factor: float | Rgb | Array) -> "Light":
         """The same lights, so many times as bright: by a number, or by one for each colour."""
 
-        def scaled(values: Array) -> Array:
+        def scaled(values: Array | None) -> Any:
+            if values is None:
+                return None
             values = as_tensor(values).to(factor.device) if isinstance(factor, Tensor) else values
             return values * (np.array(factor, np.float32) if isinstance(factor, tuple) else factor)
 
-        own = None if self.own_rgb is None else scaled(self.own_rgb)
-        return Light(self.directions, scaled(self.weights), own, self.keys)
+        own, near = scaled(self.own_rgb), scaled(self.near_weights)
+        return Light(self.directions, scaled(self.weights), own, self.keys, self.near, near)
 
     __rmul__ = __mul__
 
-    def on_cpu(self) -> RigLight:
-        """The lights as float32 tensors on the CPU; raises ValueError for what is no light."""
+    def _tensors(self) -> tuple[Tensor, Tensor]:
+        """Directions and weights as float32 tensors on the CPU; raises ValueError for what is no light."""
         directions, weights = unit_directions(self.directions), as_tensor(self.weights)
+        if weights.ndim != 2:
+            raise ValueError(f"weights have shape {list(weights.shape)}, not [L, 3]")
         if not weights.isfinite().all():
             raise ValueError("weights are not all finite")
-        return RigLight(directions, weights)
+        return directions, weights
+
+    def some(self, sums: slice) -> "Light":
+        """Some of the sums, without the near lights that shine in none of them."""
+        own = None if self.own_rgb is None else self.own_rgb[sums]
+        if self.near_weights is None:
+            return Light(self.directions, self.weights[sums], own, self.keys)
+        near_weights = self.near_weights[sums]
+        used = (near_weights != 0).any(0).any(1)
+        near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
+        return Light(self.directions, self.weights[sums], own, self.keys, near, near_weights[:, used])
+
+    @property
+    def owns(self) -> Sequence[Tensor | None]:
+        """The share [3] of the photo's own light in each sum; None where it shines in none."""
+        return [None] * len(self.weights) if self.own_rgb is None else list(self.own_rgb)
+
+    def with_keys_alone(self) -> tuple["Light", list[KeyLight]]:
+        """These sums, then each key light alone that shines in one of them with others; and the keys.
+
+        Key lights are those of `keys`, and near ones that are not wide.
+        """
+        count = len(self.weights)
+        near = torch.zeros(count, 0, 3) if self.near_weights is None else self.near_weights
+        sums = [[far, near] for far, near in zip(self.weights, near, strict=True)]
+        narrow = [at for at, light in enumerate(self.near) if has_edges(light)]
+        kinds = [(0, samples) for samples in self.keys] + [(1, slice(at, at + 1)) for at in narrow]
+        keys: list[KeyLight] = []
+        for number, (kind, samples) in product(range(count), kinds):
+            alone = [torch.zeros_like(weights) for weights in sums[number]]
+            alone[kind][samples] = sums[number][kind][samples]
+            if not alone[kind].any():
+                continue
+            same = (at for at, one in enumerate(sums[:count]) if all(map(torch.equal, alone, one)))
+            at = next(same, len(sums))
+            keys.append(KeyLight(number, at, kind == 1, samples))
+            if at == len(sums):
+                sums.append(alone)
+        far, near = (torch.stack(weights) for weights in zip(*sums, strict=True))
+        return Light(self.directions, far, near=self.near, near_weights=near if self.near else None), keys
+
+    def near_points(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
+        """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
+        weights = () if self.near_weights is None else self.near_weights.unbind(1)
+        return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
+
+    def arriving(self, place_m: Tensor, centre_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light at a place [3] of a face.
+
+        Near lights are about the face's centre [3].
+        """
+        directions, weights = [self.directions], [self.weights]
+        for points, rgb in self.near_points(centre_m):
+            toward, irradiance = points.arriving(place_m[:, None, None])
+            directions.append(toward[:, 0, 0])
+            weights.append(rgb[:, None] * irradiance[:, 0, 0, None])
+        return torch.cat(directions), torch.cat(weights, 1)
+
+    def strengths(self) -> list[float]:
+        """Luminance of all light of each sum, from wherever it comes.
+
+        Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
+        """
+        total = self.weights.sum(1)
+        if self.near_weights is not None:
+            total = total + self.near_weights.sum(1)
+        if self.own_rgb is not None:
+            total = total + self.own_rgb
+        return [float(value) for value in luminance(total.numpy())]
 
 
 def as_light(given: Any, room: float = 0.0) -> Light:
@@ -149,26 +239,27 @@ def as_light(given: Any, room: float = 0.0) -> Light:
     raise TypeError(f"light {what}, not a facerf.Light or a map [H, 2 H, 3]; read a file by read_image")
 
 
-def sums_of(lights: Sequence[Light]) -> Lights:
-    """Each of M lights as one sum; directions that they share are one light."""
-    rigs, own = [light.on_cpu() for light in lights], None
+def stacked(lights: Sequence[Light]) -> Light:
+    """Lights of far directions as sums of one; directions that they share are one light."""
+    assert not any(light.near for light in lights)
+    own, each = None, [light._tensors() for light in lights]
     if any(light.own_rgb is not None for light in lights):
-        owns = [np.zeros(3) if light.own_rgb is None else light.own_rgb for light in lights]
-        own = torch.stack([as_tensor(one) for one in owns])
-        dark = RigLight(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3))
-        rigs = [rig if len(rig.directions) else dark for rig in rigs]
-    if len(rigs) == 1:
-        keys = tuple(slice(key, key + 1) for key in lights[0].keys)
-        return replace(Lights.of_rig(rigs[0]), own=own, keys=keys)
-    directions = torch.cat([rig.directions for rig in rigs])
+        own = torch.stack([as_tensor(np.zeros(3) if one.own_rgb is None else one.own_rgb) for one in lights])
+        dark = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3)
+        each = [one if len(one[0]) else dark for one in each]
+    if len(each) == 1:
+        return Light(each[0][0], each[0][1][None], own, lights[0].keys)
+    counts = [len(directions) for directions, _ in each]
+    directions = torch.cat([directions for directions, _ in each])
     places = torch.arange(len(directions))
     if not directions.requires_grad:
         directions, places = torch.unique(directions, dim=0, return_inverse=True)
-    each = list(zip(rigs, torch.split(places, [len(rig.directions) for rig in rigs]), strict=True))
-    sharp = {int(at[key]) for light, (_, at) in zip(lights, each, strict=True) for key in light.keys}
+    at = torch.split(places, counts)
     nothing = torch.zeros(len(directions), 3)
-    weights = torch.stack([nothing.index_add(0, at, rig.weights) for rig, at in each])
-    return Lights(directions, weights, own=own, keys=tuple(slice(key, key + 1) for key in sorted(sharp)))
+    weights = torch.stack([nothing.index_add(0, some, rgb) for some, (_, rgb) in zip(at, each, strict=True)])
+    pairs = zip(lights, at, strict=True)
+    sharp = {int(number) for light, some in pairs for key in light.keys for number in some[key]}
+    return Light(directions, weights, own, tuple(slice(key, key + 1) for key in sorted(sharp)))
 
 
 def rig(lights: int = 150) -> np.ndarray:
@@ -227,7 +318,12 @@ def as_tensor(values: Any) -> Tensor:
 
 
 def _joined(one: Array, two: Array) -> Array:
-    """Arrays one after the other; tensors where either is one."""
+    """Arrays [..., L, 3] one after the other; tensors where either is one."""
     if isinstance(one, np.ndarray) and isinstance(two, np.ndarray):
-        return np.concatenate([one, two])
-    return torch.cat([as_tensor(one), as_tensor(two)])
+        return np.concatenate([one, two], -2)
+    return torch.cat([as_tensor(one), as_tensor(two)], -2)
+
+
+def _either(one: Any, two: Any, join: Callable[[Any, Any], Any]) -> Any:
+    """Both values joined, or the one that is not None."""
+    return two if one is None else one if two is None else join(one, two)

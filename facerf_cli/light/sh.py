@@ -1,4 +1,4 @@
-"""Light as real spherical harmonics: coefficients of rigs and lat-long maps, and back, of any order.
+"""Light as real spherical harmonics of any order: coefficients of rigs, and back to rigs and maps.
 
 `CONVENTION` is written into every file that holds coefficients. Coefficients [K, C], K = (order + 1)^2, are
 c_lm = integral of L(d) Y_lm(d) over the sphere: radiance times steradian. A rig's light of weight w gives a
@@ -21,9 +21,6 @@ CONVENTION = (
     "(y, z, x)"
 )
 MOST_ORDER = 20
-# Rotates camera axes so that the polar axis of the harmonics is that of the map, +y: the basis is then a
-# product of a function of the row and one of the column. (z, x, y).
-_MAP_POLAR = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
 _VALUES_AT_ONCE = 1 << 24  # of a large map, against memory
 # Of the series that is clipped to a non-negative light.
 _RIDGE = 1e-3  # bounds it if no non-negative light has the coefficients
@@ -141,56 +138,6 @@ def rotated(coefficients: Tensor, turn: Tensor) -> Tensor:
     return torch.linalg.lstsq(sh_basis(directions, order), turned, driver="gelsd").solution.to(coefficients)
 
 
-def latlong_coefficients(envmap: Tensor, order: int) -> Tensor:
-    """Coefficients [(order + 1)^2, 3] float32 of a map [H, W, 3] that is constant over each pixel.
-
-    The integral is exact over azimuth and by Gauss-Legendre quadrature over elevation, at any map size. It is
-    computed with the map's pole as the polar axis, then rotated to the convention's.
-    """
-    height, width = envmap.shape[:2]
-    across = _across(width, order)  # [W, 2 order + 1]
-    some_rows = torch.split(envmap.cpu(), max(1, _VALUES_AT_ONCE // (3 * width)))
-    by_row = torch.cat([torch.einsum("hwc,wm->hmc", part.double(), across) for part in some_rows])
-    columns = [order + m for degree in range(order + 1) for m in range(-degree, degree + 1)]
-    about_pole = torch.einsum("hk,hkc->kc", _down(height, order), by_row[:, columns])
-    return rotated(about_pole, _MAP_POLAR.T).float()
-
-
-def sh_to_latlong(coefficients: Tensor, height: int) -> Tensor:
-    """Radiance [height, 2 height, 3] float32 at the pixels' centres; it may be negative."""
-    directions = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
-    parts = torch.split(directions, max(1, _VALUES_AT_ONCE // len(coefficients)))
-    order_of(coefficients)
-    values = torch.cat([radiance(coefficients.cpu(), part) for part in parts])
-    return values.float().reshape(height, 2 * height, 3)
-
-
-def _across(width: int, order: int) -> Tensor:
-    """Integrals over each pixel's azimuths [W, 2 order + 1] of cos(m azimuth), or of sin if m < 0."""
-    edges = math.pi * (1 - 2 * torch.arange(width + 1, dtype=torch.float64)[:, None] / width)
-    m = torch.arange(1, order + 1, dtype=torch.float64)
-    cosines = (m * edges).sin() / m
-    sines = -(m * edges).cos() / m
-    antiderivatives = torch.cat([sines.flip(1), edges, cosines], 1)
-    return antiderivatives[:-1] - antiderivatives[1:]
-
-
-def _down(height: int, order: int) -> Tensor:
-    """Integrals over each row's elevations [H, K] of the harmonics' factors of elevation."""
-    points = 8 + math.ceil(order * math.pi / height)
-    nodes, weights = (torch.from_numpy(part) for part in np.polynomial.legendre.leggauss(points))
-    step = math.pi / height
-    middle = math.pi / 2 - (torch.arange(height, dtype=torch.float64) + 0.5) * step
-    elevation = middle[:, None] + step / 2 * nodes
-    ring = elevation.cos()
-    at_azimuth_0 = sh_basis(torch.stack([ring, torch.zeros_like(ring), elevation.sin()], -1), order)
-    index = [
-        degree * degree + degree + abs(m) for degree in range(order + 1) for m in range(-degree, degree + 1)
-    ]
-    factors = torch.einsum("hqk,hq->hk", at_azimuth_0, weights * ring * step / 2)
-    return factors[:, index]
-
-
 def positive_latlong(coefficients: Tensor, height: int) -> Tensor:
     """A non-negative map [height, 2 height, 3] float32 with these coefficients [K, 3].
 
@@ -199,7 +146,11 @@ def positive_latlong(coefficients: Tensor, height: int) -> Tensor:
     lights exist, the coefficients of the map are within two or three hundredths, mostly within a thousandth;
     otherwise they are about the nearest possible.
     """
-    return sh_to_latlong(clipped_series(coefficients), height).clamp(min=0)
+    series = clipped_series(coefficients)
+    directions = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
+    parts = torch.split(directions, max(1, _VALUES_AT_ONCE // len(series)))
+    values = torch.cat([radiance(series, part) for part in parts])
+    return values.float().reshape(height, 2 * height, 3).clamp(min=0)
 
 
 def clipped_series(coefficients: Tensor) -> Tensor:

@@ -1,9 +1,7 @@
 """Studio lights as points: the squares of soft lights are sampled by a regular grid."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +11,7 @@ from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
 from facerf_cli.light.entries import StudioLight, parse_lights
-from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
+from facerf_cli.light.sphere import azel_to_direction, rig_directions
 
 _APART_DEG, _MOST_A_SIDE = 6.0, 6  # samples of a square, as seen from the face
 _AROUND = 24  # samples of a light from all around
@@ -139,100 +137,9 @@ class KeyLight(NamedTuple):
     samples: slice
 
 
-@dataclass(frozen=True, eq=False)
-class Lights:
-    """M sums of lights: far ones from unit directions [L, 3], camera space, and J near ones; rgb weights.
-
-    A light of weight 1 gives a white Lambertian surface that faces it radiance 1; of a near one, at the
-    face's centre. A rig's light is one sum.
-    """
-
-    directions: Tensor
-    weights: Tensor  # [M, L, 3]
-    near: tuple[StudioLight, ...] = ()
-    near_weights: Tensor | None = None  # [M, J, 3]
-    own: Tensor | None = None  # [M, 3], of the photo's own light
-    keys: tuple[slice, ...] = ()  # of far lights, each the samples of one whose shadows have edges
-
-    @staticmethod
-    def of_rig(light: RigLight) -> "Lights":
-        """A rig's light, as the only sum."""
-        return Lights(light.directions, light.weights[None])
-
-    @staticmethod
-    def each(directions: Tensor, keys: tuple[slice, ...] = ()) -> "Lights":
-        """Each light [L, 3] alone, of rgb 1."""
-        return Lights(directions, torch.eye(len(directions))[..., None].expand(-1, -1, 3), keys=keys)
-
-    def __len__(self) -> int:
-        return len(self.weights)
-
-    def __getitem__(self, sums: slice) -> "Lights":
-        """Some of the sums, without the near lights that shine in none of them."""
-        own = None if self.own is None else self.own[sums]
-        if self.near_weights is None:
-            return Lights(self.directions, self.weights[sums], own=own, keys=self.keys)
-        some = self.near_weights[sums]
-        used = (some != 0).any(0).any(1)
-        near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
-        return Lights(self.directions, self.weights[sums], near, some[:, used], own, self.keys)
-
-    def with_keys_alone(self) -> tuple["Lights", list["KeyLight"]]:
-        """These sums, then each key light alone that shines in one of them with others; and the keys.
-
-        Key lights are those of `keys`, and near ones that are not wide.
-        """
-        near = torch.zeros(len(self), 0, 3) if self.near_weights is None else self.near_weights
-        sums = [[far, near] for far, near in zip(self.weights, near, strict=True)]
-        narrow = [at for at, light in enumerate(self.near) if _wide_deg(light) <= _WIDEST_DEG]
-        kinds = [(0, samples) for samples in self.keys] + [(1, slice(at, at + 1)) for at in narrow]
-        keys: list[KeyLight] = []
-        for number, (kind, samples) in product(range(len(self)), kinds):
-            alone = [torch.zeros_like(weights) for weights in sums[number]]
-            alone[kind][samples] = sums[number][kind][samples]
-            if not alone[kind].any():
-                continue
-            same = (at for at, one in enumerate(sums[: len(self)]) if all(map(torch.equal, alone, one)))
-            at = next(same, len(sums))
-            keys.append(KeyLight(number, at, kind == 1, samples))
-            if at == len(sums):
-                sums.append(alone)
-        far, near = (torch.stack(weights) for weights in zip(*sums, strict=True))
-        return Lights(self.directions, far, self.near, near if self.near else None), keys
-
-    @property
-    def owns(self) -> Sequence[Tensor | None]:
-        """The share [3] of the photo's own light in each sum; None where it shines in none."""
-        return [None] * len(self) if self.own is None else list(self.own)
-
-    def around(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
-        """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
-        weights = () if self.near_weights is None else self.near_weights.unbind(1)
-        return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
-
-    def arriving(self, place_m: Tensor, centre_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light at a place [3] of a face.
-
-        Near lights are about the face's centre [3].
-        """
-        directions, weights = [self.directions], [self.weights]
-        for points, rgb in self.around(centre_m):
-            toward, irradiance = points.arriving(place_m[:, None, None])
-            directions.append(toward[:, 0, 0])
-            weights.append(rgb[:, None] * irradiance[:, 0, 0, None])
-        return torch.cat(directions), torch.cat(weights, 1)
-
-    def strengths(self) -> list[float]:
-        """Luminance of all light of each sum, from wherever it comes.
-
-        Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
-        """
-        total = self.weights.sum(1)
-        if self.near_weights is not None:
-            total = total + self.near_weights.sum(1)
-        if self.own is not None:
-            total = total + self.own
-        return [float(value) for value in luminance(total.numpy())]
+def has_edges(light: StudioLight) -> bool:
+    """True of a near light whose shadows have edges."""
+    return _wide_deg(light) <= _WIDEST_DEG
 
 
 def _wide_deg(light: StudioLight) -> float:

@@ -20,7 +20,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import FaceView, photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Window
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.light import Light
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.relighting.detail import FaceDetail
 from facerf_cli.relighting.field import near_texture
@@ -77,11 +77,11 @@ class FaceAlone(Relightable):
         """Bytes of one texture."""
         return self.head.face.texture.nbytes
 
-    def relit(self, lights: Lights) -> Iterator[Relit]:
+    def relit(self, lights: Light) -> Iterator[Relit]:
         """Relight the face by each sum of lights (paper, 'Relighting')."""
         assert self.reflectance is not None
         turn = None if self.fit is None else self.head.fit.turn_to(self.fit.rotation)
-        side, near = self.head.face.texture.shape[-1], lights.around(self.vertices_m.mean(0))
+        side, near = self.head.face.texture.shape[-1], lights.near_points(self.vertices_m.mean(0))
         textures = self.reflectance.relit(lights.directions, lights.weights, turn)
         extra = [near_texture(self.reflectance, points, self.vertices_m, side, turn) for points, _ in near]
         for number, (own, texture) in enumerate(zip(lights.owns, textures, strict=True)):

@@ -13,7 +13,7 @@ import numpy as np
 
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Window, in_strips
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.light import Light
 from facerf_cli.relighting.face_alone import FaceInPhoto
 from facerf_cli.relighting.person_in_photo import COLOURS, PersonInPhoto
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
@@ -57,9 +57,9 @@ class PeopleInPhoto(Relightable):
         """The same."""
         return self.matte
 
-    def relit(self, lights: Lights | Sequence[Lights]) -> Iterator[tuple[Relit, ...]]:
+    def relit(self, lights: Light | Sequence[Light]) -> Iterator[tuple[Relit, ...]]:
         """Relight the people by each sum of lights, which may be those of each person."""
-        each = [lights] * len(self.people) if isinstance(lights, Lights) else lights
+        each = [lights] * len(self.people) if isinstance(lights, Light) else lights
         return zip(*(person.relit(own) for person, own in zip(self.people, each, strict=True)), strict=True)
 
     def exposure_ev(self, relit: Sequence[Relit], rule: ExposureRule) -> float:

@@ -18,7 +18,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import photo_camera, view_face
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Window
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.light import Light
 from facerf_cli.portrait.matte import PersonColours
 from facerf_cli.portrait.parse import UncoveredRows
 from facerf_cli.raster.texture import smoothstep
@@ -77,7 +77,7 @@ class PersonInPhoto:
         """Share [h, W] of the whole person in rows of the photo."""
         return np.minimum(self.matte[rows], self._field.person.segmentation.matte[rows])
 
-    def relit(self, lights: Lights) -> Iterator[Relit]:
+    def relit(self, lights: Light) -> Iterator[Relit]:
         """Relight the person by each sum of lights (paper, 'Relighting'); one prediction serves all.
 
         Of light from behind the face's field knows nothing.
@@ -86,7 +86,7 @@ class PersonInPhoto:
         lights, keys = lights.with_keys_alone()
         directions, weights = lights.directions, lights.weights
         middle_m, side = self.vertices_m.mean(0), self._head.face.texture.shape[-1]
-        near = lights.around(middle_m)
+        near = lights.near_points(middle_m)
         lit, _ = both(lambda: field.lit(directions, weights, near), lambda: self._eyes)
         forward = self._head.fit.rotation[:, 2]
 

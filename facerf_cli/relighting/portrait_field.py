@@ -19,8 +19,9 @@ from torch import Tensor
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_uv
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import Lights, PointLights
+from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import MEAN_RADIANCE, is_grey
 from facerf_cli.network.portrait import HAIRY, PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
@@ -259,7 +260,7 @@ class PortraitView:
             sent = sent + torch.einsum("mlc,lij->mcij", some, whole)
         return PortraitLight(shading, highlights, reached / sent.clamp_min(1e-6), behind, slopes)
 
-    def mirrored(self, lights: Lights, centre_m: Tensor) -> Tensor:
+    def mirrored(self, lights: Light, centre_m: Tensor) -> Tensor:
         """Radiance [M, N, 3, s, s] that N irises mirror under M sums of lights that reach them.
 
         The face's centre [3] is what near lights are about.
@@ -276,7 +277,7 @@ class PortraitView:
             toward, weights = lights.arriving(torch.from_numpy(shadows.origins.mean(0)), centre_m)
             *_, arrives = maps.shaded(toward[None], shadows.along(toward)[None])
             found.append(mirrored_in_cornea(toward, weights, arrives[0].mean((1, 2))))
-        return torch.stack(found, 1) if found else torch.zeros(len(lights), 0, 3, 1, 1)
+        return torch.stack(found, 1) if found else torch.zeros(len(lights.weights), 0, 3, 1, 1)
 
     def relit(self, lit: PortraitLight) -> Tensor:
         """Radiance [M, 3, S, S] of the person in the square, at the resolution of the maps."""

@@ -22,8 +22,8 @@ from facerf_cli.image.colour import (
     srgb_to_linear,
 )
 from facerf_cli.image.strips import fitted, resized
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Person
 from facerf_cli.portrait.classes import class_index
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
@@ -169,7 +169,7 @@ def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
 
     total: list[Tensor] = []
     for some in torch.split(rig, _LIGHTS_AT_ONCE):
-        for (relit,) in people.relit(Lights.each(some)):
+        for (relit,) in people.relit(Light.each(some)):
             add(relit)
             assert relit.mirrored is not None and relit.mouth is not None
             maps = [*relit.tensors, relit.mirrored, relit.mouth]

@@ -7,8 +7,8 @@ const XYZ_TO_RGB = [[3.2404542, -1.5371385, -0.4985314], [-0.969266, 1.8760108, 
 const [ROOM, OWN] = ["room", "own"]; // names of a light that stands for the room, and of the photo's own light
 // Numbers of the keys of a light, and their limits; those of a page, and others of --light, which it cannot show.
 const KEYS = {
-  at: [3, -1e4, 1e4], from: [2, -1e5, 1e5], az: [1, -1e5, 1e5], el: [1, -90, 90], rgb: [3, 0, 1e6],
-  kelvin: [1, 1667, 25000], stops: [1, -20, 20], size: [1, 0, 10], size_deg: [1, 0, 120],
+  at: [3, -1e4, 1e4], from: [2, -1e5, 1e5], rgb: [3, 0, 1e6], kelvin: [1, 1667, 25000], stops: [1, -20, 20],
+  size: [1, 0, 10], size_deg: [1, 0, 120],
 };
 const OTHER_KEYS = ["map", "rotate", "spot", "face"];
 
@@ -78,7 +78,7 @@ function lightsOf(text, known) {
   const [given, places] = [{}, []]; // values of keys; a name, if any, and the direction or preset
   for (const part of text.split(";").filter((one) => one.trim())) {
     const [first, second, more] = part.split("=").map((one) => one.trim());
-    if (more !== undefined) throw wrong("give ; between keys, as in az=60;el=10");
+    if (more !== undefined) throw wrong("give ; between keys, as in from=60,10;stops=1");
     if (second === undefined) places.push(["", first]);
     else if (OTHER_KEYS.includes(first)) throw wrong(`${first}= is not shown in a page; leave it out`);
     else if (first === "name" || KEYS[first]) given[first] = second;
@@ -91,8 +91,8 @@ function lightsOf(text, known) {
     if (values.length === count && values.every((value) => value >= low && value <= high)) return values;
     throw wrong(`${key} ${given[key]}: give ${count === 1 ? "a number" : `${count} numbers`} from ${low} to ${high}`);
   };
-  const byKeys = [given.from, given.az ?? given.el, given.at].filter((one) => one !== undefined).length;
-  if (byKeys) places.push(["", given.from ?? `${numbers("az", [0])},${numbers("el", [0])}`]);
+  const byKeys = [given.from, given.at].filter((one) => one !== undefined).length;
+  if (byKeys) places.push(["", given.from]);
   if (!places.length || byKeys + (places.length > 1) > 1) throw wrong("give one direction or preset");
   if (places.length > 1 && Object.keys(given).length) throw wrong("keys are of one light; give light= once more");
   const [tint, [stops]] = [numbers("rgb", [1, 1, 1]), numbers("stops", [0])];
@@ -112,15 +112,15 @@ function lightsOf(text, known) {
   });
 }
 
-// Lights of AZ,EL[,STRENGTH], AZ,EL,R,G,B, a word, or a preset; null of anything else.
+// Lights of AZ,EL[,STRENGTH], a word, or a preset; null of anything else.
 function placesOf(where, { words, presets }) {
   if (Object.hasOwn(words, where)) return [ofPacked(words[where])];
   if (Object.hasOwn(presets, where)) return presets[where].map(ofPacked);
   const values = numbersIn(where);
-  const [azimuth, elevation, ...colour] = values;
-  const isOne = [2, 3, 5].includes(values.length) && values.every(Number.isFinite);
-  if (!isOne || Math.abs(elevation) > 90 || colour.some((value) => value < 0)) return null;
-  return [{ ...towards(azimuth, elevation), rgb: [0, 1, 2].map((c) => colour[c] ?? colour[0] ?? 1) }];
+  const [azimuth, elevation, strength = 1] = values;
+  const isOne = [2, 3].includes(values.length) && values.every(Number.isFinite);
+  if (!isOne || Math.abs(elevation) > 90 || strength < 0) return null;
+  return [{ ...towards(azimuth, elevation), rgb: [strength, strength, strength] }];
 }
 
 // A near light as a far one: from the same side, as wide as it is seen from the head.
@@ -149,13 +149,13 @@ function textsOf(lights, named) {
   return lights.length ? [areShort ? parts.map(({ short }) => short).join(";") : parts[0].keys] : [];
 }
 
-// A light by its keys, and by numbers alone where these tell all.
+// A light by its keys, and by its direction alone where that tells all.
 function partsOf({ azimuth, elevation, around, own, rgb, kelvin, stops, size }) {
   const where = own ? OWN : around ? "around" : `${rounded(azimuth, 2)},${rounded(elevation, 2)}`;
   const colour = rgb.every((value) => value === 1) ? "" : rgb.map((value) => Number(value.toPrecision(4))).join(",");
   const keys = { kelvin: kelvin !== WHITE_K && kelvin, stops: rounded(stops, 2), size_deg: !around && !own && rounded(size, 2) };
   const others = Object.keys(keys).filter((key) => keys[key]).map((key) => `${key}=${keys[key]}`);
-  const short = others.length || around || own ? "" : [where, colour].filter(Boolean).join(",");
+  const short = others.length || colour || around || own ? "" : where;
   return { short, keys: [`from=${where}`, colour && `rgb=${colour}`, ...others].filter(Boolean).join(";") };
 }
 

@@ -18,14 +18,14 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import render_face, see_face
-from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import labels
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.light.envmap import ball, resampled
 from facerf_cli.light.forms import rig_to_latlong
-from facerf_cli.light.sh import CONVENTION, rig_coefficients
+from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import brightest_direction, direction_to_azel
 from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.network.features import FeatureNetwork
@@ -258,7 +258,7 @@ def _write(
     base = item.output(f"{face.tag}_light")
     write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)
     light, rig = estimate.light, f"--lights {options.rig}"
-    harmonics = Harmonics(rig_coefficients(light, sh_order), CONVENTION)
+    harmonics = rig_coefficients(light, sh_order)
     record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
     write_light(base.with_name(base.name + ".json"), record)
     shown = draw_estimate(face.head, models.face, estimate.explained, envmap)

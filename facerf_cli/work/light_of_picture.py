@@ -8,14 +8,14 @@ import numpy as np
 import torch
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev
 from facerf_cli.image.strips import resized
 from facerf_cli.light.envmap import ball, envmap_weights, resampled
 from facerf_cli.light.picture import FOV_DEG, PictureLight, light_of_picture
-from facerf_cli.light.sh import CONVENTION, rig_coefficients
+from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
@@ -61,7 +61,7 @@ def write_guess(
     write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)
     directions = rig_by_text(options.rig)
     light = RigLight(directions, envmap_weights(guess.envmap, directions))
-    harmonics = Harmonics(rig_coefficients(light, sh_order), CONVENTION)
+    harmonics = rig_coefficients(light, sh_order)
     record = LightRecord(directions, light.weights, f"--lights {options.rig}", harmonics, metadata)
     write_light(base.with_name(base.name + ".json"), record)
     write_display(base.with_name(base.name + ".png"), _sheet(image.pixels, guess), metadata=metadata)

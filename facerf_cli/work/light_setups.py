@@ -4,7 +4,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 from facerf_cli.batch.inputs import (
     MAP_SUFFIXES,
@@ -20,6 +19,7 @@ from facerf_cli.light.entries import (
     ROOM_BEFORE_BRIGHT,
     ROOM_BEFORE_DARK,
     MapSource,
+    Sampling,
     StudioLight,
     is_sweep,
     lit_images,
@@ -32,7 +32,6 @@ from facerf_cli.option import LIGHT, option
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions, fov_option
 
-Sampling = Literal["cell", "smooth", "paper"]
 DRAWN = "procedural:"
 BACKGROUND = "background"  # the picture behind the person, as --light-from names it
 ROOM = "room"  # the name of a room's light, and of its layer

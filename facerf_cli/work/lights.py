@@ -13,11 +13,12 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.light.entries import MapSource, StudioLight
-from facerf_cli.light.envmap import MapKeys, lights_around, rotated_weights, without_keys
-from facerf_cli.light.studio_points import Lights, far_samples, intensity_of, is_narrow, rig_by_text
+from facerf_cli.light.entries import MapSource, Sampling, StudioLight
+from facerf_cli.light.envmap import NO_KEYS, lights_around, rotated_weights, turned, without_keys
+from facerf_cli.light.light import Light
+from facerf_cli.light.studio_points import far_samples, intensity_of, is_narrow, rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, step
-from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight, Sampling
+from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight
 from facerf_cli.work.photo_options import LightOptions
 
 _DRAWN_WIDTH_PX = 512  # of a procedural map
@@ -79,38 +80,27 @@ def _map_of_photo(path: Path, options: LightOptions) -> Tensor:
 
 
 @step("light")
-def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
+def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Light:
     """The lights of M setups: maps integrated over the rig's lights, their keys, and single lights."""
     single = single_lights(setups)
     if not _maps_of(setups):
         return single
     maps = (tuple(light for light in setup.lights if light.envmap is not None) for setup in setups)
     of_maps = _maps_over_rig(tuple(LightSetup("", lights=lights) for lights in maps), rig, sampling)
-    return _with_far(single, of_maps)
+    return of_maps + single
 
 
 @lru_cache(maxsize=1)
-def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Lights:
+def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Light:
     """The maps of M setups over a rig's lights, and their keys, which the paper's sampling does not know."""
     directions = rig_by_text(rig)
     weights, keys = _map_weights(setups, directions, sampling, with_keys=sampling != "paper")
-    return _with_far(_far(len(setups), keys), Lights(directions, weights))
+    return Light(directions, weights) + _far(len(setups), keys)
 
 
-def _with_far(lights: Lights, others: Lights) -> Lights:
-    """Lights with the far ones of others before their own."""
-    first = len(others.directions)
-    return replace(
-        lights,
-        directions=torch.cat([others.directions, lights.directions]),
-        weights=torch.cat([others.weights, lights.weights], 1),
-        keys=others.keys + tuple(slice(first + key.start, first + key.stop) for key in lights.keys),
-    )
-
-
-def single_lights(setups: Sequence[LightSetup]) -> Lights:
+def single_lights(setups: Sequence[LightSetup]) -> Light:
     """The lights of M setups without their maps; at least one far light, if dark, and each near one once."""
-    far = replace(_far(len(setups), _far_lights(setups)), own=own_weights(setups))
+    far = replace(_far(len(setups), _far_lights(setups)), own_rgb=own_weights(setups))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -126,7 +116,7 @@ def single_lights(setups: Sequence[LightSetup]) -> Lights:
     return replace(far, near=lights, near_weights=near_weights)
 
 
-def _far(count: int, lights: Iterable[FarLight]) -> Lights:
+def _far(count: int, lights: Iterable[FarLight]) -> Light:
     """Far lights of so many setups, each once; at least one, if dark."""
     found: dict[bytes, tuple[Tensor, Tensor]] = {}
     for row, towards, rgb in lights:
@@ -138,7 +128,7 @@ def _far(count: int, lights: Iterable[FarLight]) -> Lights:
     keys = tuple(
         slice(*at) for at, toward in zip(pairwise(ends), directions, strict=True) if is_narrow(toward)
     )
-    return Lights(torch.cat(directions), torch.cat(weights, 1), keys=keys)
+    return Light(torch.cat(directions), torch.cat(weights, 1), keys=keys)
 
 
 def own_weights(setups: Sequence[LightSetup]) -> Tensor | None:
@@ -189,13 +179,13 @@ def as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[
     return tuple(one for setup in lit for one in (setup, *(each_alone(setup) if setup.names else ())))
 
 
-def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Lights:
+def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Light:
     """The lights of M setups by a stack's own [L, 3]; single lights are shared by those around."""
     weights, _ = _map_weights(setups, directions, sampling, with_keys=False)
     for row, towards, rgb in _far_lights(setups):
         index, share = lights_around(towards, directions)
         weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
-    return Lights(directions, weights, own=own_weights(setups))
+    return Light(directions, weights, own_weights(setups))
 
 
 def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
@@ -222,13 +212,14 @@ def _map_weights(
     for source, group in groupby(maps, lambda one: one[1].envmap):
         rows, lights = zip(*group, strict=True)
         assert source is not None
-        found = (without_keys if with_keys else MapKeys.none)(read_map(source))
+        envmap = read_map(source)
+        rest, suns = without_keys(envmap) if with_keys else (envmap, NO_KEYS)
         for row, light in zip(rows, lights, strict=True):
-            turned = found.turned(light.rotate_deg)
-            rgb = turned.weights * intensity_of(light)
-            keys += [(row, *key) for key in zip(turned.directions[:, None], rgb[:, None], strict=True)]
+            key_light = turned(suns, light.rotate_deg)
+            rgb = key_light.weights * intensity_of(light)
+            keys += [(row, *key) for key in zip(key_light.directions[:, None], rgb[:, None], strict=True)]
         angles = [light.rotate_deg for light in lights]
-        of_map = rotated_weights(found.rest, directions, angles, sampling)
+        of_map = rotated_weights(rest, directions, angles, sampling)
         colours = torch.stack([intensity_of(light) for light in lights])
         weights.index_add_(0, torch.tensor(rows), of_map * colours[:, None])
     return weights, keys

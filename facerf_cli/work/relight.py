@@ -23,7 +23,8 @@ from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.light_wrap import LightWrap
 from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
 from facerf_cli.light.envmap import Backdrop
-from facerf_cli.light.studio_points import Lights, intensity_of
+from facerf_cli.light.light import Light
+from facerf_cli.light.studio_points import intensity_of
 from facerf_cli.person import Group, Person, Target, fit
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
@@ -98,7 +99,7 @@ class Scene:
 
     subject: Relightable
     setups: tuple[LightSetup, ...]
-    lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    lights_of: Callable[[tuple[LightSetup, ...]], Light]
     metadata: Mapping[str, Any]
     people: Sequence[FittedFace] = ()
     faces: tuple[int, ...] = (0,)
@@ -111,7 +112,7 @@ class Scene:
     facts: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
-    def lights(self) -> list[Lights]:
+    def lights(self) -> list[Light]:
         """The lights of all setups, as `as_lit` lists them, on each of the people."""
         people = zip(self.faces, self.evens, strict=True)
         return [self.lights_of(as_lit(self.setups, *one)) for one in people]
@@ -132,7 +133,7 @@ class Scene:
     def relit(self, part: slice) -> list[list[Any]]:
         """The people under some of the setups: under all of its lights, and under each that has a name."""
         ends = self.ends[part.start : part.stop + 1]
-        lights = [of_one[ends[0] : ends[-1]] for of_one in self.lights]
+        lights = [of_one.some(slice(ends[0], ends[-1])) for of_one in self.lights]
         found = self.subject.relit(lights if isinstance(self.subject, PeopleInPhoto) else lights[0])
         return [list(islice(found, last - first)) for first, last in pairwise(ends)]
 
@@ -196,7 +197,7 @@ def _read(item: Item, plan: RelightPlan) -> _Read:
 
 
 def _scene_in_photo(
-    item: Item, plan: RelightPlan, read: _Read, lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    item: Item, plan: RelightPlan, read: _Read, lights_of: Callable[[tuple[LightSetup, ...]], Light]
 ) -> Scene:
     """The people of a photo in one image."""
     photo, alpha, options = read.image.pixels, read.image.alpha, plan.options
@@ -236,7 +237,7 @@ def _scene_of_face(
     plan: RelightPlan,
     read: _Read,
     face: PhotoFace,
-    lights_of: Callable[[tuple[LightSetup, ...]], Lights],
+    lights_of: Callable[[tuple[LightSetup, ...]], Light],
 ) -> Scene:
     """One face alone, in the photo's pose or in that of `--pose`."""
     fitted, person = _fitted(plan, read, face)

@@ -20,14 +20,13 @@ from facerf_cli.batch.inputs import (
 from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
-from facerf_cli.light.entries import EVEN, OWN, is_sweep, numbers, parse_lights
+from facerf_cli.light.entries import EVEN, OWN, Sampling, is_sweep, numbers, parse_lights
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
     BACKGROUND,
     LightSetup,
     LightSources,
-    Sampling,
     collect_setups,
     in_room,
 )

@@ -23,7 +23,7 @@ from facerf_cli.files.olat_stack import StackHeader, read_olat_header, stream_ol
 from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import ExposureRule, anchored_exposure_ev, auto_exposure_ev
 from facerf_cli.image.strips import Resized, Rows, Scaled
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.light import Light
 from facerf_cli.raster.camera import Camera
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import weighted_sum
@@ -99,7 +99,7 @@ class StackImages(Relightable):
     def person_matte(self) -> np.ndarray | None:
         return None if self.face is None else self.matte
 
-    def relit(self, lights: Lights) -> Iterator[Relit]:
+    def relit(self, lights: Light) -> Iterator[Relit]:
         """Sums of the stack's lights."""
         textures = weighted_sum(stream_olats(self.path), lights.weights)
         return (Relit(texture, own=own) for texture, own in zip(textures, lights.owns, strict=True))
@@ -205,7 +205,7 @@ class OpenStack(NamedTuple):
     """A stack that can be relit by its own lights; the photo's camera, if the stack is put back on it."""
 
     subject: Relightable
-    lights_of: Callable[[tuple[LightSetup, ...]], Lights]
+    lights_of: Callable[[tuple[LightSetup, ...]], Light]
     metadata: Mapping[str, Any]
     facts: Mapping[str, Any]
     camera: Camera | None = None

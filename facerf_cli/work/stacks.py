@@ -20,7 +20,8 @@ from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
-from facerf_cli.light.studio_points import Lights, rig_by_text
+from facerf_cli.light.light import Light
+from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.person import Target, fit, olat_images
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.field import Field
@@ -97,7 +98,7 @@ def _of_person(
             tiles.append(small.permute(0, 2, 3, 1).numpy())
             yield batch
 
-    first = next(subject.relit(Lights.each(directions[:1])))
+    first = next(subject.relit(Light.each(directions[:1])))
     normals = subject.rendered(RenderRequest(first, layers=("normal",)))["normal"]
     header = StackHeader(
         kind="photo",

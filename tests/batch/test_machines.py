@@ -24,7 +24,7 @@ from tests.folders import rows
 from tests.refusals import refused
 
 FOLDER_VERBS = {
-    "relight", "estimate-light", "convert-light", "predict-olat", "fit-geometry", "synth-stage",
+    "relight", "estimate-light", "predict-olat", "fit-geometry", "synth-stage",
     "prepare-dataset", "relight-dataset", "evaluate olat", "evaluate reconstruction", "evaluate transfer",
     "evaluate geometry", "evaluate yale-b", "evaluate cases", "evaluate compare", "segment", "view",
 }  # fmt: skip

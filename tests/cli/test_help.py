@@ -39,7 +39,7 @@ def test_the_order_is_that_of_a_day(capsys: Said, monkeypatch: Patch) -> None:
     lines = [line.strip("│╭─╮ ") for line in capsys.readouterr().out.splitlines()]
     first = [line.split()[0] for line in lines if line]
     order = ["Relight", "relight", "Take", "estimate-light", "predict-olat", "segment", "fit-geometry"]
-    order += ["Make", "convert-light", "envmap", "Train", "synth-stage", "prepare-dataset"]
+    order += ["Make", "envmap", "Train", "synth-stage", "prepare-dataset"]
     order += ["relight-dataset", "train", "evaluate", "Look", "doctor", "face-model"]
     assert [word for word in first if word in order] == order
 

@@ -13,7 +13,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb, luminance
 from facerf_cli.light.entries import EVEN, OWN, LitImage, lit_images
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.light import Light
 from facerf_cli.person import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.white import Balance
@@ -52,7 +52,7 @@ def test_own_is_a_light_like_others_but_for_the_room() -> None:
     (alone,) = collect_setups(LightSources(light=["own"]), Path("out"))
     assert not alone.has_single
     lights = lights_over_rig((alone, both), "12", "cell")
-    assert lights.own is not None and lights.own.tolist() == [[1, 1, 1], [1, 1, 1]]
+    assert lights.own_rgb is not None and lights.own_rgb.tolist() == [[1, 1, 1], [1, 1, 1]]
     assert lights.weights.abs().sum((1, 2)).tolist() == [0, 6]
 
 
@@ -101,7 +101,7 @@ def test_two_people_in_their_own_light_are_the_photo() -> None:
     height, width = photo.shape[:2]
     left = np.clip((width / 2 - np.arange(width)) / 40 + 0.5, 0, 1).astype(np.float32)[None].repeat(height, 0)
     both = PeopleInPhoto([person.in_photo(Target(matte=side)) for side in (left, 1 - left)])
-    dark = Lights(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own=torch.ones(1, 3))
+    dark = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own_rgb=torch.ones(1, 3))
     (relit,) = both.relit([dark, dark])
     assert np.abs(both.image(relit).pixels - photo).max() < 1e-5
 

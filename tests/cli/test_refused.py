@@ -60,7 +60,7 @@ WRONG: dict[str, dict[str, str]] = {
     },
     "relight a.jpg": {
         "": "no light given; add --envmap, --light",
-        "--light 1": "give AZ,EL or AZ,EL,STRENGTH or AZ,EL,R,G,B, numbers sep",
+        "--light 1": "'1': no such light or key; give AZ,EL",
         "--light key=1,2 --light key=3,4": "'key': give each light a name of its own",
         "--light own --pose 10,0,0": "--light own",
         "--light own --composite face": "--light own",
@@ -148,19 +148,6 @@ WRONG: dict[str, dict[str, str]] = {
         "--landmarks none": "no such file or folder",
     },
     "view": {"a.jpg b.jpg -o me.html": "is one file", "index": "rename the photo"},
-    "convert-light sky.exr": {
-        "--to dpr": "--to dpr: no such form; give one of latlong, json",
-        "--to latlong --width 33": "even number",
-        "--to sh --width 64": "--width is for --to latlong, blender, mitsuba",
-        "--to blender --to latlong --order 3": "--order is for --to json, sh",
-        "--to sh --lights 40": "--lights is for --to json",
-        "--to sh --signed": "--signed is for",
-        "--to json --lights many": "--lights",
-        "": "--to",
-        "-o b.exr --to json": "or a file as .json",
-        "-o b.exr --to latlong --to blender": "is one file",
-        "-o sky.exr --to latlong": "is the input sky.exr",
-    },
     "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
     "synth-stage": {"--renderer mitsuba --transport": "--transport"},
     "prepare-dataset stage": {

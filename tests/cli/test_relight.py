@@ -45,7 +45,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
         "olats",
         lambda self, *given: predicted.append(self.quotient is not None) or olats(self, *given),
     )
-    line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,1,0,0"]
+    line = ["--envmap", str(given / "maps"), "--rotate", "0:360:2", "--light", "40,10;-40,0,0.5"]
     assert relight(given, tmp_path, *line) == 0
     assert predicted.count(True) == 1 and predicted[-1]  # for all setups, after the photo's own light
     names = [f"astronaut_{name}.{n}" for name in ("grey", "right.0007") for n in ("0000", "0001")]
@@ -128,7 +128,7 @@ def test_layers_and_provenance(given: Path, tmp_path: Path) -> None:
 
 
 def test_lights_with_names_are_layers_that_add_up(given: Path, tmp_path: Path) -> None:
-    lights = ["--light", "key=40,20", "--light", "rim=160,10,0.2,0.4,0.9", "--light", "5,6"]
+    lights = ["--light", "key=40,20", "--light", "rim=160,10;rgb=0.2,0.4,0.9", "--light", "5,6"]
     assert relight(given, tmp_path, *lights, "--background", "0,0,0") == 0
     assert made(tmp_path) == [
         f"astronaut_{name}{suffix}" for name in ("light_5_6", "light_key+rim") for suffix in (".exr", ".png")
@@ -304,10 +304,10 @@ def test_near_lights_sweeps_and_rigs_from_the_command_line(given: Path, tmp_path
     (tmp_path / "studio.toml").write_text(
         "[key]\nat = [0.5, 0.3, 0.8]\nkelvin = 3200\n[rim]\nfrom = [160, 10]\n"
     )
-    entries = [str(tmp_path / "studio.toml"), "name=near;at=-0.4,0,0.6;size=0.2", "az=-60:60:2"]
+    entries = [str(tmp_path / "studio.toml"), "name=near;at=-0.4,0,0.6;size=0.2", "-60:60:2,0"]
     line = [word for entry in entries for word in ("--light", entry)]
     assert relight(given, tmp_path / "out", *line, "--background", "0,0,0", "--aov", "shadow") == 0
-    names = ["light_az_-60_60_2.0000", "light_az_-60_60_2.0001", "light_near", "studio"]
+    names = ["light_-60_60_2_0.0000", "light_-60_60_2_0.0001", "light_near", "studio"]
     assert made(tmp_path / "out") == sorted(
         f"astronaut_{name}{suffix}" for name in names for suffix in (".exr", ".png")
     )
@@ -348,7 +348,7 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
 
 
 def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -> None:
-    lights = ["--light", "180,20", "--light", "180,20,4,4,4", "--room", "none"]
+    lights = ["--light", "180,20", "--light", "180,20,4", "--room", "none"]
     assert relight(given, tmp_path, *lights, "--format", "png") == 0
     row = json.loads((tmp_path / "report.jsonl").read_text())
     assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image

@@ -12,7 +12,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.studio_points import Lights
+from facerf_cli.light.light import Light
 from facerf_cli.main import main
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, in_room
 from facerf_cli.work.lights import as_lit, lights_over_rig, with_room
@@ -23,7 +23,7 @@ from tests.exr_layers import exr_layers
 from tests.kinds import Said
 from tests.refusals import refused
 
-KEY, RIM = "name=key;az=40;el=20;kelvin=3200", "name=rim;az=160;stops=-1;rgb=0.5,1,1"
+KEY, RIM = "name=key;from=40,20;kelvin=3200", "name=rim;from=160,0;stops=-1;rgb=0.5,1,1"
 
 
 @pytest.fixture
@@ -39,14 +39,14 @@ def setups_of(
     return list(collect_setups(LightSources(envmap=envmap, light=light, rotate=rotate), Path("out")))
 
 
-def lights_of(*setups: LightSetup) -> Lights:
+def lights_of(*setups: LightSetup) -> Light:
     return lights_over_rig(tuple(with_room(setup) for setup in setups), "150", "cell")
 
 
 def test_a_named_light_is_one_of_the_sums_that_it_shines_in() -> None:
     (setup,) = setups_of([KEY, RIM])
     found = lights_over_rig(as_lit((replace(setup, room=0.1),), 0), "150", "cell")
-    assert len(found) == 4 and len(found.directions) == 2 + 24  # of the room
+    assert len(found.weights) == 4 and len(found.directions) == 2 + 24  # of the room
     torch.testing.assert_close(found.weights[0], found.weights[1:].sum(0))
 
 
@@ -80,14 +80,14 @@ def test_none_leaves_the_lights_and_a_rooms_light_is_a_share_of_their_sum() -> N
     (setup,) = setups_of([KEY, RIM])
     assert in_room(setup, "none", False) == setup == with_room(setup)
     assert in_room(setup, "0", False) == setup
-    red, near = "name=a;az=90;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
+    red, near = "name=a;from=90,0;rgb=1,0,0", "name=b;at=0,0,1;rgb=0,2,0;stops=1"
     (setup,) = setups_of([red, near])
     lit = with_room(in_room(setup, "0.1", False))
     assert lit.names == ("a", "b", "room") and lit.lights[:2] == setup.lights
     assert lit.lights[2] == StudioLight(rgb=pytest.approx((0.1, 0.4, 0.0)))
 
 
-def test_sums_of_images_stay_sums(sky: Path) -> None:
+def test_stacked_images_stay_sums(sky: Path) -> None:
     """Of lights by themselves, and of a map with them: weights of all that shines add up."""
     key, rim, together, alone = (
         in_room(setup, None, False)

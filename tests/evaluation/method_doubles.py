@@ -16,8 +16,8 @@ from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.olat_stack import read_olats
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face
 from facerf_cli.raster.camera import Camera, project
@@ -73,7 +73,7 @@ class Double(Method):
         return self.made[-1]
 
     def images(
-        self, photo: np.ndarray | None, head: Head, lights: Lights, target: Target
+        self, photo: np.ndarray | None, head: Head, lights: Light, target: Target
     ) -> Iterator[np.ndarray]:
         for row in lights.weights:
             light = RigLight(lights.directions, row)

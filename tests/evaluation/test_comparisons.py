@@ -42,8 +42,8 @@ from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.metrics import si_mse
 from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.main import main
 from facerf_cli.portrait.find import Face, face_at
 from facerf_cli.raster.camera import pose_to_rotation
@@ -244,7 +244,7 @@ def test_in_its_own_pose_the_composite_is_the_image_of_relight_in_the_crop(
 
     @dataclass(frozen=True, eq=False)
     class Records(Double):
-        def images(self, photo: Any, head: Any, lights: Lights, target: Any) -> Iterator[np.ndarray]:
+        def images(self, photo: Any, head: Any, lights: Light, target: Any) -> Iterator[np.ndarray]:
             asked_for.append(lights.directions)
             return super().images(photo, head, lights, target)
 

@@ -26,8 +26,8 @@ from facerf_cli.evaluation.yale_b import (
     face_mask,
 )
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import Face
 from facerf_cli.relighting.heads import fit_photo, head_of
@@ -120,7 +120,7 @@ class TooBright:
 
     name = "copy"
 
-    def images(self, photo: np.ndarray, face: Face, lights: Lights, target: Any) -> list[np.ndarray]:
+    def images(self, photo: np.ndarray, face: Face, lights: Light, target: Any) -> list[np.ndarray]:
         assert face.landmarks_px.shape == (68, 2)
         return [2 * photo] * len(lights.weights)
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.light import Light, sums_of
+from facerf_cli.light.light import Light, stacked
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import KeyLight, Lights, far_samples
+from facerf_cli.light.studio_points import KeyLight, far_samples
 from facerf_cli.person import Target
 from facerf_cli.portrait.proxy import OFF_M, Proxy, ProxyMaps
 from facerf_cli.relighting.cast_shadows import CastShadow, change, visibility
@@ -87,7 +87,7 @@ def test_key_lights_are_singled_out() -> None:
     weights = torch.tensor([[1.0, 1, 0, 0, 0], [0.5, 0.5, 0, 2, 0.1], [0, 0, 0, 0, 0.3]])[..., None].expand(
         -1, -1, 3
     )
-    lights = Lights(directions, weights, keys=(slice(0, 2), slice(3, 4)))
+    lights = Light(directions, weights, keys=(slice(0, 2), slice(3, 4)))
     every, keys = lights.with_keys_alone()
     assert keys == [
         KeyLight(0, 0, False, slice(0, 2)),
@@ -116,7 +116,7 @@ def people() -> PeopleInPhoto:
 def test_shadows_act_on_bare_skin_alone(people: PeopleInPhoto) -> None:
     """Elsewhere, and where the coarse visibility does not change, the image is that of the maps."""
     direction = azel_to_direction(45.0, 30.0)[None]
-    ((relit,),) = people.relit(Lights.each(direction, (slice(0, 1),)))
+    ((relit,),) = people.relit(Light.each(direction, (slice(0, 1),)))
     ((alone, _),) = relit.keys
     assert alone.texture is relit.texture
     fine, coarse = (people.light_layer([one]) for one in (relit, replace(relit, keys=())))
@@ -130,7 +130,7 @@ def test_shadows_act_on_bare_skin_alone(people: PeopleInPhoto) -> None:
 def test_layers_of_lights_add_up(people: PeopleInPhoto) -> None:
     directions = torch.cat([azel_to_direction(45.0, 30.0)[None], azel_to_direction(-80.0, 10.0)[None]])
     weights = torch.tensor([[1.0, 0.0], [0.0, 0.1], [1.0, 0.1]])[..., None].expand(-1, -1, 3)
-    relit = people.relit(Lights(directions, weights, keys=(slice(0, 1), slice(1, 2))))
+    relit = people.relit(Light(directions, weights, keys=(slice(0, 1), slice(1, 2))))
     key, fill, both = map(people.light_layer, relit)
     assert fill.max() > 0.02
     np.testing.assert_allclose(both, key + fill, atol=1e-5 * both.max())
@@ -145,7 +145,7 @@ def test_a_bright_texel_of_a_map_casts_the_shadow_of_a_single_light(people: Peop
     shadows = []
     for light in (of_map, single):
         sharp, soft = (
-            people.light_layer(next(people.relit(sums_of([one])))) for one in (light, replace(light, keys=()))
+            people.light_layer(next(people.relit(stacked([one])))) for one in (light, replace(light, keys=()))
         )
         shadows.append((sharp - soft) / light.weights[-1])
     assert abs(shadows[1]).max() > 0.05

@@ -1,6 +1,7 @@
 """Eyes: the mirror image of a light in the cornea, irises without the photo's catchlights; lips."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,9 @@ from torch import Tensor
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Window
 from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.light.studio_points import Lights, far_samples
+from facerf_cli.light.studio_points import far_samples
 from facerf_cli.portrait.mesh import SeenEyes
 from facerf_cli.relighting import detail as module
 from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
@@ -159,9 +161,8 @@ def nearest_of_rig() -> torch.Tensor:
 def test_light_arrives_from_near_and_far() -> None:
     place = torch.tensor([0.0, 0.0, -1.0])
     near = StudioLight(at_m=(0.0, 2.0, 0.0), rgb=(1.0, 1.0, 1.0))
-    lights = Lights(
-        azel_to_direction(90.0, 0.0)[None], torch.ones(1, 1, 3), (near,), torch.full((1, 1, 3), 2.0)
-    )
+    far = Light(azel_to_direction(90.0, 0.0)[None], torch.ones(1, 1, 3))
+    lights = replace(far, near=(near,), near_weights=torch.full((1, 1, 3), 2.0))
     directions, weights = lights.arriving(place, place)
     mean = torch.einsum("mnc,nd->mcd", weights, directions)[0, 0]
     torch.testing.assert_close(mean, torch.tensor([1.0, 2.0, 0.0]), atol=1e-4, rtol=1e-3)
@@ -170,14 +171,14 @@ def test_light_arrives_from_near_and_far() -> None:
 
 def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_is() -> None:
     lights = torch.stack([azel_to_direction(azimuth, 10.0) for azimuth in (-75.0, 0.0, 75.0)])
-    seen = astronaut.field().views[0].mirrored(Lights.each(lights), torch.zeros(3)).amax((2, 3, 4))
-    alone = mirrored_in_cornea(lights, Lights.each(lights).weights, torch.ones(3)).amax((1, 2, 3))
+    seen = astronaut.field().views[0].mirrored(Light.each(lights), torch.zeros(3)).amax((2, 3, 4))
+    alone = mirrored_in_cornea(lights, Light.each(lights).weights, torch.ones(3)).amax((1, 2, 3))
     left, right = (seen / alone[:, None]).T  # as the photo shows them
     assert left[1] > 0.8 and right[1] > 0.8
     assert left[0] > 0.5 and right[2] > 0.5
     assert right[0] < 0.05 and left[2] < 0.05  # each from the other's side
     near = StudioLight(at_m=(0.0, 0.1, 0.3), rgb=(1.0, 1.0, 1.0))
-    lights = Lights(torch.zeros(0, 3), torch.zeros(1, 0, 3), (near,), torch.ones(1, 1, 3))
+    lights = Light(torch.zeros(0, 3), torch.zeros(1, 0, 3), near=(near,), near_weights=torch.ones(1, 1, 3))
     at, view = 2 * (torch.arange(64) + 0.5) / 64 - 1, astronaut.field().views[0]
     images = view.mirrored(lights, view.person.maps.positions_m.mean((1, 2)))[0, :, 0]
     left, right = (float(image.sum(0) @ at / image.sum()) for image in images)
@@ -192,14 +193,14 @@ def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest
     teeth = polygon2mask(photo.shape[:2], inner[:, ::-1]) & (luminance(photo) > 0.3)
     lights = torch.stack([azel_to_direction(*light) for light in ((0.0, 0.0), (0.0, 55.0), (-70.0, 0.0))])
 
-    def shown(lights: Lights) -> list[np.ndarray]:
+    def shown(lights: Light) -> list[np.ndarray]:
         return [people.image(relit).pixels[teeth] for relit in people.relit(lights)]
 
-    each, (both,) = shown(Lights.each(lights)), shown(Lights(lights, torch.ones(1, 3, 3)))
+    each, (both,) = shown(Light.each(lights)), shown(Light(lights, torch.ones(1, 3, 3)))
     np.testing.assert_allclose(both, sum(each), rtol=1e-3)
     monkeypatch.setattr(module, "_CAVITY", 0.0)
     front, above, aside = (
-        kept.mean() / whole.mean() for kept, whole in zip(each, shown(Lights.each(lights)), strict=True)
+        kept.mean() / whole.mean() for kept, whole in zip(each, shown(Light.each(lights)), strict=True)
     )
     assert 0.9 < front < 1.1
     assert above < 0.8 and aside < 0.8

@@ -12,8 +12,9 @@ from torch import Tensor
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import Lights, PointLights, far_samples
+from facerf_cli.light.studio_points import PointLights, far_samples
 from facerf_cli.person import Person, Target
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.relighting.field import far_lights_of, near_texture
@@ -43,21 +44,21 @@ class Shown:
     def under(self, directions: Tensor, shares: Tensor) -> np.ndarray:
         """The person under far lights [L, 3], white, of shares [L]."""
         weights = shares[None, :, None].expand(-1, -1, 3)
-        return over_black(self.people, Lights(directions, weights, keys=(slice(len(shares)),)))
+        return over_black(self.people, Light(directions, weights, keys=(slice(len(shares)),)))
 
     def reached_by(self, light: StudioLight) -> Tensor:
         """Share [S, S] of a near light that arrives."""
         lights = near(light)
         assert isinstance(self.people, PeopleInPhoto)
-        around = lights.around(self.people.people[0].vertices_m.mean(0))
+        around = lights.near_points(self.people.people[0].vertices_m.mean(0))
         return self.field.views[0].lit(lights.directions, lights.weights, around).reached[0, 0]
 
 
-def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Lights:
-    return Lights(*DARK, lights, torch.tensor(rgb).expand(1, len(lights), 3))
+def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
+    return Light(*DARK, near=lights, near_weights=torch.tensor(rgb).expand(1, len(lights), 3))
 
 
-def over_black(people: Relightable, lights: Lights) -> np.ndarray:
+def over_black(people: Relightable, lights: Light) -> np.ndarray:
     return people.light_layer(next(people.relit(lights)))
 
 
@@ -112,7 +113,7 @@ def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Shown)
     dark = {name: 0 * getattr(maps, name) for name in ("gloss", "lit", "around", "shadow")}
     matt = replace(view, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
     light = StudioLight(at_m=(0.1, 0.2, 0.3))
-    ((points, rgb),) = near(light).around(person.people.people[0].vertices_m.mean(0))
+    ((points, rgb),) = near(light).near_points(person.people.people[0].vertices_m.mean(0))
     lit = matt.lit(*DARK, [(points, rgb)])
     offsets = points.places_m[0, :, None, None] - view.person.maps.positions_m
     cosine = (offsets / offsets.norm(dim=0) * maps.normals[0]).sum(0).clamp_min(0)

@@ -16,8 +16,8 @@ from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import Crop
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Window, strips
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.light.studio_points import Lights
 from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.person import Person, Target, fit
 from facerf_cli.portrait.classes import class_index
@@ -70,6 +70,10 @@ class Seen:
 
 def lamp(azimuth_deg: float, elevation_deg: float = 0.0) -> RigLight:
     return RigLight(azel_to_direction(azimuth_deg, elevation_deg)[None], torch.ones(1, 3))
+
+
+def one_sum(light: RigLight) -> Light:
+    return Light(light.directions, light.weights[None])
 
 
 def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_what_is_before_it(
@@ -224,7 +228,7 @@ def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: Person
     directions = torch.cat([lamp(azimuth, 20).directions for azimuth in (30, 140, 175)])
     people = person.composed(Target(background="none"))
     weights = torch.cat([torch.eye(3), torch.ones(1, 3)])[..., None].expand(-1, -1, 3)
-    relit = list(people.relit(Lights(directions, weights)))
+    relit = list(people.relit(Light(directions, weights)))
     ahead, behind = relit[0][0].texture, relit[2][0].texture
     assert behind.abs().max() < 1e-4 * ahead.max()
     *each, together = (people.image(one).pixels for one in relit)
@@ -236,7 +240,7 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     people = person.composed()
-    relit = next(people.relit(Lights.of_rig(lamp(40, 30))))
+    relit = next(people.relit(one_sum(lamp(40, 30))))
     names = (*NAMES, "classes", "face", "uv")
     layers = people.rendered(RenderRequest(relit, layers=names))
     assert {"rgb", "albedo", "class.hair", "face.A", "uv"} <= set(layers)
@@ -255,7 +259,7 @@ def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
     alpha = np.ones(photo.shape[:2], np.float32)
     alpha[:, : photo.shape[1] // 2] = 0
     people = person.composed(Target(alpha=alpha))
-    request = RenderRequest(next(people.relit(Lights.of_rig(lamp(40, 30)))), layers=NAMES)
+    request = RenderRequest(next(people.relit(one_sum(lamp(40, 30)))), layers=NAMES)
     cut, matte = people.rendered(request), people.matte
     assert ((matte > 0.02) & (matte < 0.9)).sum() > 100
     assert isinstance(people, PeopleInPhoto)
@@ -279,7 +283,7 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
 
     def shown() -> list[np.ndarray]:
         people = person.composed()
-        relit = next(people.relit(Lights.of_rig(lights)))
+        relit = next(people.relit(one_sum(lights)))
         return list(people.rendered(RenderRequest(relit, layers=names)).values())
 
     at_once = shown()

@@ -27,8 +27,9 @@ from facerf_cli.image.colour import (
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import envmap_weights
+from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
-from facerf_cli.light.studio_points import Lights, far_samples
+from facerf_cli.light.studio_points import far_samples
 from facerf_cli.main import main
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import find_faces
@@ -61,7 +62,7 @@ class Shown:
         """Under lights and what a room sends of them."""
         around, shares = far_samples(StudioLight())
         sent = room * shares[:, None] * weights.sum(0)
-        lights = Lights(torch.cat([directions, around]), torch.cat([weights, sent])[None])
+        lights = Light(torch.cat([directions, around]), torch.cat([weights, sent])[None])
         return next(self.whole.relit(lights))
 
     def truth(self, relit: Any, ev: float) -> np.ndarray:
@@ -116,7 +117,7 @@ def text_of(light: torch.Tensor) -> str:
 
 RIG = on_rig((40, 25), (0, 80), (-140, 20), (180, 10))
 BETWEEN = [(40, 25), (-70, 10), (0, -40), (110, 20), (-30, 50)]
-OWN_LIGHT = Lights(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own=torch.ones(1, 3))
+OWN_LIGHT = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own_rgb=torch.ones(1, 3))
 PAIR = on_rig((75, 20), (-150, 10))
 COLOURED = f"light={text_of(PAIR[0])},1,0.5,0.25;{text_of(PAIR[1])}&ev=-0.5"
 ALONE, MAP = COLOURED + "&background=none", "env=sun&rotate=50"
@@ -221,7 +222,7 @@ def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -
     assert "--light own -o out" in images[OWN].command
     assert "--envmap envmap=maps/00000_sun.exr --light own -o out" in images[f"{OWN}&env=sun"].command
     assert "--light 'own;stops=-1' --exposure 1 " in images[DIMMED].command
-    assert "--light rim=-150,15,2,2,2 --light own -o out" in images[RIM].command
+    assert "--light name=rim;from=-150,15;rgb=2,2,2 --light own -o out" in images[RIM].command
 
 
 def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path) -> None:

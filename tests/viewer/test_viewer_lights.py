@@ -30,19 +30,19 @@ _SCRIPT = """
 ONE = [
     "40,25",
     "40,25,2",
-    "-30,10,1,0.5,0.25",
+    "-30,10;rgb=1,0.5,0.25",
     "from=75,20;kelvin=1800",
     "from=75,20;kelvin=3200;stops=-1.5;rgb=1,0.8,0.6",
-    "az=120;el=-30;kelvin=12000;size_deg=5",
+    "from=120,-30;kelvin=12000;size_deg=5",
     "from=0,90;size_deg=60",
-    "el=89.9;size_deg=3",
+    "0,89.9;size_deg=3",
     "from=-140,40;size_deg=120",
     "from=around;stops=-5;kelvin=4000",
     "own",
     "own;stops=-1.5;kelvin=5000",
     "name=day;from=own;rgb=1,0.9,0.8",
 ]
-MANY = ["40,25;-60,10,1,0.5,0.25", "key=40,20;rim=160,10,0.5", *("beauty", "rembrandt", "rim")]
+MANY = ["40,25;-60,10,2", "key=40,20;rim=160,10,0.5", *("beauty", "rembrandt", "rim")]
 FREE = {  # forms that are one with others
     "key=40,20;stops=-1": "name=key;from=40,20;stops=-1",
     "left": "-90,0",
@@ -60,7 +60,8 @@ WRONG = {
     "40,100": "40,100 is no direction",
     "40,": "40, is no direction",
     "40,20,-1": "is no direction",
-    "az=-90:90:24": "az -90:90:24: give a number",
+    "from=-90:90:24,0": "-90:90:24,0 is no direction",
+    "40,20,1,1,1": "is no direction",
     "from=40,20;kelvin=900": "kelvin 900: give a number from 1667 to 25000",
     "key=40,20;rim=160,10;stops=1": "keys are of one light",
     "from=40,20;at=1,1,1": "give one direction",
@@ -68,7 +69,7 @@ WRONG = {
     "size=40,20": "give one direction",
     "map=sky.exr": "map= is not shown in a page",
     "1st=40,20": "1st is no name",
-    "az=1=2": "give ; between keys",
+    "from=1=2": "give ; between keys",
 }
 
 

@@ -11,10 +11,9 @@ import torch
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.light_files import Harmonics, LightRecord, write_light
+from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
-from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
 from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.main import main, repeat_options
@@ -58,8 +57,7 @@ def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.L
     lamp = (rig @ azel_to_direction(60, 30)).clamp_min(0)[:, None] ** 20
     weights = 0.01 + lamp * torch.tensor([1, 0.8, 0.6])
     write_light(tmp_path / "a_light.json", LightRecord(rig, weights))
-    harmonics = Harmonics(torch.ones(9, 3), CONVENTION)
-    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=harmonics))
+    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=torch.ones(9, 3)))
     (tmp_path / "c.json").write_text("{}")
     given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
     setups = readable(collect_setups(LightSources(envmap=given, rotate="90"), tmp_path / "out"))
@@ -225,7 +223,8 @@ def test_rotation_adds_to_the_azimuth(tmp_path: Path) -> None:
 
 
 def test_lamps_shine_together_with_their_colours() -> None:
-    setups = collect_setups(LightSources(light=["90,0,1,0,0;-90,0,0,0,2", "0,0"]), Path("out"))
+    entries = ["0,0", "a=90,0;rgb=1,0,0", "b=-90,0;rgb=0,0,2"]
+    setups = collect_setups(LightSources(light=entries), Path("out"))[::-1]
     lights = lights_over_rig(setups, "150", "cell")
     directions, weights = lights.directions, lights.weights
     assert directions.shape == (3, 3)  # the rig is not needed
@@ -240,8 +239,8 @@ def test_lamps_of_a_stack_are_shared_by_the_lights_around_them() -> None:
     """Three at most, whose sum lies where the lamp is; a light of the stack is itself."""
     directions = rig_directions(50)
     azimuth, elevation = direction_to_azel(directions[7])
-    own = f"{float(azimuth)},{float(elevation)},1,2,3"
-    setups = collect_setups(LightSources(light=["30,20,1,2,3", own]), Path("out"))
+    own = f"{float(azimuth)},{float(elevation)};rgb=1,2,3"
+    setups = collect_setups(LightSources(light=["30,20;rgb=1,2,3", own]), Path("out"))
     mixed, exact = lights_over_stack(setups, directions, "cell").weights
     lamp = azel_to_direction(30.0, 20.0)
     torch.testing.assert_close(mixed.sum(0), torch.tensor([1.0, 2, 3]))
@@ -279,8 +278,7 @@ def test_lights_by_their_keys_and_by_the_names_of_presets() -> None:
     assert near == StudioLight(None, (0.5, 0.3, 1.0), (1.0, 0.5, 0.25), 3200.0, 1.0, 0.4, 0.0, 40.0)
     far = StudioLight((40.0, 20.0), kelvin=5600.0, stops=-1.0, size_deg=30.0)
     assert single("from=40,20; kelvin=5600 ;stops=-1;size_deg=30") == far
-    assert single("az=40;el=20;kelvin=5600;stops=-1;size_deg=30") == far
-    assert single("az=40") == single("40,0") and single("el=20") == single("0,20")
+    assert single("40,20,2") == single("from=40,20,2") == StudioLight((40.0, 20.0), rgb=(2.0, 2.0, 2.0))
     assert single("from=around;stops=-3") == StudioLight(stops=-3.0)
     assert single("at=0,0,1;size=0") == StudioLight(at_m=(0.0, 0.0, 1.0))
     assert lit_images(["rim"])[0].names == ("right", "left", "fill")
@@ -295,12 +293,12 @@ def test_lights_by_their_keys_and_by_the_names_of_presets() -> None:
 
 
 def test_lights_with_names_share_an_image_whatever_their_form() -> None:
-    entries = ["key=40,20;rim=160,10,1,0,0", "5,6", "name=top;at=0,1,0", "at=0,0,2;size=1"]
+    entries = ["key=40,20;rim=160,10,2", "5,6", "name=top;at=0,1,0", "at=0,0,2;size=1"]
     images = lit_images(entries)
     assert [image.name for image in images] == ["light_5_6", "light_at_0_0_2_size_1", "light_key+rim+top"]
     assert images[2].names == ("key", "rim", "top") and images[0].names == ()
     (lights,) = images[2].frames
-    assert lights[1] == StudioLight((160.0, 10.0), rgb=(1.0, 0.0, 0.0)) and lights[2].at_m == (0, 1, 0)
+    assert lights[1] == StudioLight((160.0, 10.0), rgb=(2.0, 2.0, 2.0)) and lights[2].at_m == (0, 1, 0)
 
 
 def test_a_name_a_place_and_options_combine_in_any_light() -> None:
@@ -309,7 +307,7 @@ def test_a_name_a_place_and_options_combine_in_any_light() -> None:
     assert key.frames == ((StudioLight((40.0, 20.0), kelvin=3200.0, stops=-1.0),),)
     assert lit_images(["name=key;40,20;stops=-1;kelvin=3200"]) == [key]
     assert lit_images(["stops=-1;kelvin=3200;name=key;from=40,20"]) == [key]
-    assert single("40,20,1,0.5,0;rgb=0.5,1,1;size_deg=9") == StudioLight(
+    assert single("40,20,2;rgb=0.25,0.25,0;size_deg=9") == StudioLight(
         (40.0, 20.0), rgb=(0.5, 0.5, 0.0), size_deg=9.0
     )
     assert [one.name for one in lit_images(["40,20;stops=1", "40.0,20"])] == [
@@ -330,7 +328,7 @@ def test_options_of_a_preset_act_on_all_its_lights(tmp_path: Path) -> None:
     assert [light.at_m for light in named[0].frames[0]] == [light.at_m for light in plain.frames[0]]
     assert (named[0].name, named[0].names) == ("light_key", ("key_key", "key_fill"))
     assert (alone[0].name, alone[0].names) == ("light_rembrandt_stops_-1", ("key", "fill"))
-    (tmp_path / "a;b=c.toml").write_text("[top]\nfrom = 'above'\n[side]\naz = '0:90:2'\n")
+    (tmp_path / "a;b=c.toml").write_text("[top]\nfrom = 'above'\n[side]\nfrom = '0:90:2,0'\n")
     (rig,) = lit_images([str(tmp_path / "a;b=c.toml")])
     assert (rig.name, rig.names, len(rig.frames)) == ("a;b=c", ("top", "side"), 2)
     assert rig.frames[1] == (StudioLight((0.0, 90.0)), StudioLight((45.0, 0.0)))
@@ -374,29 +372,29 @@ def test_lights_apart_from_those_with_names_are_said(caplog: pytest.LogCaptureFi
 
 
 def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
-    setups = collect_setups(LightSources(light=["az=-90:90:3;el=20"]), Path("out"))
+    setups = collect_setups(LightSources(light=["from=-90:90:3,20"]), Path("out"))
     assert [setup.frame for setup in setups] == [".0000", ".0001", ".0002"]
-    assert {setup.name for setup in setups} == {"light_az_-90_90_3_el_20"}  # and so of one exposure
+    assert {setup.name for setup in setups} == {"light_from_-90_90_3_20"}  # and so of one exposure
     assert [setup.lights[0].azel_deg for setup in setups] == [(-90, 20), (-30, 20), (30, 20)]
     item = Item(Path("a.jpg"), Path("out/a"), "a")
-    assert setups[1].output(item, "", ".exr") == Path("out/a_light_az_-90_90_3_el_20.0001.exr")
-    both = collect_setups(LightSources(light=["az=0:20:2;el=0:90:2;stops=1"]), Path("out"))
+    assert setups[1].output(item, "", ".exr") == Path("out/a_light_from_-90_90_3_20.0001.exr")
+    both = collect_setups(LightSources(light=["0:20:2,0:90:2;stops=1"]), Path("out"))
     assert [setup.lights[0].azel_deg for setup in both] == [(0, 0), (10, 45)]
-    assert collect_setups(LightSources(light=["az=0:20:1"]), Path("out"))[0].frame == ".0000"
-    setups = collect_setups(LightSources(light=["name=key;az=0:90:3", "fill=-40,0"]), Path("out"))
+    assert collect_setups(LightSources(light=["0:20:1,5"]), Path("out"))[0].name == "light_0_20_1_5"
+    setups = collect_setups(LightSources(light=["key=0:90:3,0", "fill=-40,0"]), Path("out"))
     assert [[light.azel_deg for light in setup.lights] for setup in setups] == [
         [(0, 0), (-40, 0)],
         [(30, 0), (-40, 0)],
         [(60, 0), (-40, 0)],
     ]
     assert all(setup.names == ("key", "fill") for setup in setups)
-    refused(UsageError, "sweeps of 2 and 3 frames", lit_images, ["name=a;az=0:90:3", "name=b;az=0:90:2"])
+    refused(UsageError, "sweeps of 2 and 3 frames", lit_images, ["a=0:90:3,0", "b=0:90:2,0"])
 
 
 @pytest.mark.parametrize(
     "entry, said",
     [
-        ("at=0,0,1;colour=red", "'colour': no such key; give at, from"),
+        ("at=0,0,1;colour=red", "'colour=red': no such light or key ... keys are at, from"),
         ("at=0,0", "at '0,0': give X,Y,Z"),
         ("at=0,0,0.1", "at '0,0,0.1': the distance from the face is out of range; give 0.15"),
         ("at=0,0,1;from=0,0", "give one of at=X,Y,Z"),
@@ -406,31 +404,33 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
         ("at=0,0,1;size_deg=3", "size_deg is of far lights"),
         ("from=0,0;size=1", "size is of near lights"),
         ("at=0,0,1;at=0,0,2", "at is given twice"),
-        ("az=60,el=10", "give ; between keys, as in 'az=60;el=10'"),
-        ("az=0:90;el=3", "az '0:90': give degrees, or FROM:TO:N"),
-        ("az=0:90:2;el=0:9:3", "give one N"),
-        ("el=0:200:4", "the elevation is out of range"),
-        ("from=around;size_deg=3", "a light from all around has no size; leave size_deg out"),
+        ("az=60,el=10", "give ; between keys, as in 'from=60,10;stops=1'"),
+        ("from=0:90,3", "from '0:90': give degrees, or FROM:TO:N"),
+        ("0:90:2,0:9:3", "give one N"),
+        ("az=0:360:24;el=10", "az and el: no such keys; use from=0:360:24,10"),
+        ("name=a;az=20", "use from=20,0"),
+        ("a=40,20,1,2,3", "use 40,20;rgb=1,2,3"),
+        ("from=0,0:200:4", "the elevation is out of range"),
+        ("from=around;size_deg=3", "size_deg is of far lights (from=AZ,EL)"),
         ("at=0,0,1;rotate=30", "rotate is of maps (map=); leave it out"),
-        ("az=20;face=1.5", "face '1.5': give the number of one"),
+        ("from=20,0;face=1.5", "face '1.5': give the number of one"),
         ("name=;at=0,0,1", "'': give each light a name of its own"),
         ("=40,20", "'': give each light a name"),
-        ("rembrant", "no such preset; give AZ,EL, a rig file (.toml) or one of beauty, "),
-        ("key=40,20;colour=red", "'colour': no such key; give at, from"),
+        ("rembrant", "no such light or key; give AZ,EL, a rig file (.toml) or one of beauty, "),
+        ("key=rembrant", "'key=rembrant': no such light or key"),
+        ("key=40,20;colour=red", "'colour=red': no such light or key"),
         ("key=40,20,stops=-1", "give ; between keys"),
-        ("key=40,20;az=3", "give one of AZ,EL, at=X,Y,Z"),
-        ("a=40,20;b=left;stops=1", "stops is of one light; give each light a --light of its own"),
+        ("key=40,20;at=0,0,3", "keys are of one light; give each light a --light of its own"),
+        ("a=40,20;b=left;stops=1", "keys are of one light"),
         ("key=40,20;60,30", "some lights have names; give each one, as in key=40,20, or none"),
         ("name=a;key=40,20", "the light has two names"),
-        ("map=40,20", "map is a key; give another name, as in map_light=40,20"),
-        ("size=rembrandt;stops=1", "size is a key; give another name, as in size_light=rembrandt"),
-        ("face=left", "face is a key; give another name, as in face_light=left"),
+        ("size=rembrandt;stops=1", "give one of at=X,Y,Z"),
         ("key=rembrandt;size=3", "size is of near lights"),
         ("from=up", "from 'up': give AZ,EL or one of left, right"),
         ("missing.toml", "missing.toml: no such rig file"),
-        ("own;at=0,0,1", "give one of"),
+        ("own;at=0,0,1", "keys are of one light"),
         ("own;size=1", "size is of near lights"),
-        ("own;size_deg=5", "no size"),
+        ("own;size_deg=5", "size_deg is of far lights"),
         ("own;rotate=5", "rotate is of maps"),
     ],
 )
@@ -440,7 +440,7 @@ def test_faults_say_what_to_give(entry: str, said: str) -> None:
 
 def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> None:
     (tmp_path / "studio.toml").write_text(
-        "[key]\nat = [0.5, 0.3, 1]\nsize = 0.4\nkelvin = 3200\n[rim]\naz = '150:170:2'\nel = 10\nstops = -1\n"
+        "[key]\nat = [0.5, 0.3, 1]\nsize = 0.4\nkelvin = 3200\n[rim]\nfrom = '150:170:2,10'\nstops = -1\n"
     )
     setups = collect_setups(LightSources(light=[str(tmp_path / "studio.toml"), "key=1,2"]), tmp_path / "out")
     assert [setup.name + setup.frame for setup in setups] == ["studio.0000", "studio.0001", "light_key"]
@@ -459,7 +459,7 @@ def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> 
         ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0': give X,Y,Z"),
         ("['a b']\nat = [0, 0, 1]\n", "'a b': give each light a name"),
         ("[key]\nfrom = 'up'\n", "key: from 'up': give AZ,EL or one of left, right"),
-        ("[a]\naz = '0:9:2'\n[b]\naz = '0:9:3'\n", "sweeps of 2 and 3 frames"),
+        ("[a]\nfrom = '0:9:2,0'\n[b]\nfrom = '0:9:3,0'\n", "sweeps of 2 and 3 frames"),
     ],
 )
 def test_a_fault_of_a_rig_file_names_file_and_light(tmp_path: Path, text: str, said: str) -> None:
@@ -479,14 +479,14 @@ def test_near_lights_are_kept_apart_from_far_ones_and_prepared_once() -> None:
         [[2, 2, 2], [0, 0, 0]],
     ]
     assert len(lights.directions) == 1 and lights.weights.sum((1, 2)).tolist() == [0, 0, 3]
-    assert [light.at_m for light in lights[1:2].near] == [(0, 0, 2)]
+    assert [light.at_m for light in lights.some(slice(1, 2)).near] == [(0, 0, 2)]
     alone = lights_over_rig(setups[:1], "150", "cell")
     assert len(alone.directions) == 1 and alone.weights.abs().max() == 0  # a dark one, since models want one
 
 
 def test_strengths_count_all_light_wherever_it_comes_from(tmp_path: Path) -> None:
     write_exr(tmp_path / "even.exr", np.full((16, 32, 3), 0.5, np.float32))
-    entries = ["0,0,3,3,3", "180,0", "at=0,0,1;stops=1", "from=around"]
+    entries = ["0,0,3", "180,0", "at=0,0,1;stops=1", "from=around"]
     setups = collect_setups(LightSources(envmap=[str(tmp_path / "even.exr")], light=entries), Path("out"))
     assert lights_over_rig(setups, "150", "cell").strengths() == pytest.approx(
         [2, 3, 1, 2, 4], rel=1e-3
