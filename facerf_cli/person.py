@@ -51,7 +51,6 @@ from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import Relightable, RelitImage, RenderRequest
 from facerf_cli.relighting.white import Balance
-from facerf_cli.run.memory import batches
 
 if TYPE_CHECKING:
     import trimesh
@@ -456,13 +455,12 @@ class Person(PersonOrGroup):
         face = self.composed(Target(posed, "face"))
         assert isinstance(face, FaceAlone)
         view = face.view
-        for part in batches(len(lights), face.nbytes):
-            for one in face.relit(stacked(lights[part])):
-                image = torch.zeros(*face.size_px, 4)
-                image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
-                arrays = face.rendered(RenderRequest(one, layers=layers))
-                del arrays["rgb"]
-                yield {"image": image, **arrays}
+        for (one,) in face.relit_images(lambda part: stacked(lights[part]), [1] * len(lights)):
+            image = torch.zeros(*face.size_px, 4)
+            image[view.window] = torch.cat([view.render(one.texture), view.mask[..., None]], -1)
+            arrays = face.rendered(RenderRequest(one, layers=layers))
+            del arrays["rgb"]
+            yield {"image": image, **arrays}
 
     @property
     def _wanted(self) -> Tensor | None:
@@ -577,14 +575,13 @@ class Group(PersonOrGroup):
             one_of(Literal["photo", "none"], "background", background)
         if straight := isinstance(background, str) and background == "none":
             people = replace(people, background="none")
-        for part in batches(len(lights), people.nbytes):
-            for one in people.relit(stacked(lights[part])):
-                arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
-                image = torch.from_numpy(arrays.pop("rgb"))
-                if straight:
-                    image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
-                found = {"person.A": people.matte, **arrays} if layers else arrays
-                yield {"image": image, **found}
+        for (one,) in people.relit_images(lambda part: stacked(lights[part]), [1] * len(lights)):
+            arrays = people.rendered(RenderRequest(one, layers=layers, background=behind))
+            image = torch.from_numpy(arrays.pop("rgb"))
+            if straight:
+                image = torch.cat([image, torch.from_numpy(people.matte)[..., None]], -1)
+            found = {"person.A": people.matte, **arrays} if layers else arrays
+            yield {"image": image, **found}
 
 
 def olat_images(subject: Relightable, directions: Tensor) -> Iterator[np.ndarray]:

@@ -7,6 +7,7 @@ frame, some rows at a time. Both are linear in light: layers of single lights ad
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Empty, Rows, in_strips, new_array
 from facerf_cli.relighting.cast_shadows import CastShadow
 from facerf_cli.relighting.portrait_field import PortraitLight
+from facerf_cli.run.memory import batches
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +121,23 @@ class Relightable(ABC):
     @abstractmethod
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
         """The exposure in EV of the subject under one sum of lights, by a rule."""
+
+    def relit_images(self, lights_of: Callable[[slice], Any], sums: Sequence[int]) -> Iterator[list[Any]]:
+        """Relight the subject for images that need some `sums` of lights each; yield a list for each image.
+
+        As many images at a time as fit the memory share one prediction. `lights_of` gives the lights of a
+        range of all sums.
+        """
+        first = 0
+        for part in self.parts(sums):
+            last = first + sum(sums[part])
+            found = self.relit(lights_of(slice(first, last)))
+            yield from ([*islice(found, count)] for count in sums[part])
+            first = last
+
+    def parts(self, sums: Sequence[int]) -> list[slice]:
+        """As many images at a time as fit the memory, of images that need some `sums` of lights each."""
+        return batches(len(sums), max(sums, default=1) * self.nbytes)
 
     def rendered(self, request: RenderRequest, empty: Empty = new_array) -> dict[str, np.ndarray]:
         """All rows of what is asked; `empty` makes the array of a layer, by its name and shape.

@@ -1,10 +1,9 @@
 """One item of `facerf relight`: read, find, fit, light, relight, write."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
-from itertools import accumulate, islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -118,24 +117,28 @@ class Scene:
         return [self.lights_of(as_lit(self.setups, *one)) for one in people]
 
     @property
-    def ends(self) -> list[int]:
-        """The end of each setup among the sums of `lights`, after a first 0."""
-        alone = (len(with_room(setup).names) if setup.names else 0 for setup in self.setups)
-        return list(accumulate((1 + lights for lights in alone), initial=0))
+    def sums(self) -> list[int]:
+        """How many of the lights each setup needs: all together, then each that has a name."""
+        return [1 + (len(with_room(setup).names) if setup.names else 0) for setup in self.setups]
 
-    @property
-    def parts(self) -> list[slice]:
-        """As many of the setups at a time as fit the memory."""
-        most = max(last - first for first, last in pairwise(self.ends))
-        return batches(len(self.setups), most * self.subject.nbytes)
+    def relit(self) -> Iterable[list[Any]]:
+        """The people under each setup, and under each of its lights that has a name.
 
+        What fits the memory at once is kept; else it is predicted again whenever it is asked for.
+        """
+        return self._whole or self._relit()
+
+    @cached_property
     @step("render")
-    def relit(self, part: slice) -> list[list[Any]]:
-        """The people under some of the setups: under all of its lights, and under each that has a name."""
-        ends = self.ends[part.start : part.stop + 1]
-        lights = [of_one.some(slice(ends[0], ends[-1])) for of_one in self.lights]
-        found = self.subject.relit(lights if isinstance(self.subject, PeopleInPhoto) else lights[0])
-        return [list(islice(found, last - first)) for first, last in pairwise(ends)]
+    def _whole(self) -> list[list[Any]]:
+        return list(self._relit()) if len(self.subject.parts(self.sums)) == 1 else []
+
+    def _relit(self) -> Iterator[list[Any]]:
+        def lights_of(part: slice) -> Any:
+            each = [of_one.some(part) for of_one in self.lights]
+            return each if isinstance(self.subject, PeopleInPhoto) else each[0]
+
+        return self.subject.relit_images(lights_of, self.sums)
 
 
 def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
@@ -322,7 +325,7 @@ def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
         if isinstance(rule := plan.exposure_rule, float):
             return dict.fromkeys((setup.name for setup in plan.setups), rule)
         scene = next(_scenes_of(leader, with_background(plan, leader)))
-        known |= _exposures_ev(scene, scene.relit, plan)
+        known |= _exposures_ev(scene, plan)
     return known
 
 
@@ -346,34 +349,26 @@ def _write_images(
     Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
     of each image, and facts of it for the report: the exposure of the PNG in its place, the identity.
     """
-    parts = scene.parts
-    whole = scene.relit(parts[0]) if len(parts) == 1 else None
-
-    def relit_by(part: slice) -> list[list[Any]]:
-        return scene.relit(part) if whole is None else whole
-
-    exposures_ev = shared_ev or _exposures_ev(scene, relit_by, plan)
+    exposures_ev = shared_ev or _exposures_ev(scene, plan)
     written: dict[Path, dict[str, float]] = {}
-    for part in parts:
-        for setup, (relit, *each) in zip(scene.setups[part], relit_by(part), strict=True):
-            _require_finite(item, setup, relit)
-            path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
-            with canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
-                image = _rendered(scene, setup, relit, each, ev, plan, empty)
-                image = replace(image, header={**scene.plate, **_made_by(setup, plan)})
-                write_output(
-                    path, image, ev, plan.options.output, {**scene.metadata, "facerf:exposure_ev": ev}
-                )
-                written[path] = {"exposure_ev": ev}
-                if scene.identity is not None:
-                    written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
-                del image
-            said = [f"exposed by {ev:+.2f} EV"]
-            if setup.room:
-                said.append(f"with {100 * setup.room:g} % of the light bounced by the room (--room)")
-            if not shared_ev:
-                log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
-            del relit, each  # of all of its part, beside the next
+    for setup, (relit, *each) in zip(scene.setups, scene.relit(), strict=True):
+        _require_finite(item, setup, relit)
+        path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
+        with canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
+            image = _rendered(scene, setup, relit, each, ev, plan, empty)
+            image = replace(image, header={**scene.plate, **_made_by(setup, plan)})
+            metadata = {**scene.metadata, "facerf:exposure_ev": ev}
+            write_output(path, image, ev, plan.options.output, metadata)
+            written[path] = {"exposure_ev": ev}
+            if scene.identity is not None:
+                written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
+            del image
+        said = [f"exposed by {ev:+.2f} EV"]
+        if setup.room:
+            said.append(f"with {100 * setup.room:g} % of the light bounced by the room (--room)")
+        if not shared_ev:
+            log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
+        del relit, each  # of all of its part, beside the next
     return written
 
 
@@ -450,23 +445,20 @@ def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
             )
 
 
-def _exposures_ev(
-    scene: Scene, relit_by: Callable[[slice], list[list[Any]]], plan: RelightPlan
-) -> dict[str, float]:
+def _exposures_ev(scene: Scene, plan: RelightPlan) -> dict[str, float]:
     """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
     if isinstance(rule := plan.exposure_rule, float):
         return dict.fromkeys((setup.name for setup in plan.setups), rule)
     found: dict[str, float] = {}
-    strengths = scene.lights[0].strengths()
-    for part in scene.parts:
-        at = scene.ends[:-1][part]
-        for setup, first, (relit, *_) in zip(scene.setups[part], at, relit_by(part), strict=True):
-            chosen_ev = setup.exposure_ev
-            if chosen_ev is None:
-                most_ev = most_exposure_ev(rule, strengths[first])
-                chosen_ev = round(min(scene.subject.exposure_ev(relit, rule), most_ev), 2)
-            found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
-            del relit  # a view of one holds all of its part, beside the next
+    strengths, first = scene.lights[0].strengths(), 0
+    for setup, (relit, *each) in zip(scene.setups, scene.relit(), strict=True):
+        chosen_ev = setup.exposure_ev
+        if chosen_ev is None:
+            most_ev = most_exposure_ev(rule, strengths[first])
+            chosen_ev = round(min(scene.subject.exposure_ev(relit, rule), most_ev), 2)
+        found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
+        first += 1 + len(each)
+        del relit, each  # of all of its part, beside the next
     return found
 
 
