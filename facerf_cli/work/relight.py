@@ -351,7 +351,9 @@ def _write_images(
     """
     exposures_ev = shared_ev or _exposures_ev(scene, plan)
     written: dict[Path, dict[str, float]] = {}
-    for setup, (relit, *each) in zip(scene.setups, scene.relit(), strict=True):
+    images = iter(scene.relit())  # `zip` would hold one image's beside the next
+    for setup in scene.setups:
+        relit, *each = next(images)
         _require_finite(item, setup, relit)
         path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
         with canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
@@ -451,7 +453,9 @@ def _exposures_ev(scene: Scene, plan: RelightPlan) -> dict[str, float]:
         return dict.fromkeys((setup.name for setup in plan.setups), rule)
     found: dict[str, float] = {}
     strengths, first = scene.lights[0].strengths(), 0
-    for setup, (relit, *each) in zip(scene.setups, scene.relit(), strict=True):
+    images = iter(scene.relit())
+    for setup in scene.setups:
+        relit, *each = next(images)
         chosen_ev = setup.exposure_ev
         if chosen_ev is None:
             most_ev = most_exposure_ev(rule, strengths[first])
