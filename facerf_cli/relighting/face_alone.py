@@ -170,9 +170,9 @@ def face_layer(view: FaceView, name: str, window: Window) -> dict[str, np.ndarra
     part = window.common(view.window)
     inside = part.inside(view.window)
     if name == "face":
-        return {_FACE_ALPHA: window.framed(view.mask[inside].numpy(), part)}
+        return {_FACE_ALPHA: window.framed(view.mask[inside].detach().numpy(), part)}
     if name == "uv":
-        return {name: window.framed(view.uv[inside].numpy(), part)}
+        return {name: window.framed(view.uv[inside].detach().numpy(), part)}
     surface = view.surface(inside.rows)[:, inside.columns]
     values = {"normal": surface[..., :3], "position": surface[..., 3:], "depth": -surface[..., 5:]}[name]
-    return {name: window.framed(values.numpy(), part)}
+    return {name: window.framed(values.detach().numpy(), part)}
