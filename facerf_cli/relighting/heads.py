@@ -19,6 +19,8 @@ from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import step
 
+_REGRESSED = (BUILTIN, f"{BUILTIN}-mean")  # models that take what the Geometry Network regresses
+
 
 @step("fit")
 def head_of(
@@ -80,10 +82,11 @@ def regress_photo(models: Models, photo: np.ndarray, box_px: Box, sides: Sides |
 def regress_head(models: Models, cropped: np.ndarray) -> GeometryEstimate:
     """Regress pose and coefficients from a crop [S, S, 3] by the Geometry Network.
 
+    The mean face (`MorphableModel.pose_only`) takes the pose alone.
     Raises UsageError for a face model that is not the network's.
     """
     network: Any = models.networks.geometry
-    if models.face.name != BUILTIN:
+    if models.face.name not in _REGRESSED:
         raise UsageError(
             f"face model {models.face.name!r}: geometry 'network' regresses heads of the built-in one; "
             "use that, or geometry 'landmarks'"

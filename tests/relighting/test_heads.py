@@ -97,6 +97,14 @@ def test_another_network_gives_its_own_head(models: Models) -> None:
     assert (one.rotation - other.rotation).abs().max() > 0.3
 
 
+def test_the_mean_face_takes_the_regressed_pose(models: Models) -> None:
+    network, mean = Knows(15.0), models.face.pose_only()
+    own = replace(models.with_networks(geometry=network), face=mean)
+    fit = regress_photo(own, PHOTO, BOX, SIDES).fit
+    wanted = mean.mean @ network.head.rotation[0].T + network.head.translation_m[0]
+    torch.testing.assert_close(fit.vertices_camera(mean), wanted)
+
+
 def test_heads_of_another_face_model_are_not_regressed(models: Models) -> None:
     other = replace(models.with_networks(geometry=Knows(15.0)), face=replace(models.face, name="other"))
     refused(UsageError, "geometry 'landmarks'", regress_photo, other, PHOTO, BOX, SIDES)
