@@ -49,7 +49,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     assert relight(given, tmp_path, *line) == 0
     assert predicted.count(True) == 1 and predicted[-1]  # for all setups, after the photo's own light
     names = [f"astronaut_{name}.{n}" for name in ("grey", "right.0007") for n in ("0000", "0001")]
-    names.append("astronaut_light_40_10+-40_0_1_0_0")
+    names.append("astronaut_light_40_10+-40_0_0.5")
     images = sorted(name + suffix for name in names for suffix in (".exr", ".png"))
     assert [name for name in made(tmp_path) if name.startswith("astronaut")] == images
     row = json.loads((tmp_path / "report.jsonl").read_text())
