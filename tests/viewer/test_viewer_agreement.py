@@ -84,7 +84,7 @@ def shown() -> Shown:
     models = load_models()
     photo = read_image(ASTRONAUT).pixels
     face = find_faces(models.networks.people, photo, "astronaut")[0]
-    photo, head = shrunk_photo(photo, head_of(models, photo, face, models.sides(128)), 384)
+    photo, head = shrunk_photo(photo, head_of(models, photo, face, sides=models.sides(128)), 384)
     photo = np.clip(photo, 0, 1)
     basis, plate = of_photo(models, photo, head)
     field = reflectance_of(models, head, "portrait", photo=photo)
@@ -119,7 +119,7 @@ RIG = on_rig((40, 25), (0, 80), (-140, 20), (180, 10))
 BETWEEN = [(40, 25), (-70, 10), (0, -40), (110, 20), (-30, 50)]
 OWN_LIGHT = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own_rgb=torch.ones(1, 3))
 PAIR = on_rig((75, 20), (-150, 10))
-COLOURED = f"light={text_of(PAIR[0])},1,0.5,0.25;{text_of(PAIR[1])}&ev=-0.5"
+COLOURED = f"light=a={text_of(PAIR[0])};rgb=1,0.5,0.25&light=b={text_of(PAIR[1])}&ev=-0.5"
 ALONE, MAP = COLOURED + "&background=none", "env=sun&rotate=50"
 BOTH = f"{MAP}&mapstops=-2&room=0.2&{COLOURED}"
 SOFT = "light=key=40,25;kelvin=3200;size_deg=40&light=fill=left;stops=-2;rgb=0.5,0.7,1"
@@ -222,7 +222,7 @@ def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -
     assert "--light own -o out" in images[OWN].command
     assert "--envmap envmap=maps/00000_sun.exr --light own -o out" in images[f"{OWN}&env=sun"].command
     assert "--light 'own;stops=-1' --exposure 1 " in images[DIMMED].command
-    assert "--light name=rim;from=-150,15;rgb=2,2,2 --light own -o out" in images[RIM].command
+    assert "--light 'name=rim;from=-150,15;rgb=2,2,2' --light own -o out" in images[RIM].command
 
 
 def test_without_webgl_a_smaller_image_follows_the_same_formulas(tmp_path: Path) -> None:
