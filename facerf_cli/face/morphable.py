@@ -15,6 +15,7 @@ from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights, on_
 from facerf_cli.run.logs import one_line
 
 BUILTIN = "builtin"
+MEAN = "-mean"  # ends the name of a model of pose alone
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
 EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means, in imported models
 _MAX_COEFFICIENTS = 500
@@ -61,7 +62,7 @@ class MorphableModel:
         """The model with shapes of zero, so that its fit is a pose alone (paper, 'Ablative Study')."""
         return replace(
             self,
-            name=f"{self.name}-mean",
+            name=self.name + MEAN,
             identity=self.identity[:1] * 0,
             expression=self.expression[:1] * 0,
             expression_names=self.expression_names[:1],

@@ -11,15 +11,13 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import Box, from_box, from_landmarks
 from facerf_cli.face.fit import Geometry, fit_landmarks, regressed_fit, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.morphable import BUILTIN
+from facerf_cli.face.morphable import BUILTIN, MEAN
 from facerf_cli.image.colour import without_fireflies
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.parse import uncovered, uncovered_by
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.run.logs import step
-
-_REGRESSED = (BUILTIN, f"{BUILTIN}-mean")  # models that take what the Geometry Network regresses
 
 
 @step("fit")
@@ -86,7 +84,7 @@ def regress_head(models: Models, cropped: np.ndarray) -> GeometryEstimate:
     Raises UsageError for a face model that is not the network's.
     """
     network: Any = models.networks.geometry
-    if models.face.name not in _REGRESSED:
+    if models.face.name.removesuffix(MEAN) != BUILTIN:
         raise UsageError(
             f"face model {models.face.name!r}: geometry 'network' regresses heads of the built-in one; "
             "use that, or geometry 'landmarks'"

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache, lru_cache
 from itertools import accumulate, groupby, pairwise
@@ -24,6 +24,7 @@ from facerf_cli.work.photo_options import LightOptions
 _DRAWN_WIDTH_PX = 512  # of a procedural map
 _LIGHT_WIDTH_PX = 512  # of the map of a photo's light
 _CLIPPED = 2.0  # above what display values have in linear Rec.709, of any gamut
+LightsOf = Callable[[tuple[LightSetup, ...]], Light]  # gives the lights of M setups
 FarLight = tuple[int, Tensor, Tensor]  # its setup, directions [n, 3] and rgb weights [n, 3]
 log = logging.getLogger(LOGGER_NAME)
 

@@ -31,7 +31,7 @@ from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line, step
 from facerf_cli.run.memory import batches
 from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import as_lit, lights_over_rig, read_map, with_room
+from facerf_cli.work.lights import LightsOf, as_lit, lights_over_rig, read_map, with_room
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
@@ -98,7 +98,7 @@ class Scene:
 
     subject: Relightable
     setups: tuple[LightSetup, ...]
-    lights_of: Callable[[tuple[LightSetup, ...]], Light]
+    lights_of: LightsOf
     metadata: Mapping[str, Any]
     people: Sequence[FittedFace] = ()
     faces: tuple[int, ...] = (0,)
@@ -149,17 +149,16 @@ def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
         if is_olat_stack(item.input_path):
             yield _scene_of_stack(item, plan)
             return
-    lights_of = partial(lights_over_rig, rig=plan.options.rig, sampling=plan.sampling)
-    lights_of(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
+    _over_rig(plan)(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
     read = _read(item, plan)
     _check_faces(item, [face.number for face in read.faces], plan)
     if plan.options.composite == "photo":
         with naming(item.input_path):
             require_people(len(read.faces), read.image.pixels.shape[:2])
-        yield _scene_in_photo(item, plan, read, lights_of)
+        yield _scene_in_photo(item, plan, read)
         return
     for face in reversed(read.faces):
-        yield _scene_of_face(item, plan, read, face, lights_of)
+        yield _scene_of_face(item, plan, read, face)
 
 
 def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
@@ -199,9 +198,11 @@ def _read(item: Item, plan: RelightPlan) -> _Read:
     return _Read(image, faces, matte, normals, in_shot=place is not None)
 
 
-def _scene_in_photo(
-    item: Item, plan: RelightPlan, read: _Read, lights_of: Callable[[tuple[LightSetup, ...]], Light]
-) -> Scene:
+def _over_rig(plan: RelightPlan) -> LightsOf:
+    return partial(lights_over_rig, rig=plan.options.rig, sampling=plan.sampling)
+
+
+def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
     """The people of a photo in one image."""
     photo, alpha, options = read.image.pixels, read.image.alpha, plan.options
     keeps_photo, shown = options.background.kind == "photo", None
@@ -223,7 +224,7 @@ def _scene_in_photo(
     return Scene(
         subject=Group([person for _, person in fitted]).composed(target),
         setups=plan.setups,
-        lights_of=lights_of,
+        lights_of=_over_rig(plan),
         metadata=_metadata(item, plan),
         people=people,
         faces=tuple(face.number for face, _ in fitted),
@@ -235,13 +236,7 @@ def _scene_in_photo(
     )
 
 
-def _scene_of_face(
-    item: Item,
-    plan: RelightPlan,
-    read: _Read,
-    face: PhotoFace,
-    lights_of: Callable[[tuple[LightSetup, ...]], Light],
-) -> Scene:
+def _scene_of_face(item: Item, plan: RelightPlan, read: _Read, face: PhotoFace) -> Scene:
     """One face alone, in the photo's pose or in that of `--pose`."""
     fitted, person = _fitted(plan, read, face)
     rotation = rotation_of(plan.options.pose)
@@ -251,7 +246,7 @@ def _scene_of_face(
     return Scene(
         subject=person.composed(Target(posed, "face")),
         setups=plan.setups,
-        lights_of=lights_of,
+        lights_of=_over_rig(plan),
         metadata=_metadata(item, plan),
         people=[fitted],
         faces=(fitted.number,),

@@ -29,8 +29,7 @@ from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import weighted_sum
 from facerf_cli.relighting.relightable import Relightable, Relit, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum
-from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import lights_over_stack, off_rig_deg
+from facerf_cli.work.lights import LightsOf, lights_over_stack, off_rig_deg
 from facerf_cli.work.photos import companion, face_model, fit_facts
 from facerf_cli.work.plan import KEPT_PX, beside
 from facerf_cli.work.relight_options import RelightPlan
@@ -205,7 +204,7 @@ class OpenStack(NamedTuple):
     """A stack that can be relit by its own lights; the photo's camera, if the stack is put back on it."""
 
     subject: Relightable
-    lights_of: Callable[[tuple[LightSetup, ...]], Light]
+    lights_of: LightsOf
     metadata: Mapping[str, Any]
     facts: Mapping[str, Any]
     camera: Camera | None = None
