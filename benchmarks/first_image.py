@@ -83,7 +83,7 @@ def main() -> None:
                 before = best.get((tree, name), cost)
                 least = min(before, cost, key=lambda one: one.seconds)
                 best[tree, name] = least._replace(wall_s=min(before.wall_s, cost.wall_s))
-    against = [] if other is None else [f"CPU ÷ {given.against}", f"wall ÷ {given.against}"]
+    against = [] if other is None else [f"{one} ÷ {given.against}" for one in ("CPU", "wall", "MB")]
     print_header("", "CPU s", "wall s", "÷ import", *against, "MB")
     for name in given.cases:
         now = best[ROOT, name]
@@ -91,10 +91,9 @@ def main() -> None:
         ratios = []
         if other is not None:
             then = best[other, name]
-            ratios = [f"{now.seconds / then.seconds:.2f}", f"{now.wall_s / then.wall_s:.2f}"]
-        peak = (
-            "" if name == _HELP else f"{now.peak_mb:.0f}"
-        )  # below the peak of this process, which starts it
+            pairs = zip(now[:3], then[:3], strict=True)
+            ratios = [f"{one / another:.2f}" for one, another in pairs]
+        peak = "" if name == _HELP else f"{now.peak_mb:.0f}"  # help: below the peak of this process
         print_row(name, f"{now.seconds:.2f}", f"{now.wall_s:.2f}", f"{now.seconds / unit:.2f}", *ratios, peak)
     print()
     print_header("", "in no step", *_STEPS)
