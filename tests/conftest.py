@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.batch import made_from
+from facerf_cli.batch import journal
 from facerf_cli.face.importers.ict import ict_source as ict_source_of
 from facerf_cli.face.importers.resample import resample_model
 from facerf_cli.face.importers.source import SourceModel
@@ -87,11 +87,11 @@ def ict_model(ict_source: SourceModel) -> MorphableModel:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _cache_of_indexes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Keep the indexes of files that `-o` names out of the user's cache."""
-    folder, in_cache = tmp_path_factory.mktemp("indexes"), made_from._in_cache
+def _cache_of_journals(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep the journals of files that `-o` names out of the user's cache."""
+    folder, in_cache = tmp_path_factory.mktemp("journals"), journal._in_cache
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(made_from, "_in_cache", lambda file: folder / in_cache(file).name)
+        patch.setattr(journal, "_in_cache", lambda file: folder / in_cache(file).name)
         yield
 
 

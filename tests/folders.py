@@ -6,17 +6,21 @@ from pathlib import Path
 
 
 def tree(folder: Path) -> dict[str, str]:
-    """Every file but the reports and indexes, which hold times, by the digest of its bytes."""
+    """Every file but reports and journals, which hold times, by the digest of its bytes."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and not path.name.startswith(("report", ".facerf-index"))
+        if path.is_file() and not path.name.startswith(("report", ".facerf"))
     }
 
 
-def rows(folder: Path, report: str = "report.jsonl") -> dict[str, dict]:
-    """The rows of a report by item, one each."""
-    found = [json.loads(row) for row in (folder / report).read_text().split("\n") if row]
-    table = {row["item"]: row for row in found}
-    assert len(table) == len(found), "an item has two rows"
-    return table
+def rows(folder: Path, journal: str = ".facerf.jsonl") -> dict[str, dict]:
+    """The last row of each item in a journal or a report."""
+    found = [json.loads(row) for row in (folder / journal).read_text().split("\n") if row]
+    return {row["item"]: row for row in found if "status" in row}
+
+
+def only_row(folder: Path, journal: str = ".facerf.jsonl") -> dict:
+    """The row of the one item."""
+    (row,) = rows(folder, journal).values()
+    return row

@@ -12,9 +12,9 @@ import typer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from facerf_cli.batch.inputs import NamePattern
-from facerf_cli.batch.made_from import FolderIndex, keyed
-from facerf_cli.batch.run import open_report
+from facerf_cli.batch.inputs import Item, NamePattern
+from facerf_cli.batch.journal import Journal
+from facerf_cli.batch.run import write_report
 from facerf_cli.batch.settings import Shard
 from facerf_cli.cli.installation import read_config
 from facerf_cli.errors import FacerfError
@@ -177,10 +177,16 @@ def _flame(path: Path) -> None:
         read_flame(path)
 
 
-def _index(path: Path) -> None:
-    recipes, index = keyed([{"verb": "segment", "files": {}}]), FolderIndex(path.parent, "segment")
-    index.why_again(path, [path.parent / "x.png"], recipes)
-    index.open(recipes, has_work=True)
+def _journal(path: Path) -> None:
+    item, output = Item(path, path, path.name), path.with_name("x.png")
+    output.write_bytes(b"x")
+    journal = Journal(path.parent, "segment")
+    journal.why(item, output, "key")
+    journal.open([item])
+
+
+def _report(path: Path) -> None:
+    write_report(path.parent, [])
 
 
 def _options(path: Path) -> None:
@@ -203,11 +209,11 @@ OF_CORPUS: dict[str, Callable[[Path], object]] = {
     "files_of_lights": lambda path: parse_lights(str(path)),
     "fits": load_fit,
     "images": _image,
-    "index": _index,
+    "journals": _journal,
     "landmarks": read_landmarks,
     "npy_images": read_array,
     "options": _options,
-    "report": lambda path: open_report(path, "segment", [], [], lambda _: []),
+    "report": _report,
     "rigs": lambda path: lit_images([str(path)]),
     "safetensors": _checkpoint,
 }

@@ -1,6 +1,5 @@
 """The Python API: the page in the docs runs, and it gives what the command line gives."""
 
-import json
 import math
 import re
 import subprocess
@@ -20,6 +19,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.main import main
 from facerf_cli.portrait.confidence import SCALES
 from tests import astronaut
+from tests.folders import only_row
 from tests.refusals import refused
 
 ROOT = Path(__file__).parents[1]
@@ -89,7 +89,7 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
     written = facerf.read_image(tmp_path / "astronaut_light_60_30.exr")
     relit = page["person"].relight(KEY, room=0.06)
     np.testing.assert_array_equal(written, relit.astype(np.float16).astype(np.float32))
-    row = json.loads((tmp_path / "report.jsonl").read_text())
+    row = only_row(tmp_path)
     assert set(row["factors"]) == set(SCALES) - {"masked"}  # which judges a given matte
     assert row["certainty"] == "sure"
 

@@ -34,7 +34,7 @@ from facerf_cli.baselines.synthesis import (
     solve,
     with_detail,
 )
-from facerf_cli.batch.made_from import Recipe, key_of, recipe_of
+from facerf_cli.batch.recipe import Recipe, key_of, recipe_of
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture

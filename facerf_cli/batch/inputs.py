@@ -160,6 +160,11 @@ class Item:
         """True for a file that the user named or that was found in a folder of theirs."""
         return self.mirrored is not None
 
+    @property
+    def is_drawn(self) -> bool:
+        """True for an item that is made from no file, such as a synthetic person."""
+        return self.input_path == self.output_base
+
     def output(self, ending: str) -> Path:
         """An output of the item: `item.output("_relit.exr")`, or `item.output("/mesh.glb")` in a folder."""
         return Path(f"{self.output_base}{ending}")
@@ -320,7 +325,7 @@ def _place(path: Path) -> tuple[int, int] | None:
 def files_read(given: Any, items: Sequence[Item]) -> Iterator[Path]:
     """Yield the items' files, and those that settings name; of a folder of companions those of the items."""
     if isinstance(given, Item):
-        yield from [given.input_path] if given.input_path != given.output_base else []  # as of what is drawn
+        yield from [] if given.is_drawn else [given.input_path]
     elif isinstance(given, (list, tuple)):
         for one in given:
             yield from files_read(one, items)

@@ -4,7 +4,6 @@ A verb passes a `Job` to `run_items`. It raises `InputError` for a faulty item (
 other `FacerfError` concerns the whole run and ends it.
 """
 
-import itertools
 import logging
 import os
 import re
@@ -17,25 +16,15 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar
 
 from facerf_cli.batch.inputs import Item, NamePattern, check_case, file_pattern, files_read, refuse_read
-from facerf_cli.batch.made_from import (
-    DigestOf,
-    FolderIndex,
-    Keyed,
-    Made,
-    Recipe,
-    Writes,
-    json_rows,
-    keyed,
-    lines_of,
-    read_row,
-)
+from facerf_cli.batch.journal import Journal, Made, Row, Writes, file_row, json_rows, lines_of
+from facerf_cli.batch.recipe import DigestOf, Recipe, key_of
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard, torch_device
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, asking, atomic_path, sweep_leftovers
-from facerf_cli.files.texts import is_regular, regular_size, require_regular
+from facerf_cli.files.texts import regular_size, require_regular
 from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
 from facerf_cli.run.logs import (
@@ -55,7 +44,7 @@ from facerf_cli.run.workers import Workers, ending, process_died, spread
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-REPORT_NAME, _SHARD_REPORTS = "report.jsonl", "report-*-of-*.jsonl"
+REPORT_NAME = "report.jsonl"
 T = TypeVar("T")
 R = TypeVar("R")
 log = logging.getLogger(LOGGER_NAME)
@@ -117,43 +106,27 @@ class ItemResult:
     stops_the_run: FacerfError | None = None
 
 
-def open_report(
-    path: Path,
-    verb: str,
-    todo: list[Item],
-    finished: list[Item],
-    outputs_of: Callable[[Item], Sequence[Path]],
-) -> None:
-    """Start the report: older rows stay, except those of items that are about to be made again.
+def write_report(folder: Path, rows: Iterable[Row]) -> None:
+    """Write the rows of items to report.jsonl, after those of other items that it has."""
+    path = folder / REPORT_NAME
+    table = {(row.get("verb"), row.get("item")): row for row in _earlier_rows(path)}
+    for row in rows:
+        table.pop((row["verb"], row["item"]), None)
+        table[row["verb"], row["item"]] = row
+    with atomic_path(path) as temporary:
+        temporary.write_text(lines_of(table.values()), encoding="utf-8")
 
-    A run without `--shard` takes over the rows of earlier shards. Raises UsageError for a file of this name
-    that is not a report.
-    """
-    rows = {(row.get("verb"), row.get("item")): row for row in rows_of(path)}
-    if not rows and regular_size(path) and not path.read_bytes().startswith(b'{"verb"'):
+
+def _earlier_rows(path: Path) -> list[Row]:
+    """The rows of a report; raises UsageError for a file of this name that is none."""
+    rows = [
+        row
+        for row in json_rows(path)
+        if isinstance(row.get("verb"), str) and isinstance(row.get("item"), str)
+    ]
+    if not rows and regular_size(path):
         raise UsageError(f"{path}: was not written by facerf; move it, or choose another -o")
-    for shard in sorted(path.parent.glob(_SHARD_REPORTS)) if path.name == REPORT_NAME else ():
-        for row in rows_of(shard):
-            key = row.get("verb"), row.get("item")
-            if key not in rows or rows[key].get("status") == "failed":
-                rows[key] = row
-    for item in todo:
-        rows.pop((verb, item.name), None)
-    for item in finished:
-        if (verb, item.name) not in rows:
-            skipped = ItemResult(item, 0.0, Outcome(outputs_of(item)))
-            rows[verb, item.name] = _row(verb, skipped, path.parent) | {"status": "skipped"}
-    try:
-        with atomic_path(path) as temporary:
-            temporary.write_text(lines_of(rows.values()), encoding="utf-8")
-    except FacerfError as error:
-        raise unusable(path.parent, error.__cause__ or error) from error
-
-
-def add_row(report: Path, verb: str, result: ItemResult) -> None:
-    """Write the row of an item that was processed."""
-    with report.open("a", encoding="utf-8") as stream:
-        stream.write(lines_of([_row(verb, result, report.parent)]))
+    return rows
 
 
 def unusable(folder: Path, error: BaseException) -> UsageError:
@@ -164,14 +137,7 @@ def unusable(folder: Path, error: BaseException) -> UsageError:
     return UsageError(f"-o {folder}: cannot be written to ({reason}); give another folder")
 
 
-def rows_of(path: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a report; what is no row is passed over, a missing file holds none."""
-    for row in json_rows(path):
-        if isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
-            yield row
-
-
-def _row(verb: str, result: ItemResult, output_folder: Path) -> dict[str, Any]:
+def _row(verb: str, result: ItemResult, output_folder: Path) -> Row:
     outcome = result.outcome or Outcome([])
     row = {
         "verb": verb,
@@ -222,6 +188,7 @@ class BatchOptions:
         ray: Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).
         name: Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is
             follows it.
+        report: Write report.jsonl, too: a row for each item with its outputs, and facts or an error.
     """
 
     output: Path = option(
@@ -257,8 +224,8 @@ class BatchOptions:
         parse=file_pattern,
         panel=BATCH,
     )
+    report: bool = option(False, in_recipe=False, panel=BATCH)
     file: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # the one that -o names
-    reports: bool = field(default=True, metadata=NOT_IN_RECIPE)
     in_a_row: int = field(default=1, metadata=NOT_IN_RECIPE)  # neighbouring items that a process takes
     print_outputs: bool = field(default=True, metadata=NOT_IN_RECIPE)  # on stdout
 
@@ -286,74 +253,107 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
 
     Raises UsageError where the output folder cannot be used, or an output is a file to be read.
     """
-    each = {item: job.outputs_of(item) for item in items}
-    outputs = list(itertools.chain.from_iterable(each.values()))
+    outputs = [path for item in items for path in job.outputs_of(item)]
     refuse_read(outputs, files_read((items, job), items))
-    items, verb = options.shard.share(items), job.verb
-    lock_name = f".facerf-lock{options.shard.suffix}"
+    items = options.shard.share(items)
     with ExitStack() as stack:
         if not options.dry_run:
             try:
-                stack.enter_context(alone_in(options.output, lock_name))
+                stack.enter_context(alone_in(options.output, f".facerf-lock{options.shard.suffix}"))
             except OSError as error:
                 raise unusable(options.output, error) from error
         check_case(outputs, options.output)
-        index = FolderIndex(options.output, verb, options.shard, options.file)
-        recipes = keyed(job.recipes_of(index.digest_of))
-        each = {item: each[item] for item in items}
-        stale, refused = _planned(each, recipes, options, index)
-        lacks = 0
-        if any(stale.values()):
+        if options.report:
+            _earlier_rows(options.output / REPORT_NAME)
+        journal = Journal(options.output, job.verb, options.shard, options.file)
+        plan = _plan(job, items, options, journal)
+        lacks = False
+        if any(plan.stale.values()):
             usable = job.ready(options.dry_run)
-            if usable is not job:
-                lacks, job, recipes = 1, usable, keyed(usable.recipes_of(index.digest_of))
-                each = {item: job.outputs_of(item) for item in items}
-                stale, refused = _planned(each, recipes, options, index)
-        todo = [
-            _to_make(item, each[item], paths, index, recipes, options)
-            for item, paths in stale.items()
-            if paths
-        ]
-        finished = [item for item, paths in stale.items() if not paths]
-        kept = {item: [path for path in each[item] if path not in stale[item]] for item in stale}
-        again = Counter(next(filter(None, paths.values()), "") for paths in stale.values())
-        if count := sum(map(len, kept.values())):
-            log.info("%d of %d results are finished and kept", count, count + sum(map(len, stale.values())))
+            lacks = usable is not job
+            if lacks:
+                job, plan = usable, _plan(usable, items, options, journal)
+        _log_plan(plan)
         if options.dry_run:
-            _log_to_make_again(again)
-            for result in refused:
+            for result in plan.refused:
                 _print_result(result, options)
-            return max(lacks, int(bool(refused)), _list_what_would_be_done(stale))
-        report = options.output / f"report{options.shard.suffix}.jsonl"
-        if options.reports:
-            open_report(report, verb, [*todo, *(one.item for one in refused)], finished, job.outputs_of)
-        if recipes:
-            index.open(recipes, bool(todo))
-        _log_to_make_again(again)
-        if recipes and options.overwrite == "changed":
-            of_item = ((paths, files_read((item, job), [item])) for item, paths in kept.items())
-            warn_of_edited(sum(keep(index, paths, read) for paths, read in of_item))
-
-        def done(result: ItemResult) -> int:
-            """Record and print the result of an item; return 1 for a failure."""
-            if result.made:
-                index.add(result.item.name, result.made, job.outputs_of(result.item), recipes)
-            if options.reports:
-                add_row(report, verb, result)
-            return _print_result(result, options)
-
-        failures = sum(map(done, refused))
-        if todo:
-            owner = (options.output, verb, index.path, options.overwrite) if recipes else None
-            with ending(_results(job, todo, owner, options, settings)) as results:
-                failures += sum(map(done, results))
-            index.close()
-        if failures and len(items) > 1:
-            log.error("%d of %d failed; %s has a row for each", failures, len(items), report)
-        return max(lacks, int(failures > 0))
+            failures = int(bool(plan.refused)) + _list_what_would_be_done(plan.stale)
+        else:
+            failures = _make(job, plan, journal, options, settings)
+            if options.report:
+                write_report(options.output, _rows_of(job, items, journal))
+    return int(lacks or failures > 0)
 
 
-Owner = tuple[Path, str, Path, Overwrite]  # output folder, command, its index, --overwrite
+class Plan(NamedTuple):
+    """What a run makes.
+
+    Attributes:
+        keys: Digests of the recipes of an item's outputs.
+        outputs: Of each item.
+        stale: The outputs of each item that must be made, and why: '' where they never were.
+        refused: The items that may not replace a file.
+    """
+
+    keys: Sequence[str]
+    outputs: Mapping[Item, Sequence[Path]]
+    stale: Mapping[Item, Mapping[Path, str]]
+    refused: Sequence[ItemResult]
+
+
+def _plan(job: Job, items: Sequence[Item], options: BatchOptions, journal: Journal) -> Plan:
+    keys = [key_of(recipe) for recipe in job.recipes_of(journal.digest_of)]
+    each = {item: job.outputs_of(item) for item in items}
+    stale: dict[Item, dict[Path, str]] = {}
+    refused: list[ItemResult] = []
+    for item, outputs in each.items():
+        if not keys:
+            done = options.overwrite != "always" and _exist(outputs)
+            stale[item] = {} if done else dict.fromkeys(outputs, "")
+            continue
+        try:
+            stale[item] = journal.to_make(item, outputs, keys, options.overwrite)
+        except InputError as error:
+            refused.append(ItemResult(item, 0.0, error=str(error)))
+    return Plan(keys, each, stale, refused)
+
+
+def _make(job: Job, plan: Plan, journal: Journal, options: BatchOptions, settings: Settings) -> int:
+    """Make what is stale, note and print the end of each item; return how many failed."""
+    todo = [_to_make(item, plan, journal, options) for item, paths in plan.stale.items() if paths]
+    try:
+        journal.open([*todo, *(result.item for result in plan.refused)])
+    except FacerfError as error:
+        raise unusable(options.output, error.__cause__ or error) from error
+    if plan.keys and options.overwrite == "changed":
+        for item, stale in plan.stale.items():
+            kept = [path for path in plan.outputs[item] if path not in stale]
+            keep_newer(kept, files_read((item, job), [item]))
+
+    def done(result: ItemResult) -> int:
+        """Note and print the result of an item; return 1 for a failure."""
+        row = _row(job.verb, result, options.output)
+        journal.add(result.item, row, result.made, plan.outputs[result.item], plan.keys)
+        return _print_result(result, options)
+
+    failures = sum(map(done, plan.refused))
+    if todo:
+        owner = (options.output, job.verb, journal.path, options.overwrite) if plan.keys else None
+        with ending(_results(job, todo, owner, options, settings)) as results:
+            failures += sum(map(done, results))
+    if failures and len(plan.outputs) > 1:
+        log.error("%d of %d failed; %s has a row for each", failures, len(plan.outputs), journal.path)
+    return failures
+
+
+def _rows_of(job: Job, items: Sequence[Item], journal: Journal) -> Iterator[Row]:
+    """The journal's rows of items; that of one without a row says that it was skipped."""
+    for item in items:
+        skipped = _row(job.verb, ItemResult(item, 0.0, Outcome(job.outputs_of(item))), Path())
+        yield journal.items.get((job.verb, item.name)) or skipped | {"status": "skipped"}
+
+
+Owner = tuple[Path, str, Path, Overwrite]  # output folder, command, its journal, --overwrite
 
 
 def _results(
@@ -380,58 +380,21 @@ def _results(
                 sweep_leftovers(folder)
 
 
-def _planned(
-    each: Mapping[Item, Sequence[Path]], recipes: Keyed, options: BatchOptions, index: FolderIndex
-) -> tuple[dict[Item, dict[Path, str]], list[ItemResult]]:
-    """Return the outputs of each item that must be made, and why; and items that may not replace a file."""
-    stale: dict[Item, dict[Path, str]] = {}
-    refused: list[ItemResult] = []
-    for item, outputs in each.items():
-        if not recipes:
-            done = options.overwrite != "always" and _exist(outputs)
-            stale[item] = {} if done else dict.fromkeys(outputs, "")
-            continue
-        try:
-            stale[item] = index.to_make(item.input_path, outputs, recipes, options.overwrite)
-        except InputError as error:
-            refused.append(ItemResult(item, 0.0, error=str(error)))
-    return stale, refused
-
-
-def _to_make(
-    item: Item,
-    outputs: Sequence[Path],
-    stale: Mapping[Path, str],
-    index: FolderIndex,
-    recipes: Keyed,
-    options: BatchOptions,
-) -> Item:
+def _to_make(item: Item, plan: Plan, journal: Journal, options: BatchOptions) -> Item:
     """Return an item with the outputs that its work may replace and keeps, and the key of its one file."""
-    others = index.replaceable(item).difference(outputs) if recipes else set()
-    key = index.key_of(item.input_path, recipes[0][0]) if recipes and options.file else ""
+    outputs, stale = plan.outputs[item], plan.stale[item]
+    others = journal.replaceable(item).difference(outputs) if plan.keys else set()
+    key = journal.key_of(item, plan.keys[0]) if plan.keys and options.file else ""
     return replace(item, stale=frozenset({*stale, *others}), kept=frozenset(outputs) - set(stale), key=key)
 
 
-def keep(index: FolderIndex, outputs: Sequence[Path], read: Iterable[Path]) -> int:
-    """Set the time of finished outputs that are older than a file they were made from, as Make expects.
-
-    Returns how many of them were changed after facerf wrote them.
-    """
-    edited = sum(map(index.is_edited, outputs))
+def keep_newer(outputs: Sequence[Path], read: Iterable[Path]) -> None:
+    """Set the time of finished outputs that are older than a file they were made from, as Make expects."""
     with suppress(OSError):
         newest_ns = max((path.stat().st_mtime_ns for path in read), default=0) if outputs else 0
         for path in outputs:
             if path.stat().st_mtime_ns < newest_ns:
                 os.utime(path)
-    return edited
-
-
-def warn_of_edited(count: int) -> None:
-    """Log that results were changed by the user and stay as they are."""
-    if count:
-        was, them = ("was", "it") if count == 1 else ("were", "them")
-        said = "kept %s that %s changed after facerf wrote %s (--overwrite always replaces %s)"
-        log.warning(said, counted(count, "result"), was, them, them)
 
 
 def sums_up(
@@ -471,21 +434,19 @@ def _run_one(
         return ItemResult(item, round(time.perf_counter() - start_s, 3), **ends)
 
     try:
-        can_be_read = is_regular(item.input_path) or item.input_path.is_dir()
-        read = read_row(item.input_path) if owner and can_be_read else None
         if item.is_file:
             require_regular(item.input_path)
+        if owner is None:
+            return result(outcome=process(item))
+        read = {} if item.is_drawn else file_row(item.input_path)
+        writes = Writes(item, *owner)
         with ExitStack() as stack:
-            writes = Writes(item, *owner) if owner else None
-            if writes:
-                stack.enter_context(asking(writes))
+            stack.enter_context(asking(writes))
             if item.is_file:
                 stack.enter_context(all_or_none())
             outcome = process(item)
-        if writes is None:
-            return result(outcome=outcome)
         outcome = replace(outcome, outputs=[path for path in outcome.outputs if path not in writes.left])
-        return result(outcome=outcome, made=Made(read, writes.rows(outcome.outputs)) if read else None)
+        return result(outcome=outcome, made=Made(read, writes.rows(outcome.outputs)))
     except InputError as error:
         return result(error=str(error), trace=traceback.format_exc())
     except FacerfError as error:
@@ -506,7 +467,12 @@ def _exist(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.is_dir() or regular_size(path) for path in outputs)
 
 
-def _log_to_make_again(reasons: Counter[str]) -> None:
+def _log_plan(plan: Plan) -> None:
+    """Log how many results are finished, and why others are made again."""
+    stale = sum(map(len, plan.stale.values()))
+    if kept := sum(len(plan.outputs[item]) for item in plan.stale) - stale:
+        log.info("%d of %d results are finished and kept", kept, kept + stale)
+    reasons = Counter(next(filter(None, paths.values()), "") for paths in plan.stale.values())
     for reason, count in sorted(reasons.items()):
         if reason:
             log.info("%d to make again: %s", count, reason)

@@ -9,8 +9,8 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import collect_items
-from facerf_cli.batch.made_from import FolderIndex, keyed, recipe_of
-from facerf_cli.batch.run import keep, warn_of_edited
+from facerf_cli.batch.journal import Journal
+from facerf_cli.batch.recipe import key_of, recipe_of
 from facerf_cli.cli.examples import examples_of
 from facerf_cli.cli.options import settings_of
 from facerf_cli.cli.relight import RelightJob
@@ -42,11 +42,11 @@ def demo(
         raise UsageError(f"-o {output}: not an image; give a file that ends in .jpg or .png")
     settings, level = settings_of(context), log.level
     photo, maps = _DEMO / "astronaut.jpg", sorted(map(str, _DEMO.glob("maps/*.exr")))
-    index = FolderIndex(output.parent, "demo", file=output)
-    recipes = keyed([recipe_of(settings, index.digest_of)])
-    if not index.to_make(photo, [output], recipes, "changed"):
+    journal = Journal(output.parent, "demo", file=output)
+    recipe = key_of(recipe_of(settings, journal.digest_of))
+    (item,) = collect_items([str(photo)], output.parent)
+    if not journal.to_make(item, [output], [recipe], "changed"):
         log.info("%s: is finished and kept", output)
-        warn_of_edited(keep(index, [output], [photo]))
         return
     log.setLevel(logging.WARNING if level == logging.INFO else level)  # lines with the photo's long path
     options = RelightOptions(
@@ -59,9 +59,9 @@ def demo(
         (item,) = collect_items([str(photo)], Path(folder))
         images = RelightJob(plan).ready(dry_run=False).process(item).outputs
         words = [*(f"--envmap {Path(one).name}" for one in maps), *(f"--light {one}" for one in _LIGHTS)]
-        key = index.key_of(photo, recipes[0][0])
+        key = journal.key_of(item, recipe)
         _write_sheet(output, [photo, *images], ["the photo", *words], {"facerf:key": key})
-        index.add_file(photo, output, recipes)
+        journal.add_file(item, output, recipe)
     log.setLevel(level)
     print(output)
     log.info("a photo of yours: %s", examples_of("relight")[0])

@@ -12,7 +12,7 @@ from typing import Annotated, Self
 import typer
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, NamePattern, collect_items, files_read, refuse_read
-from facerf_cli.batch.made_from import DigestOf, Recipe
+from facerf_cli.batch.recipe import DigestOf, Recipe
 from facerf_cli.batch.run import Job, Outcome, run_items
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.errors import FacerfError, UsageError
@@ -160,12 +160,12 @@ def relight(
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
     refuse_read([film.path] if film else images, files_read((items, plan, sources), items))
-    recipes = film.recipes_of_new(items, taken, images, plan.recipes_of, batch) if film else []
-    if film is not None and not recipes:
+    recipe = film.recipe_if_new(items, taken, images, plan.recipes_of, batch) if film else ""
+    if film is not None and not recipe:
         return
     code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
     if film is not None:
-        code = film.joined(items, images, taken, recipes, code)
+        code = film.joined(items, images, taken, recipe, code)
     raise typer.Exit(code)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items
-from facerf_cli.batch.made_from import FolderIndex
+from facerf_cli.batch.journal import Journal
 from facerf_cli.batch.run import sums_up
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import InputError, UsageError
@@ -64,8 +64,8 @@ def view(
     many = not end_of_file(output, work.alone_as)
     if many and any(item.name == Path(_INDEX).stem for item in items):
         raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
-    index = FolderIndex(output, work.verb)
-    refusal = index.refusal(output / _INDEX) if many and batch.overwrite != "always" else ""
+    journal = Journal(output, work.verb)
+    refusal = journal.refusal(output / _INDEX) if many and batch.overwrite != "always" else ""
     if refusal and batch.overwrite == "changed":
         raise InputError(refusal)
     code = work.run_on(items, batch)
@@ -73,5 +73,5 @@ def view(
         from facerf_cli.work.view_photos import write_index
 
         write_index(output / _INDEX, items, photo)
-        index.own(output / _INDEX)
+        journal.own(output / _INDEX)
     raise typer.Exit(code)

@@ -26,7 +26,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.batch.made_from import Recipe, key_of, text_of_state
+from facerf_cli.batch.recipe import Recipe, key_of, text_of_state
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, people_of, read_stack
 from facerf_cli.dataset.pairs import DRAW_AGAIN, Pair, image_path, load_pairs, read_pairs
 from facerf_cli.dataset.weights import relit_images

@@ -5,7 +5,7 @@
     olat/SUBJECT/CAMERA.exr    OLAT stack of the face's crop (`files/olat_stack.py`, kind 'image')
     fits/SUBJECT/CAMERA.npz    its fit (`face/fit.py`)
     fits/SUBJECT.json          record of the subject; written last of the subject's files
-    sheets/SUBJECT.jpg, index.html, report.jsonl
+    sheets/SUBJECT.jpg, index.html
 
 Lights and cameras in dataset.json are in DESIGN's axes (x right, y up, z toward the camera) and the capture's
 world space; each stack holds its lights in its own crop's camera space. A subject that lacks lights lists
@@ -27,7 +27,7 @@ import torch
 from pydantic import Field, model_validator
 
 from facerf_cli._version import __version__
-from facerf_cli.batch.made_from import Recipe
+from facerf_cli.batch.recipe import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.stage_json import MOST_CAMERAS, MOST_LIGHTS, MOST_SUBJECTS
 from facerf_cli.errors import InputError, UsageError

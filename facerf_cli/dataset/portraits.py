@@ -21,7 +21,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.made_from import is_made_from
+from facerf_cli.batch.recipe import is_made_from
 from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
 from facerf_cli.dataset.unwrapped import stamp
 from facerf_cli.errors import InputError

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.batch.made_from import Recipe
+from facerf_cli.batch.recipe import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.findings import Finding, Selection
 from facerf_cli.dataset.dataset import DatasetFolder

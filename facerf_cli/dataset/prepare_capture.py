@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.made_from import Recipe, json_rows, require_same
+from facerf_cli.batch.journal import json_rows
+from facerf_cli.batch.recipe import Recipe, require_same
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up, with_bar
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture

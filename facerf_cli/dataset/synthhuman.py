@@ -20,7 +20,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.made_from import is_made_from
+from facerf_cli.batch.recipe import is_made_from
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.read import read_image

@@ -19,7 +19,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
-from facerf_cli.batch.made_from import is_made_from, text_of_state
+from facerf_cli.batch.recipe import is_made_from, text_of_state
 from facerf_cli.dataset.dataset import PREPARE_AGAIN, Dataset, read_stack
 from facerf_cli.dataset.pairs import DRAW_AGAIN, Pair, image_path, load_pairs
 from facerf_cli.errors import InputError

@@ -12,7 +12,8 @@ import numpy as np
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.made_from import DigestOf, FolderIndex, Recipe, keyed, recipe_of
+from facerf_cli.batch.journal import Journal
+from facerf_cli.batch.recipe import DigestOf, Recipe, key_of, recipe_of
 from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
 from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError, UsageError
@@ -120,12 +121,12 @@ class Evaluation(Job):
 
     def _made_otherwise(self) -> list[Item]:
         """The finished items that were made from other inputs or by another recipe: one table has one way."""
-        index = FolderIndex(self.options.output, self.verb, self.options.shard)
-        recipes = keyed(self.recipes_of(index.digest_of))
+        journal = Journal(self.options.output, self.verb, self.options.shard)
+        (key,) = map(key_of, self.recipes_of(journal.digest_of))
         return [
             item
             for item in self.chosen.items
-            if (path := self.path_of(item)).exists() and index.why_again(item.input_path, [path], recipes)
+            if (path := self.path_of(item)).exists() and journal.why(item, path, key) is not None
         ]
 
     def path_of(self, item: Item) -> Path:

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.batch.made_from import Recipe, recipe_of, require_same
+from facerf_cli.batch.recipe import Recipe, recipe_of, require_same
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256, parse_json

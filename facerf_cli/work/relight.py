@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.made_from import recipe_of
+from facerf_cli.batch.recipe import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import display_ev

@@ -17,7 +17,7 @@ from facerf_cli.batch.inputs import (
     numbered_images,
     only_item,
 )
-from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import EVEN, OWN, Sampling, is_sweep, numbers, parse_lights

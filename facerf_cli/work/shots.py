@@ -21,16 +21,9 @@ from facerf_cli.batch.inputs import (
     fields_of,
     in_order,
 )
-from facerf_cli.batch.made_from import (
-    DigestOf,
-    FolderIndex,
-    Keyed,
-    Recipe,
-    RecipesOf,
-    key_of,
-    keyed,
-)
-from facerf_cli.batch.run import BatchOptions, folder_not_file, keep, warn_of_edited
+from facerf_cli.batch.journal import Journal
+from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf, key_of
+from facerf_cli.batch.run import BatchOptions, folder_not_file, keep_newer
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import BATCH, option
@@ -230,18 +223,18 @@ class FilmOutput:
         return (_FORMATS[self.path.suffix.lower()],)
 
     @property
-    def _index(self) -> FolderIndex:
-        return FolderIndex(self.path.parent, "relight", file=self.path)
+    def _journal(self) -> Journal:
+        return Journal(self.path.parent, "relight", file=self.path)
 
-    def recipes_of_new(
+    def recipe_if_new(
         self,
         items: Sequence[Item],
         shots: Sequence[Shot],
         images: Sequence[Path],
         recipes_of: RecipesOf,
         batch: BatchOptions,
-    ) -> Keyed:
-        """Return the recipe of a film of images; nothing in a dry run, or if the film is finished.
+    ) -> str:
+        """Return the digest of the recipe of a film of images; '' in a dry run, or if the film is finished.
 
         Raises UsageError unless the images are the frames of one film, and InputError where the film would
         replace a file that is not facerf's.
@@ -256,27 +249,26 @@ class FilmOutput:
         if self.rate and shots and shots[0].film:
             raise UsageError("--fps: a film keeps its own times; leave it out")
         digest_of = cache(file_sha256)
-        made_from: Any = recipes_of(digest_of), [digest_of(item.input_path) for item in items], str(self.rate)
-        recipes = keyed([{"film": key_of(made_from)}])
-        read, index = items[0].input_path, self._index
-        if not index.to_make(read, [self.path], recipes, batch.overwrite):
+        inputs = [digest_of(item.input_path) for item in items]
+        recipe = key_of({"film": recipes_of(digest_of), "inputs": inputs, "rate": str(self.rate)})
+        if not self._journal.to_make(items[0], [self.path], [recipe], batch.overwrite):
             log.info("%s: is finished and kept", self.path)
             if batch.overwrite == "changed" and not batch.dry_run:
-                warn_of_edited(keep(index, [self.path], [item.input_path for item in items]))
-            return []
+                keep_newer([self.path], [item.input_path for item in items])
+            return ""
         if batch.dry_run:
-            print(named(f"{read} -> {self.path}"))
-            return []
+            print(named(f"{items[0].input_path} -> {self.path}"))
+            return ""
         if shots and shots[0].film:
             from facerf_cli.files.film_writer import check_writable
 
             check_writable(self.path, shots[0].film)
         elif len({_stated(item, self.rate)[0] for item in items}) > 1:
             log.warning("%s: its frames state several rates; the first one's is used (--fps)", self.path)
-        return recipes
+        return recipe
 
     def joined(
-        self, items: Sequence[Item], images: Sequence[Path], shots: Sequence[Shot], recipes: Keyed, code: int
+        self, items: Sequence[Item], images: Sequence[Path], shots: Sequence[Shot], recipe: str, code: int
     ) -> int:
         """Write the film from its frames, in order, and remove them, unless some failed; the exit code."""
         if code or not all(path.exists() for path in images):
@@ -290,15 +282,15 @@ class FilmOutput:
         timing = film_timing(source) if source else Timing.steady(len(images), *_stated(items[0], self.rate))
         facts = Provenance(source.name if source else "").attributes()
         said = "; ".join(f"{name}={value}" for name, value in facts.items())
-        read, index = items[0].input_path, self._index
-        key = index.key_of(read, recipes[0][0])
+        journal = self._journal
+        key = journal.key_of(items[0], recipe)
         write_film(
             self.path, images, timing, f"Synthetic: relit by a trained model; {said}; facerf:key={key}"
         )
-        index.add_file(read, self.path, recipes)
-        frames = FolderIndex(self.folder, "relight")
+        journal.add_file(items[0], self.path, recipe)
+        frames = Journal(self.folder, "relight")
         edited = {path for path in images if frames.refusal(path)}
-        records = [*self.folder.glob(".facerf-index*.jsonl"), *self.folder.glob("report*.jsonl")]
+        records = self.folder.glob(".facerf*.jsonl")
         for path in (*images, *(() if edited else (*(shot.track for shot in shots), *records))):
             if path not in edited:
                 path.unlink(missing_ok=True)

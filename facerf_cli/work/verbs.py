@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, only_item
-from facerf_cli.batch.made_from import DigestOf, Recipe, recipe_of
+from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, folder_not_file, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
-from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
+from facerf_cli.option import IMAGE, LIGHT, METHOD, option
 from facerf_cli.relighting import White
 from facerf_cli.work.photo_options import (
     PhotoOptions,
@@ -37,7 +37,6 @@ class FileOrFolder(BatchOptions):
 
     Attributes:
         output: Write the results to this folder; or one of them, of one input, to this file, by its suffix.
-        report: Write report.jsonl beside the one file of -o, too.
     """
 
     output: Path = option(
@@ -48,11 +47,10 @@ class FileOrFolder(BatchOptions):
         shown_default=False,
         required=True,
     )
-    report: bool = option(False, in_recipe=False, panel=BATCH)
 
     def of_file(self) -> Self:
         """The contract of the one file that `-o` names."""
-        return replace(self, output=self.output.parent, file=self.output, reports=self.report)
+        return replace(self, output=self.output.parent, file=self.output)
 
 
 def end_of_file(output: Path, ends: Sequence[str]) -> str:

@@ -44,7 +44,7 @@ def photos_of(folder: Path, *names: str) -> Path:
 
 def test_names_of_all_characters_have_a_row_an_output_and_a_pattern_each(tmp_path: Path) -> None:
     photos = photos_of(tmp_path / "in", *HOSTILE)
-    assert run(photos, tmp_path / "out") == 0
+    assert run(photos, tmp_path / "out", report=True) == 0
     text = (tmp_path / "out" / "report.jsonl").read_text()
     assert all(line.isprintable() for line in text.split("\n")) and len(text.splitlines()) == len(HOSTILE)
     assert rows(tmp_path / "out").keys() == set(HOSTILE)

@@ -1,7 +1,6 @@
 """The items of a command line: which files, under which names."""
 
 import io
-import json
 import logging
 import os
 import subprocess
@@ -33,6 +32,7 @@ from facerf_cli.work.photo_options import PhotoOptions, check_companion
 from facerf_cli.work.photos import companion
 from facerf_cli.work.shots import ShotOptions, collect_frames
 from tests.batch import toy_batch
+from tests.folders import rows as rows_of
 from tests.kinds import Log, Patch, Said
 from tests.refusals import refused
 
@@ -216,7 +216,7 @@ def test_an_image_on_stdin_is_not_named_by_its_temporary_file(
         assert toy_batch.run(Path("-"), out) == 0
         assert (tmp_path / "written").read_text() == "stdin\n"
     assert "finished and kept" in capsys.readouterr().err
-    rows = map(json.loads, (out / "report.jsonl").read_text().splitlines())
+    rows = rows_of(out).values()
     assert {(row["item"], row["input"]) for row in rows} == {("stdin", "-")}
     pipe(monkeypatch, b"\x89PNG")
     assert names(tmp_path, Path("-"), pattern="{parent}-{stem}-{ext}") == ["stdin-stdin-png"]

@@ -137,17 +137,16 @@ def test_shards_do_their_own_and_a_run_without_takes_their_rows(
     (photos / "b.png").write_bytes(b"bad")
     out = tmp_path / "out"
     assert run(photos, out, Shard(1, 2)) == 0 and run(photos, out, Shard(2, 2)) == 1
-    first, second = (rows(out, f"report-{number}-of-2.jsonl") for number in (1, 2))
+    first, second = (rows(out, f".facerf-{number}-of-2.jsonl") for number in (1, 2))
     assert set(first) == {"a", "c", "e"} and set(second) == {"b", "d"}
-    assert not (out / "report.jsonl").exists()
     (photos / "b.png").write_bytes(b"good")
-    assert run(photos, out) == 0
-    whole = rows(out)
+    assert run(photos, out, report=True) == 0
+    whole = rows(out, "report.jsonl")
     assert {name: whole[name] for name in "acde"} == first | {"d": second["d"]}
     assert whole["b"]["status"] == "done"
     assert (tmp_path / "written").read_text().split() == ["a", "c", "e", "d", "b"]
     assert run(photos, tmp_path / "out", Shard(6, 9)) == 0
-    assert rows(tmp_path / "out", "report-6-of-9.jsonl") == {}
+    assert not (out / ".facerf-6-of-9.jsonl").exists()
     capsys.readouterr()
     assert run(photos, tmp_path / "dry", Shard(2, 2), dry_run=True) == 0
     assert [Path(line.split(" -> ")[0]).name for line in capsys.readouterr().out.splitlines()] == [

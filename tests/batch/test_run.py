@@ -12,9 +12,9 @@ from typing import Never
 
 import pytest
 
-from facerf_cli.batch import made_from as folder_index
+from facerf_cli.batch import journal
 from facerf_cli.batch.inputs import Item, _ignores_case, collect_items
-from facerf_cli.batch.made_from import DigestOf, Recipe, other_options, recipe_of
+from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of, require_same
 from facerf_cli.batch.run import BatchOptions, Outcome, run_items
 from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
 from facerf_cli.errors import FacerfError, UsageError
@@ -77,12 +77,9 @@ def test_finished_items_are_skipped_and_keep_their_row(photos: Path, tmp_path: P
     assert run([photos], out) == 1
     before = rows(out)
     (photos / "b.jpg").write_bytes(b"good")
-    assert run([photos], out) == 0
+    assert run([photos], out, report=True) == 0
     assert rows(out)["x/c"] == before["x/c"] and rows(out)["b"]["status"] == "done"
-    assert len((out / "report.jsonl").read_text().splitlines()) == 5  # the older row of b is gone
-    (out / "report.jsonl").unlink()
-    assert run([photos], out) == 0
-    assert [row["status"] for row in rows(out).values()] == ["skipped"] * 5
+    assert rows(out, "report.jsonl") == rows(out)
     (out / "a_copy.bin").write_bytes(b"mine!")
     assert run([photos], out) == 0
     assert (out / "a_copy.bin").read_bytes() == b"mine!"
@@ -111,12 +108,11 @@ def test_a_worker_that_dies_is_reported(photos: Path, tmp_path: Path, capsys: Sa
 def test_old_reports_keep_the_rows_of_other_verbs_and_lose_half_lines(photos: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
-    (out / "report.jsonl").write_text('{"verb": "other", "item": "elsewhere"}\n')
-    run([photos], out)
-    with (out / "report.jsonl").open("a") as stream:
-        stream.write('{"verb": "copy", "it')
-    assert run([photos], out) == 0
-    assert len(rows(out)) == 6 and "elsewhere" in rows(out)
+    other = '{"verb": "other", "item": "elsewhere", "status": "done"}'
+    (out / "report.jsonl").write_text(other + '\n{"verb": "copy", "it')
+    assert run([photos], out, report=True) == run([photos], out, report=True) == 0
+    report = rows(out, "report.jsonl")
+    assert len(report) == 6 and "elsewhere" in report
 
 
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
@@ -163,7 +159,7 @@ def test_ctrl_c_leaves_only_whole_files(photos: Path, tmp_path: Path, jobs: int)
     process.wait()
     assert process.returncode != 0
     left = sorted(path.name for path in out.rglob("*") if path.is_file())
-    assert left == [".facerf-index.jsonl", "report.jsonl", "started"]
+    assert left == [".facerf.jsonl", "started"]
 
 
 @pytest.fixture
@@ -188,7 +184,7 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
     assert run([two], tmp_path / "out") == 0
     said = capsys.readouterr()
     assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
-    assert "1 to make again: made from another input" in said.err
+    assert "1 to make again: input changed" in said.err
     assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
     run([two], tmp_path / "out")
     two.rename(tmp_path / "moved")
@@ -209,7 +205,7 @@ def test_another_photo_of_the_same_size_and_time_is_processed(
     assert made(capsys) == ["a"]
 
 
-def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, capsys: Said) -> None:
+def test_other_options_make_all_again(two: Path, tmp_path: Path, capsys: Said) -> None:
     run([two], tmp_path / "out", recipe={"lights": 150})
     (two / "a.png").write_bytes(b"A")
     capsys.readouterr()
@@ -218,9 +214,9 @@ def test_other_options_make_all_again_and_say_which(two: Path, tmp_path: Path, c
     assert [Path(line).name for line in said.out.splitlines()] == ["a_copy.bin"]
     assert "1 of 2 results are finished" in said.err and "1 result would be made" in said.err
     run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
-    assert "2 to make again: made from other options: the lights" in capsys.readouterr().err
+    assert "2 to make again: options changed" in capsys.readouterr().err
     run([two], tmp_path / "out", recipe={"lights": 300})
-    assert "2 to make again: made from other options: the lights" in capsys.readouterr().err
+    assert "2 to make again: options changed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
@@ -239,12 +235,10 @@ def test_outputs_that_the_user_changed_are_kept_and_empty_ones_made_again(
     run([two], out)
     (out / "a_copy.bin").write_bytes(b"retouched")
     assert run([two], out) == 0
-    assert "kept 1 result that was changed" in capsys.readouterr().err
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
-    run([two], out)
     (out / "a_copy.bin").write_bytes(b"")
     run([two], out)
-    assert "1 to make again: an output is empty" in capsys.readouterr().err
+    assert "1 to make again: missing or empty" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("edited", [True, False])
@@ -277,7 +271,7 @@ def test_copies_are_recognised_by_their_content_with_the_index_and_not_without(
         shutil.copytree(tmp_path / "out", tmp_path / name)
         for path in (tmp_path / name).glob("*.bin"):
             os.utime(path, (1, 1))
-    (tmp_path / "bare/.facerf-index.jsonl").unlink()
+    (tmp_path / "bare/.facerf.jsonl").unlink()
     capsys.readouterr()
     assert run([two], tmp_path / "copied", recipe={"lights": 2}) == 0 and made(capsys) == ["a", "b"]
     (tmp_path / "bare/a_copy.bin").write_bytes(b"")  # holds nothing that could be lost
@@ -319,7 +313,7 @@ def test_outputs_of_a_run_that_was_killed_are_facerfs(tmp_path: Path) -> None:
     assert (tmp_path / "out/a_copy.bin").read_bytes() == b"late"
     assert run([tmp_path / "a.png"], tmp_path / "out") == 0
     assert rows(tmp_path / "out")["a"]["status"] == "done"
-    assert [path.name for path in (tmp_path / "out").glob(".facerf*")] == [".facerf-index.jsonl"]
+    assert [path.name for path in (tmp_path / "out").glob(".facerf*")] == [".facerf.jsonl"]
 
 
 def test_outputs_of_a_worker_that_died_are_facerfs(two: Path, tmp_path: Path, capsys: Said) -> None:
@@ -328,7 +322,7 @@ def test_outputs_of_a_worker_that_died_are_facerfs(two: Path, tmp_path: Path, ca
     assert (tmp_path / "out/a_copy.bin").read_bytes() == b"late"
     for number in range(3):  # rows of items without an end are not multiplied
         assert run([two], tmp_path / "out", recipe={"lights": number}, overwrite="never") == 0
-    assert (tmp_path / "out/.facerf-index.jsonl").read_text().count('"output": "a_copy.bin"') == 1
+    assert (tmp_path / "out/.facerf.jsonl").read_text().count('"output": "a_copy.bin"') == 1
     assert run([two], tmp_path / "out") == 0
 
 
@@ -378,7 +372,8 @@ def test_a_result_that_is_edited_while_its_item_runs_is_the_users(two: Path, tmp
 def test_a_report_of_another_program_stays(two: Path, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out/report.jsonl").write_text('{"test": "passed"}\n')
-    refused(UsageError, "report.jsonl: was not written by facerf", run, [two], tmp_path / "out")
+    line = ([two], tmp_path / "out")
+    refused(UsageError, "report.jsonl: was not written by facerf", run, *line, report=True)
     assert (tmp_path / "out/report.jsonl").read_text() == '{"test": "passed"}\n'
 
 
@@ -450,11 +445,11 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
     assert call() == 0
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
-    assert "make again" not in said.err and "kept 1 result that was changed" in said.err
+    assert "make again" not in said.err
     assert (out / "a_a.bin").read_bytes() == b"retouched"
     (out / "b_a.bin").unlink()
     assert call() == 0
-    assert "1 to make again: an output is missing" in capsys.readouterr().err
+    assert "1 to make again: missing or empty" in capsys.readouterr().err
 
 
 def test_a_finished_folder_is_read_without_writing_or_reading_much(
@@ -462,12 +457,12 @@ def test_a_finished_folder_is_read_without_writing_or_reading_much(
 ) -> None:
     run([two], tmp_path / "out")
     read: list[Path] = []
-    monkeypatch.setattr(folder_index, "file_sha256", lambda path: read.append(path) or file_sha256(path))
+    monkeypatch.setattr(journal, "file_sha256", lambda path: read.append(path) or file_sha256(path))
     run([two], tmp_path / "out")
     assert read == []
     # So that a rerun of thousands of items is quick; a file whose time changed is noted.
     run([two], tmp_path / "out")
-    index = tmp_path / "out/.facerf-index.jsonl"
+    index = tmp_path / "out/.facerf.jsonl"
     inode = index.stat().st_ino
     run([two], tmp_path / "out")
     assert index.stat().st_ino == inode
@@ -478,7 +473,7 @@ def test_a_finished_folder_is_read_without_writing_or_reading_much(
 
 def test_damaged_rows_are_passed_over(two: Path, tmp_path: Path, capsys: Said) -> None:
     run([two], tmp_path / "out")
-    index = tmp_path / "out" / ".facerf-index.jsonl"
+    index = tmp_path / "out/.facerf.jsonl"
     index.write_text('5\n{"output": 3}\n{"of": {}}\n{"sha256"' + "\n" + index.read_text() + '{"outp')
     capsys.readouterr()
     assert run([two], tmp_path / "out") == 0
@@ -491,7 +486,8 @@ def test_shards_know_what_the_others_made(two: Path, tmp_path: Path, capsys: Sai
     assert made(capsys) == ["a", "b"]
     run([two], tmp_path / "out")
     assert made(capsys) == []
-    assert {row["status"] for row in rows(tmp_path / "out").values()} == {"done"}
+    run([two], tmp_path / "out", report=True)
+    assert [row["status"] for row in rows(tmp_path / "out", "report.jsonl").values()] == ["done", "done"]
 
 
 def test_a_first_photo_that_fails_keeps_its_row(two: Path, tmp_path: Path) -> None:
@@ -535,7 +531,9 @@ def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) 
     assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
-    assert other_options(one, other) == "other options: the lights, --matte"
+    refused(
+        UsageError, "run: other options: --lights, --matte; advice", require_same, one, other, "run", "advice"
+    )
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
     (tmp_path / "mattes").mkdir()
     (tmp_path / "mattes" / "a.png").write_bytes(b"1")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from facerf_cli.batch.inputs import Item, collect_items
-from facerf_cli.batch.made_from import DigestOf, Recipe
+from facerf_cli.batch.recipe import DigestOf, Recipe
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
 from facerf_cli.batch.settings import Settings, Shard
 from facerf_cli.errors import FacerfError, InputError

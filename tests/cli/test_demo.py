@@ -32,7 +32,7 @@ def test_the_sheet_shows_the_photo_and_it_under_eight_lights(
     left, right = (tiles[5][50:140, columns].mean() for columns in (slice(0, 165), slice(165, None)))
     assert left > 1.5 * right  # --light -75,0
     before = Path("facerf_demo.jpg").read_bytes()
-    monkeypatch.setattr("facerf_cli.batch.made_from._in_cache", lambda file: tmp_path / "fresh/index.jsonl")
+    monkeypatch.setattr("facerf_cli.batch.journal._in_cache", lambda file: tmp_path / "fresh/index.jsonl")
     assert main(["demo"]) == 0 and Path("facerf_demo.jpg").read_bytes() == before  # as in a fresh container
     assert main(["--seed", "1", "demo"]) == 1 and Path("facerf_demo.jpg").read_bytes() == before
 

@@ -1,6 +1,5 @@
 """`facerf estimate-light` and `relight --light-from`, with a network that is Lambert's law."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.main import main
 from tests.astronaut import PATH as PHOTO
+from tests.folders import rows
 from tests.kinds import Folders, Said
 
 
@@ -34,7 +34,7 @@ def estimated(given: Path, tmp_path_factory: Folders) -> Path:
 
 
 def row_of(output: Path) -> dict:
-    return json.loads((output / "report.jsonl").read_text().splitlines()[-1])
+    return list(rows(output).values())[-1]
 
 
 def test_a_light_is_a_map_numbers_and_a_image(given: Path, estimated: Path, capsys: Said) -> None:

@@ -29,6 +29,8 @@ from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
 from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint
+from tests.folders import only_row
+from tests.folders import rows as rows_of
 from tests.kinds import Folders, Log, Patch, Said
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
@@ -94,8 +96,8 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     out = tmp_path / "out"
     assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
     images = [f"me_light_70_20.{number:04d}.{kind}" for number in range(FRAMES) for kind in ("exr", "png")]
-    assert names(out) == sorted([*images, "me_track.jsonl", "report.jsonl"])
-    rows = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
+    assert names(out) == sorted([*images, "me_track.jsonl"])
+    rows = list(rows_of(out).values())
     assert [row["item"] for row in rows] == [f"me.{number:04d}" for number in range(FRAMES)]
     assert len({tuple(row["exposure_ev"].values()) for row in rows}) == 1
     track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:-1]
@@ -103,7 +105,7 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     assert np.diff(left) == pytest.approx([-2] * (FRAMES - 1), abs=0.5)  # pixels: as the film moves
     capsys.readouterr()
     assert facerf(given, "relight", given / "me.mp4", "--light", "70,20", "-o", out, *CHEAP) == 0
-    assert capsys.readouterr().out == "" and names(out) == sorted([*images, "me_track.jsonl", "report.jsonl"])
+    assert capsys.readouterr().out == "" and names(out) == sorted([*images, "me_track.jsonl"])
 
 
 def test_all_frames_have_the_one_light_of_the_picture_behind_them(
@@ -120,7 +122,7 @@ def test_all_frames_have_the_one_light_of_the_picture_behind_them(
     assert len(guessed) == 1
     lights = {read_image(path).metadata["facerf:lights"] for path in out.glob("*.exr")}
     assert len(lights) == 1 and len(list(out.glob("*.exr"))) == FRAMES
-    rows = [json.loads(row) for row in (out / "report.jsonl").read_text().splitlines()]
+    rows = list(rows_of(out).values())
     assert all(list(row["exposure_ev"].values()) == [0] for row in rows)
     capsys.readouterr()
     film = ("--background", given / "me.mp4", "--light-from", "background", "--dry-run")
@@ -268,7 +270,7 @@ def test_a_photo_under_a_turning_map_becomes_a_film(
     before = out.read_bytes()
     for cache in ("here", "elsewhere"):  # a fresh cache knows the film by the key that it carries
         in_cache = partial(lambda cache, file: tmp_path / cache / f"{file.name}.jsonl", cache)
-        monkeypatch.setattr("facerf_cli.batch.made_from._in_cache", in_cache)
+        monkeypatch.setattr("facerf_cli.batch.journal._in_cache", in_cache)
         capsys.readouterr()
         assert facerf(given, "relight", given / "small.png", *line, *CHEAP) == 0
         assert "is finished" in capsys.readouterr().err and out.read_bytes() == before
@@ -480,8 +482,8 @@ def test_sound_that_cannot_be_written_is_said_before_the_first_frame(
 def test_one_light_is_estimated_for_a_film(given: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert facerf(given, "estimate-light", given / "me.mp4", "--lights", "20", "-o", out) == 0
-    assert names(out) == ["me_light.exr", "me_light.json", "me_light.png", "me_track.jsonl", "report.jsonl"]
-    (row,) = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
+    assert names(out) == ["me_light.exr", "me_light.json", "me_light.png", "me_track.jsonl"]
+    row = only_row(out)
     assert row["frames"] == [0, 1, 2] and row["residual"] < 0.3
 
 
@@ -513,8 +515,8 @@ def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> Non
     def made(folder: str, *more: str) -> tuple[list[dict[str, Any]], list[float]]:
         assert facerf(given, "relight", *line, "-o", tmp_path / folder, *more) == 0
         track = (tmp_path / folder / "cut_track.jsonl").read_text().splitlines()[1:-1]
-        report = (tmp_path / folder / "report.jsonl").read_text().splitlines()
-        exposures = [next(iter(json.loads(row)["exposure_ev"].values())) for row in report]
+        ended = rows_of(tmp_path / folder).values()
+        exposures = [next(iter(row["exposure_ev"].values())) for row in ended]
         return [json.loads(row) for row in track], exposures
 
     rows, exposures = made("out")
@@ -544,7 +546,7 @@ def test_each_take_has_its_light(given: Path, tmp_path: Path) -> None:
     assert facerf(given, "estimate-light", tmp_path / "cut.mp4", "--lights", "20", "-o", out) == 0
     lights = {name for name in names(out) if name.endswith("_light.json")}
     assert lights == {"cut_light.json", "cut_take2_light.json"}
-    (row,) = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
+    row = only_row(out)
     assert [take["frames"] for take in row["takes"]] == [[0, 1], [2, 3]]
 
 

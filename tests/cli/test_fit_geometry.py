@@ -25,6 +25,7 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
+from tests.folders import only_row
 
 NAMES = ("texture.exr", "texture.png", "normals.exr", "normals.png", "mesh.glb", "mesh.obj", "mesh.mtl")
 ENDINGS = {f"_{name}" for name in (*NAMES, "fit.jpg", "fit.npz")}
@@ -47,7 +48,7 @@ def fitted(landmarks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_file_is_there_and_says_whose_model_it_is_of(fitted: Path) -> None:
-    row = json.loads((fitted / "report.jsonl").read_text())
+    row = only_row(fitted)
     assert set(row["outputs"]) == {f"astronaut{ending}" for ending in ENDINGS}
     assert all((fitted / name).is_file() for name in row["outputs"])
     assert row["error_iod"] < 0.045 and row["quality"] == "good" and len(row["pose_deg"]) == 3
@@ -122,7 +123,7 @@ def test_two_faces_each_get_their_files_and_are_named_by_number_and_place(
     assert main(["fit-geometry", str(tmp_path / "two.png"), "-o", str(tmp_path / "o"), "--face", "all"]) == 0
     said = " ".join(capsys.readouterr().err.split())
     assert "face 0 from the left, at x 1" in said and "face 1 from the left, at x 5" in said
-    row = json.loads((tmp_path / "o" / "report.jsonl").read_text())
+    row = only_row(tmp_path / "o")
     assert set(row["outputs"]) == {f"two_face{n}{ending}" for n in (0, 1) for ending in ENDINGS}
     left, right = (load_fit(tmp_path / "o" / f"two_face{n}_fit.npz").crop.x0_px for n in (0, 1))
     assert abs(right - left - 340) < 10 and len(row["faces"]) == 2
@@ -146,7 +147,7 @@ def test_bad_landmarks_name_the_photo(tmp_path: Path, capsys: Capture) -> None:
         assert main([*line, str(marks)]) == 1
         err = capsys.readouterr().err
         assert "astronaut" in err and message in err and "Traceback" not in err and "unexpected" not in err
-    assert [path.name for path in (tmp_path / "o").glob("[!.]*")] == ["report.jsonl"]
+    assert not list((tmp_path / "o").glob("[!.]*"))
 
 
 def fit(output: Path, *words: str) -> int:
@@ -155,13 +156,13 @@ def fit(output: Path, *words: str) -> int:
 
 def is_regressed(output: Path) -> bool:
     """Tell whether the head was not fitted to landmarks, whose error would be known."""
-    row = json.loads((output / "report.jsonl").read_text())
+    row = only_row(output)
     return row["quality"] == "unknown" and "error_iod" not in row
 
 
 def networks_of(output: Path) -> set[str]:
     """The networks that served a run, by its report."""
-    return set(json.loads((output / "report.jsonl").read_text())["networks"])
+    return set(only_row(output)["networks"])
 
 
 def test_the_network_regresses_the_head_of_a_photo(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from facerf_cli.work.plan import canvas
 from tests.astronaut import PATH
 from tests.cli import lines
 from tests.exr_layers import exr_layers
+from tests.folders import only_row, rows
 from tests.kinds import Folders, Patch, Said
 from tests.refusals import refused
 
@@ -61,7 +62,7 @@ def test_every_format_holds_the_same_image(given: Path, tmp_path: Path, capsys: 
     assert relight(given, tmp_path, *line, "--output-colourspace", "ACEScg", "--compression", "piz") == 0
     printed = [Path(text).name for text in capsys.readouterr().out.splitlines()]
     assert printed == [f"{NAME}{suffix}" for suffix in (".exr", ".png", ".tif", ".jpg")]
-    assert json.loads((tmp_path / "report.jsonl").read_text())["outputs"] == printed
+    assert only_row(tmp_path)["outputs"] == printed
     spec = oiio.ImageBuf(str(tmp_path / f"{NAME}.exr")).spec()
     assert spec.get_string_attribute("compression") == "piz"
     assert spec.getattribute("chromaticities") == pytest.approx(colour.ACESCG.chromaticities, abs=1e-6)
@@ -253,6 +254,6 @@ def test_the_header_keeps_the_plate_s_camera_and_says_what_made_the_image(
 def test_the_distance_of_the_identity_is_reported(given: Path, tmp_path: Path) -> None:
     pytest.importorskip("dlib")
     assert relight(given, tmp_path, *LIGHT, "--identity") == 0
-    (row,) = map(json.loads, (tmp_path / "report.jsonl").read_text().splitlines())
+    (row,) = rows(tmp_path).values()
     assert row["exposure_ev"].keys() == row["identity_distance"].keys() == {NAME}
     assert 0.01 < row["identity_distance"][NAME] < 0.6  # below it dlib takes two photos for one person's

@@ -1,6 +1,5 @@
 """The photo's own light and even light, to which others add."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from tests import astronaut
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight
 from tests.exr_layers import exr_layers
+from tests.folders import only_row
 from tests.refusals import refused
 
 HALF = 2.0**-11  # relative error of half floats
@@ -62,7 +62,7 @@ def test_alone_it_gives_the_photo_back(given: Path, tmp_path: Path) -> None:
     assert np.abs(image - photo).max() <= HALF
     shown, plate = (read_image(path).pixels for path in (tmp_path / "astronaut_light_own.png", PHOTO))
     assert np.abs(linear_to_srgb(shown) - linear_to_srgb(plate)).max() < 1.5 / 255
-    (ev,) = json.loads((tmp_path / "report.jsonl").read_text())["exposure_ev"].values()
+    (ev,) = only_row(tmp_path)["exposure_ev"].values()
     assert ev == 0
 
 
@@ -82,7 +82,7 @@ def test_layers_of_lights_and_the_background_add_up_to_the_image(given: Path, tm
 def test_exposure_is_chosen_where_it_is_asked(given: Path, tmp_path: Path) -> None:
     line = ["--light", "own;stops=-3", "--exposure", "auto", "--format", "png"]
     assert relight(given, tmp_path, *line) == 0
-    (ev,) = json.loads((tmp_path / "report.jsonl").read_text())["exposure_ev"].values()
+    (ev,) = only_row(tmp_path)["exposure_ev"].values()
     assert 2.5 < ev < 3.5
 
 
@@ -143,7 +143,7 @@ def test_its_brightness_is_that_of_each_person_and_it_is_its_own_room() -> None:
 def test_skin_is_as_bright_as_in_the_photo_at_0_ev_and_own_adds_to_it(given: Path, tmp_path: Path) -> None:
     line = ["--light", "even", "--light", "own;stops=-1", "--format", "exr"]
     assert relight(given, tmp_path, *line) == 0
-    (ev,) = json.loads((tmp_path / "report.jsonl").read_text())["exposure_ev"].values()
+    (ev,) = only_row(tmp_path)["exposure_ev"].values()
     assert ev == 0
     path, photo = tmp_path / "astronaut_light_even+own.exr", astronaut.photo()
     channels = exr_layers(path)

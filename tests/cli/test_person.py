@@ -28,6 +28,7 @@ from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import fit_faces, load_models_once, person_matte, read_matte, read_photo
 from tests.exr_layers import exr_layers
+from tests.folders import rows as rows_of
 from tests.kinds import Folders, Log, Said
 from tests.refusals import refused
 
@@ -111,7 +112,7 @@ def test_frames_of_a_sequence_are_rated_and_landmarks_off_the_face_fail_it(
 ) -> None:
     line = ("segment", given / "plates", "--sequence")
     assert facerf(*line, "-o", tmp_path / "out") == 0
-    rows = [json.loads(row) for row in (tmp_path / "out/report.jsonl").read_text().splitlines()]
+    rows = list(rows_of(tmp_path / "out").values())
     assert [row["certainty"] for row in rows] == ["sure", "sure"]
     points = read_landmarks(tmp_path / "out/me.0000_landmarks.json")
     (tmp_path / "half.json").write_text(json.dumps((points / 2).tolist()))

@@ -1,6 +1,5 @@
 """`facerf predict-olat` from the command line, with a network that is Lambert's law until it is trained."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +17,7 @@ from facerf_cli.main import main
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.viewer.page import strip_of
 from tests.astronaut import PATH as PHOTO
+from tests.folders import only_row
 from tests.kinds import Patch, Said
 from tests.stacks import OlatStack, read_olat_stack
 
@@ -107,7 +107,7 @@ def test_the_stack_is_enough_to_render_the_face(given: Path, tmp_path: Path) -> 
     assert header.source.shape == (256, 256, 3) and header.layout_version == LAYOUT_VERSION
     assert np.allclose(np.linalg.norm(header.normals, axis=-1), 1, atol=2e-3)
     assert header.metadata["facerf:input"] == PHOTO.name and header.metadata["facerf:synthetic"] == 1
-    row = json.loads((tmp_path / "report.jsonl").read_text())
+    row = only_row(tmp_path)
     assert row["lights"] == 2 and row["quality"] == "good" and len(row["pose_deg"]) == 3
 
 

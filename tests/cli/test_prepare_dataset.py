@@ -30,6 +30,7 @@ from facerf_cli.network.files import SHIPPED
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE
 from tests.cli.lines import prepare
+from tests.folders import rows as rows_of
 from tests.folders import tree
 from tests.stacks import read_olat_stack
 from tests.worlds import Truth, write_capture
@@ -61,7 +62,7 @@ def test_every_camera_of_every_subject_is_there(prepared: Dataset) -> None:
             stack = read_olat_stack(prepared.stack_path(subject, camera))
             assert stack.header.kind == "image" and stack.olats.shape == (LIGHTS, 3, 96, 96)
             assert (stack.olats >= 0).all() and 0.1 < stack.header.seen.mean() < 0.7
-    rows = [json.loads(row) for row in (prepared.folder / "report.jsonl").read_text().splitlines()]
+    rows = list(rows_of(prepared.folder).values())
     assert [row["status"] for row in rows] == ["done", "done"]
     assert all(row["faces_found"] == 3 and row["cameras"] == 3 for row in rows)
     assert all(row["error_iod"] < 0.05 and row["worst_crop_off_iod"] < 0.005 for row in rows)

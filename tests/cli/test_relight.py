@@ -1,6 +1,5 @@
 """`facerf relight` from the command line, with a network that is Lambert's law until it is trained."""
 
-import json
 import re
 import weakref
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from facerf_cli.work.relight_options import RelightOptions, parse_aov
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import face_sides, relight
 from tests.exr_layers import exr_layers
+from tests.folders import only_row
 from tests.kinds import Patch, Said
 from tests.refusals import refused
 
@@ -52,7 +52,7 @@ def test_maps_rotations_and_lamps_from_one_prediction(
     names.append("astronaut_light_40_10+-40_0_0.5")
     images = sorted(name + suffix for name in names for suffix in (".exr", ".png"))
     assert [name for name in made(tmp_path) if name.startswith("astronaut")] == images
-    row = json.loads((tmp_path / "report.jsonl").read_text())
+    row = only_row(tmp_path)
     assert row["status"] == "done" and row["quality"] == "good" and len(row["exposure_ev"]) == 5
     assert row["exposure_ev"][names[0]] == row["exposure_ev"][names[1]]  # a turning sky does not pump
     written = capsys.readouterr().out.splitlines()
@@ -68,7 +68,7 @@ def test_frames_that_do_not_fit_the_memory_at_once_share_their_exposure(
     monkeypatch.setattr("facerf_cli.run.memory._RELIT_HELD", 1 << 30)  # so that one frame fits
     line = ["--envmap", str(given / "maps/right.0007.exr"), "--rotate", "0:360:3", "--composite", "face"]
     assert relight(given, tmp_path, *line) == 0
-    row = json.loads((tmp_path / "report.jsonl").read_text())
+    row = only_row(tmp_path)
     assert len(row["exposure_ev"]) == 3 and len(set(row["exposure_ev"].values())) == 1
 
 
@@ -311,7 +311,7 @@ def test_near_lights_sweeps_and_rigs_from_the_command_line(given: Path, tmp_path
     assert made(tmp_path / "out") == sorted(
         f"astronaut_{name}{suffix}" for name in names for suffix in (".exr", ".png")
     )
-    ev = json.loads((tmp_path / "out/report.jsonl").read_text())["exposure_ev"]
+    ev = only_row(tmp_path / "out")["exposure_ev"]
     assert ev[f"astronaut_{names[0]}"] == ev[f"astronaut_{names[1]}"]
     layers = exr_layers(tmp_path / "out/astronaut_studio.exr")
     red, green, blue, rim, room, whole, shadow, matte = (
@@ -350,5 +350,5 @@ def test_near_lights_need_the_photo_or_a_pose_of_it(
 def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -> None:
     lights = ["--light", "180,20", "--light", "180,20,4", "--room", "none"]
     assert relight(given, tmp_path, *lights, "--format", "png") == 0
-    row = json.loads((tmp_path / "report.jsonl").read_text())
+    row = only_row(tmp_path)
     assert list(row["exposure_ev"].values()) == [3.0, 1.0]  # four times the light, the same image

@@ -26,6 +26,7 @@ from facerf_cli.training.options import TrainOptions
 from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
 from tests import astronaut
 from tests.dataset.dataset_fixture import write_small_dataset
+from tests.folders import rows
 from tests.kinds import Folders, Patch, Said
 from tests.own_package import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset
@@ -235,7 +236,7 @@ def require_served(tmp_path: Path, name: str, shipped: tuple[list[str], np.ndarr
     assert main([*line, "--checkpoint", str(tmp_path / "run"), "-o", str(tmp_path / "trained")]) == 0
     relit = read_image(tmp_path / "trained/astronaut_light_40_20.exr").pixels
     assert abs(relit - image).max() > 0.01
-    (row,) = map(json.loads, (tmp_path / "trained/report.jsonl").read_text().splitlines())
+    (row,) = rows(tmp_path / "trained").values()
     path = tmp_path / "run/best.safetensors"
     assert row["networks"].pop(name) == {"file": str(path), "sha256": file_sha256(path)}
     assert row["networks"].pop("mediapipe")["file"] == "mediapipe.safetensors"

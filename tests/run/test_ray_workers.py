@@ -1,7 +1,6 @@
 """`--ray`: the contract of a folder verb, on two workers that are killed while they work."""
 
 import importlib.util
-import json
 import os
 import signal
 import socket
@@ -20,6 +19,7 @@ from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import configure_logging
 from facerf_cli.run.ray_workers import _initialise, connect, in_ray
 from tests.batch.toy_batch import run
+from tests.folders import rows
 from tests.processes import wait_until
 from tests.refusals import refused
 
@@ -57,11 +57,9 @@ def photos(tmp_path: Path) -> Path:
     return folder
 
 
-def rows(report: Path) -> dict[str, dict]:
-    found = [json.loads(line) for line in report.read_text().splitlines()]
-    table = {row["item"]: row | {"seconds": None} for row in found}
-    assert len(table) == len(found), "an item has two rows"
-    return table
+def ends(folder: Path) -> dict[str, dict]:
+    """How the items of a report ended, without times."""
+    return {item: row | {"seconds": None} for item, row in rows(folder, "report.jsonl").items()}
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -96,14 +94,14 @@ def test_one_tree_however_it_is_made(photos: Path, tmp_path: Path, two_workers: 
     (photos / "x" / "c.png").write_bytes(b"bad")
     ways = {"one": {}, "two": {"jobs": 2}, "ray": {"ray": "local", "jobs": 2}}
     for name, options in ways.items():
-        assert run(photos, tmp_path / name, **options) == 1
+        assert run(photos, tmp_path / name, report=True, **options) == 1
     assert run(photos, tmp_path / "shards", Shard(1, 2)) == 1
     assert run(photos, tmp_path / "shards", Shard(2, 2), ray="local") == 0
-    assert len(rows(tmp_path / "shards/report-1-of-2.jsonl")) == 4
-    assert run(photos, tmp_path / "shards") == 1
+    assert len(rows(tmp_path / "shards", ".facerf-1-of-2.jsonl")) == 4
+    assert run(photos, tmp_path / "shards", report=True) == 1
     for name in (*ways, "shards"):
         assert tree(tmp_path / name) == tree(tmp_path / "one") and len(tree(tmp_path / name)) == 7
-        assert rows(tmp_path / name / "report.jsonl") == rows(tmp_path / "one/report.jsonl")
+        assert ends(tmp_path / name) == ends(tmp_path / "one")
         assert not parts(tmp_path / name)
 
 
@@ -117,7 +115,7 @@ def test_a_worker_is_killed_while_it_works(
     assert run(photos, tmp_path / "out", ray="local", jobs=2) == 0
     killer.join()
     assert written(tmp_path) == ITEMS
-    assert [row["status"] for row in rows(tmp_path / "out/report.jsonl").values()] == ["done"] * len(NAMES)
+    assert [row["status"] for row in rows(tmp_path / "out").values()] == ["done"] * len(NAMES)
     assert len(tree(tmp_path / "out")) == len(NAMES) and not parts(tmp_path / "out")
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.splitlines()] == [f"{name[0]}_copy.bin" for name in NAMES]
@@ -145,7 +143,7 @@ def test_a_worker_is_killed_when_it_has_written(photos: Path, tmp_path: Path, tw
     (photos / "x" / "b.png").write_bytes(b"late")
     assert run(photos, tmp_path / "out", ray="local", jobs=2) == 0
     assert written(tmp_path).count("x/b") == 2  # made again, as nothing says that it was whole
-    assert rows(tmp_path / "out/report.jsonl")["x/b"]["status"] == "done"
+    assert rows(tmp_path / "out")["x/b"]["status"] == "done"
 
 
 @needs_ray

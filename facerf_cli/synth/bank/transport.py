@@ -19,7 +19,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.made_from import is_made_from
+from facerf_cli.batch.recipe import is_made_from
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import fit_landmarks

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from facerf_cli._version import __version__
-from facerf_cli.batch.made_from import FolderIndex
+from facerf_cli.batch.journal import Journal
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Overwrite
 from facerf_cli.errors import InputError, UsageError
@@ -46,12 +46,12 @@ def write_envmaps(
     if not batch.dry_run:
         sweep_leftovers(batch.output)
     new = {path for path in maps if _is_to_be_made(path, maps[path], size_px, batch.overwrite)}
-    sheet, index_of = batch.output / SHEET, FolderIndex(batch.output, "envmap")
+    sheet, journal = batch.output / SHEET, Journal(batch.output, "envmap")
     stays = batch.overwrite == "never" and sheet.exists()
     is_shown_anew = not stays and (bool(new) or _is_older(sheet, maps))
     if batch.overwrite == "changed":
         for path in [*sorted(new), *([sheet] if is_shown_anew else [])]:
-            if refusal := index_of.refusal(path):
+            if refusal := journal.refusal(path):
                 raise InputError(refusal)
     for index, (path, facts) in enumerate(maps.items()):
         if path not in new:
@@ -60,12 +60,12 @@ def write_envmaps(
         if not batch.dry_run:
             pixels, _ = draw_sky(index, seed, size_px, kinds)
             write_exr(path, pixels, metadata={**facts, "Software": f"facerf {__version__}"})
-            index_of.own(path)
+            journal.own(path)
         print(path, flush=True)
     if is_shown_anew:
         if not batch.dry_run:
             write_sheet(list(maps), sheet)
-            index_of.own(sheet)
+            journal.own(sheet)
             log.info("%s: shows %d of %d maps", sheet, min(count, MOST_MAPS), count)
         print(sheet, flush=True)
 
