@@ -83,7 +83,7 @@ def parsing(bank: Bank) -> Objective:
 
 
 def portrait(bank: Bank) -> Objective:
-    network = PortraitNetwork(PortraitSettings((8, 8, 8), (0, 1, 1), 14, 32, sees_scale=True))
+    network = PortraitNetwork(PortraitSettings((8, 8, 8), (0, 1, 1), 14, 32))
     return PortraitObjective(toy_portrait.Portraits(), network, toy_portrait.SETTINGS)
 
 

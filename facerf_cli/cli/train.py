@@ -19,7 +19,6 @@ _STAGES = {  # the stages that an option applies to
     "vgg_weights": ("joint",),
     "appearance_features": ("joint",),
     "photos": ("joint",),
-    "synthhuman": _PEOPLE_STAGES,
     "light_features": ("joint", "reflectance"),
     "form": ("joint", "reflectance"),
     "without_normals": ("joint", "reflectance"),

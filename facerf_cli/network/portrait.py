@@ -32,7 +32,6 @@ _STRAND_SHARPNESS = 30.0
 _TURNED = 0.15  # n . l at which highlights begin to fade, and, below 0, end
 _VIEW = (0.0, 0.0, 1.0)  # toward the camera, which is far
 _DIM = 0.15  # added to the proxy's shading before the photo is divided by it
-_FACE_PX = 64.0  # pixels along a face for which the scale is 0
 _FINE = {"gain": 3, "bias": 3, "normals": 3, "strands": 3, "gloss": len(_SHARPNESS) + 1, "trust": 1}
 _COARSE = {  # maps at half the side
     "lit": (LIT_ORDER + 1) ** 2,
@@ -50,7 +49,6 @@ class PortraitSettings:
     blocks: Blocks = (1, 1, 2, 2, 2)
     classes: Classes = 14
     side: Side = 192
-    sees_scale: bool = False  # pixels along a face are an input
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ class PortraitInputs(Batch):
     image [B, 3, S, S] scene-linear, exposed so that the mean of the skin is `MEAN_RADIANCE`; classes
     [B, C, S, S]; normals [B, 3, S, S], depth [B, 1, S, S] (0.1 m) and covered [B, 1, S, S] of the proxy;
     reached [B, K, S, S]: spherical harmonics of the proxy's visibility; own [B, 1, S, S]: its shading under
-    the photo's light, 1 on average over the skin; sides [B, 1, 1, 1]: of the square, in faces.
+    the photo's light, 1 on average over the skin.
     """
 
     image: Tensor
@@ -70,12 +68,6 @@ class PortraitInputs(Batch):
     covered: Tensor
     reached: Tensor
     own: Tensor
-    sides: Tensor
-
-    @property
-    def scale(self) -> Tensor:
-        """Pixels a face [B, 1, 1, 1], as a logarithm."""
-        return (self.image.shape[-1] / self.sides / _FACE_PX).log()
 
     def mirrored(self) -> "PortraitInputs":
         """The people as a mirror shows them."""
@@ -209,7 +201,7 @@ class PortraitNetwork(UNet):
 
     def __init__(self, settings: PortraitSettings = PortraitSettings()) -> None:
         inputs = 3 + settings.classes + 3 + 1 + 1 + (_REACH + 1) ** 2 + 1
-        super().__init__(settings, inputs + settings.sees_scale)
+        super().__init__(settings, inputs)
         widths = settings.widths
         self.last = Residual(widths[0])
         self.predict = nn.Conv2d(widths[0], _OUTPUTS, 1)
@@ -217,10 +209,7 @@ class PortraitNetwork(UNet):
 
     def forward(self, inputs: PortraitInputs) -> PortraitMaps:
         """Predict maps; sides are multiples of 32."""
-        stacked = inputs.stacked()
-        if self.settings.sees_scale:
-            stacked = torch.cat([stacked, inputs.scale.expand_as(inputs.covered)], 1)
-        predicted = self.predict(self.last(self.doubled(self.halved(stacked))[-1]))
+        predicted = self.predict(self.last(self.doubled(self.halved(inputs.stacked()))[-1]))
         fine, coarse = torch.split(predicted, [4 * sum(_FINE.values()), sum(_COARSE.values())], 1)
         shuffled = F.pixel_shuffle(fine, 2).float()
         parts = [
@@ -228,19 +217,6 @@ class PortraitNetwork(UNet):
             *torch.split(coarse.float(), list(_COARSE.values()), 1),
         ]
         return _maps(dict(zip((*_FINE, *_COARSE), parts, strict=True)), inputs)
-
-    def at_every_scale(self, side: int) -> "PortraitNetwork":
-        """The same network for squares of any scale, to be trained at a side.
-
-        Its new weights are 0, so that it begins with the same maps.
-        """
-        if self.settings.sees_scale:
-            return self
-        wider = PortraitNetwork(replace(self.settings, sees_scale=True, side=side))
-        weights = self.state_dict()
-        weights["stem.enter.weight"] = F.pad(weights["stem.enter.weight"], (0, 0, 0, 0, 0, 1))
-        wider.load_state_dict(weights)
-        return wider
 
 
 def _maps(raw: dict[str, Tensor], inputs: PortraitInputs) -> PortraitMaps:

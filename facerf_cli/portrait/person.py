@@ -129,11 +129,8 @@ class SeenPerson:
         """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible, self.sides)
         reached = reached_by(rig, visible, self.square.size_px)
-        sides = torch.full((1, 1, 1, 1), self.sides)
         surface = surface_of(self.maps)
-        return PortraitInputs(
-            self.exposed[None], self.classes[None], *surface, reached[None], own[None], sides
-        )
+        return PortraitInputs(self.exposed[None], self.classes[None], *surface, reached[None], own[None])
 
 
 def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:

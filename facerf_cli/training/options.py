@@ -50,8 +50,6 @@ class TrainOptions:
         texture_size: Unwrap a dataset to textures of this side; the stages joint and appearance-features
             read its crops at this side, too.
         photos: Train on photos of faces, too, in a fifth of the batches of the stage joint.
-        synthhuman: Train on images of SynthHuman, too: by their alpha in the stage parsing, their normals in
-            the stage portrait.
         heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
         fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint it needs
             --geometry landmarks.
@@ -103,7 +101,6 @@ class TrainOptions:
         panel=DATA,
     )
     photos: Path | None = option(None, metavar="DIR", shown_default="none", panel=DATA)
-    synthhuman: Path | None = option(None, metavar="DIR", shown_default="none", panel=DATA)
     heads_from: str = option("builtin", metavar="NAME|PATH", panel=DATA)
     fit_with: str = option("builtin", metavar="NAME|PATH", panel=DATA)
     heads: int | None = option(None, shown_default="240; tiny 16", least=2, panel=DATA)

@@ -2,8 +2,7 @@
 
 The classes' loss is a cross-entropy with the matte as a soft target; it is the matte's, too, with an error of
 the matte and of its gradient. A landmark's error is weighed by the error that the network expects of it
-(Wood et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1). Images of SynthHuman, whose alpha
-alone is known, teach person against background: any class of a person is right there.
+(Wood et al., *3D face reconstruction with dense landmarks*, 2022, Eq. 1).
 """
 
 from dataclasses import dataclass
@@ -13,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.synthhuman import SynthHuman, with_licence
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.inputs import concatenate
@@ -38,7 +36,6 @@ class ParsingObjectiveSettings:
     landmarks: float = 0.15  # of their negative log-likelihood
     distance: float = 12.0  # of their distance, in sides
     presence: float = 0.1
-    synthhuman: float = 0.25  # share of samples, if its images are given
     held_out_people: int = 12
     held_out_draws: int = 12
 
@@ -54,12 +51,10 @@ class ParsingObjective(Objective):
         portraits: StoredPortraits,
         network: ParsingNetwork | None = None,
         settings: ParsingObjectiveSettings = ParsingObjectiveSettings(),
-        synthhuman: SynthHuman | None = None,
     ) -> None:
         network = network or ParsingNetwork()
-        provenance = with_licence(portraits.provenance) if synthhuman else portraits.provenance
-        super().__init__({"parsing": network}, provenance)
-        self.portraits, self.synthhuman = portraits, synthhuman
+        super().__init__({"parsing": network}, portraits.provenance)
+        self.portraits = portraits
         self.side = network.side
         self.settings = settings
         self.people, self.held_out = portraits.people(settings.held_out_people)
@@ -67,10 +62,7 @@ class ParsingObjective(Objective):
         self.register_buffer("rarity", torch.tensor(rarity), persistent=False)
 
     def draw_one(self, generator: torch.Generator) -> PortraitCrops:
-        """Draw a crop of a random person, or of an image of SynthHuman."""
-        share = self.settings.synthhuman
-        if self.synthhuman is not None and torch.rand((), generator=generator) < share:
-            return self.synthhuman.draw(self.side, generator)
+        """Draw a crop of a random person."""
         return self.portraits.draw(self.people, self.side, generator)
 
     def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitCrops:
@@ -82,9 +74,7 @@ class ParsingObjective(Objective):
             found: Parsing = self.network(batch.crops)
         settings = self.settings
         log_share = found.logits.float().log_softmax(1)
-        labelled, label = batch.label >= 0, batch.label.clamp_min(0)
-        covered = log_share.gather(1, label[:, None])[:, 0]
-        covered = torch.where(labelled, self.rarity[label] * covered, log_share[:, 1:].logsumexp(1))
+        covered = self.rarity[batch.label] * log_share.gather(1, batch.label[:, None])[:, 0]
         entropy = -(batch.alpha * covered + (1 - batch.alpha) * log_share[:, 0])
         matte = 1 - log_share[:, 0].exp()
         off = (matte - batch.alpha) * batch.weight
@@ -94,8 +84,7 @@ class ParsingObjective(Objective):
         likelihood = distance * (-log_error).exp() + 2 * log_error
         known = batch.known.float() * batch.present[:, None]
         count = known.sum().clamp_min(1)
-        known_head = labelled.any(2).any(1).float()
-        presence = F.binary_cross_entropy_with_logits(found.presence, batch.present, known_head)
+        presence = F.binary_cross_entropy_with_logits(found.presence, batch.present)
         return {
             "classes": settings.classes * (entropy * batch.weight).mean(),
             "matte": settings.matte * (off.abs().mean() + edges),

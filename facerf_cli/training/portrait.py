@@ -3,7 +3,7 @@
 Errors of single lights, which sums of lights follow from, and of their contrast; of the photo under its
 light, so that it comes back; and of normals and albedo, which make training on synthetic people hold for
 others (Yeh et al., *Learning to relight portrait images via a virtual light stage and synthetic-to-real
-adaptation*, 2022). Some batches are people of SynthHuman, of whom the normals alone are known.
+adaptation*, 2022).
 """
 
 from collections.abc import Callable
@@ -13,7 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.dataset.synthhuman import SeenNormals, SynthHumanNormals, with_licence
 from facerf_cli.network.inputs import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.classes import class_index
@@ -32,8 +31,6 @@ _REGIONS = {
     "neck": ("neck",),
     "garment": ("garment",),
 }
-# Sides in faces of squares that are measured by themselves: of a face, of head and shoulders, and wider ones.
-_BANDS = {"close": (0.0, 2.5), "shoulders": (2.5, 3.6), "wide": (3.6, 99.0)}
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,6 @@ class PortraitObjectiveSettings:
     normals: float = 0.5
     contrast: float = 0.5
     scale: float = 0.05
-    synthhuman: float = 0.2  # share of batches, if its people are given
     targets: int = 12
     held_out_people: int = 16
     held_out_draws: int = 3
@@ -62,22 +58,13 @@ class PortraitObjective(Objective):
         portraits: PortraitSource,
         network: PortraitNetwork | None = None,
         settings: PortraitObjectiveSettings = PortraitObjectiveSettings(),
-        synthhuman: SynthHumanNormals | None = None,
     ) -> None:
-        provenance = with_licence(portraits.provenance) if synthhuman else portraits.provenance
-        super().__init__({"portrait": network or PortraitNetwork()}, provenance)
-        self.portraits, self.synthhuman = portraits, synthhuman
-        self.settings = settings
+        super().__init__({"portrait": network or PortraitNetwork()}, portraits.provenance)
+        self.portraits, self.settings = portraits, settings
         self.people, self.held_out = portraits.people(settings.held_out_people)
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Batch:
-        """Draw `count` samples of random people, all in squares of one side (see `Objective.draw`).
-
-        On `synthhuman` of the steps they are people of SynthHuman.
-        """
-        chance = float(torch.rand((), generator=seeded(step, 1)))
-        if self.synthhuman is not None and chance < self.settings.synthhuman:
-            return concatenate([self.synthhuman.draw(generator_of(i)) for i in range(count)])
+        """Draw `count` samples of random people, all in squares of one side (see `Objective.draw`)."""
         sides = self.portraits.sides_px(self.people)
         side = sides[int(torch.randint(len(sides), (), generator=seeded(step)))]
         targets = self.settings.targets
@@ -88,12 +75,9 @@ class PortraitObjective(Objective):
     def draw_held_out(self, person: int, generator: torch.Generator) -> PortraitSample:
         return self.portraits.draw([person], self.settings.targets, generator)
 
-    def forward(self, batch: PortraitSample | SeenNormals) -> dict[str, Tensor]:
+    def forward(self, batch: PortraitSample) -> dict[str, Tensor]:
         """Compute the weighted terms, each a mean over samples."""
         maps, settings = self._maps(batch), self.settings
-        if isinstance(batch, SeenNormals):
-            share = batch.alpha / batch.alpha.mean((1, 2, 3), keepdim=True).clamp_min(1e-3)
-            return {"normals": settings.normals * (_turned(maps, batch.normals) * share).mean()}
         found, own = maps.olats(batch.lights, _larger(batch.visible, batch.inputs.image)), _own(maps, batch)
         scale = _best_scale(found, batch.targets, 1 - batch.shares[:, :1])
         alpha = (1 - batch.shares[:, :1])[:, None]
@@ -116,7 +100,7 @@ class PortraitObjective(Objective):
             "scale": settings.scale * scale.log().abs().mean(),
         }
 
-    def _maps(self, batch: PortraitSample | SeenNormals) -> PortraitMaps:
+    def _maps(self, batch: PortraitSample) -> PortraitMaps:
         with self.mixed_precision():
             maps: PortraitMaps = self.network(batch.inputs)
         return maps
@@ -134,13 +118,7 @@ class PortraitObjective(Objective):
             if len(rows) < _SHEET_ROWS:
                 pairs = torch.stack([found[0], sample.targets[0]], 1)[:_SHEET_TARGETS].flatten(0, 1)
                 rows.append([_shrunk(image) for image in (sample.inputs.image[0], *pairs)])
-        table, sides = torch.stack(measured).cpu(), [float(x.inputs.sides) for x in self.held_out_samples()]
-        metrics = _summed(table, "")
-        for name, (low, high) in _BANDS.items():
-            metrics |= _summed(table[[low <= side < high for side in sides]], f"_{name}")
-        if "neck_shoulders" in metrics:  # in wider squares arms count as neck
-            metrics["neck"] = metrics["neck_shoulders"]
-        return Validation(metrics, tiled(rows))
+        return Validation(_summed(torch.stack(measured).cpu()), tiled(rows))
 
 
 def _turned(maps: PortraitMaps, truth: Tensor) -> Tensor:
@@ -161,11 +139,11 @@ def _measured(found: Tensor, sample: PortraitSample) -> Tensor:
     return torch.stack([*sums, torch.stack([root, alpha.mean()])])
 
 
-def _summed(table: Tensor, suffix: str) -> dict[str, float]:
+def _summed(table: Tensor) -> dict[str, float]:
     """Relative errors of samples [N, R + 1, 2]; none of regions that nobody shows."""
     sums = table.sum(0)
     names = (*_REGIONS, "error")
-    return {f"{n}{suffix}": float(a / b) for n, (a, b) in zip(names, sums, strict=True) if b > 0}
+    return {n: float(a / b) for n, (a, b) in zip(names, sums, strict=True) if b > 0}
 
 
 def _shrunk(image: Tensor) -> Tensor:

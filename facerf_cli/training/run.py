@@ -19,7 +19,6 @@ from facerf_cli.dataset.crops import mean_translation_m, open_photos, require_cr
 from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.light_crops import open_light_stacks
 from facerf_cli.dataset.portraits import open_dataset_portraits
-from facerf_cli.dataset.synthhuman import SynthHuman, SynthHumanNormals
 from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
@@ -45,7 +44,6 @@ from facerf_cli.synth.bank.portraits import (
 )
 from facerf_cli.synth.bank.texture_samples import SampleSource
 from facerf_cli.synth.bank.transport import (
-    SIDE_PX,
     TINY_BANK,
     TransportBankSettings,
     add_proxies,
@@ -206,29 +204,25 @@ class _TrainedStage:
     def parsing(self) -> Objective:
         """The Parsing Network on photos of synthetic people, which are taken first where they are missing."""
         options, folder, tiny = self.options, self._bank / "portraits", self.options.preset == "tiny"
-        images = SynthHuman(options.synthhuman) if options.synthhuman else None  # before hours of baking
         people, models, provenance = self._whole_people(self.make.sizes.held_out_heads)
         settings = PortraitBankSettings(views=1, photos=1, side_px=96) if tiny else PortraitBankSettings()
         add_portraits(folder, models, people, options.jobs, options.settings.seed, settings)
         stored = StoredPortraits(folder, self._backgrounds(self._bank), provenance)
         objective = ParsingObjectiveSettings(held_out_people=self.make.sizes.held_out_heads)
-        return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective, images)
+        return self._kind(ParsingObjective)(stored, self.make.network("parsing"), objective)
 
     def portrait(self) -> Objective:
         """The Portrait Network on a dataset, or on synthetic people."""
         options, few = self.options, self.options.preset == "tiny"
-        images = SynthHuman(options.synthhuman) if options.synthhuman else None
         source: PortraitSource
-        network = self.make.network("portrait")
         if options.dataset:
             backgrounds = self._backgrounds(options.output)
             source = open_dataset_portraits(options.dataset, backgrounds, self.networks, options.jobs)
         else:
-            source, network = self._stored_transport(), network.at_every_scale(SIDE_PX)
+            source = self._stored_transport()
         settings = PortraitObjectiveSettings(held_out_people=self._held_out_of_few)
         settings = replace(settings, targets=2) if few else settings
-        seen = images and SynthHumanNormals(images, self._bank / "synthhuman", self.networks, options.jobs)
-        return self._kind(PortraitObjective)(source, network, settings, seen)
+        return self._kind(PortraitObjective)(source, self.make.network("portrait"), settings)
 
     def _stored_transport(self) -> StoredTransport:
         """Synthetic people; those that are missing in the bank are baked and looked at first."""

@@ -24,13 +24,11 @@ from facerf_cli.synth.bank.transport import seen_path
 from facerf_cli.training import run as training_run
 from facerf_cli.training.options import TrainOptions
 from facerf_cli.training.settings import Adadelta, Constant, PaperWeights
-from tests import astronaut
 from tests.dataset.dataset_fixture import write_small_dataset
 from tests.folders import rows
 from tests.kinds import Folders, Patch, Said
 from tests.own_package import FORMS, write_own_package
 from tests.training.joint_dataset import write_joint_dataset
-from tests.training.synthhuman_folder import write_seen_synthhuman, write_synthhuman
 
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
 
@@ -261,11 +259,9 @@ def test_the_parsing_network_trains_on_a_bank_of_portraits(
         }
         save_file(person_of, bank / "portraits" / f"{person:05}.safetensors")
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "parsing", "--preset", "tiny", "--heads", "5"]
-    images = ["--synthhuman", str(write_synthhuman(tmp_path, 2))]
-    assert main([*line, *images, "--bank", str(bank), "--steps", "5", "--workers", "0"]) == 0
+    assert main([*line, "--bank", str(bank), "--steps", "5", "--workers", "0"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["parsing"] and "CC0" in metadata["licence"]
-    assert "SynthHuman: CDLA-Permissive-2.0" in metadata["licence"]
     assert metadata["provenance"]["heads"].startswith("synthetic people drawn from builtin")
     require_served(tmp_path, "parsing", shipped)
 
@@ -295,13 +291,9 @@ def test_the_portrait_network_trains_on_a_dataset(tmp_path: Path, monkeypatch: P
     monkeypatch.setattr("facerf_cli.dataset.portraits.in_shards", lambda work, items, jobs: work(items))
     dataset = write_small_dataset(tmp_path / "dataset", (1, 1, 0), 1, lights=6, crop_px=192)
     line = ["train", "-o", str(tmp_path / "run"), "--stage", "portrait", "--preset", "tiny", "--workers", "0"]
-    monkeypatch.setattr("facerf_cli.dataset.synthhuman.in_shards", lambda work, items, jobs: work(items))
-    images = str(write_seen_synthhuman(tmp_path / "images", astronaut.person().normals))
-    assert main([*line, "--dataset", str(dataset.folder), "--synthhuman", images, "--steps", "5"]) == 0
+    assert main([*line, "--dataset", str(dataset.folder), "--steps", "5"]) == 0
     networks, metadata = load_networks(tmp_path / "run" / "last.safetensors", LAYOUT_VERSION)
     assert list(networks) == ["portrait"] and metadata["provenance"]["trained_on"] == "dataset, 1 subjects"
-    assert "SynthHuman: CDLA-Permissive-2.0" in metadata["licence"]
-    assert len(list((tmp_path / "run/bank/synthhuman").iterdir())) == 1
 
 
 def test_help_has_its_options_in_groups(capsys: Said) -> None:

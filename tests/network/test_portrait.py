@@ -21,7 +21,6 @@ from facerf_cli.network.portrait import (
 )
 
 SIDE = 32
-SIDES = torch.full((1, 1, 1, 1), 3.0)
 TINY = PortraitSettings((8, 8, 12), (0, 1, 1), side=SIDE)
 
 
@@ -32,7 +31,7 @@ def inputs() -> PortraitInputs:
     normals = F.normalize(torch.randn(1, 3, SIDE, SIDE, generator=random), dim=1)
     one = torch.ones(1, 1, SIDE, SIDE)
     image = torch.rand(1, 3, SIDE, SIDE, generator=random)
-    return PortraitInputs(image, classes, normals, 0 * one, one, one.expand(-1, 16, -1, -1), 2 * one, SIDES)
+    return PortraitInputs(image, classes, normals, 0 * one, one, one.expand(-1, 16, -1, -1), 2 * one)
 
 
 def plain_maps() -> PortraitMaps:
@@ -173,18 +172,12 @@ def test_the_gain_starts_from_the_quotient_of_the_proxys_own_shading() -> None:
     assert maps.lit.shape == (1, 16, SIDE // 2, SIDE // 2) and maps.gloss.shape == (1, 3, SIDE, SIDE)
 
 
-def test_every_input_matters_and_every_scale_begins_with_the_same_maps() -> None:
-    network, given = PortraitNetwork(replace(TINY, sees_scale=True)), inputs()
+def test_every_input_matters() -> None:
+    network, given = PortraitNetwork(TINY), inputs()
     before = network(given).gain
     for name in PortraitInputs.__dataclass_fields__:
         changed = replace(given, **{name: getattr(given, name) * 0.5 + 0.1})
         assert not torch.allclose(network(changed).gain, before, atol=1e-4), name
-    network, given = PortraitNetwork(TINY), inputs()
-    wider = network.at_every_scale(SIDE)
-    assert wider.settings == replace(TINY, sees_scale=True) and wider.at_every_scale(64) is wider
-    for sides in (1.5, 3.0):
-        for own, other in zip(network(given), wider(replace(given, sides=0 * SIDES + sides)), strict=True):
-            torch.testing.assert_close(own, other)
 
 
 def test_exposure_is_that_of_the_skin_and_what_reaches_a_point_is_summed_over_the_rig() -> None:

@@ -1,22 +1,16 @@
 """The terms of the stage parsing against known answers."""
 
-from dataclasses import replace
-from pathlib import Path
 from typing import cast
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.synthhuman import LICENCE, SynthHuman
-from facerf_cli.errors import InputError
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.portrait.classes import CLASSES, class_index
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.parsing import ParsingObjective
-from tests.refusals import refused
-from tests.training.synthhuman_folder import write_synthhuman
 from tests.training.toy_parsing import SETTINGS, SIDE, TINY, Portraits, truth
 
 
@@ -121,34 +115,3 @@ def test_the_loss_of_a_real_network_falls() -> None:
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < losses[0] - 1
-
-
-def test_where_the_alpha_alone_is_known_any_class_of_a_person_is_right() -> None:
-    unknown = replace(truth(), label=torch.full((1, SIDE, SIDE), -1), known=torch.zeros(1, LANDMARKS).bool())
-    sure = seen(truth())
-    other = torch.where(truth().alpha > 0.5, sure.logits.roll(3, 1), sure.logits)
-    garment = sure._replace(logits=other)
-    for answer in (sure, garment, sure._replace(presence=-sure.presence)):
-        found = terms(answer, unknown)
-        assert max(found["classes"], found["matte"], found["presence"]) < 1e-5 and found["distance"] == 0
-    missed = torch.zeros_like(sure.logits)
-    missed[:, 0] = 30
-    assert terms(sure._replace(logits=missed), unknown)["classes"] > 1
-
-
-def test_a_share_of_the_samples_is_of_synthhuman(tmp_path: Path) -> None:
-    folder = write_synthhuman(tmp_path, 3)
-    images = SynthHuman(folder)
-    crop = images.draw(SIDE, torch.Generator().manual_seed(0))
-    assert crop.alpha.min() < 0.2 and crop.alpha.max() > 0.8 and (crop.label == -1).all()
-    assert (crop.crops[0, 0] - crop.alpha[0]).abs().max() < 0.02  # its people are white, before black
-    objective = ParsingObjective(cast(StoredPortraits, Portraits()), ParsingNetwork(TINY), SETTINGS, images)
-    assert objective.provenance["licence"] == f"MIT; {LICENCE}"
-    drawn = [objective.draw_one(torch.Generator().manual_seed(seed)) for seed in range(40)]
-    share = sum(bool((one.label < 0).all()) for one in drawn) / len(drawn)
-    assert 0.1 < share < 0.4
-    (folder / "0/alpha_0000000.png").unlink()
-    with pytest.raises(InputError, match="alpha_0000000"):
-        for seed in range(20):
-            images.draw(SIDE, torch.Generator().manual_seed(seed))
-    refused(InputError, "has no rgb_*.png; give a folder of SynthHuman", SynthHuman, tmp_path / "none")

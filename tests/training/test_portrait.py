@@ -1,26 +1,16 @@
 """The terms of the stage portrait against known answers."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import cast
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from facerf_cli.dataset.synthhuman import LICENCE, SeenNormals, SynthHuman, SynthHumanNormals
-from facerf_cli.errors import InputError
-from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork, PortraitSettings
-from facerf_cli.portrait.classes import class_index
-from facerf_cli.relighting.models import SHIPPED_NETWORKS
+from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from facerf_cli.training.portrait import PortraitObjective
-from tests import astronaut
-from tests.kinds import Patch
-from tests.refusals import refused
-from tests.training.synthhuman_folder import write_seen_synthhuman
 from tests.training.toy_portrait import NORMAL, SETTINGS, SIDE, Portraits, truth, whole
 
 
@@ -109,23 +99,6 @@ def test_validation_is_by_region_and_a_sample_moves_as_one() -> None:
     assert torch.equal(moved.inputs.own, sample.inputs.own)
 
 
-def test_arms_of_wide_squares_are_no_neck() -> None:
-    """Half of the person is neck; what is wrong in a wide square is counted there alone."""
-    wrong = objective(perfect()._replace(normals=whole(F.normalize(torch.tensor([0.5, 0.1, 1.0]), dim=0))))
-    shares, sides = truth().shares.clone(), truth().inputs.sides
-    shares[:, class_index("neck"), : SIDE // 2] = shares[:, class_index("skin"), : SIDE // 2]
-    shares[:, class_index("skin"), : SIDE // 2] = 0
-    shown = replace(truth(), shares=shares)
-    wide = replace(shown, inputs=replace(shown.inputs, sides=2 * sides), targets=shown.targets.flip(1))
-    wrong._held_out_samples = [shown, wide]
-    both = wrong.validate().metrics
-    assert both["neck"] == both["neck_shoulders"] != both["neck_wide"]
-    wrong._held_out_samples = [wide]
-    alone = wrong.validate().metrics
-    assert alone["error_wide"] == both["error_wide"] and "error_close" not in both
-    assert both["error_shoulders"] != both["error_wide"]
-
-
 def test_a_batch_has_squares_of_one_side() -> None:
     stage = objective(perfect())
     asked = []
@@ -135,41 +108,3 @@ def test_a_batch_has_squares_of_one_side() -> None:
         (side,) = set(stage.portraits.asked)
         asked.append(side)
     assert set(asked) == {SIDE, 2 * SIDE}
-
-
-def test_people_of_synthhuman_teach_normals_alone(tmp_path: Path, monkeypatch: Patch) -> None:
-    """Five steps, some of them on a made-up folder, whose y is down and z away from the camera."""
-    monkeypatch.setattr("facerf_cli.dataset.synthhuman.in_shards", lambda work, items, jobs: work(items))
-    own = astronaut.person().normals
-    images = SynthHuman(write_seen_synthhuman(tmp_path, own * np.array([1, -1, -1], np.float32)))
-    people = SynthHumanNormals(images, tmp_path / "cache", SHIPPED_NETWORKS, 1)
-    samples = [people.draw(torch.Generator().manual_seed(seed)) for seed in range(8)]
-    for sample in samples:  # some are mirrored
-        shown = sample.alpha[:, 0] > 0.9
-        agreed = (sample.inputs.normals[:, 0] * sample.normals[:, 0])[shown]
-        assert shown.float().mean() > 0.1 and agreed.mean() > 0.1
-    assert len({round(float(one.alpha[..., :80].sum())) for one in samples}) == 2
-    with monkeypatch.context() as patched:  # shaded skin is seen as in photos
-        patched.setattr("facerf_cli.dataset.synthhuman.even_shade_of", lambda image, classes: 0 * image)
-        assert not people.draw(torch.Generator()).inputs.image.any()
-    settings = replace(SETTINGS, synthhuman=0.5)
-    network = PortraitNetwork(PortraitSettings((4, 4, 4, 4, 4)))
-    stage = PortraitObjective(Portraits(), network, settings, people)
-    assert stage.provenance["licence"] == f"MIT; {LICENCE}"
-    drawn = [stage.draw(2, lambda i: torch.Generator().manual_seed(i), step) for step in range(20)]
-    batches = [batch for batch in drawn if isinstance(batch, SeenNormals)]
-    assert 5 <= len(batches) <= 15
-    optimizer = torch.optim.Adam(stage.parameters(), 3e-3)
-    losses = []
-    for batch in batches[:5]:
-        (loss,) = stage(batch).values()
-        optimizer.zero_grad()
-        loss.backward()
-        assert all(part.grad is not None for part in stage.parameters())
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < losses[0]
-    answer = cast(PortraitNetwork, Answer(perfect()._replace(normals=sample.normals)))
-    assert float(PortraitObjective(Portraits(), answer, settings, people)(sample)["normals"]) < 1e-3
-    write_seen_synthhuman(tmp_path, np.zeros_like(own))
-    refused(InputError, "no image shows", SynthHumanNormals, images, tmp_path / "other", SHIPPED_NETWORKS, 1)

@@ -35,7 +35,6 @@ def truth() -> PortraitSample:
     return PortraitSample(
         inputs=PortraitInputs(
             *(whole(own), shares, whole(NORMAL), whole(0, 1), whole(1, 1), whole(0, 16), whole(1, 1)),
-            sides=torch.full((1, 1, 1, 1), 3.0),
         ),
         lights=lights,
         visible=torch.ones(1, 2, SIDE // 2, SIDE // 2),

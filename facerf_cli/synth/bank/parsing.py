@@ -106,7 +106,7 @@ class PortraitCrops(Batch):
 
     crops: Tensor  # [B, 3, S, S] in 0..1
     alpha: Tensor  # [B, S, S] in 0..1
-    label: Tensor  # [B, S, S] long, class of what is covered; -1: unknown
+    label: Tensor  # [B, S, S] long, class of what is covered
     weight: Tensor  # [B, S, S], 0 where the truth is unknown
     landmarks: Tensor  # [B, N, 2] in sides of the crop
     known: Tensor  # [B, N] whether a landmark is in the crop

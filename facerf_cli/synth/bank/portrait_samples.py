@@ -210,7 +210,6 @@ def sample_of(
         covered=seen["covered"].float() / 255,
         reached=reached_by(directions, around, side),
         own=own_shading(photo, classes, normals, directions, around, float(sides)),
-        sides=sides.view(1, 1, 1),
     )
     sample = PortraitSample(
         inputs=inputs,

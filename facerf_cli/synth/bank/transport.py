@@ -2,7 +2,7 @@
 
 A portrait is kept without light: the facets of the image, how much of each light reaches them, and what they
 are made of in several looks. A person's light is baked once, at the vertices of the mesh; each camera takes a
-photo of it, in which the person is found, and squares of several scales, as the Portrait Network sees them of
+photo of it, in which the person is found, and squares, as the Portrait Network sees them of
 photos (`portrait.proxy`). `portrait_samples.py` draws samples of it.
 """
 
@@ -55,10 +55,9 @@ _BAKE = BakeSettings(light_samples=2, light_radius_deg=1.5, bounce_samples=10, b
 _POSE_STD_DEG, _POSE_MAX_DEG = (24.0, 9.0, 5.0), (65.0, 28.0, 18.0)
 _NEAREST, _FARTHEST_M = 0.17, 3.0  # of the camera: metres for each face that its squares show, and metres
 SIDE_PX, PHOTO_PX = 256, 448  # most of a square, and of the photo in which the person is found
-SCALES = (1.5, 7.0)  # sides of half of the squares in faces, the extents of the landmarks
 _FACE_PX = (58.0, 80.0)  # pixels along a face, as far as the square's side allows
 _LEAST_PX, _STEP_PX = 96, 32  # of a square's side
-_SIDES_STD = 0.06  # of the sides of the other squares, which show as much as those of photos
+_SIDES_STD = 0.06  # of the sides of squares, which show as much as those of photos
 _CUT, _CUT_FACES = 1 / 3, (0.7, 1.6)  # share of photos that end below the face's middle, and where
 _PHOTO_SIDES = (1.0, 1.25)  # of the photo, in sides of what its squares take; it is no smaller than `SIDES`
 _PHOTO = "photo_"  # before the names of photos
@@ -153,14 +152,10 @@ class _Views(NamedTuple):
 
 
 def _draw_cameras(subject: Subject, random: Random, settings: TransportBankSettings) -> list[_Views]:
-    """Draw cameras; half of their squares show what those of photos show, others are spread over `SCALES`."""
-    count = settings.cameras * settings.squares
-    spread = count - count // 2
-    low, high = np.log(SCALES)
-    scales = np.exp(low + (high - low) * (np.arange(spread) + random.uniform(size=spread)) / spread)
-    usual = SIDES * np.exp(random.normal(0, _SIDES_STD, count // 2))
-    scales = random.permutation(np.concatenate([scales, usual]))
-    return [_draw_views(subject, sides, random, settings) for sides in scales.reshape(settings.cameras, -1)]
+    """Draw cameras, whose squares show what those of photos show."""
+    shape = settings.cameras, settings.squares
+    scales = SIDES * np.exp(random.normal(0, _SIDES_STD, shape))
+    return [_draw_views(subject, sides, random, settings) for sides in scales]
 
 
 def _draw_views(
