@@ -1,4 +1,4 @@
-"""Faults planted in a sound capture, one at a time: which do the checks find, and what does `--align` undo?
+"""Faults planted in a sound capture, one at a time: which do the checks find?
 
     facerf synth-stage -o CAPTURE --subjects 8
     python benchmarks/capture_faults.py --capture CAPTURE [--subjects 2] [--only rig]
@@ -7,16 +7,13 @@ A subject's frames of one camera (of more where cameras are at fault) are copied
 the copy is checked. A row is a fault and its strength: how many of the faulty frames are found (or whether
 the subject is), by which check, and what else is reported. The naive twin is the sound copy: whatever is
 reported in it is a false alarm.
-
-Then all frames are moved along a smooth path of the head, with jitter of each frame, and aligned. Shifts
-count from their mean, since nobody knows where the head should be.
 """
 
 import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,8 +23,6 @@ import OpenImageIO as oiio
 from _common import arguments, print_header, print_row, required
 from scipy import ndimage
 
-from facerf_cli.capture.capture import Capture
-from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import Finding
 from facerf_cli.capture.layouts import read_capture
@@ -36,9 +31,6 @@ from facerf_cli.files.read import read_image
 
 _IN_FRONT = 0.7  # cosine to the first camera's axis of the lights whose frames get faults
 _PLACE = 3  # of the faulty light among those in front
-_JITTER_PX = 0.3  # of each frame, added to the path
-_SMOOTH = 20  # frames over which the path bends
-_KINDS = (("all", -2.0, 2.0), ("front", 0.3, 1.1), ("side", -0.3, 0.3), ("behind", -1.1, -0.3))  # cosines
 
 
 class Copy:
@@ -211,18 +203,6 @@ def swapped(other_of: Callable[[Copy, str], str]) -> Plant:
     return plant
 
 
-def woven(other_of: Callable[[Copy, str], str]) -> Plant:
-    """Replace the even rows of a frame by another light's."""
-
-    def plant(copy: Copy) -> list[str]:
-        pixels = copy.read(copy.faulty)
-        pixels[::2] = copy.read(other_of(copy, copy.faulty))[::2]
-        copy.write(copy.faulty, pixels)
-        return [copy.faulty]
-
-    return plant
-
-
 def rolled(copy: Copy) -> list[str]:
     """Give each light the direction of the next one."""
     lights = copy.description["lights"]
@@ -320,8 +300,6 @@ FAULTS = (
     *(Fault("rig turned", f"{deg} degrees", ("rig",), rig(about_y(deg))) for deg in (10, 25, 45)),
     *(Fault("camera turned", f"{deg} degrees, 1 of 3", ("camera",), misplaced(deg), 3) for deg in (40, 60)),
     *(Fault("cameras swapped", f"2 of {n}", ("camera", "rig"), cameras_swapped, n) for n in (2, 3)),
-    Fault("two fields", "of neighbours", ("fields",), woven(Copy.near)),
-    Fault("two fields", "of lights far apart", ("fields",), woven(Copy.far)),
     *(Fault("head moves in a third", f"{px} px", ("motion",), moved(px)) for px in (1, 2, 3, 4)),
 )
 
@@ -331,8 +309,7 @@ def main() -> None:
     parser.add_argument("--capture", type=Path, help="a sound capture with a stage.json")
     parser.add_argument("--subjects", type=int, default=2, help="that each fault is planted in")
     parser.add_argument("--sound", type=int, default=8, help="subjects that are checked without a fault")
-    parser.add_argument("--only", default="", help="only faults with this in their name, or motion")
-    parser.add_argument("--paths", type=float, nargs="+", default=[0, 2, 6], help="furthest points, pixels")
+    parser.add_argument("--only", default="", help="only faults with this in their name")
     given = parser.parse_args()
     source = required(given.capture, "a sound capture of synth-stage", "--capture")
     subjects = list(read_capture(source).subjects)
@@ -341,10 +318,6 @@ def main() -> None:
     for fault in FAULTS:
         if given.only in fault.name:
             report_fault(fault, source, subjects[: given.subjects])
-    if given.only in "motion":
-        for seed, subject in enumerate(subjects[: given.subjects]):
-            for furthest_px in given.paths:
-                report_alignment(source, subject, furthest_px, seed)
 
 
 def report_sound(source: Path, subjects: Sequence[str]) -> None:
@@ -381,48 +354,6 @@ def report_fault(fault: Fault, source: Path, subjects: Sequence[str]) -> None:
         right += said
     kinds = ", ".join(sorted({f"{f.check} ({f.severity})" for f in right})) or "-"
     print_row(fault.name, fault.strength, f"{hits} of {wanted}", kinds, counted(others))
-
-
-def report_alignment(source: Path, subject: str, furthest_px: float, seed: int) -> None:
-    """Print what alignment leaves of a path of the head, and of the frames' differences, by kind of light."""
-    with tempfile.TemporaryDirectory() as name:
-        copy = Copy(source, Path(name), subject, 1)
-        camera, moved_px = copy.cameras[0], path_px(len(copy.ids), furthest_px, seed)
-        still = np.stack(list(frames_of(read_capture(copy.folder), subject, camera)))
-        for light, by_px in zip(copy.ids, moved_px, strict=True):
-            copy.write(light, shifted(copy.read(light), by_px))
-        capture = read_capture(copy.folder)
-        aligned = with_alignment(capture, subject, {})
-        back_px = np.array([aligned.shifts.get((subject, camera, light), (0, 0)) for light in copy.ids])
-        before, after = (np.stack(list(frames_of(of, subject, camera))) for of in (capture, aligned))
-    left_px = moved_px + back_px
-    still = np.stack([shifted(frame, left_px.mean(0)) for frame in still])
-    aligned_frames = int(np.any(back_px, 1).sum())
-    print(f"{subject}, path to {furthest_px:g} px: {aligned_frames} of {len(back_px)} frames aligned")
-    for kind, least, most in _KINDS:
-        rows = (copy.directions[:, 2] >= least) & (copy.directions[:, 2] < most)
-        shifts = [np.sqrt(((px[rows] - px.mean(0)) ** 2).sum(1).mean()) for px in (moved_px, left_px)]
-        off = [np.abs(frames[rows] - still[rows]).mean() / still[rows].mean() for frames in (before, after)]
-        print(
-            f"  {kind}, {rows.sum()} frames: {shifts[0]:.2f} px -> {shifts[1]:.2f} px RMS; "
-            f"frames differ by {off[0]:.1%} -> {off[1]:.1%}",
-            flush=True,
-        )
-
-
-def path_px(frames: int, furthest_px: float, seed: int) -> np.ndarray:
-    """A smooth path [L, 2] of the head, down and right, up to `furthest_px` from its mean, with jitter."""
-    generator = np.random.default_rng(seed)
-    path = ndimage.gaussian_filter1d(generator.normal(size=(frames, 2)), _SMOOTH, axis=0, mode="nearest")
-    path -= path.mean(0)
-    path *= furthest_px / max(float(np.hypot(*path.T).max()), 1e-9)
-    return path + (generator.normal(size=path.shape) * _JITTER_PX if furthest_px else 0)
-
-
-def frames_of(capture: Capture, subject: str, camera: str) -> Iterator[np.ndarray]:
-    """Yield grey frames [H, W]."""
-    for place in range(len(capture.light_ids)):
-        yield capture.frame(subject, camera, place).mean(-1)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from scipy import ndimage
 from torch import Tensor
 
 from facerf_cli.errors import InputError
@@ -85,15 +84,12 @@ class Capture:
     distortion: Mapping[str, Coefficients] = field(
         default_factory=dict
     )  # of the cameras whose lenses distort
-    align: bool = False  # whether to undo head motion: `shifts` are then found for each subject
     charts: tuple[ChartCorrection, ...] = ()  # corrections of the cameras by photographed colour charts
     colour_matrix: np.ndarray | None = None  # [3, 3], on linear values without the black level
     positions_m: np.ndarray | None = None  # [L, 3] of near lights, in the world; NaN of far ones
     centre_m: np.ndarray = field(default_factory=lambda: np.zeros(3))  # [3], to which near light is measured
     stops: Mapping[str, float] = field(default_factory=dict)  # by which a subject's frames are brighter
     ignored: frozenset[str] = frozenset()  # names in a light's place that are of no single light
-    # Pixels down and right that undo the head motion of a frame, by subject, camera and light.
-    shifts: Mapping[tuple[str, str, str], tuple[float, float]] = field(default_factory=dict)
 
     def frame_path(self, subject: str, camera: str, light: str) -> Path:
         """Path of the frame of a subject seen by a camera under one light."""
@@ -106,8 +102,8 @@ class Capture:
     def frame(self, subject: str, camera: str, light: int) -> np.ndarray:
         """Read a frame [H, W, 3] as under a light of rgb 1, linear Rec.709, float32.
 
-        The colour chart's correction is applied, the lens's distortion undone, and the frame shifted. NaN and
-        infinite values become 0, with a warning. Values below the black level, from noise or a wide gamut,
+        The colour chart's correction is applied and the lens's distortion undone. NaN and infinite values
+        become 0, with a warning. Values below the black level, from noise or a wide gamut,
         stay negative here so that sums have no bias. InputError for a file that cannot be read,
         FrameSizeError for one that has not the camera's size.
         """
@@ -120,13 +116,10 @@ class Capture:
                 f"{posed.width_px} x {posed.height_px}; give frames of one size, or correct the camera"
             )
         ambient = self.ambient(subject, camera) if self.subtract_ambient else None
-        shift_px = self.shifts.get((subject, camera, self.light_ids[light]), (0.0, 0.0))
         exposed = np.float32(2.0 ** self.stops.get(subject, 0.0)) * self.intensities[light].astype(np.float32)
         lit = self.without_dark(pixels, ambient) / exposed
         lit = correct_colours(self.charts, camera, lit)
-        if camera in self.distortion:
-            lit = undistorted(lit, posed, self.distortion[camera])
-        return shift_image(lit, *shift_px)
+        return undistorted(lit, posed, self.distortion[camera]) if camera in self.distortion else lit
 
     def without_dark(self, pixels: np.ndarray, ambient: np.ndarray | None = None) -> np.ndarray:
         """Values [..., 3] without the black level, or an ambient image, in the colours of the matrix."""
@@ -167,22 +160,6 @@ def read_frame(path: Path, colour_space: str) -> np.ndarray:
 
 
 _read_ambient = lru_cache(maxsize=2)(read_frame)  # every frame of a camera needs the same one
-
-
-def shift_image(image: np.ndarray, down_px: float, right_px: float) -> np.ndarray:
-    """Shift an image [H, W, ...] down and right; the border is repeated, and whole-pixel shifts are exact.
-
-    Values between pixels come from cubic convolution (R. Keys, *Cubic convolution interpolation for digital
-    image processing*, ASSP 1981, equation 15), which keeps detail that linear interpolation blurs.
-    """
-    for axis, by_px in enumerate((down_px, right_px)):
-        if by_px:
-            reach = int(abs(by_px)) + 2
-            far = np.abs(np.arange(-reach, reach + 1) + by_px)
-            inner, outer = 1.5 * far**3 - 2.5 * far**2 + 1, -0.5 * far**3 + 2.5 * far**2 - 4 * far + 2
-            kernel = np.where(far < 1, inner, np.where(far < 2, outer, 0))
-            image = ndimage.correlate1d(image, kernel, axis, mode="nearest")
-    return image
 
 
 def require_pattern(

@@ -95,15 +95,6 @@ def stopping(findings: Iterable[Finding], strict: bool = False) -> list[Finding]
     return [found for found in findings if found.consequence(strict) == "subject stopped"]
 
 
-def frames_left_out(findings: Iterable[Finding]) -> dict[str, set[str]]:
-    """Collect the ids of the lights whose frames are left out, by camera."""
-    broken: dict[str, set[str]] = {}
-    for found in findings:
-        if found.leaves_out:
-            broken.setdefault(found.camera, set()).add(found.light)
-    return broken
-
-
 @dataclass(frozen=True)
 class Selection:
     """Lights and cameras of a subject's stacks, and the reasons for what is left out."""

@@ -36,4 +36,4 @@ def read_capture(folder: Path, settings: ReadSettings = _AS_STORED) -> Capture:
         raise UsageError(
             f"--subtract-ambient: {folder / STAGE_FILE} names no 'ambient' images; add them, or omit it"
         )
-    return replace(capture, subtract_ambient=settings.subtract_ambient, align=settings.align)
+    return replace(capture, subtract_ambient=settings.subtract_ambient)

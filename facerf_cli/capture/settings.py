@@ -16,12 +16,10 @@ class ReadSettings:
         layout: Read this layout: stage (with stage.json), extended-yale-b (cropped),
             faceolat, or faceolat-linear (without colour calibration).
         subtract_ambient: Subtract each camera's image without lights, where there is one.
-        align: Shift frames in which the head has moved back to its place.
     """
 
     layout: str = option("stage", metavar="NAME", panel=CAPTURE, everyday=True)
     subtract_ambient: bool = option(False, panel=CORRECTION)
-    align: bool = option(False, panel=CORRECTION)
 
 
 @dataclass(frozen=True)

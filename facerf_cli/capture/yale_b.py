@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from facerf_cli.capture.capture import Capture, shift_image
+from facerf_cli.capture.capture import Capture
 from facerf_cli.errors import InputError
 from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import read_text
@@ -125,7 +125,9 @@ class YaleB:
                 f"{path}: {image.shape[1]} x {image.shape[0]} pixels, not {WIDTH_PX} x {HEIGHT_PX}; use the "
                 "cropped database as distributed (CroppedYale.zip); some public copies are shrunk"
             )
-        return shift_image(image, *self.shifts.get((subject, flash), (0, 0)))
+        down_px, right_px = self.shifts.get((subject, flash), (0, 0))
+        rows, columns = np.arange(HEIGHT_PX) - down_px, np.arange(WIDTH_PX) - right_px
+        return image[rows.clip(0, HEIGHT_PX - 1)][:, columns.clip(0, WIDTH_PX - 1)]
 
     def images(self, subject: str) -> np.ndarray:
         """Read the images [L, 192, 168] of a subject under all its `flashes`."""

@@ -369,7 +369,6 @@ def _calibration(capture: Capture) -> dict[str, Any]:
             **({} if capture.colour_matrix is None else {"colour_matrix": capture.colour_matrix.tolist()}),
             **({"exposure_stops": dict(capture.stops)} if capture.stops else {}),
             **({"ambient": "subtracted where there is a picture of it"} if capture.subtract_ambient else {}),
-            **({"head_motion": "frames shifted back, by fits/SUBJECT.json"} if capture.align else {}),
             "gain": dict(gains),
             **({"colour_charts": [chart.record for chart in capture.charts]} if capture.charts else {}),
             "non_finite": "set to 0",

@@ -173,14 +173,13 @@ def _remove_dropped(subject: str, chosen: Selection, how: Preparation, any_left:
 
 
 def _optional_entries(person: _Subject, chosen: Selection) -> dict[str, Any]:
-    """Entries of a record that it has where they are not empty: missing, shifted and uncorrected frames."""
+    """Entries of a record that it has where they are not empty: missing and uncorrected frames."""
     capture = person.capture
     entries = {
         "dropped": chosen.dropped,
         "missing": list(chosen.missing),
         "lights": [capture.light_ids[light] for light in chosen.lights] if chosen.left_out else [],
         "left_out": chosen.left_out,
-        "shifts_px": {"/".join(key[1:]): list(by) for key, by in capture.shifts.items()},
         "ambient_kept": _ambient_kept(person, chosen.cameras),
     }
     return {name: entry for name, entry in entries.items() if entry}

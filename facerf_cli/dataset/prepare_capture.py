@@ -15,14 +15,12 @@ from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up,
 from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.chart import read_charts, write_chart_overlays
-from facerf_cli.capture.checks.motion import with_alignment
 from facerf_cli.capture.checks.subject import check_subject
 from facerf_cli.capture.findings import (
     FINDINGS_FILE,
     Finding,
     Selection,
     collect_findings,
-    frames_left_out,
     has_new_frames,
     keep_findings,
     require_sound,
@@ -215,8 +213,8 @@ class Prepare(Job):
     def __call__(self, item: Item) -> Outcome:
         """Prepare a subject on one thread, so that its bytes do not depend on the number of cores."""
         with one_thread():
-            capture, chosen = self._choose(item.name)
-            record = prepare_subject(capture, item.name, chosen, self.how)
+            chosen = self._choose(item.name)
+            record = prepare_subject(self.capture, item.name, chosen, self.how)
         if record["quality"] == "poor":
             log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
         worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
@@ -225,16 +223,13 @@ class Prepare(Job):
         facts |= {"lights": len(chosen.lights)}
         return Outcome(self.outputs_of(item), facts)
 
-    def _choose(self, subject: str) -> tuple[Capture, Selection]:
-        """Check a subject, select its sound frames, and align them on request; InputError for too few."""
+    def _choose(self, subject: str) -> Selection:
+        """Check a subject and select its sound frames; InputError for too few."""
         capture, strict = self.capture, self.how.strict
         findings = check_subject(capture, subject) if self.with_checks else []
         keep_findings(self.how.dataset.folder, subject, findings)
         require_sound(subject, findings, strict)
-        chosen = select_frames(capture, subject, findings, strict)
-        if capture.align:
-            capture = with_alignment(capture, subject, frames_left_out(findings))
-        return capture, chosen
+        return select_frames(capture, subject, findings, strict)
 
 
 def _write_dataset(

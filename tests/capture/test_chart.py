@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +14,8 @@ from skimage import data
 from facerf_cli.capture.capture import Capture, ChartCorrection, correct_colours
 from facerf_cli.capture.chart import (
     GREYS,
-    centres,
     fit_colours,
     four_turns,
-    neutral_matrix,
     published_colours,
     read_charts,
     sample,
@@ -40,10 +37,6 @@ from tests.capture.chart_image import CAMERA, CORNERS, SHAPE, chart_image, kept_
 from tests.refusals import refused
 from tests.worlds import FLAT, write_flat_stage
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore")  # colour-science warns of optional packages that are not there
-    import colour as oracle
-
 
 def test_published_colours_are_those_of_the_chart() -> None:
     """X-Rite's L*a*b* under D50 of dark skin, orange and neutral 5, by matrices of our own."""
@@ -63,32 +56,8 @@ def test_a_camera_is_undone_and_luminance_stays() -> None:
     fit = fit_colours(0.37 * published_colours() @ CAMERA.T)
     np.testing.assert_allclose(fit.matrix, kept_luminance(CAMERA), atol=1e-6)
     assert fit.delta_e_after.max() < 1e-3 < 5 < fit.delta_e_before.mean()
-    np.testing.assert_allclose(fit.light, 1, atol=1e-6)
     greys = (published_colours() @ CAMERA.T)[GREYS].sum(0)
     assert luminance(fit.matrix @ greys) == pytest.approx(luminance(greys))
-
-
-def test_light_that_falls_off_is_taken_off_and_greys_stay_exact() -> None:
-    light = np.exp(centres() @ [0.07, -0.05])
-    fit = fit_colours(published_colours() @ CAMERA.T * light[:, None])
-    np.testing.assert_allclose(fit.light / fit.light[0], light / light[0], rtol=1e-3)
-    np.testing.assert_allclose(fit.matrix, kept_luminance(CAMERA), atol=2e-3)
-    assert fit.delta_e_after.mean() < 0.05
-    noisy = published_colours() * np.exp(0.2 * np.random.default_rng(1).standard_normal((24, 3)))
-    matrix, level = neutral_matrix(noisy, published_colours())
-    greys, wanted = noisy[GREYS].sum(0), published_colours()[GREYS].sum(0)
-    np.testing.assert_allclose(matrix @ greys, level * wanted)
-    assert luminance(matrix @ greys) == pytest.approx(luminance(greys))
-
-
-def test_without_bound_greys_it_is_the_least_squares_of_colour_science() -> None:
-    """Greys that are where they belong bind nothing: both fits are the same."""
-    draw = np.random.default_rng(2)
-    measured = published_colours() @ CAMERA.T
-    measured[:18] *= 1 + 0.01 * draw.standard_normal((18, 3))
-    matrix, level = neutral_matrix(measured, published_colours())
-    plain = oracle.matrix_colour_correction(measured, level * published_colours(), "Finlayson 2015", degree=1)
-    np.testing.assert_allclose(matrix, plain, atol=0.03)
 
 
 def test_importing_colour_science_changes_nothing_and_nothing_is_printed_at_the_end() -> None:
@@ -107,17 +76,13 @@ def test_importing_colour_science_changes_nothing_and_nothing_is_printed_at_the_
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_middles_are_sampled_and_noise_and_clipping_counted() -> None:
-    patches = sample(chart_image(noise=0.0, exposure=1.0), CORNERS)
-    np.testing.assert_allclose(patches.colours, published_colours(), atol=1e-6)
-    assert patches.counts.min() > 150 and patches.noise.max() < 1e-6 and not patches.at_white.any()
+def test_the_middles_are_sampled() -> None:
+    np.testing.assert_allclose(
+        sample(chart_image(noise=0.0, exposure=1.0), CORNERS), published_colours(), atol=1e-6
+    )
     careless = CORNERS + np.array([[4, -4], [-4, 4], [4, 4], [-4, -4]])
-    patches = sample(chart_image(noise=0.0, exposure=1.0), careless)
-    np.testing.assert_allclose(patches.colours, published_colours(), atol=1e-6)
-    patches = sample(chart_image(noise=0.02, exposure=1.13).clip(max=1), CORNERS)
-    grey = 1.13 * published_colours()[19, 1]
-    assert patches.noise[19] == pytest.approx(0.02 * np.sqrt(grey + 0.01), rel=0.15)
-    assert 0.2 < patches.at_white[18] < 0.9 and not patches.at_white[[0, 5, 20]].any()
+    found = sample(chart_image(noise=0.0, exposure=1.0), careless)
+    np.testing.assert_allclose(found, published_colours(), atol=1e-6)
 
 
 WHITE = [{**light, "intensity": [2, 2, 2]} for light in FLAT["lights"]]
@@ -142,12 +107,11 @@ def delta_e(chart: ChartCorrection) -> float:
 
 
 def test_a_camera_with_noise_is_undone_and_lamps_of_one_colour_change_nothing(tmp_path: Path) -> None:
-    image = chart_image(matrix=CAMERA, light=(1.2, 0.8), noise=0.01)
+    image = chart_image(matrix=CAMERA, noise=0.01)
     chart = correction(tmp_path, image)
     before, after = (chart.record["delta_e_2000"][when] for when in ("before", "after"))
     np.testing.assert_allclose(chart.record["matrix"], kept_luminance(CAMERA), atol=0.02)
     assert after["mean"] < 0.5 and after["max"] < 1.5 < 5 < before["mean"]
-    assert chart.record["light_span"] == pytest.approx(1.25, abs=0.05)
     assert chart.record["cameras"] == ["C0", "C1"]
     # A camera that was calibrated by the lamps sees the chart in their colour; frames lose it first.
     tinted = [{**light, "intensity": [3, 2, 1]} for light in FLAT["lights"]]
@@ -204,13 +168,13 @@ DIM, FACE = 0.0005, data.astronaut()[:240, 60:390].astype(np.float32) / 255
 REFUSED: dict[str, tuple[np.ndarray, np.ndarray, str]] = {
     "clipped at 1": (chart_image(exposure=1.5).clip(max=1 - LEVEL), CORNERS, "white patch is clipped"),
     "clipped below 1": (chart_image().clip(max=0.5), CORNERS, "white patch is clipped"),
-    "grey": (chart_image().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "is grey"),
+    "grey": (chart_image().mean(-1, keepdims=True).repeat(3, -1), CORNERS, "delta E"),
     "a face": (FACE, CORNERS, "delta E"),
-    "too dark": (chart_image(exposure=DIM), CORNERS, "too dark"),
+    "too dark": (chart_image(exposure=DIM), CORNERS, "delta E"),
     "encoded": (linear_to_srgb(chart_image().clip(0, 1)), CORNERS, "lin_rec709"),
     "small": (chart_image(CORNERS / 8, (60, 80), noise=0.0), CORNERS / 8, "pixels in its middle"),
     "outside": (chart_image(), CORNERS + np.array([90, 0]), "outside its 330 x 240"),
-    "crossed": (chart_image(), CORNERS[[0, 2, 1, 3]], "convex"),
+    "crossed": (chart_image(), CORNERS[[0, 2, 1, 3]], "delta E"),
 }
 
 

@@ -30,7 +30,7 @@ def capture(tmp_path: Path) -> Capture:
 
 
 def broken(light: str, severity: Severity = "error") -> Finding:
-    return Finding(severity, "fields", "yaleB05", "is dark", "P00", light)
+    return Finding(severity, "black", "yaleB05", "is dark", "P00", light)
 
 
 def test_everything_is_there_but_nobody_is_left_without_frames(capture: Capture) -> None:
@@ -56,9 +56,9 @@ def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None
     assert chosen.left_out == {
         missing: "P00: missing",
         marked: "P00: marked as damaged",
-        woven: "P00: fields",
+        woven: "P00: black",
     }
-    assert chosen.in_words() == f"2 lights left out ({missing}: P00: missing; {woven}: P00: fields)"
+    assert chosen.in_words() == f"2 lights left out ({missing}: P00: missing; {woven}: P00: black)"
     assert chosen.missing == (f"P00/{missing}", f"P00/{marked}")
     refused(InputError, "yaleB05: 9 of 13", select_frames, capture, "yaleB05", [*findings, broken(another)])
     with pytest.raises(InputError, match=f"yaleB05/P00/{re.escape(missing)}: missing .*strict"):
@@ -71,7 +71,7 @@ def test_broken_missing_and_marked_frames_are_left_out(capture: Capture) -> None
 
 STOPS = Finding("error", "rig", "0001", "the lights\nare mirrored [left] to right", "C0")
 WARNS = Finding("warning", "motion", "0000", "the head moves", "C0")
-FIELDS = [Finding("error", "fields", "0000", f"has {k} fields", "C0", f"L{k:03d}") for k in range(9)]
+FIELDS = [Finding("error", "black", "0000", f"has {k} values", "C0", f"L{k:03d}") for k in range(9)]
 
 
 def shown(findings: list[Finding], width: int = 200, strict: bool = False) -> str:

@@ -41,8 +41,8 @@ def prepare(capture: Path, output: Path, *line: str) -> int:
 
 
 def frame(light: int, subject: str = "0000", camera: str = "C1") -> Finding:
-    words = "has rows of two fields"
-    return Finding("error", "fields", subject, words, camera, f"L{light:03d}", {"share": 0.1})
+    words = "is black"
+    return Finding("error", "black", subject, words, camera, f"L{light:03d}", {"share": 0.1})
 
 
 ORDER = Finding("error", "order", "0001", "the lamps are in another order", "C0")
@@ -56,7 +56,7 @@ def test_broken_frames_are_left_out_and_errors_stop_their_subject(
     plant(frame(4), ORDER, CLIPPED)
     assert prepare(capture, tmp_path) == 1
     said = capsys.readouterr().err
-    assert "0000: 1 light left out (L004: C1: fields)" in said
+    assert "0000: 1 light left out (L004: C1: black)" in said
     assert "0001/C0: order: the lamps are in another order" in said and "subject stopped" in said
     dataset = read_dataset(tmp_path)
     assert dataset.subjects == ("0000",) and 4 not in dataset.lights_of("0000")
@@ -126,25 +126,3 @@ def test_real_checks_in_processes_find_the_missing_frame(capture: Path, tmp_path
     assert {"0001/C2/L002"} == {
         f"{row['subject']}/{row['camera']}/{row['light']}" for row in rows if row["check"] == "missing"
     }
-
-
-def test_heads_that_moved_are_moved_back(
-    capture: Path, tmp_path: Path, plant: Plant, monkeypatch: Patch
-) -> None:
-    """The shifts reach the frames that are stacked, and the record."""
-    plant()
-    asked = {}
-
-    def align_shifts(
-        capture: Said, subject: str, camera: str, broken: set[str]
-    ) -> dict[str, tuple[float, float]]:
-        asked[camera] = broken
-        return {"L002": (1.0, -2.0)} if camera == "C0" else {}
-
-    monkeypatch.setattr("facerf_cli.capture.checks.motion.align_shifts", align_shifts)
-    assert prepare(capture, tmp_path, "--align", "--split", "1/1/0") == 0
-    assert set(asked) == {"C0", "C1", "C2"}
-    record = json.loads((tmp_path / "fits/0000.json").read_text())
-    assert record["shifts_px"] == {"C0/L002": [1.0, -2.0]}
-    assert "shifted" in json.loads((tmp_path / "dataset.json").read_text())["normalisation"]["head_motion"]
-    assert prepare(capture, tmp_path) == 2  # not a dataset of the same kind

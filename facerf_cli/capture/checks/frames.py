@@ -1,7 +1,7 @@
 """Frames of a camera as the checks see them, and the faults of single frames.
 
-A frame may be missing, unreadable, black, clipped, another camera's, or of two interlaced fields. Each is
-read once for all checks, and one full frame is in memory at a time.
+A frame may be missing, unreadable, black, clipped or another camera's. Each is read
+once for all checks, and one full frame is in memory at a time.
 """
 
 import hashlib
@@ -16,7 +16,6 @@ from facerf_cli.capture.capture import Capture, FrameSizeError, unlisted_kind
 from facerf_cli.capture.findings import Finding
 from facerf_cli.errors import InputError
 
-_BRIGHT = 0.2  # of the brightest blocks: darker ones do not count in `comb`
 _AT_THE_TOP = 1 - 1e-5  # of a frame's maximum: arithmetic may move clipped values this far apart
 _LISTED = 3  # file names of a message
 _MOST_OF_ANOTHER_SIZE = 0.5  # of a camera's frames: with more, the camera's description is wrong
@@ -24,11 +23,6 @@ _BLACK = 1e-3  # of the median of the frames' maxima: less than any light on ski
 _FLAT = 1e-6  # of a frame's maximum
 _CLIPPED_SHARE = 0.01  # of the pixels: highlights on skin are smaller, a clipped cheek is larger
 _CEILING = 1e-4  # relative distance within which values count as the ceiling
-# Sound frames of Extended Yale B's subjects 05, 15 and 22 have ratios within 1.3 times their median, those of
-# a dozen lights far apart up to 3; the two broken ones there are 78 and 184 times above it, a planted one 7.
-_TIMES_USUAL = 5.0
-_NEIGHBOURS = 6
-_COMB = 0.01  # of the mean: smaller differences may be noise, and do no harm
 # Lights that head, body, hair or brows can hide from the face, in camera space.
 _BEHIND = -0.5  # cosine to the camera's axis: the head hides lights further behind
 _BELOW = -0.7  # sine of the elevation: the body hides lights further below
@@ -42,8 +36,6 @@ _MEASURED = np.dtype(
         ("highest", float),  # largest value
         ("share_highest", float),  # of the pixels with the largest value in some channel
         ("spread", float),  # largest less smallest value
-        ("comb", float),  # relative difference between odd and even rows, see `comb`
-        ("comb_ratio", float),  # that over the difference between odd and even columns
     ]
 )
 
@@ -120,33 +112,10 @@ def _grey_of(pixels: np.ndarray) -> np.ndarray:
 
 def _measure(pixels: np.ndarray) -> tuple[str | float, ...]:
     """Measure a frame [H, W, 3] at full size."""
-    highest, grey = float(pixels.max()), _grey_of(pixels)
-    rows, columns = comb(grey), comb(grey.T)
+    highest = float(pixels.max())
     top = (pixels >= highest * _AT_THE_TOP).any(-1) if highest > 0 else np.zeros(1)
     digest = hashlib.sha256(pixels.tobytes()).hexdigest()
-    return digest, highest, top.mean(), highest - float(pixels.min()), rows, rows / max(columns, 1e-6)
-
-
-def comb(grey: np.ndarray) -> float:
-    """Relative difference between odd and even rows of an image [H, W], as the median of bright blocks.
-
-    A row's deviation from the mean of its neighbours, with alternating sign, adds up over a block of 8 x 4
-    pixels only if rows alternate. Blocks are small because rows of a resampled image alternate in phase only
-    locally.
-    """
-    departure = grey[1:-1] - (grey[:-2] + grey[2:]) / 2
-    departure = departure * np.where(np.arange(len(departure)) % 2, -1, 1)[:, None]
-    if len(departure) < 8 or departure.shape[1] < 4:
-        return 0.0
-    mean = _blocks(grey[1:-1])
-    bright = mean > max(_BRIGHT * float(np.percentile(mean, 95)), 0)
-    return float(np.median(np.abs(_blocks(departure))[bright] / mean[bright])) if bright.any() else 0.0
-
-
-def _blocks(plane: np.ndarray) -> np.ndarray:
-    """Means of the complete blocks of 8 x 4 pixels."""
-    height, width = plane.shape[0] // 8, plane.shape[1] // 4
-    return plane[: height * 8, : width * 4].reshape(height, 8, width, 4).mean((1, 3))
+    return digest, highest, top.mean(), highest - float(pixels.min())
 
 
 def reaches_face(directions: np.ndarray) -> np.ndarray:
@@ -256,25 +225,3 @@ def check_other_cameras(frames: CameraFrames, earlier: Mapping[str, str]) -> Ite
         light, place = frames.light_ids[again[0]], earlier[frames.measured["digest"][again[0]]]
         words = f"{len(again)} frames are another camera's ({light} is identical to {place}); copy them again"
         yield frames.error("duplicate", words, frames=len(again))
-
-
-def check_fields(frames: CameraFrames) -> Iterator[Finding]:
-    """Report each frame whose rows alternate far more than its columns do, compared with other frames.
-
-    Hair alternates too, under lights from above; so the frames of neighbouring lights set what is usual.
-    Lights behind the head light edges one row wide, and are not judged.
-    """
-    ratios, combs = frames.measured["comb_ratio"], frames.measured["comb"]
-    if len(ratios) < 3:
-        return
-    near = np.argsort(-frames.directions @ frames.directions.T, axis=1)[:, 1 : 1 + _NEIGHBOURS]
-    usual = np.maximum(np.median(ratios[near], axis=1), max(float(np.median(ratios)), 1.0))
-    broken = (ratios > _TIMES_USUAL * usual) & (combs > _COMB) & reaches_face(frames.directions)
-    for row in np.flatnonzero(broken).tolist():
-        times = float(ratios[row] / usual[row])
-        words = (
-            f"has odd and even rows under different light ({combs[row]:.1%} of the mean, {times:.0f} times "
-            "the usual), as from two video fields; take it again"
-        )
-        measured = {"times_usual": round(times, 2), "comb": round(float(combs[row]), 4)}
-        yield frames.error("fields", words, row, **measured)

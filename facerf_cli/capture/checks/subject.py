@@ -7,7 +7,6 @@ from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.checks.frames import (
     check_black,
     check_clipped,
-    check_fields,
     check_missing,
     check_other_cameras,
     check_readable,
@@ -55,7 +54,7 @@ def _check_camera(
     """Check the frames of a camera, first one by one, then those that are sound by their shading."""
     frames, unread = read_frames(capture, subject, camera, side_px)
     found = [*check_missing(capture, subject, camera), *check_readable(frames, unread)]
-    for check in (check_black, check_clipped, check_fields):
+    for check in (check_black, check_clipped):
         found += check(frames)
     found += check_other_cameras(frames, cameras.frame_of)
     places = (f"{camera}/{light}" for light in frames.light_ids)

@@ -9,7 +9,7 @@ import pytest
 
 from facerf_cli.capture.checks.shading import RigFit, check_rigs
 from facerf_cli.capture.checks.subject import check_subject
-from facerf_cli.capture.findings import Finding, frames_left_out, stopping
+from facerf_cli.capture.findings import Finding, stopping
 from facerf_cli.capture.layouts import read_capture
 from facerf_cli.files.write import write_exr
 from tests.worlds import (
@@ -68,7 +68,7 @@ def test_a_missing_frame_is_left_out(tmp_path: Path, sound: np.ndarray) -> None:
     frame(folder, FRONT).unlink()
     found = only(findings(folder))
     assert (found.check, found.camera, found.light) == ("missing", EGG_CAMERA, EGG_LIGHTS[FRONT])
-    assert frames_left_out([found]) == {EGG_CAMERA: {EGG_LIGHTS[FRONT]}} and not stopping([found])
+    assert found.leaves_out and not stopping([found])
 
 
 def test_a_camera_without_frames_is_one_finding(tmp_path: Path, sound: np.ndarray) -> None:
@@ -150,15 +150,6 @@ def test_clipped_frames_are_counted(tmp_path: Path, sound: np.ndarray) -> None:
 
     found = only(changed(clip, sound, tmp_path / "s"))
     assert found.check == "clipped" and found.severity == "warning" and found.figures["frames"] > 3
-
-
-@pytest.mark.parametrize("strength", [1.0, 0.1])
-def test_two_fields_under_two_lamps(tmp_path: Path, sound: np.ndarray, strength: float) -> None:
-    def weave(frames: np.ndarray) -> None:
-        frames[FRONT, ::2] += strength * (frames[FRONT + 6, ::2] - frames[FRONT, ::2])
-
-    found = only(changed(weave, sound, tmp_path / "s"))
-    assert (found.check, found.light, found.leaves_out) == ("fields", EGG_LIGHTS[FRONT], True)
 
 
 def test_a_lamp_that_did_not_fire_leaves_the_light_of_the_room(tmp_path: Path, sound: np.ndarray) -> None:
