@@ -24,7 +24,6 @@ import numpy as np
 from pydantic import Field
 
 from facerf_cli.capture.capture import BlackLevel, Capture, find_subjects
-from facerf_cli.capture.light_lists import sphere_middle
 from facerf_cli.capture.metashape import read_metashape
 from facerf_cli.capture.stage_json import MOST_LIGHTS, CameraEntry
 from facerf_cli.errors import InputError
@@ -160,3 +159,9 @@ def _colours(path: Path) -> tuple[np.ndarray, BlackLevel]:
         raise InputError(f"{path}: is not a matrix of 3 x 4 numbers; {advice}")
     red, green, blue = matrix[:, 3].tolist()
     return matrix[:, :3], (red, green, blue)
+
+
+def sphere_middle(points: np.ndarray) -> np.ndarray:
+    """The middle [3] of the sphere nearest to points [N, 3], by linear least squares."""
+    terms = np.column_stack([2 * points, np.ones(len(points))])
+    return np.asarray(np.linalg.lstsq(terms, (points**2).sum(1), rcond=None)[0][:3])

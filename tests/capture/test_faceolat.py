@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from facerf_cli.capture.capture import distorted
+from facerf_cli.capture.faceolat import sphere_middle
 from facerf_cli.capture.layouts import read_capture
-from facerf_cli.capture.light_lists import sphere_middle
 from facerf_cli.capture.metashape import read_metashape
 from facerf_cli.capture.settings import ReadSettings
 from facerf_cli.dataset.dataset import read_dataset

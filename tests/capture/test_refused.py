@@ -103,14 +103,12 @@ def test_a_frame(tmp_path: Path) -> None:
 
 
 def draft(pattern: str, *names: str) -> Callable[[Path], Any]:
-    """Draft a folder of images; those in a folder `torn` are."""
+    """Draft a folder of images."""
 
     def call(folder: Path) -> Any:
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             write_display(folder / name, np.full((6, 8, 3), 0.25, np.float32))
-            if name.startswith("torn"):
-                (folder / name).write_bytes(b"torn")
         return draft_stage(folder, frozenset({".png"}), pattern)
 
     return call
@@ -159,7 +157,6 @@ ROWS: dict[str, Callable[[Path], Any]] = {
     "here: no such folder": lambda folder: draft("")(folder / "here"),
     "no images": draft(""),
     "2 lights": draft("{light}.png", "a.png", "b.png"),
-    "cannot be read": draft("torn/{light}.png", "torn/a.png", "torn/b.png", "torn/c.png"),
     "'{light}.png' for L1.png": draft("", "L1.png", "L2.png"),
     "'{subject}/{light}.png' for a/L1.png": draft("", "a/L1.png", "a/L2.png"),
     "'raw/{subject}/{camera}/{light}.png'": draft("", "raw/a/C0/L1.png", "raw/a/C0/L2.png"),
