@@ -2,18 +2,12 @@
 
 The assumption is that of Schneider et al. (*Efficient Global Illumination for Morphable Models*, ICCV 2017),
 on this project's fitted mesh and priors; their code and models are not used. They learn the transfer of a
-morphable model; here the transfer of each mesh is baked. It is kept in the user's cache for the next run:
-
-    CACHE/transfer/KEY.npy   [2, K, t, t] float16; KEY is that of the recipe: the mesh and the bake's settings
+morphable model; here the transfer of each mesh is baked.
 """
 
-import hashlib
 import logging
 import math
-import os
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -34,14 +28,9 @@ from facerf_cli.baselines.synthesis import (
     solve,
     with_detail,
 )
-from facerf_cli.batch.recipe import Recipe, key_of, recipe_of
-from facerf_cli.errors import FacerfError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture
-from facerf_cli.face.topology import GRID, LAYOUT_VERSION, grid_triangles
-from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.downloads import cache_folder
-from facerf_cli.files.texts import file_sha256
+from facerf_cli.face.topology import GRID, grid_triangles
 from facerf_cli.light.sh import coefficients_to_rig, rig_coefficients, rotated, sh_basis
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.transport import BakeSettings, bake_transport
@@ -52,7 +41,6 @@ from facerf_cli.run.logs import LOGGER_NAME
 log = logging.getLogger(LOGGER_NAME)
 
 _ROUNDS = 2  # of estimating the mean albedo of the face, which tints the bounce
-_MOST_FILES = 160  # of the cache, 1.6 MB each: beyond, those that were not used for longest are removed
 
 
 @dataclass(frozen=True)
@@ -101,7 +89,7 @@ class Prt:
 def explain_by_prt(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
     """Estimate the most probable albedo and light of a fitted photo."""
     vertices = models.face.vertices(fit.alpha[None], fit.beta[None])[0]
-    direct, bounce = baked_transfer(vertices, BAKE)
+    direct, bounce = bake_transfer(vertices, BAKE)
     skin, light, side = skin_prior(), light_prior(BAKE.order), face.texture.shape[-1]
     tint = skin.diffuse.mean.exp().mean((1, 2))
     for _ in range(_ROUNDS):
@@ -124,30 +112,13 @@ def _scene(transfer: Tensor, fit: FaceFit, face: FaceTexture) -> Scene:
     return scene_of(face, in_camera, torch.zeros_like(in_camera[0]))
 
 
-def baked_transfer(vertices_head: Tensor, settings: TransferSettings, cache: Path | None = None) -> Tensor:
-    """Transfer vectors [2, K, t, t] of a mesh [V, 3] in the head frame, from the cache if they are there.
+def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
+    """Bake the transfer vectors [2, K, t, t] of a mesh [V, 3] in the head frame.
 
     Times the coefficients of a light they give the radiance of a white diffuse face: [0] direct, with its own
-    shadows, and [1] after one bounce off a face of albedo 1.
+    shadows, and [1] after one bounce off a face of albedo 1 (Sloan, Kautz and Snyder, *Precomputed Radiance
+    Transfer*, 2002).
     """
-    path = (cache or cache_folder() / "transfer") / f"{key_of(_recipe(vertices_head, settings))}.npy"
-    kept = _read(path, settings)
-    if kept is not None:
-        return kept
-    transfer = bake_transfer(vertices_head, settings).half()
-    try:
-        with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.save(file, transfer.numpy())
-        with suppress(FileNotFoundError):  # other processes may remove files at the same time
-            for old in sorted(path.parent.glob("*.npy"), key=lambda p: p.stat().st_mtime_ns)[:-_MOST_FILES]:
-                old.unlink()
-    except FacerfError as error:
-        log.warning("%s; the next run bakes the transfer again", error)
-    return transfer.float()
-
-
-def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
-    """Bake the transfer (Sloan, Kautz and Snyder, *Precomputed Radiance Transfer*, 2002)."""
     positions = bake_attributes(vertices_head, GRID, settings.side).permute(1, 2, 0)
     normals = normal_map(vertices_head, grid_triangles(), settings.side).permute(1, 2, 0)
     directions = rig_directions(settings.lights)
@@ -168,22 +139,3 @@ def bake_transfer(vertices_head: Tensor, settings: TransferSettings) -> Tensor:
     transfer = torch.einsum("lk,nlij->nkij", basis, both).numpy()
     blur = settings.blur_texels
     return torch.from_numpy(gaussian_filter(transfer, (0, 0, blur, blur), mode="nearest"))
-
-
-def _recipe(vertices_head: Tensor, settings: TransferSettings) -> Recipe:
-    rounded_um = np.round(vertices_head.double().numpy() * 1e6).astype(np.int64)
-    mesh = hashlib.sha256(rounded_um.tobytes()).hexdigest()
-    return recipe_of(settings, file_sha256) | {"mesh": mesh, "layout": LAYOUT_VERSION}
-
-
-def _read(path: Path, settings: TransferSettings) -> Tensor | None:
-    """Read a transfer from the cache; None if it is missing or damaged."""
-    shape = (2, (settings.order + 1) ** 2, settings.side, settings.side)
-    try:
-        kept = np.load(path, allow_pickle=False)
-        os.utime(path)  # marks it as used
-    except (OSError, ValueError, EOFError):
-        return None
-    if kept.shape != shape or kept.dtype != np.float16 or not np.isfinite(kept).all():
-        return None
-    return torch.from_numpy(kept).float()

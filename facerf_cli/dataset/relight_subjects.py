@@ -11,7 +11,6 @@ from typing import Any, TypeVar
 from facerf_cli.batch.inputs import MAP_SUFFIXES, Item, collect_items
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, with_bar
 from facerf_cli.batch.settings import Settings
-from facerf_cli.dataset.cost import cost_of_sources, in_words, recipe_bytes
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import (
     draw_pairs,
@@ -44,10 +43,9 @@ def relight_subjects(folder: Path, wanted: PairSettings, batch: BatchOptions, se
     if not pairs:
         raise UsageError(f"{folder}: no subject is in a split; run prepare-dataset with another --split")
     if batch.dry_run:
-        log.info("%d recipes with their weights: %s", len(pairs), in_words(recipe_bytes(dataset, pairs)))
-        if not wanted.lazy:
-            todo = [pair for pair in pairs if overwrite or not image_path(dataset, *pair.key).exists()]
-            log.info("%d sources of %d px: %s", len(todo), dataset.crop_px, cost_of_sources(dataset, todo))
+        todo = [pair for pair in pairs if overwrite or not image_path(dataset, *pair.key).exists()]
+        sources = 0 if wanted.lazy else len(todo)
+        log.info("%d recipes, %d sources of %d px", len(pairs), sources, dataset.crop_px)
     else:
         write_pairs(dataset, pairs, overwrite, partial(_spread_maps, batch, settings))
         if test_maps != maps:

@@ -44,7 +44,6 @@ class TrainOptions:
         form: Train this form of the Reflectance Network: default, paper, or a class that you have installed.
         objective: Train by an installed subclass of the stage's objective (docs/training.md).
         resume: Continue the run in DIR from its last save; give the same options.
-        dry_run: Log the files that the run will write and what they take; write nothing.
         start_from: Start from a checkpoint; networks that the stage does not train are copied.
         dataset: Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.
         texture_size: Unwrap a dataset to textures of this side; the stages joint and appearance-features
@@ -89,7 +88,6 @@ class TrainOptions:
         everyday=True,
     )
     resume: bool = option(False, panel=RUN)
-    dry_run: bool = option(False, panel=RUN, everyday=True)
     start_from: Path | None = option(None, metavar="FILE", shown_default="none", panel=RUN, everyday=True)
     dataset: Path | None = option(None, metavar="DIR", shown_default="synthetic heads", panel=DATA)
     texture_size: int | None = option(

@@ -62,7 +62,7 @@ from facerf_cli.training.portrait import PortraitObjective, PortraitObjectiveSet
 from facerf_cli.training.processes import first_process_first, joined_processes, process_rank
 from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import CONFIG, Stage, TrainSettings, write_config
-from facerf_cli.training.stage_networks import TINY_LIGHTS, StageNetworks, say_cost
+from facerf_cli.training.stage_networks import TINY_LIGHTS, StageNetworks
 from facerf_cli.training.texture import HeadsSettings, TextureObjective, TextureObjectiveSettings
 
 _WORKERS_ON_GPU = 4
@@ -76,10 +76,6 @@ def run_training(options: TrainOptions) -> None:
     with joined_processes(), ExitStack() as stack:
         device, first = _device(options.settings), process_rank() == 0
         use_form(options.form)
-        if options.dry_run:
-            if first:
-                say_cost(options, StageNetworks(options, _load_start(options)[0]))
-            return
         if first:
             stack.enter_context(alone_in(options.output, ".facerf-lock"))
         workers = options.workers

@@ -3,7 +3,6 @@
 Ctrl-C and SIGTERM end a run between two steps, so that nothing is lost; a second one ends it at once.
 """
 
-import csv
 import json
 import logging
 import math
@@ -31,7 +30,7 @@ from facerf_cli.run.logs import LOGGER_NAME, json_line
 from facerf_cli.run.stopping import unhurried
 from facerf_cli.training.settings import Adadelta, AdamW, TrainSettings
 
-LOG, CURVES = "log.jsonl", "curves.csv"
+LOG = "log.jsonl"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 log = logging.getLogger(LOGGER_NAME)
 
@@ -61,7 +60,6 @@ class RunLog:
 
     def __exit__(self, *_: Any) -> None:
         self.file.close()
-        write_curves(self.folder)
         if self.board:
             self.board.close()
 
@@ -79,18 +77,6 @@ class RunLog:
         write_display(path, sheet.astype(np.float32), exposure=1.0)  # EV
         if self.board:
             self.board.add_image("sheet", linear_to_srgb(sheet.clip(0, 1)), step, dataformats="HWC")
-
-
-def write_curves(folder: Path) -> None:
-    """Write curves.csv, a row for each of log.jsonl's, with a column for each value of any row."""
-    rows = [
-        _flat(row) | {"step": row["step"]} for row in map(parse_json, (folder / LOG).read_text().splitlines())
-    ]
-    names = dict.fromkeys(["step", *(name for row in rows for name in row)])
-    with atomic_path(folder / CURVES) as temporary, temporary.open("w", newline="") as file:
-        table = csv.DictWriter(file, list(names))
-        table.writeheader()
-        table.writerows(rows)
 
 
 def _step_of(line: str) -> float:

@@ -1,15 +1,10 @@
 """The networks that `facerf train` trains or compares with, made of a preset and options; and their cost."""
 
 import logging
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from torch import Tensor, nn
-
-from facerf_cli.dataset.cost import cost_of_textures, in_words
 from facerf_cli.dataset.dataset import read_dataset
-from facerf_cli.dataset.textures import model_of
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.light.transport import BakeSettings
 from facerf_cli.network.checkpoint import form_of, new_network
@@ -18,7 +13,6 @@ from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.synth.bank.heads import HeadBakeSettings
 from facerf_cli.training.losses import load_features
 from facerf_cli.training.options import TrainOptions
-from facerf_cli.training.run_folder import refuse_another_run
 from facerf_cli.training.settings import Preset
 
 # Sizes of networks with the preset `tiny`, and the lights of the rig that it bakes heads under.
@@ -33,7 +27,6 @@ _TINY_NETWORKS: dict[str, dict[str, Any]] = {
     "portrait default": _TINY_UNET,
 }
 
-_UNWRAPPED = ("reflectance", "diffuse-sh")  # stages that unwrap a dataset into files
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -91,24 +84,6 @@ class StageNetworks:
         if self.options.preset == "tiny":
             return HeadBakeSettings(32, TINY_LIGHTS, bake=BakeSettings(light_samples=1, bounce_samples=2))
         return HeadBakeSettings()
-
-    def of_stage(self) -> dict[str, Any]:
-        """The networks that the stage trains, before their data is known: the right sizes, not starts."""
-        options, stage = self.options, self.options.stage
-        name = stage.replace("-", "_")
-        if stage == "light-features":
-            return {name: self.features(name, self.texture_side)}
-        if stage == "appearance-features":
-            assert options.dataset
-            people = len(read_dataset(options.dataset).subjects)
-            return {name: self.features(name, self.joint_side, people=people)}
-        found: dict[str, Any] = {}
-        if stage in ("reflectance", "joint"):
-            side = self.joint_side if stage == "joint" else self.texture_side
-            found["reflectance"] = self.reflectance(side)
-        if stage == "geometry" or (stage == "joint" and options.geometry == "network"):
-            found["geometry"] = self.geometry((0.0, 0.0, -1.0))
-        return found or {name: self.network(name)}
 
     def frozen_appearance(self, side: int) -> Any:
         """V_f; None without one."""
@@ -171,32 +146,3 @@ class StageNetworks:
         form = "paper" if self.options.preset == "paper" else "default"
         shapes = {"identity": 0, "expression": 0} if self.options.mean_face else {}
         return self.network("geometry", form, mean_translation_m=mean_translation_m, **shapes)
-
-
-def say_cost(options: TrainOptions, make: StageNetworks) -> None:
-    """Log (`--dry-run`) the sizes of the run's checkpoints and of the textures that its dataset lacks."""
-    if not options.resume:
-        refuse_another_run(options.output)
-    networks = make.of_stage()
-    weights, state = checkpoint_bytes(networks, bool(options.training.ema_decay))
-    trained = ", ".join(networks)
-    log.info("last.safetensors and best.safetensors (%s): %s each", trained, in_words(weights))
-    log.info("state.pt: %s", in_words(state))
-    if options.dataset and options.stage in _UNWRAPPED:
-        dataset, side = read_dataset(options.dataset), make.texture_side
-        subjects = [*dataset.splits["train"], *dataset.splits["validation"]]
-        cost = cost_of_textures(dataset, model_of(dataset, options.fit_with), side, subjects)
-        log.info("%s: %s", dataset.folder / f"textures-{side}", cost)
-    elif options.dataset is None or options.photos or options.stage == "portrait":
-        log.info("synthetic heads, portraits and the faces of photos that are kept: not computed")
-
-
-def checkpoint_bytes(networks: Mapping[str, nn.Module], averaged: bool) -> tuple[int, int]:
-    """Bytes of a checkpoint of networks and of a run's state; both optimizers keep two moments a weight."""
-    tensors = _bytes(tensor for network in networks.values() for tensor in network.state_dict().values())
-    weights = _bytes(weight for network in networks.values() for weight in network.parameters())
-    return tensors, tensors * (2 if averaged else 1) + 2 * weights
-
-
-def _bytes(tensors: Iterable[Tensor]) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)

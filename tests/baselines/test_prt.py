@@ -1,22 +1,17 @@
 """Transfer that is baked: shadows, poses, and the cache."""
 
-import io
 import math
-from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines import prt as baked
 from facerf_cli.baselines.prt import Prt, TransferSettings, bake_transfer
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.sh import cosine_lobe, sh_basis
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.raster.texture import normal_map
-from tests.kinds import Log, Patch
 
 SMALL = TransferSettings(order=4, side=32, lights=80, light_samples=2, bounce_samples=4, blur_texels=0.5)
 
@@ -72,36 +67,3 @@ def test_lights_that_turn_with_the_head_change_nothing(transfer: Tensor) -> None
     assert torch.allclose(face.relit(rig @ turn.T, weights, turn), wanted, atol=1e-5)
     assert torch.allclose(white(transfer, turn).relit(rig @ turn.T, weights), wanted, atol=1e-5)
     assert not torch.allclose(face.relit(rig, weights, turn), wanted, atol=0.01)
-
-
-def test_a_second_run_does_not_bake(vertices: Tensor, tmp_path: Path, monkeypatch: Patch) -> None:
-    first = baked.baked_transfer(vertices, SMALL, tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(baked, "bake_transfer", None)  # to call it would fail
-        again = baked.baked_transfer(vertices, SMALL, tmp_path)
-        assert torch.allclose(first, again)
-        with pytest.raises(TypeError):
-            baked.baked_transfer(1.001 * vertices, SMALL, tmp_path)
-    assert not list(tmp_path.glob(".*"))
-
-
-def test_a_damaged_file_is_baked_again(
-    vertices: Tensor, transfer: Tensor, tmp_path: Path, monkeypatch: Patch
-) -> None:
-    monkeypatch.setattr(baked, "bake_transfer", lambda *_: transfer)
-    baked.baked_transfer(vertices, SMALL, tmp_path)
-    (path,) = tmp_path.glob("*.npy")
-    whole = path.read_bytes()
-    other = io.BytesIO()
-    np.save(other, np.zeros((2, 25, 16, 16), np.float16))
-    for broken in (b"", whole[:100], b"\x80\x04pickle", whole[:-7], other.getvalue()):
-        path.write_bytes(broken)
-        baked.baked_transfer(vertices, SMALL, tmp_path)
-        assert len(path.read_bytes()) == len(whole)
-
-
-def test_a_cache_that_cannot_be_written_is_a_warning(vertices: Tensor, tmp_path: Path, caplog: Log) -> None:
-    (tmp_path / "file").write_text("not a folder")
-    caplog.set_level("WARNING")
-    assert baked.baked_transfer(vertices, SMALL, tmp_path / "file").isfinite().all()
-    assert "the next run bakes the transfer again" in caplog.text
