@@ -17,6 +17,7 @@ from skimage.data import astronaut
 from facerf_cli.batch.inputs import Item, files_read
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Settings
+from facerf_cli.errors import InputError
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
@@ -25,11 +26,13 @@ from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.relight import with_background
 from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
-from facerf_cli.work.sequence import OpenShot, ShotFrames
+from facerf_cli.work.sequence import OpenShot, ShotFrames, ShotTrack
 from facerf_cli.work.sequence import _made_from as made_from
+from facerf_cli.work.sequence import _require_own as require_own
 from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Folders, Log, Patch, Said
+from tests.refusals import refused
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -505,7 +508,7 @@ def test_a_track_of_the_user_is_not_replaced(given: Path, tmp_path: Path, capsys
 
 @pytest.mark.slow
 def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> None:
-    """The second take is dark and mirrored; the film is stopped in it, and goes on."""
+    """The second take is dark and mirrored."""
     takes = [frame_of(0)] * 2 + [(frame_of(0)[:, ::-1] * 0.5).astype(np.uint8)] * 2
     write_source(tmp_path / "cut.mp4", takes)
     line = (tmp_path / "cut.mp4", "--light", "70,20", "--format", "png", *CHEAP)
@@ -524,17 +527,23 @@ def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> Non
     assert np.abs(np.diff(places[:2], axis=0)).max() < 1 > np.abs(np.diff(places[2:], axis=0)).max()
     first, second = exposures[:2], exposures[2:]
     assert len(set(first)) == len(set(second)) == 1 and first[0] != second[0]
-    kept = (tmp_path / "out" / "cut_track.jsonl").read_text().splitlines(keepends=True)
-    (tmp_path / "out" / "cut_track.jsonl").write_text("".join(kept[:4]))
-    (tmp_path / "out" / "cut_light_70_20.0003.png").unlink()
-    again = made("out")[0]
-    assert [row.get("cut") for row in again] == [row.get("cut") for row in rows]
-    apart = [np.subtract(a["landmarks"], b["landmarks"]) for a, b in zip(again, rows, strict=True)]
-    assert np.abs(apart).max() < 0.5  # pixels: the track's are rounded
     capsys.readouterr()
     rows, exposures = made("one", "--no-cuts")
     assert not any("cut" in row for row in rows) and len(set(exposures)) == 1
     assert "cuts at" not in capsys.readouterr().err
+
+
+def test_half_a_track_is_not_read_and_not_replaced(tmp_path: Path) -> None:
+    """A whole one is, also if an editor has cut off its last line break."""
+    rows = [{"frame": 0, "landmarks": None}, {"frame": 1, "cut": True, "landmarks": None}]
+    path, track = tmp_path / "me_track.jsonl", ShotTrack({"frames": 2}, rows)
+    track.write(path)
+    assert ShotTrack.read(path) == track and track.takes == [range(1), range(1, 2)]
+    path.write_text(path.read_text().removesuffix("\n"))
+    require_own(path)
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
+    assert ShotTrack.read(path).head is None
+    refused(InputError, "was not written by facerf, or was changed", require_own, path)
 
 
 @pytest.mark.slow
