@@ -52,12 +52,6 @@ def thumbnail(image_srgb: np.ndarray) -> np.ndarray:
     return F.adaptive_avg_pool2d(pixels, (_ROWS, _COLUMNS))[0].permute(1, 2, 0).numpy()
 
 
-def takes(count: int, cuts: Sequence[int]) -> list[range]:
-    """The frames of each take of a film of `count` frames, in order; cuts are first frames of takes."""
-    edges = [0, *cuts, count]
-    return [range(first, end) for first, end in pairwise(edges)]
-
-
 LONGEST_GAP = 12  # frames without the face that are bridged: half a second at 24 frames a second
 _FURTHEST = 1.5  # extents of its landmarks that a face may move while it is lost
 _SIZES = (0.6, 1.7)  # range of the change of its size meanwhile

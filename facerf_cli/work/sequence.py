@@ -5,9 +5,9 @@ import json
 import logging
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise, starmap
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import described_file
 from facerf_cli.relighting.shot import SteadyShot
-from facerf_cli.relighting.tracking import FaceTracker, Sighting, gaps, is_bridged, takes, with_cuts
+from facerf_cli.relighting.tracking import FaceTracker, Sighting, gaps, is_bridged, with_cuts
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
@@ -41,7 +41,6 @@ from facerf_cli.work.photos import (
 from facerf_cli.work.shots import Shot, Shots
 
 _WHOLE = 0.9  # largest value of a matte from which on the person is all there
-_SEAL = '{"sha256": '  # begins the last row of a track
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -95,28 +94,32 @@ class ShotFrames:
 class ShotTrack:
     """The face and the cuts of a shot: a head that says what they were made from, and a row per frame.
 
-    In the file beside the shot's outputs, a last row has the SHA-256 of all before it, which tells whether
-    the user has edited the file.
+    In the file beside the shot's outputs, the head also has the SHA-256 of the rows, which tells whether the
+    user has edited them.
     """
 
     head: Any
-    rows: list[dict[str, Any]]
+    rows: Sequence[dict[str, Any]]
+    is_own: bool = True  # written by facerf, and not edited
 
     @staticmethod
     def read(path: Path) -> "ShotTrack":
         """Read a track; without a head if there is none, or none that facerf reads."""
         try:
-            head, *rows = map(json.loads, path.read_text(encoding="utf-8").partition(_SEAL)[0].splitlines())
-            track = ShotTrack(head, rows)
-            return track if len(track.sightings) == head["frames"] else ShotTrack(None, [])
+            first, *lines = path.read_text(encoding="utf-8").splitlines()
+            head = json.loads(first)
+            is_own = head.pop("sha256") == _digest(lines)
+            track = ShotTrack(head, [json.loads(line) for line in lines], is_own)
+            return track if len(track.sightings) == head["frames"] else ShotTrack(None, (), False)
         except (OSError, ValueError, TypeError, KeyError, AttributeError):  # not a track
-            return ShotTrack(None, [])
+            return ShotTrack(None, (), False)
 
     def write(self, path: Path) -> None:
-        """Write the track with its seal."""
-        content = "".join(f"{json_line(row)}\n" for row in (self.head, *self.rows)).encode()
+        """Write the track."""
+        lines = [json_line(row) for row in self.rows]
+        head = json_line({**self.head, "sha256": _digest(lines)})
         with atomic_path(path) as temporary:
-            temporary.write_bytes(content + _seal(content))
+            temporary.write_text("".join(f"{line}\n" for line in (head, *lines)), encoding="utf-8")
 
     @cached_property
     def sightings(self) -> list[Sighting | None]:
@@ -135,8 +138,8 @@ class ShotTrack:
 
     @property
     def takes(self) -> list[range]:
-        """The frames of each take."""
-        return takes(len(self.rows), self.cuts)
+        """The frames of each take, in order."""
+        return list(starmap(range, pairwise([0, *self.cuts, len(self.rows)])))
 
     @property
     def takes_with_face(self) -> list[range]:
@@ -144,30 +147,25 @@ class ShotTrack:
         return [take for take in self.takes if any(self.sightings[take.start : take.stop])]
 
 
-def _seal(content: bytes) -> bytes:
-    return f'{_SEAL}"{hashlib.sha256(content).hexdigest()}"}}\n'.encode()
-
-
-def _require_own(path: Path) -> None:
-    """Raise InputError for a track that facerf did not write, or that was changed since."""
-    if os.path.lexists(path):
-        text = path.read_bytes() if path.is_file() else b""
-        content, mark, seal = text.partition(_SEAL.encode())
-        if not mark or not _seal(content).startswith(mark + seal):
-            raise InputError(
-                f"{path}: was not written by facerf, or was changed since; move it, or choose another -o"
-            )
+def _digest(lines: Sequence[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def follow_all(shots: Sequence[Shot], options: PhotoOptions) -> None:
     """Follow the face through each shot, unless its track is there; say where the face is lost.
 
-    After a cut the face is chosen as in a new film.
+    After a cut the face is chosen as in a new film. Raises InputError for a track that was made from
+    something else and that the user wrote or edited.
     """
     for shot in shots:
         head = json.loads(json_line(_made_from(shot, options)))
-        if ShotTrack.read(shot.track).head != head:
-            _require_own(shot.track)
+        track = ShotTrack.read(shot.track)
+        if track.head != head:
+            if os.path.lexists(shot.track) and not track.is_own:
+                raise InputError(
+                    f"{shot.track}: was not written by facerf, or was changed since; move it, or choose "
+                    "another -o"
+                )
             ShotTrack(head, list(_followed(shot, options))).write(shot.track)
         _log_cuts_and_gaps(shot, ShotTrack.read(shot.track))
 
@@ -282,7 +280,7 @@ class OpenShot:
     def segmented(self, number: int) -> tuple[LinearImage, PhotoFace, Segmentation]:
         """A frame, its face, and its person, steadied by the frames around it."""
         take = self.take_of(number)
-        with self._naming(number):
+        with naming(self.shot.frames[number].input_path):
             face, found = face_at(take.landmarks_px(number)), take.segmentation(number)
             facts = self._facts_of(number, face.landmarks_px)
         person = PhotoFace("", str(self.shot.frames[number].input_path), face, facts)
@@ -291,7 +289,7 @@ class OpenShot:
     def fitted(self, number: int, portrait: bool = True) -> tuple[LinearImage, FittedFace]:
         """A frame, and its head with what is steadied by the frames around it; see `SteadyShot.window`."""
         take = self.take_of(number)
-        with self._naming(number):
+        with naming(self.shot.frames[number].input_path):
             steady = take.window(number, portrait)
             head, matte = steady.head, steady.segmentation.matte
             found = face_at(head.fit.crop.to_photo(head.landmarks_px))
@@ -300,15 +298,6 @@ class OpenShot:
         left = int(which) if which.isdecimal() else 0
         face = FittedFace("", name, found, facts, number=left, head=head, steady=steady, matte=matte)
         return self.frames.image(number), face
-
-    @contextmanager
-    def _naming(self, number: int) -> Iterator[None]:
-        """Put the name of a frame's file before an error that lacks it."""
-        try:
-            yield
-        except InputError as error:
-            before = f"{self.shot.frames[number].input_path}: "
-            raise InputError(before + str(error).removeprefix(before)) from None
 
 
 def open_at(

@@ -17,7 +17,6 @@ from skimage.data import astronaut
 from facerf_cli.batch.inputs import Item, files_read
 from facerf_cli.batch.run import BatchOptions
 from facerf_cli.batch.settings import Settings
-from facerf_cli.errors import InputError
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
@@ -28,11 +27,9 @@ from facerf_cli.work.relight import with_background
 from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
 from facerf_cli.work.sequence import OpenShot, ShotFrames, ShotTrack
 from facerf_cli.work.sequence import _made_from as made_from
-from facerf_cli.work.sequence import _require_own as require_own
 from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Folders, Log, Patch, Said
-from tests.refusals import refused
 
 av: Any = pytest.importorskip("av", reason="films need av: pip install 'facerf[video]'")
 PHOTO = Path(__file__).parents[2] / "examples/astronaut.jpg"
@@ -101,7 +98,7 @@ def test_a_film_becomes_numbered_images_of_one_identity_and_exposure(
     rows = [json.loads(line) for line in (out / "report.jsonl").read_text().splitlines()]
     assert [row["item"] for row in rows] == [f"me.{number:04d}" for number in range(FRAMES)]
     assert len({tuple(row["exposure_ev"].values()) for row in rows}) == 1
-    track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:-1]
+    track = [json.loads(line) for line in (out / "me_track.jsonl").read_text().splitlines()][1:]
     left = [np.mean(row["landmarks"], 0)[0] for row in track]
     assert np.diff(left) == pytest.approx([-2] * (FRAMES - 1), abs=0.5)  # pixels: as the film moves
     capsys.readouterr()
@@ -299,7 +296,7 @@ def test_images_are_a_shot_with_sequence_and_a_frame_without_a_face_is_bridged(
     assert [name for name in names(out) if name.endswith(".png")] == [
         f"plate_light_70_20.{number}.png" for number in (1001, 1002, 1003)
     ]
-    track = [json.loads(line) for line in (out / "plate_track.jsonl").read_text().splitlines()][1:-1]
+    track = [json.loads(line) for line in (out / "plate_track.jsonl").read_text().splitlines()][1:]
     assert [row["landmarks"] is None for row in track] == [False, True, False]
 
 
@@ -515,7 +512,7 @@ def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> Non
 
     def made(folder: str, *more: str) -> tuple[list[dict[str, Any]], list[float]]:
         assert facerf(given, "relight", *line, "-o", tmp_path / folder, *more) == 0
-        track = (tmp_path / folder / "cut_track.jsonl").read_text().splitlines()[1:-1]
+        track = (tmp_path / folder / "cut_track.jsonl").read_text().splitlines()[1:]
         report = (tmp_path / folder / "report.jsonl").read_text().splitlines()
         exposures = [next(iter(json.loads(row)["exposure_ev"].values())) for row in report]
         return [json.loads(row) for row in track], exposures
@@ -533,17 +530,18 @@ def test_nothing_crosses_a_cut(given: Path, tmp_path: Path, capsys: Said) -> Non
     assert "cuts at" not in capsys.readouterr().err
 
 
-def test_half_a_track_is_not_read_and_not_replaced(tmp_path: Path) -> None:
-    """A whole one is, also if an editor has cut off its last line break."""
-    rows = [{"frame": 0, "landmarks": None}, {"frame": 1, "cut": True, "landmarks": None}]
-    path, track = tmp_path / "me_track.jsonl", ShotTrack({"frames": 2}, rows)
+def test_a_track_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
+    """It is facerf's as long as its rows are; a last line break does not matter."""
+    rows = [{"frame": number, "cut": number in (2, 4), "landmarks": None} for number in range(5)]
+    path, track = tmp_path / "me_track.jsonl", ShotTrack({"frames": 5}, rows)
+    assert track.takes == [range(2), range(2, 4), range(4, 5)]
     track.write(path)
-    assert ShotTrack.read(path) == track and track.takes == [range(1), range(1, 2)]
     path.write_text(path.read_text().removesuffix("\n"))
-    require_own(path)
+    assert ShotTrack.read(path) == track
+    path.write_text(path.read_text().replace("true", "false", 1))
+    assert ShotTrack.read(path).takes == [range(4), range(4, 5)] and not ShotTrack.read(path).is_own
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:2]))
-    assert ShotTrack.read(path).head is None
-    refused(InputError, "was not written by facerf, or was changed", require_own, path)
+    assert ShotTrack.read(path) == ShotTrack(None, (), False)
 
 
 @pytest.mark.slow

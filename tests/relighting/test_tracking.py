@@ -19,7 +19,6 @@ from facerf_cli.relighting.tracking import (
     gaps,
     path_of,
     smoothed,
-    takes,
     thumbnail,
     with_cuts,
 )
@@ -69,13 +68,6 @@ def test_frames_are_shown_once_in_order_and_few_are_held() -> None:
     for number, (image, cut) in enumerate(with_cuts(map(show, range(20)))):
         assert (int(image[0, 0, 0]), cut) == (number, False)
         assert shown == list(range(min(number + 4, 20)))
-
-
-@pytest.mark.parametrize(
-    ("cuts", "wanted"), [([], [range(5)]), ([2], [range(2), range(2, 5)]), ([4], [range(4), range(4, 5)])]
-)
-def test_takes(cuts: list[int], wanted: list[range]) -> None:
-    assert takes(5, cuts) == wanted
 
 
 BLANK = np.zeros((100, 160, 3), np.uint8)
