@@ -90,6 +90,7 @@ class Film:
 
     def __init__(self, path: Path) -> None:
         self._path, self._av = path, require_av(path)
+        self._matrix: bytes | None = None
         self._kept: dict[int, np.ndarray] = {}
         self._readers: list[_Reader] = []  # the last used one last
         with self._opened() as (container, stream):
@@ -207,17 +208,20 @@ class Film:
         values = frame.to_ndarray(format=form, width=width, height=height, **colours)
         if alpha and not is_rgb:  # 10 or 12 bits, whose white is to be white
             values[..., 3] |= values[..., 3] >> parts[-1].bits
-        return _upright(values, frame.side_data.get("DISPLAYMATRIX"))
+        if self._matrix is None:  # once, since side data keep their frame until garbage is collected
+            matrix = frame.side_data.get("DISPLAYMATRIX")
+            self._matrix = b"" if matrix is None else bytes(matrix)
+        return _upright(values, self._matrix)
 
 
-def _upright(values: np.ndarray, matrix: Any) -> np.ndarray:
-    """Turn and mirror a frame [H, W, C] by a film's display matrix, to quarters.
+def _upright(values: np.ndarray, matrix: bytes) -> np.ndarray:
+    """Turn and mirror a frame [H, W, C] by a film's display matrix, to quarters; it may have none.
 
     Its first two columns are a, b, of x, and c, d, of y: (x, y) is shown at (a x + c y, b x + d y).
     """
-    if matrix is None:
+    if not matrix:
         return np.ascontiguousarray(values)
-    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
     if abs(a) < abs(b):
         values, to_right, to_bottom = values.swapaxes(0, 1), c, b
     else:

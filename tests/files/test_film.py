@@ -1,5 +1,6 @@
 """Films read by frame, and written with times, sound and metadata."""
 
+import gc
 import struct
 import sys
 from fractions import Fraction
@@ -383,6 +384,14 @@ def test_frames_are_decoded_in_order_by_few_readers(tmp_path: Path, monkeypatch:
                 assert film.read(near).mean() == pytest.approx(3 * near, abs=2.5)
             assert len(film._kept) <= 12
     assert len(passes) == 3
+    gc.collect()
+    gc.disable()
+    held = 0
+    for number in range(80):
+        film.read(number)
+        held = max(held, sum(type(one) is av.VideoFrame for one in gc.get_objects()))
+    gc.enable()
+    assert held < 40, "frames are let go at once"
 
 
 def with_sounds(path: Path, tones: list[tuple[str, int, float, float]], late_s: int = 0) -> Path:
