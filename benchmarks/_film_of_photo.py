@@ -21,7 +21,7 @@ def frames_of(path: Path, count: int) -> list[np.ndarray]:
         from facerf_cli.files.film import Film
 
         film = Film(path)
-        coded = [film.read(n) for n in range(min(count, len(film.timing().times_s)))]
+        coded = [film.read(n) for n in range(min(count, len(film.timing.times_s)))]
         return [np.asarray(srgb_to_linear(x[..., :3] / np.iinfo(x.dtype).max), np.float32) for x in coded]
     photo = read_image(path).pixels
     photo = resized(photo, *fitted(*photo.shape[:2], SIDE_PX)) if max(photo.shape[:2]) > SIDE_PX else photo

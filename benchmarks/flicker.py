@@ -48,7 +48,8 @@ from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.relighting.reflectance import reflectance_of
-from facerf_cli.relighting.sequence import Follower, SteadyShot
+from facerf_cli.relighting.shot import SteadyShot
+from facerf_cli.relighting.tracking import FaceTracker
 
 PATCH = 1 / 64  # of the side
 FLOOR = 0.02  # radiance added to results and truth before their ratio
@@ -73,9 +74,9 @@ def as_shot(models: Models, frames: list[np.ndarray]) -> list[np.ndarray]:
 
 def steady_shot(models: Models, frames: list[np.ndarray]) -> SteadyShot:
     """A shot whose face was followed."""
-    follower = Follower(models.networks.people, "largest")
-    sightings = [follower.see(to_display(frame)) for frame in frames]
-    return SteadyShot(models, frames, sightings, models.sides())
+    tracker = FaceTracker(models.networks.people, "largest")
+    sightings = [tracker.track(to_display(frame)) for frame in frames]
+    return SteadyShot(models, frames.__getitem__, sightings, models.sides())
 
 
 def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | None = None) -> np.ndarray:

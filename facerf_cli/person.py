@@ -112,7 +112,7 @@ def fit(
             "scene", those without that light; None: those of the networks.
         face: The face, from `find_faces`, in place of the largest one.
         head: The head, where it was fitted before.
-        steady: What the frames around it steady, of a frame of a shot (`relighting/sequence.py`).
+        steady: What the frames around it steady, of a frame of a shot (`relighting/shot.py`).
         normals: Normals [h, w, 3] of the photo from another method, in place of the networks' in the portrait
             field: camera space, x to the right, y up and z toward the camera, or y down and z away; 0 where
             there are none.

@@ -153,7 +153,6 @@ class Item:
     stale: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs to be made; empty: all
     kept: frozenset[Path] = field(default=frozenset(), compare=False)  # outputs that stay as they are
     key: str = field(default="", compare=False)  # of the one file of -o, for its metadata
-    frame: int | None = field(default=None, compare=False)  # of a film, from 0
 
     @property
     def is_file(self) -> bool:
@@ -299,7 +298,7 @@ def _ignores_case(folder: Path) -> bool:
 def only_item(items: Sequence[Item], output: Path, several: bool) -> Item:
     """The one item whose output is the file that `-o` names; UsageError for several, or outputs of one."""
     item = items[0]
-    if several or len(items) > 1 or item.frame is not None:
+    if several or len(items) > 1 or item.input_path.suffix.lower() in FILM_SUFFIXES:
         raise UsageError(f"-o {output}: is one file; give one photo, face and light, or a folder")
     return replace(item, output_base=output.with_suffix(""), name=output.stem)
 

@@ -1,16 +1,15 @@
-"""Films by PyAV, an extra (`facerf[video]`): frames read by number and with their times.
+"""Videos read by PyAV, an extra (`facerf[video]`): frames by number, decoded in order, and their times.
 
 The wheel of PyAV holds FFmpeg with x264 and x265, which are under the GPL; facerf does not bundle it.
 """
 
-import io
 import logging
-import struct
+from bisect import bisect_right
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import chain
+from itertools import groupby, repeat
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +24,12 @@ log = logging.getLogger(LOGGER_NAME)
 _LARGEST_PX = 8192 * 4320
 _MOST_FRAMES = 1_000_000
 _BT601, BT709, _UNKNOWN = 5, 1, 2
-_HD_LINES = 720  # films without a stated matrix have BT.709 from here on
+_HD_LINES = 720  # videos without a stated matrix have BT.709 from here on
 _MICROSECONDS = 1_000_000  # a second, in which FFmpeg counts for whole files
-_WITH_ALPHA = {"vp8": "libvpx", "vp9": "libvpx-vp9"}  # FFmpeg's own decoders leave alpha out
-_EARLIER = 50  # frames by which a seek that came to a later frame begins before
-
-_Stamped = Iterator[tuple[int, Any]]  # frames, each after its time stamp
+_READERS = (
+    3  # one goes from key frame to key frame, one to the middle of each take, and one through all frames
+)
+_KEPT, _BEFORE = 12, 5  # decoded frames that are kept; of those that a reader passes over, the last ones
 
 
 @dataclass(frozen=True)
@@ -69,77 +68,87 @@ def exact(av: Any) -> int:
     return int(way.BICUBIC | way.ACCURATE_RND | way.FULL_CHR_H_INT | way.FULL_CHR_H_INP)
 
 
+@dataclass(eq=False)
+class _Reader:
+    """A pass through a video: the frames that it has yet to decode, and the number of the next one."""
+
+    frames: Iterator[Any]
+    next: int = 0
+
+
 class Film:
-    """An open film; frames are read fastest in order."""
+    """The frames of a video, by number; decoded in order, without seeking.
+
+    A frame is decoded by the nearest of up to three readers before it, each of which only goes forward. So a
+    pass over the frames of each take after its key frames decodes the video at most three times. Few frames
+    are held at a time. Raises InputError for a file that cannot be decoded.
+
+    Attributes:
+        timing: Times of the frames, their mean rate, the timecode, and the file itself if it has sound.
+        lost_sounds: Number of sound tracks of unknown codecs.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path, self._av = path, require_av(path)
-        self._open()
-        self._is_counted = self._container.format.name == "avi"  # it has no times of presentation
-        self._clean = _clean_aperture(path) if "mp4" in self._container.format.name else ()
-        self._pts = self._presented()
-        self._coming: _Stamped = iter(())
-        self._next = -1  # number of the frame that is decoded next, without a seek
+        self._matrix: bytes | None = None
+        self._kept: dict[int, np.ndarray] = {}
+        self._readers: list[_Reader] = []  # the last used one last
+        with self._opened() as (container, stream):
+            self._is_counted = container.format.name == "avi"  # it has no times of presentation
+            self._aspect = Fraction(stream.sample_aspect_ratio or 1)
+            coded = stream.codec_context
+            self._codes = int(coded.color_primaries), int(coded.color_trc)
+            sounds = [track.codec_context for track in container.streams.audio]
+            self.lost_sounds = sounds.count(None)
+            self._pts = self._presented(container, stream)
+            self.timing = self._timed(container, stream, any(sounds))
 
-    def _open(self) -> None:
+    @contextmanager
+    def _opened(self) -> Iterator[tuple[Any, Any]]:
+        """Open the file and its video stream; raise InputError for what FFmpeg cannot read in the block."""
         try:
-            self._container = self._av.open(str(self._path))
-        except (self._av.error.FFmpegError, OSError, ValueError) as error:
-            raise InputError(f"{self._path}: not a readable film; convert it ({reason(error)})") from None
-        self._stream = self._container.streams.best("video")
-        if self._stream is None or self._stream.codec_context is None:
+            with self._av.open(str(self._path), metadata_errors="replace") as container:
+                stream = container.streams.best("video")
+                if stream is None or stream.codec_context is None:
+                    raise InputError(
+                        f"{self._path}: holds no pictures that FFmpeg decodes; give a film, or convert it"
+                    )
+                stream.thread_type = "AUTO"
+                yield container, stream
+        except (self._av.error.FFmpegError, OSError) as error:
             raise InputError(
-                f"{self._path}: holds no pictures that FFmpeg decodes; give a film, or convert it"
-            )
-        self._coder = self._stream.codec_context
-        name = _WITH_ALPHA.get(self._coder.name)
-        if name in self._av.codecs_available and self._stream.metadata.get("alpha_mode") == "1":
-            self._coder = self._av.CodecContext.create(name, "r")
-        self._coder.thread_type = "AUTO"
+                f"{self._path}: not a readable film, or a damaged one; convert it, or copy it again "
+                f"({reason(error)})"
+            ) from None
 
-    def close(self) -> None:
-        self._container.close()
-
-    def _presented(self) -> list[int]:
+    def _presented(self, container: Any, stream: Any) -> list[int]:
         """Time stamps of all frames in the order of presentation; packets are read, and hardly decoded."""
-        try:
-            packets = self._container.demux(self._stream)
-            whole = (packet for packet in packets if packet.size and not packet.is_discard)
-            if self._coder.name == "h264" and self._coder.field_order > 1 and not self._is_counted:
-                whole = self._container.decode(self._stream)  # since packets may be single fields
-            pts = {one.dts if self._is_counted else one.pts for one in whole} - {None}
-        except self._av.error.FFmpegError as error:
-            raise InputError(f"{self._path}: damaged or cut short; copy it again ({reason(error)})") from None
+        coder = stream.codec_context
+        packets = (one for one in container.demux(stream) if one.size and not one.is_discard)
+        if coder.name == "h264" and coder.field_order > 1 and not self._is_counted:
+            packets = container.decode(stream)  # since packets may be single fields
+        pts = {one.dts if self._is_counted else one.pts for one in packets} - {None}
         if not 0 < len(pts) <= _MOST_FRAMES:
             raise InputError(f"{self._path}: has {len(pts)} frames; give a film of 1 to {_MOST_FRAMES}")
         return sorted(pts)
 
-    def timing(self) -> Timing:
-        """Return the frame times in order, the mean rate, the timecode, and the film if it has sound."""
-        base, begins_s = Fraction(self._stream.time_base), start_s(self._container)
+    def _timed(self, container: Any, stream: Any, has_sound: bool) -> Timing:
+        base, begins_s = Fraction(stream.time_base), start_s(container)
         times_s = tuple(pts * base - begins_s for pts in self._pts)
-        rate = Fraction(self._stream.average_rate or 0)
+        rate = Fraction(stream.average_rate or 0)
         if rate <= 0:
             length_s = times_s[-1] - times_s[0]
             rate = (len(times_s) - 1) / length_s if length_s else Fraction(24)
-        parts = (self._container, *self._container.streams, self._stream)
+        parts = (container, *container.streams, stream)
         said = {key.lower(): value for part in parts for key, value in part.metadata.items()}
-        sound = self._path if any(self.sounds) else None
-        return Timing(times_s, rate, sound, said.get("timecode", ""))
-
-    @property
-    def sounds(self) -> list[Any]:
-        """The decoders of the sound tracks; None of an unknown codec."""
-        return [track.codec_context for track in self._container.streams.audio]
+        return Timing(times_s, rate, self._path if has_sound else None, said.get("timecode", ""))
 
     @property
     def space(self) -> ColourSpace:
         """The colour space that the film's codes state; sRGB where they say nothing that is known."""
-        coded = self._stream.codec_context
-        codes = int(coded.color_primaries), int(coded.color_trc)
-        found = space_of_codes(*codes)
+        found = space_of_codes(*self._codes)
         if found is None:
-            log.warning("%s: colour codes %d and %d are not known; taken for sRGB", self._path, *codes)
+            log.warning("%s: colour codes %d and %d are not known; taken for sRGB", self._path, *self._codes)
         return found or SRGB
 
     def read(self, number: int) -> np.ndarray:
@@ -147,46 +156,41 @@ class Film:
 
         It is uint8, or uint16 of deeper films; its colour is not multiplied by alpha.
         """
-        try:
-            return self._read(number)
-        except self._av.error.FFmpegError as error:
-            raise InputError(f"{self._path}: frame {number} is damaged ({reason(error)})") from None
+        if number not in self._kept:
+            before = [reader for reader in self._readers if reader.next <= number]
+            reader = max(before, key=lambda one: one.next) if before else _Reader(self._decoded())
+            self._readers = [*(one for one in self._readers if one is not reader), reader][-_READERS:]
+            while reader.next <= number:
+                if (frame := next(reader.frames, None)) is None:
+                    raise InputError(f"{self._path}: ends before frame {number}; copy it again")
+                if number - reader.next < _BEFORE:
+                    self._kept[reader.next] = self._pixels(frame)
+                reader.next += 1
+            for earlier in list(self._kept)[:-_KEPT]:
+                del self._kept[earlier]
+        return self._kept[number]
 
-    def _read(self, number: int) -> np.ndarray:
-        if number != self._next:
-            self._coming = self._from(number)
-        for pts, frame in self._coming:
-            if pts >= self._pts[number]:
-                self._next = number + 1
-                return self._pixels(frame)
-        raise InputError(f"{self._path}: ends before frame {number}; copy it again")
+    def _decoded(self) -> Iterator[Any]:
+        """Decode the frames from the first to the last, progressive, one for each time."""
+        with self._opened() as (container, stream):
+            frames = self._one_for_each_time(container.decode(stream))
+            for _, alike in groupby(frames, lambda one: (one.width, one.height, one.format.name)):
+                yield from _progressive(self._av, alike)
 
-    def _from(self, number: int) -> _Stamped:
-        """Decode from the frame before `number`, which makes that progressive, or from an earlier one."""
-        start = max(number - 1, 0)
-        while not self._is_counted:
-            self._container.seek(self._pts[start], stream=self._stream, backward=True)
-            coming = self._decoded()
-            first = next(coming, None)
-            if first is not None and first[0] <= self._pts[start]:
-                return chain([first], coming)
-            if start == 0:
-                break
-            start = max(start - _EARLIER, 0)
-        self._container.close()
-        self._open()
-        return self._decoded()
-
-    def _decoded(self) -> _Stamped:
-        self._coder.flush_buffers()
-        packets = self._container.demux(self._stream)
-        frames = (frame for packet in packets for frame in self._coder.decode(packet))
-        if self._is_counted:
-            return _progressive(self._av, zip(self._pts, frames, strict=False))
-        return _progressive(self._av, ((frame.pts, frame) for frame in frames if frame.pts is not None))
+    def _one_for_each_time(self, frames: Iterator[Any]) -> Iterator[Any]:
+        """The frame of each time stamp; a later one in place of one that was not decoded."""
+        count = 0
+        for frame in frames:
+            if self._is_counted:
+                yield frame
+            elif frame.pts is not None:
+                due = bisect_right(self._pts, frame.pts)
+                yield from repeat(frame, due - count)
+                count = max(count, due)
 
     def _pixels(self, frame: Any) -> np.ndarray:
-        width, height = self._square_size(frame)
+        width = round(frame.width * max(self._aspect, 1))
+        height = round(frame.height / min(self._aspect, 1))
         if width * height > _LARGEST_PX:
             raise InputError(f"{self._path}: {width} x {height} are too many pixels; scale it")
         if name := HDR_CURVES.get(int(frame.color_trc)):
@@ -202,38 +206,22 @@ class Film:
         form = ("rgb24", "rgb48le", "rgba", "rgba64le")[2 * alpha + deep]
         colours = {} if is_rgb else {"src_colorspace": matrix, "interpolation": exact(self._av)}
         values = frame.to_ndarray(format=form, width=width, height=height, **colours)
-        if alpha and deep and not is_rgb:  # FFmpeg fills up its bits with zeros
-            white = 0x10000 - (0x10000 >> parts[-1].bits)
-            values[..., 3] = np.round(values[..., 3] * (0xFFFF / white)).clip(0, 0xFFFF)
-        return _upright(self._cropped(values, frame), frame.side_data.get("DISPLAYMATRIX"))
-
-    def _cropped(self, values: np.ndarray, frame: Any) -> np.ndarray:
-        """The clean aperture of a frame's values [H, W, C]; all of them where the frame does not hold it."""
-        for axis, (length, offset) in enumerate(self._clean):
-            whole = frame.width if axis else frame.height
-            first = (whole - length) / 2 + offset
-            if first >= 0 < length <= whole - first:
-                step = values.shape[axis] / whole
-                start, stop = round(first * step), round((first + length) * step)
-                values = values[start:stop] if axis == 0 else values[:, start:stop]
-        return values
-
-    def _square_size(self, frame: Any) -> tuple[int, int]:
-        """Width and height of a frame whose samples are made square; none is lost."""
-        aspect = Fraction(self._stream.sample_aspect_ratio or 1)
-        if aspect <= 0:
-            return frame.width, frame.height
-        return round(frame.width * max(aspect, 1)), round(frame.height / min(aspect, 1))
+        if alpha and not is_rgb:  # 10 or 12 bits, whose white is to be white
+            values[..., 3] |= values[..., 3] >> parts[-1].bits
+        if self._matrix is None:  # once, since side data keep their frame until garbage is collected
+            matrix = frame.side_data.get("DISPLAYMATRIX")
+            self._matrix = b"" if matrix is None else bytes(matrix)
+        return _upright(values, self._matrix)
 
 
-def _upright(values: np.ndarray, matrix: Any) -> np.ndarray:
-    """Turn and mirror a frame [H, W, C] by a film's display matrix, to quarters.
+def _upright(values: np.ndarray, matrix: bytes) -> np.ndarray:
+    """Turn and mirror a frame [H, W, C] by a film's display matrix, to quarters; it may have none.
 
     Its first two columns are a, b, of x, and c, d, of y: (x, y) is shown at (a x + c y, b x + d y).
     """
-    if matrix is None:
+    if not matrix:
         return np.ascontiguousarray(values)
-    a, b, _, c, d = np.frombuffer(bytes(matrix), np.int32)[:5].tolist()
+    a, b, _, c, d = np.frombuffer(matrix, np.int32)[:5].tolist()
     if abs(a) < abs(b):
         values, to_right, to_bottom = values.swapaxes(0, 1), c, b
     else:
@@ -241,65 +229,46 @@ def _upright(values: np.ndarray, matrix: Any) -> np.ndarray:
     return np.ascontiguousarray(values[:: -1 if to_bottom < 0 else 1, :: -1 if to_right < 0 else 1])
 
 
+def _progressive(av: Any, frames: Iterator[Any]) -> Iterator[Any]:
+    """Frames of one size, of which interlaced ones are made progressive by FFmpeg's bwdif.
+
+    They then show the time of their first field. From the first interlaced frame on, all pass the filter,
+    which looks at the frames around each, and leaves progressive ones as they are.
+    """
+    graph: Any = None
+    for frame in frames:
+        if graph is None and frame.interlaced_frame:
+            graph = av.filter.Graph()
+            size = {"width": frame.width, "height": frame.height}
+            source = graph.add_buffer(format=frame.format, time_base=frame.time_base, **size)
+            bwdif = graph.add("bwdif", "mode=send_frame:deint=interlaced")
+            graph.link_nodes(source, bwdif, graph.add("buffersink")).configure()
+        if graph is None:
+            yield frame
+        else:
+            yield from _filtered(graph, frame)
+    if graph is not None:
+        yield from _filtered(graph, None)
+
+
+def _filtered(graph: Any, frame: Any) -> Iterator[Any]:
+    """Give a graph a frame, or None at the end; yield the frames that it has ready."""
+    graph.vpush(frame)
+    with suppress(BlockingIOError, EOFError):
+        while True:
+            yield graph.vpull()
+
+
 def start_s(container: Any) -> Fraction:
     """The time at which pictures or sound begin, which is late in streams that were cut out of others."""
     return max(Fraction(0), Fraction(container.start_time or 0, _MICROSECONDS))
 
 
-def _progressive(av: Any, frames: _Stamped) -> _Stamped:
-    """Frames, of which interlaced ones are made progressive."""
-    before, now = None, next(frames, None)
-    while now is not None:
-        if not now[1].interlaced_frame:
-            yield now
-            before, now = now, next(frames, None)
-        else:
-            after = next(frames, None)
-            around = [one[1] for one in (before, now, after) if one is not None]
-            yield now[0], _deinterlaced(av, around, around.index(now[1]))
-            before, now = now, after
-
-
-def _deinterlaced(av: Any, frames: list[Any], number: int) -> Any:
-    """One of some frames, at the time of its first field, by FFmpeg's bwdif, which looks at those around."""
-    frame, graph = frames[number], av.filter.Graph()
-    size = {"width": frame.width, "height": frame.height}
-    source = graph.add_buffer(format=frame.format, time_base=frame.time_base, **size)
-    bwdif = graph.add("bwdif", "mode=send_frame:deint=interlaced")
-    graph.link_nodes(source, bwdif, graph.add("buffersink")).configure()
-    for one in (*frames, None):
-        graph.vpush(one)
-    return [graph.vpull() for _ in range(number + 1)][number]
-
-
-def _clean_aperture(path: Path) -> tuple[tuple[Fraction, Fraction], ...]:
-    """Height and width of the clean aperture of an MP4 or QuickTime file, each with its middle's offset.
-
-    Nothing where the file has none (ISO 14496-12, `clap`).
-    """
-    with path.open("rb") as stream:
-        while len(head := stream.read(16)) == 16:
-            short, kind, long = struct.unpack(">I4sQ", head)
-            size = long if short == 1 else short
-            if kind == b"moov":
-                boxes = stream.read(min(size, path.stat().st_size))
-                at = boxes.find(b"\0\0\0\x28clap")
-                values = struct.unpack(">8i", boxes[at + 8 : at + 40].ljust(32, b"\0"))
-                if at < 0 or min(values[1::2]) <= 0:
-                    break
-                width, height, right, down = map(Fraction, values[::2], values[1::2])
-                return (height, down), (width, right)
-            if size < 8:
-                break
-            stream.seek(size - 16, io.SEEK_CUR)
-    return ()
-
-
 def film_timing(path: Path) -> Timing:
     """Read the timing of a film; its first frame is decoded, so that an HDR film is refused here."""
-    with closing(Film(path)) as film:
-        film.read(0)
-        return film.timing()
+    film = Film(path)
+    film.read(0)
+    return film.timing
 
 
 def reason(error: Exception) -> str:

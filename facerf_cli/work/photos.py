@@ -175,11 +175,11 @@ def read_photo(
 
 @contextmanager
 def naming(name: object) -> Iterator[None]:
-    """Let errors of the block begin with the name of the input."""
+    """Let errors of the block begin with the name of the input, once."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{name}: {error}") from None
+        raise InputError(f"{name}: " + str(error).removeprefix(f"{name}: ")) from None
 
 
 def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FittedFace]:

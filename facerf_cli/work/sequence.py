@@ -4,17 +4,16 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise, starmap
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
 from facerf_cli.face.landmarks import read_landmarks, to_display
 from facerf_cli.files.atomic import atomic_path
@@ -25,7 +24,8 @@ from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import described_file
-from facerf_cli.relighting.sequence import LONGEST_GAP, Follower, Sighting, SteadyShot, gaps, takes, with_cuts
+from facerf_cli.relighting.shot import SteadyShot
+from facerf_cli.relighting.tracking import FaceTracker, Sighting, gaps, is_bridged, with_cuts
 from facerf_cli.run.logs import LOGGER_NAME, STDERR, json_line
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import (
@@ -41,9 +41,6 @@ from facerf_cli.work.photos import (
 from facerf_cli.work.shots import Shot, Shots
 
 _WHOLE = 0.9  # largest value of a matte from which on the person is all there
-_SEAL = '{"sha256": '  # begins the last row of a track
-_DECODED = 12  # frames of a film that are kept as they were decoded
-T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -52,12 +49,10 @@ class ShotFrames:
 
     def __init__(self, shot: Shot, options: PhotoOptions) -> None:
         self._shot, self._options = shot, options
-        space = options.colourspace
         self._film = Film(shot.film) if shot.film else None
         stated = self._film.space if self._film else SRGB
+        space = options.colourspace
         self._space = stated if space is None else named_space(space, options.ocio_config)
-        self._decoded: dict[int, np.ndarray] = {}
-        self._shape: tuple[int, ...] = ()
 
     def image(self, number: int) -> LinearImage:
         """Frame `number`; alpha that is 0 in every frame is none."""
@@ -78,18 +73,17 @@ class ShotFrames:
         """Frame `number` with the alpha that it has itself."""
         if self._film is None:
             return read_photo(self._shot.frames[number], self._options, in_shot=True)
-        if number not in self._decoded:
-            if len(self._decoded) == _DECODED:
-                del self._decoded[next(iter(self._decoded))]  # the first that was decoded
-            self._decoded[number] = self._film.read(number)
-        values = self._decoded[number]
+        values = self._film.read(number)
         pixels = np.ascontiguousarray(to_linear_rec709(values[..., :3], self._space), np.float32)
         alpha = unit_floats(values[..., 3]) if values.shape[2] == 4 else None
         return LinearImage(pixels, alpha, self._space.name)
 
-    def __getitem__(self, number: int, /) -> np.ndarray:
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        return self.read(0).pixels.shape
+
+    def pixels(self, number: int) -> np.ndarray:
         """Pixels [H, W, 3]; raises InputError where their size is not that of the first frame."""
-        self._shape = self._shape or self.read(0).pixels.shape
         pixels = self.read(number).pixels
         if pixels.shape != self._shape:
             raise InputError("is not of the size of the first frame; give frames of one size")
@@ -97,141 +91,110 @@ class ShotFrames:
 
 
 @dataclass(frozen=True)
-class ShotMattes:
-    """Given mattes of the person in the frames of a take, by number."""
-
-    shot: Shot
-    take: range
-    frames: ShotFrames
-    options: PhotoOptions
-
-    def __getitem__(self, number: int, /) -> np.ndarray:
-        """A matte [H, W], which may be black; raises InputError where all are."""
-        found = self._read(number)
-        if not found.any() and not any(self._read(other).any() for other in self.take):
-            raise InputError("its mattes are black in every frame; make them white where the person is")
-        return found
-
-    def _read(self, number: int) -> np.ndarray:
-        found = person_matte(self.shot.frames[number], self.frames[number], self.options, in_shot=True)
-        assert found is not None
-        return found
-
-
 class ShotTrack:
-    """The face and the cuts of a shot, as the file beside its outputs has them: a head, and a row per frame.
+    """The face and the cuts of a shot: a head that says what they were made from, and a row per frame.
 
-    The last row is the SHA-256 of all before it, which tells whether the user has edited the file. A run that
-    was killed may leave half a row, which is cut off.
+    In the file beside the shot's outputs, the head also has the SHA-256 of the rows, which tells whether the
+    user has edited them.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.head: Any = None
-        self.sightings: list[Sighting | None] = []
-        self.cuts: list[int] = []  # first frames of takes, but for that of the first take
-        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
-        self._is_facerfs = not text and (path.is_file() or not os.path.lexists(path))
-        content, mark, seal = text.partition(_SEAL)
-        whole = text if mark else text[: text.rfind("\n") + 1]
-        content = content if mark else whole
+    head: Any
+    rows: Sequence[dict[str, Any]]
+    is_own: bool = True  # written by facerf, and not edited
+
+    @staticmethod
+    def read(path: Path) -> "ShotTrack":
+        """Read a track; without a head if there is none, or none that facerf reads."""
         try:
-            self.head, *rows = map(json.loads, content.splitlines())
-            for row in rows:
-                self._take(row)
-        except (ValueError, TypeError, KeyError, AttributeError):  # not a track
-            return
-        self._is_facerfs = isinstance(self.head, dict) and "parsing" in self.head
-        self._is_facerfs &= self._seal(content).startswith(seal)
-        if whole != text and self._is_facerfs:
-            path.write_text(whole, encoding="utf-8")
+            first, *lines = path.read_text(encoding="utf-8").splitlines()
+            head = json.loads(first)
+            is_own = head.pop("sha256") == _digest(lines)
+            track = ShotTrack(head, [json.loads(line) for line in lines], is_own)
+            return track if len(track.sightings) == head["frames"] else ShotTrack(None, (), False)
+        except (OSError, ValueError, TypeError, KeyError, AttributeError):  # not a track
+            return ShotTrack(None, (), False)
+
+    def write(self, path: Path) -> None:
+        """Write the track."""
+        lines = [json_line(row) for row in self.rows]
+        head = json_line({**self.head, "sha256": _digest(lines)})
+        with atomic_path(path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in (head, *lines)), encoding="utf-8")
+
+    @cached_property
+    def sightings(self) -> list[Sighting | None]:
+        """The face in each frame; None where it is not seen."""
+        return [
+            Sighting(np.array(row["landmarks"], np.float64), float(row["expected_error"]))
+            if row["landmarks"] is not None
+            else None
+            for row in self.rows
+        ]
+
+    @property
+    def cuts(self) -> list[int]:
+        """First frames of takes, but for that of the first take."""
+        return [number for number, row in enumerate(self.rows) if row.get("cut")]
 
     @property
     def takes(self) -> list[range]:
-        return takes(len(self.sightings), self.cuts)
+        """The frames of each take, in order."""
+        return list(starmap(range, pairwise([0, *self.cuts, len(self.rows)])))
 
     @property
     def takes_with_face(self) -> list[range]:
         """The frames of each take that shows the face."""
         return [take for take in self.takes if any(self.sightings[take.start : take.stop])]
 
-    def begin(self, head: Any) -> None:
-        """Forget all frames, unless they were made from what the head says.
 
-        Raises InputError for a file that facerf did not write, or that was changed since.
-        """
-        head = json.loads(json_line(head))
-        if self.head != head:
-            if not self._is_facerfs:
-                raise InputError(
-                    f"{self._path}: was not written by facerf, or was changed since; move it, or choose "
-                    "another -o"
-                )
-            with atomic_path(self._path) as temporary:
-                temporary.write_text(json_line(head) + "\n", encoding="utf-8")
-            self.head, self.sightings, self.cuts = head, [], []
-
-    def add(self, seen: Sighting | None, cut: bool) -> None:
-        """Add the next frame, to the file at once."""
-        row: dict[str, Any] = {
-            "frame": len(self.sightings),
-            **({"cut": True} if cut else {}),
-            "landmarks": None,
-        }
-        if seen is not None:
-            row |= {"landmarks": seen.landmarks_px.round(3), "expected_error": round(seen.error, 4)}
-        line = json_line(row)
-        with self._path.open("a", encoding="utf-8") as stream:
-            stream.write(line + "\n")
-        self._take(json.loads(line))
-        if len(self.sightings) == self.head["frames"]:
-            seal = self._seal(self._path.read_text(encoding="utf-8"))
-            with self._path.open("a", encoding="utf-8") as stream:
-                stream.write(_SEAL + seal)
-
-    @staticmethod
-    def _seal(content: str) -> str:
-        return f'"{hashlib.sha256(content.encode()).hexdigest()}"}}\n'
-
-    def _take(self, row: dict[str, Any]) -> None:
-        if row.get("cut"):
-            self.cuts.append(len(self.sightings))
-        given = row.get("landmarks")
-        seen = None if given is None else Sighting(np.array(given, np.float64), float(row["expected_error"]))
-        self.sightings.append(seen)
+def _digest(lines: Sequence[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def follow_all(shots: Sequence[Shot], options: PhotoOptions) -> None:
-    """Follow the face through each shot, from where an earlier run stopped; say where it is lost.
+    """Follow the face through each shot, unless its track is there; say where the face is lost.
 
-    After a cut the face is chosen as in a new film.
+    After a cut the face is chosen as in a new film. Raises InputError for a track that was made from
+    something else and that the user wrote or edited.
     """
     for shot in shots:
-        track = ShotTrack(shot.track)
-        track.begin(_made_from(shot, options))
-        if len(track.sightings) < len(shot.frames):
-            _follow(shot, track, options)
-        _log_cuts_and_gaps(shot, track)
+        head = json.loads(json_line(_made_from(shot, options)))
+        track = ShotTrack.read(shot.track)
+        if track.head != head:
+            if os.path.lexists(shot.track) and not track.is_own:
+                raise InputError(
+                    f"{shot.track}: was not written by facerf, or was changed since; move it, or choose "
+                    "another -o"
+                )
+            ShotTrack(head, list(_followed(shot, options))).write(shot.track)
+        _log_cuts_and_gaps(shot, ShotTrack.read(shot.track))
 
 
-def _follow(shot: Shot, track: ShotTrack, options: PhotoOptions) -> None:
-    first = len(track.sightings)
-    in_take = track.sightings[[0, *track.cuts][-1] :]
-    last = next((seen.landmarks_px for seen in reversed(in_take) if seen), None)
-    networks, frames = load_models_once(options).networks.people, ShotFrames(shot, options)
-    follower = Follower(networks, options.face, last)
-    images = with_cuts(lambda number: to_display(frames.read(number).pixels), first, len(shot.frames))
-    for number, image, cut in _with_progress(images, first, shot, options.settings):
-        cut = cut and shot.cuts
-        if cut:
-            follower = Follower(networks, options.face)
+def _followed(shot: Shot, options: PhotoOptions) -> Iterator[dict[str, Any]]:
+    """Yield the row of each frame, with a progress bar on a terminal."""
+    from rich.progress import track
+
+    networks, settings = load_models_once(options).networks.people, options.settings
+    frames, count = ShotFrames(shot, options), len(shot.frames)
+    log.info("%s: following the face through %d frames", shot.base.name, count)
+    images = with_cuts(to_display(frames.read(number).pixels) for number in range(count))
+    hidden = not STDERR.is_terminal or settings.verbosity < 0 or settings.log_json
+    shown = track(images, "face", count, console=STDERR, disable=hidden, transient=True)
+    tracker = FaceTracker(networks, options.face)
+    for number, (image, cut) in enumerate(shown):
+        row: dict[str, Any] = {"frame": number}
+        if cut and shot.cuts:
+            row["cut"], tracker = True, FaceTracker(networks, options.face)
         if options.landmarks is None:
-            seen = follower.see(image)
+            seen = tracker.track(image)
         else:
             path = companion(shot.frames[number], options.landmarks, "--landmarks")
             with naming(path):
                 seen = Sighting(face_with(networks, image, read_landmarks(path)).landmarks_px, 0.0)
-        track.add(seen, cut)
+        row["landmarks"] = None
+        if seen is not None:
+            row |= {"landmarks": seen.landmarks_px.round(3), "expected_error": round(seen.error, 4)}
+        yield row
 
 
 def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
@@ -249,16 +212,6 @@ def _made_from(shot: Shot, options: PhotoOptions) -> dict[str, Any]:
     }
 
 
-def _with_progress(frames: Iterator[T], first: int, shot: Shot, settings: Settings) -> Iterable[T]:
-    """The frames, with a progress bar on a terminal."""
-    from rich.progress import track
-
-    hidden = not STDERR.is_terminal or settings.verbosity < 0 or settings.log_json
-    count = len(shot.frames)
-    log.info("%s: following the face through %d frames", shot.base.name, count)
-    return track(frames, "face", count - first, console=STDERR, disable=hidden, transient=True)
-
-
 def _log_cuts_and_gaps(shot: Shot, track: ShotTrack) -> None:
     """Say where a film cuts, and where its face is not seen."""
     sightings, cuts = track.sightings, track.cuts
@@ -272,7 +225,7 @@ def _log_cuts_and_gaps(shot: Shot, track: ShotTrack) -> None:
     for take in track.takes:
         inside = sightings[take.start : take.stop]
         for first, last in gaps(inside):
-            bridged = first > 0 and last + 1 < len(inside) and last - first < LONGEST_GAP
+            bridged = is_bridged(first, last, len(inside))
             result = "filled in from the frames around" if bridged else "not relit; cut them off"
             begin, end = take.start + first, take.start + last
             names = f"frame {begin}" if begin == end else f"frames {begin} to {end}"
@@ -286,7 +239,7 @@ class OpenShot:
     """
 
     def __init__(self, shot: Shot, options: PhotoOptions, white: White | None = None) -> None:
-        self.shot, self.track, self.frames = shot, ShotTrack(shot.track), ShotFrames(shot, options)
+        self.shot, self.track, self.frames = shot, ShotTrack.read(shot.track), ShotFrames(shot, options)
         self._options, self._white = options, white
         self._take = range(0)
         self._steady: SteadyShot | None = None
@@ -297,25 +250,37 @@ class OpenShot:
             self._take = take = next(take for take in self.track.takes if number in take)
             models, options = load_models_once(self._options), self._options
             sightings = [seen if one in take else None for one, seen in enumerate(self.track.sightings)]
-            mattes = ShotMattes(self.shot, take, self.frames, options) if options.person else None
+            mattes = self._matte_in_take if options.person else None
             sides = models.sides(options.texture_side)
-            self._steady = SteadyShot(models, self.frames, sightings, sides, mattes, self._white)
+            self._steady = SteadyShot(models, self.frames.pixels, sightings, sides, mattes, self._white)
         return self._steady
+
+    def _given_matte(self, number: int) -> np.ndarray | None:
+        item, pixels = self.shot.frames[number], self.frames.pixels(number)
+        return person_matte(item, pixels, self._options, in_shot=True)
+
+    def _matte_in_take(self, number: int) -> np.ndarray:
+        """The given matte [H, W] of a frame; raises InputError where it is black in the whole take."""
+        matte = self._given_matte(number)
+        assert matte is not None
+        if not matte.any() and not any(np.any(self._given_matte(other)) for other in self._take):
+            raise InputError("its mattes are black in every frame; make them white where the person is")
+        return matte
 
     def _facts_of(self, number: int, landmarks_px: np.ndarray) -> dict[str, float]:
         """Measure the face of a frame, and a given matte unless it is faint; see `facts_of_face`."""
         if self.track.sightings[number] is None:
             return {"unclear": 1.0}  # filled in
-        item, pixels, options = self.shot.frames[number], self.frames[number], self._options
+        item, pixels, options = self.shot.frames[number], self.frames.pixels(number), self._options
         face = face_with(load_models_once(options).networks.people, to_display(pixels), landmarks_px)
-        matte = person_matte(item, pixels, options, in_shot=True)
+        matte = self._given_matte(number)
         shown = matte is not None and matte.max() > _WHOLE
         return facts_of_face(item, face, pixels, options, matte if shown else None)
 
     def segmented(self, number: int) -> tuple[LinearImage, PhotoFace, Segmentation]:
         """A frame, its face, and its person, steadied by the frames around it."""
         take = self.take_of(number)
-        with self._naming(number):
+        with naming(self.shot.frames[number].input_path):
             face, found = face_at(take.landmarks_px(number)), take.segmentation(number)
             facts = self._facts_of(number, face.landmarks_px)
         person = PhotoFace("", str(self.shot.frames[number].input_path), face, facts)
@@ -324,7 +289,7 @@ class OpenShot:
     def fitted(self, number: int, portrait: bool = True) -> tuple[LinearImage, FittedFace]:
         """A frame, and its head with what is steadied by the frames around it; see `SteadyShot.window`."""
         take = self.take_of(number)
-        with self._naming(number):
+        with naming(self.shot.frames[number].input_path):
             steady = take.window(number, portrait)
             head, matte = steady.head, steady.segmentation.matte
             found = face_at(head.fit.crop.to_photo(head.landmarks_px))
@@ -333,15 +298,6 @@ class OpenShot:
         left = int(which) if which.isdecimal() else 0
         face = FittedFace("", name, found, facts, number=left, head=head, steady=steady, matte=matte)
         return self.frames.image(number), face
-
-    @contextmanager
-    def _naming(self, number: int) -> Iterator[None]:
-        """Put the name of a frame's file before an error that lacks it."""
-        try:
-            yield
-        except InputError as error:
-            before = f"{self.shot.frames[number].input_path}: "
-            raise InputError(before + str(error).removeprefix(before)) from None
 
 
 def open_at(

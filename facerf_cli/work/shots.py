@@ -129,7 +129,7 @@ def _of_film(item: Item, pattern: NamePattern | None) -> Shot:
         place = mirrored.with_name(f"{mirrored.stem}.{number:0{digits}d}{mirrored.suffix}")
         plain = place.with_suffix("").as_posix()
         name = pattern.filled(fields_of(item.input_path, place)) if pattern else plain
-        frames.append(Item(item.input_path, folder / name, name, place, frame=number))
+        frames.append(Item(item.input_path, folder / name, name, place))
     return Shot(item.output_base, tuple(frames), item.input_path)
 
 

@@ -1,7 +1,6 @@
 """Several people in one image, by people with known answers."""
 
 from collections.abc import Iterator
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -138,7 +137,6 @@ def test_the_face_of_a_shot_has_the_number_by_which_it_was_chosen() -> None:
         take_of=lambda _: SimpleNamespace(window=lambda *_: steady),
         shot=SimpleNamespace(frames=[Item(Path("a.0001.png"), Path("a.0001"), "a.0001")]),
         frames=SimpleNamespace(image=lambda _: None),
-        _naming=lambda _: nullcontext(),
         _options=PhotoOptions(Settings(), face="2"),
         _facts_of=lambda *_: {},
     )

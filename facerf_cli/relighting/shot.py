@@ -1,17 +1,13 @@
-"""Cuts of a film, one face followed through the frames of a shot, and smoothing over time.
+"""One person through the frames of a shot: one identity and one light, and maps that are smoothed over time.
 
-A curve is smoothed by a local quadratic (Savitzky and Golay, *Smoothing and differentiation of data by
-simplified least squares procedures*, 1964), with weights, so that frames that are missing or unsure count for
-nothing or little. It has no delay, and keeps a movement that is a parabola over the window. Maps are smoothed
-by a bilateral filter along time (Tomasi and Manduchi, *Bilateral filtering for gray and color images*, 1998):
-a pixel takes part in the mean as far as the image there looks as it does in the frame itself.
+Maps are smoothed by a bilateral filter along time (Tomasi and Manduchi, *Bilateral filtering for gray and
+color images*, 1998): a pixel takes part in the mean as far as the image there looks as it does in the frame
+itself.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -26,8 +22,6 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.portrait import PortraitMaps
-from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.find import Face, choose_face, detect_faces, face_near
 from facerf_cli.portrait.parse import uncovered_in
 from facerf_cli.portrait.person import SeenPerson, look_at_person, portrait_square, wider_square
 from facerf_cli.portrait.segment import (
@@ -43,88 +37,13 @@ from facerf_cli.relighting.field import balance_of
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
 from facerf_cli.relighting.source_light import light_of_frames, source_light
+from facerf_cli.relighting.tracking import Sighting, path_of
 from facerf_cli.relighting.white import Balance
 
-_ROWS, _COLUMNS = 12, 16  # of a thumbnail
-_LEAST = 0.05  # change at a cut, display values in 0..1
-_TIMES = 3.0  # of the largest change around it
-_REACH = 3  # frames on each side
-
-
-def with_cuts(
-    show: Callable[[int], np.ndarray], first: int, count: int
-) -> Iterator[tuple[int, np.ndarray, bool]]:
-    """Yield frames of a film of `count` from `first` on: number, image, and True where a new shot begins.
-
-    `show` gives a frame, sRGB uint8 [H, W, 3], by number; it is called once for each, in order.
-    """
-    ahead: dict[int, np.ndarray] = {}
-    changes: dict[int, float] = {}
-    before: np.ndarray | None = None
-    for number in range(max(0, first - _REACH - 1), count + _REACH):
-        if number < count:
-            image = show(number)
-            now = thumbnail(image)
-            if before is not None:
-                changes[number] = float(np.abs(now - before).mean())
-            before = now
-            if number >= first:
-                ahead[number] = image
-        if (frame := number - _REACH) >= first:
-            around = [
-                changes[one] for one in range(frame - _REACH, number + 1) if one in changes and one != frame
-            ]
-            yield frame, ahead.pop(frame), frame > 0 and stands_out(changes[frame], around)
-
-
-def stands_out(change: float, around: Sequence[float]) -> bool:
-    """Tell if a change is that of a cut, among the changes of the frames around it."""
-    return change > max(_LEAST, _TIMES * max(around, default=0.0))
-
-
-def thumbnail(image_srgb: np.ndarray) -> np.ndarray:
-    """Means [_ROWS, _COLUMNS, 3] in 0..1 of parts of an image, uint8 [H, W, 3]."""
-    pixels = torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255
-    return F.adaptive_avg_pool2d(pixels, (_ROWS, _COLUMNS))[0].permute(1, 2, 0).numpy()
-
-
-def takes(count: int, cuts: Sequence[int]) -> list[range]:
-    """The frames of each take of a film of `count` frames, in order; cuts are first frames of takes."""
-    edges = [0, *cuts, count]
-    return [range(first, end) for first, end in pairwise(edges)]
-
-
-REACH = 5  # frames on each side of a curve's window
-_FULL = 4  # frames with weight from which on a window has a quadratic; with fewer it is a line or a mean
 MAPS_REACH = 2  # frames on each side of a map's window
 _ALIKE = 0.03  # difference of images, in 0..1, at which a neighbour's weight falls to 0.6
 _BLUR_PX = 3  # side of the square over which images are compared, against their noise
 _TINY = 1e-9
-
-
-def smoothed(values: np.ndarray, weights: np.ndarray, reach: int = REACH) -> np.ndarray:
-    """Smooth curves [N, ...] with weights [N] >= 0 by local quadratics; NaN where a window has no weight.
-
-    The window has `reach` frames on each side, under a tricube (Cleveland, *Robust locally weighted
-    regression and smoothing scatterplots*, 1979).
-    """
-    flat = values.reshape(len(values), -1).astype(np.float64)
-    result = np.full_like(flat, np.nan)
-    for frame in range(len(flat)):
-        first, last = max(0, frame - reach), min(len(flat), frame + reach + 1)
-        at = np.arange(first, last) - frame
-        weight = weights[first:last] * (1 - (np.abs(at) / (reach + 1)) ** 3) ** 3
-        used = weight > 0
-        if used.any():
-            result[frame] = _local(at[used], flat[first:last][used], weight[used])
-    return result.reshape(values.shape)
-
-
-def _local(at: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The value [C] at 0 of the polynomial that fits values [M, C] at times [M] best."""
-    order = 2 if len(at) >= _FULL else min(1, len(at) - 1)
-    columns = np.vander(at, order + 1, increasing=True) * np.sqrt(weight)[:, None]
-    return np.asarray(np.linalg.lstsq(columns, values * np.sqrt(weight)[:, None], rcond=None)[0][0])
 
 
 def steadied(maps: Sequence[Tensor], images: Sequence[Tensor], middle: int) -> Tensor:
@@ -144,105 +63,6 @@ def steadied(maps: Sequence[Tensor], images: Sequence[Tensor], middle: int) -> T
 
 def _blurred(image: Tensor) -> Tensor:
     return F.avg_pool2d(image[None], _BLUR_PX, stride=1, padding=_BLUR_PX // 2, count_include_pad=False)[0]
-
-
-LONGEST_GAP = 12  # frames without the face that are bridged: half a second at 24 frames a second
-_FURTHEST = 1.5  # extents of its landmarks that a face may move while it is lost
-_SIZES = (0.6, 1.7)  # range of the change of its size meanwhile
-_BRIDGE_WEIGHT = 0.05  # of a frame in a gap
-
-
-@dataclass(frozen=True, eq=False)
-class Sighting:
-    """A face in one frame: landmarks [68, 2] in pixels, and its median expected error, in their extent."""
-
-    landmarks_px: np.ndarray
-    error: float
-
-
-class Follower:
-    """Finds the same face in frame after frame; `last` are its landmarks [68, 2] where it was seen last."""
-
-    def __init__(
-        self,
-        people: PeopleNetworks,
-        which: str,
-        last: np.ndarray | None = None,
-    ) -> None:
-        self._people = people
-        self._which, self._last = which, last
-
-    def see(self, image_srgb: np.ndarray) -> Sighting | None:
-        """Find the face in the next frame, sRGB uint8 [H, W, 3]; None where it is not seen.
-
-        Near the place of the frame before, else in the whole frame: the one nearest to that place, of about
-        its size. The first face is the one that `which` chooses: largest, or an index from the left.
-        """
-        face: Face | None = None
-        if self._last is not None:
-            face = face_near(self._people, image_srgb, self._last)
-            if face is not None and not _may_be(face, self._last):
-                face = None
-        if face is None:
-            face = self._searched(image_srgb)
-        if face is None:
-            return None
-        self._last = face.landmarks_px
-        error = face.view.relative_error if face.view else 0.0
-        return Sighting(face.landmarks_px, error)
-
-    def _searched(self, image_srgb: np.ndarray) -> Face | None:
-        last = self._last
-        everyone = last is not None or self._which != "largest"
-        faces = detect_faces(self._people, image_srgb, everyone)
-        if last is None:
-            few = self._which.isdecimal() and int(self._which) >= len(faces)
-            return None if few or not faces else choose_face(faces, self._which, "frame")[0]
-        near = [face for face in faces if _may_be(face, last)]
-        return min(near, key=lambda face: _apart_px(face.landmarks_px, last)) if near else None
-
-
-def _may_be(face: Face, last: np.ndarray) -> bool:
-    """Tell if a face can be the one that was at landmarks [68, 2]."""
-    before, now = _extent_px(last), _extent_px(face.landmarks_px)
-    low, high = _SIZES
-    return low < now / before < high and _apart_px(face.landmarks_px, last) < _FURTHEST * before
-
-
-def _apart_px(one: np.ndarray, other: np.ndarray) -> float:
-    return float(np.linalg.norm(one.mean(0) - other.mean(0)))
-
-
-def _extent_px(landmarks_px: np.ndarray) -> float:
-    return max(float(np.ptp(landmarks_px, axis=0).max()), 1.0)
-
-
-def path_of(sightings: Sequence[Sighting | None]) -> np.ndarray:
-    """Smoothed landmarks [N, 68, 2] of a shot; NaN where the face is lost, but for gaps that are bridged."""
-    path = np.full((len(sightings), 68, 2), np.nan)
-    weights = np.zeros(len(sightings))
-    for frame, seen in enumerate(sightings):
-        if seen is not None:
-            path[frame], weights[frame] = seen.landmarks_px, 1.0
-    for first, last in gaps(sightings):
-        if first > 0 and last + 1 < len(sightings) and last - first < LONGEST_GAP:
-            share = (np.arange(first, last + 1) - first + 1)[:, None, None] / (last - first + 2)
-            path[first : last + 1] = path[first - 1] + share * (path[last + 1] - path[first - 1])
-            weights[first : last + 1] = _BRIDGE_WEIGHT
-    kept = weights > 0
-    found = smoothed(np.where(kept[:, None, None], path, 0), weights)
-    return np.where(kept[:, None, None], found, np.nan)
-
-
-def gaps(sightings: Sequence[Sighting | None]) -> Iterator[tuple[int, int]]:
-    """First and last frames of each run of frames without the face."""
-    first = None
-    for frame, seen in enumerate([*sightings, Sighting(np.zeros((68, 2)), 0.0)]):
-        if seen is None and first is None:
-            first = frame
-        elif seen is not None and first is not None:
-            yield first, frame - 1
-            first = None
 
 
 _KEYS = 12  # frames whose identities are averaged
@@ -288,19 +108,13 @@ KEY_FRAMES = 5  # from which the light is estimated
 _UNIT = ("normals", "strands")  # maps of unit vectors
 
 
-class Numbered(Protocol):
-    """Arrays by the number of their frame, such as a list."""
-
-    def __getitem__(self, number: int, /) -> np.ndarray:
-        """The array of a frame."""
-
-
 @dataclass(eq=False)
-class _Seen:
+class _Observation:
     """Classes [C, h, w] that a frame shows alone, its small image, and the rest once it is asked for."""
 
     classes: Tensor
     small: Tensor
+    fit: FaceFit | None = None
     segmentation: Segmentation | None = None
     views: list[tuple[SeenPerson, PortraitMaps]] | None = None
 
@@ -313,20 +127,20 @@ class SteadyShot:
 
     Args:
         models: The face model and the networks.
-        frames: Scene-linear [H, W, 3], all of one size.
+        frames: Gives frames by number, scene-linear [H, W, 3], all of one size.
         sightings: The face in each of them.
         sides: Those of texture and crop.
-        mattes: The person's [H, W], if given; black in frames without the person.
+        mattes: Gives the person's [H, W] by number, if given; black in frames without the person.
         white: Whose colours skin has under even white light; None: those of the networks.
     """
 
     def __init__(
         self,
         models: Models,
-        frames: Numbered,
+        frames: Callable[[int], np.ndarray],
         sightings: Sequence[Sighting | None],
         sides: Sides,
-        mattes: Numbered | None = None,
+        mattes: Callable[[int], np.ndarray] | None = None,
         white: White | None = None,
     ) -> None:
         self._models, self._frames, self._mattes = models, frames, mattes
@@ -334,7 +148,7 @@ class SteadyShot:
         self._path = path_of(sightings)  # [N, 68, 2], NaN where the face is lost
         self._sighted = [frame for frame, seen in enumerate(sightings) if seen]
         self._shown = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
-        self._near: dict[int, _Seen] = {}
+        self._near: dict[int, _Observation] = {}
 
     def window(self, frame: int, portrait: bool = True) -> SteadyFrame:
         """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
@@ -401,7 +215,7 @@ class SteadyShot:
 
     @cached_property
     def _person(self) -> OnePerson:
-        size_px, crop_px = self._frames[self._sighted[0]].shape[:2], self._sides.crop_px
+        size_px, crop_px = self._frames(self._sighted[0]).shape[:2], self._sides.crop_px
         places = [self._path[frame] for frame in self._sighted]
         alpha = identity_of(self._models.face, places, size_px, crop_px)
         return OnePerson(self._models.face, alpha, size_px, crop_px)
@@ -409,7 +223,7 @@ class SteadyShot:
     @cached_property
     def _wide(self) -> tuple[float, float, float] | None:
         """Place and side of the wider square in the middle of the shot, in sides of the head's square."""
-        fit = self._person.fit(self.landmarks_px(self.middle))
+        fit = self._fit(self.middle)
         head = portrait_square(fit.crop.to_photo(fit.landmarks_px.numpy()))
         wide = wider_square(head, self._segmentation(self.middle).matte)
         if wide is None:
@@ -418,7 +232,7 @@ class SteadyShot:
         return offsets[0] / head.side_px, offsets[1] / head.side_px, wide.side_px / head.side_px
 
     def _shows(self, frame: int) -> bool:
-        return self._mattes is None or bool(self._mattes[frame].any())
+        return self._mattes is None or bool(self._mattes(frame).any())
 
     def _around(self, frame: int) -> list[int]:
         """The frame and its neighbours that show the face, without those beyond a frame where it is lost."""
@@ -435,17 +249,17 @@ class SteadyShot:
         reach = 2 * MAPS_REACH
         self._near = {one: seen for one, seen in self._near.items() if abs(one - frame) <= reach}
 
-    def _seen(self, frame: int) -> _Seen:
+    def _seen(self, frame: int) -> _Observation:
         """Look at a frame alone, once."""
         if frame not in self._near:
             people, landmarks_px = self._models.networks.people, self.landmarks_px(frame)
-            image = to_display(self._frames[frame])
+            image = to_display(self._frames(frame))
             small = small_image(image)
             if self._mattes is not None:
                 classes = parsed(people.parsing, image, landmarks_px, small)
             else:
                 classes = seen_classes(people, image, landmarks_px, small)
-            self._near[frame] = _Seen(classes, small)
+            self._near[frame] = _Observation(classes, small)
         return self._near[frame]
 
     def _segmentation(self, frame: int) -> Segmentation:
@@ -456,15 +270,21 @@ class SteadyShot:
             mean = steadied([one.classes for one in near], [one.small for one in near], around.index(frame))
             mean = mean / mean.sum(0).clamp_min(1e-6)
             if self._mattes is not None:
-                seen.segmentation = within_matte(mean, self._mattes[frame])
+                seen.segmentation = within_matte(mean, self._mattes(frame))
             else:
-                image = to_display(self._frames[frame])
+                image = to_display(self._frames(frame))
                 seen.segmentation = segmentation_of(mean, image, self.landmarks_px(frame))
         return seen.segmentation
 
+    def _fit(self, frame: int) -> FaceFit:
+        seen = self._seen(frame)
+        if seen.fit is None:
+            seen.fit = self._person.fit(self.landmarks_px(frame))
+        return seen.fit
+
     def _head(self, frame: int) -> Head:
         """The head of a frame, without what covers its skin."""
-        model, fit, photo = self._models.face, self._person.fit(self.landmarks_px(frame)), self._frames[frame]
+        model, fit, photo = self._models.face, self._fit(frame), self._frames(frame)
         cropped = fit.crop.apply(photo)
         head = Head(cropped, fit, unwrap_face(model, fit, cropped, self._sides.texture, photo.shape))
         height, width = photo.shape[:2]
@@ -478,8 +298,8 @@ class SteadyShot:
         """The person around the head and, if it needs it, in a wider square that follows the head."""
         seen = self._seen(frame)
         if seen.views is None:
-            networks, photo = self._models.networks, self._frames[frame]
-            fit, segmentation = self._person.fit(self.landmarks_px(frame)), self._segmentation(frame)
+            networks, photo = self._models.networks, self._frames(frame)
+            fit, segmentation = self._fit(frame), self._segmentation(frame)
             person = look_at_person(networks.people, self._models.face, photo, fit, segmentation=segmentation)
             people = [person]
             if self._wide is not None:
