@@ -1,4 +1,4 @@
-"""JSON documents: each is a pydantic model, read within limits, and written as strict JSON.
+"""JSON documents and TOML rigs: pydantic validates them; JSON is written strictly.
 
 An error is one line with the file and the path to the entry, as in `stage.json: lights[2]: id is 3; ...`.
 Import this module where a document is read alone: pydantic takes a tenth of a second.
@@ -14,16 +14,25 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, PlainValidator, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.texts import read_json
+from facerf_cli.files.texts import read_json, read_toml
 
 # Names become parts of paths: no separators, no hidden files, no way out of a folder.
 _NAME = re.compile(r"[A-Za-z0-9_+@=-][A-Za-z0-9_+@=. -]{0,99}")
 _RESERVED_ENDS = (" ", ".", ".json", ".jsonl")  # a dataset's own files end in the last two
+MOST_RIG_LIGHTS = 32
 _LARGEST = 1e12  # magnitude of a number; keeps products of two finite
 _UNIT_TOLERANCE = 1e-3  # a direction's length may differ from 1 by this
 _AN_OBJECT = "an object { } is needed"
@@ -75,6 +84,30 @@ def _said(error: ErrorDetails, where: str) -> str:
         return f"{where} is {reprlib.repr(value)}; {wanted}"
     except ValueError:  # a number of thousands of digits
         return f"{where} is too large; {wanted}"
+
+
+def read_rig(path: Path) -> dict[str, dict[str, str]]:
+    """Read the settings of each light by its name, as the text that an option would have.
+
+    [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
+    """
+    kind = dict[str, dict[str, Annotated[str, BeforeValidator(_text_of_option)]]]
+    lights = checked(kind, read_toml(path, "see docs/lights.md"), str(path))
+    if not 1 <= len(lights) <= MOST_RIG_LIGHTS:
+        raise InputError(f"{path}: {len(lights)} lights; give 1 to {MOST_RIG_LIGHTS}")
+    return lights
+
+
+def _text_of_option(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    parts = value if isinstance(value, list) else [value]
+    try:
+        if all(type(part) in (int, float) for part in parts):
+            return ",".join(f"{float(part)!r}" for part in parts)
+    except OverflowError:
+        pass
+    raise ValueError("give numbers, lists of them, or text such as '0:360:24'")
 
 
 def write_document(path: Path, content: Mapping[str, Any]) -> None:

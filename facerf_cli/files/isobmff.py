@@ -195,30 +195,17 @@ def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
-    """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12."""
+    """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12.
+
+    The properties of the main image come before those of its alpha and thumbnails.
+    """
     try:
         meta = dict(_boxes(dict(_boxes(content))[b"meta"][4:]))
-        properties = dict(_properties(meta[b"pitm"], dict(_boxes(meta[b"iprp"]))))
-        flags = properties.get(b"av1C", bytes(4))[2]
+        properties = list(_boxes(dict(_boxes(meta[b"iprp"]))[b"ipco"]))
+        flags = next((body for kind, body in properties if kind == b"av1C"), bytes(4))[2]
+        codes = [body for kind, body in properties if kind == b"colr" and body[:4] == b"nclx"]
         bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
-        bits = max([bits, *properties.get(b"pixi", b"")[5:]])
-        colours = properties.get(b"colr", b"")
-        codes = struct.unpack_from(">HH", colours, 4) if colours[:4] == b"nclx" else None
-        return bits, codes, b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
+        is_associated = b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
+        return bits, struct.unpack_from(">HH", codes[0], 4) if codes else None, is_associated
     except (KeyError, IndexError, struct.error):
         return 8, None, False
-
-
-def _properties(primary: bytes, inside: dict[bytes, bytes]) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the properties of the primary item, by the boxes `ipco` and `ipma`."""
-    every, table = list(_boxes(inside[b"ipco"])), inside[b"ipma"]
-    main = int.from_bytes(primary[4 : 8 if primary[0] else 6], "big")
-    of_item, of_index = (4 if table[0] else 2), 1 + (table[3] & 1)
-    at = 8
-    while at < len(table):
-        item, count = int.from_bytes(table[at : at + of_item], "big"), table[at + of_item]
-        at += of_item + 1
-        for place in range(at, at + of_index * count, of_index) if item == main else ():
-            index = int.from_bytes(table[place : place + of_index], "big") & ((1 << 8 * of_index - 1) - 1)
-            yield every[index - 1]
-        at += of_index * count

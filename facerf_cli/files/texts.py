@@ -1,4 +1,4 @@
-"""Files that other people wrote, read within limits: text, JSON, TOML, and lists and rigs of lights.
+"""Files that other people wrote, read within limits: text, JSON, TOML, and lists of lights.
 
 Only regular files are opened: a pipe or a device could be waited for without end. The module imports nothing
 heavy, since the index of a finished folder is read with it.
@@ -13,15 +13,13 @@ import re
 import stat
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from facerf_cli.errors import InputError
 
 LIMIT_BYTES = 64 << 20  # of any text
-MOST_RIG_LIGHTS = 32
 _ENDS_IN_NUMBER = re.compile(r"(.*\s)?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
-Settings = dict[str, str]
 Vector = list[float]
 ListedLight = tuple[str, Vector]  # name of an image, empty in a list without names
 
@@ -114,34 +112,6 @@ def read_toml(path: Path, advice: str) -> dict[str, Any]:
         return tomllib.loads(text_of(content))
     except (ValueError, RecursionError) as error:  # also of the decoding
         raise InputError(f"{path}: not TOML ({error}); {advice}") from None
-
-
-def read_rig(path: Path) -> dict[str, Settings]:
-    """Read the settings of each light by its name, as the text that an option would have.
-
-    [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
-    """
-    from pydantic import BeforeValidator  # few runs read a rig
-
-    from facerf_cli.files.documents import checked
-
-    kind = dict[str, dict[str, Annotated[str, BeforeValidator(_text_of_option)]]]
-    lights = checked(kind, read_toml(path, "see docs/lights.md"), str(path))
-    if not 1 <= len(lights) <= MOST_RIG_LIGHTS:
-        raise InputError(f"{path}: {len(lights)} lights; give 1 to {MOST_RIG_LIGHTS}")
-    return lights
-
-
-def _text_of_option(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    parts = value if isinstance(value, list) else [value]
-    try:
-        if all(type(part) in (int, float) for part in parts):
-            return ",".join(f"{float(part)!r}" for part in parts)
-    except OverflowError:
-        pass
-    raise ValueError("give numbers, lists of them, or text such as '0:360:24'")
 
 
 def read_light_list(path: Path) -> list[ListedLight]:

@@ -308,6 +308,16 @@ def lab_d65(linear: np.ndarray) -> np.ndarray:
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 
 
+def ita_deg(linear: np.ndarray) -> np.ndarray:
+    """Return the individual typology angle in degrees [...] of linear Rec.709 albedo [..., 3].
+
+    atan((L* - 50) / b*) under D65, higher for lighter skin (Chardon et al., *Skin colour typology and
+    suntanning pathways*, 1991).
+    """
+    lab = lab_d65(linear)
+    return np.degrees(np.arctan2(lab[..., 0] - 50, lab[..., 2]))
+
+
 def without_fireflies(linear: np.ndarray) -> np.ndarray:
     """Limit [H, W, 3] to 8 times its 99th percentile, so that a broken pixel sets no mean; 1 is never cut."""
     if linear.max() <= 1:

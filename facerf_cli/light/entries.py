@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.texts import read_light_list, read_rig, read_text
+from facerf_cli.files.texts import read_light_list, read_text
 
 MOST_LIGHTS = 4096
 MOST_FRAMES = 9999
@@ -384,6 +384,8 @@ def _rig_path(text: str) -> Path | None:
 
 def _rig(path: Path) -> LitImage:
     """The lights of a rig file, whose image has its name; paths of maps begin at the file's folder."""
+    from facerf_cli.files.documents import read_rig  # pydantic takes a tenth of a second
+
     lights = []
     try:
         for name, table in read_rig(path).items():

@@ -8,8 +8,8 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.files import texts
-from facerf_cli.files.documents import Document, Name, checked, distinct
-from facerf_cli.files.texts import MOST_RIG_LIGHTS, parse_json, read_json, read_rig, read_text, read_toml
+from facerf_cli.files.documents import MOST_RIG_LIGHTS, Document, Name, checked, distinct, read_rig
+from facerf_cli.files.texts import parse_json, read_json, read_text, read_toml
 from facerf_cli.light.entries import parse_lights
 from tests.refusals import refused
 
