@@ -69,11 +69,11 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 def _said(error: ErrorDetails, where: str) -> str:
     """Describe an error of pydantic by the path to its entry."""
-    kind, value = error["type"], error["input"]
-    for part in error["loc"]:
+    kind, value, path = error["type"], error["input"], error["loc"]
+    for part in path[:-1] if kind == "missing" else path:
         where += f"[{part}]" if isinstance(part, int) else f": {part}"
     if kind == "missing":
-        return f"{where} is missing; add it"
+        return f"{where} has no {path[-1]!r}; add it"
     if value is None:
         return f"{where} is null; fill it in"
     said = error["msg"].removeprefix("Value error, ")

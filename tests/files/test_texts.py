@@ -72,10 +72,10 @@ class Root(Document):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({}, "x.json: entries is missing; add it"),
+        ({}, "x.json has no 'entries'; add it"),
         ({"entries": 3}, r"x.json: entries is 3; a list \[ \] is needed"),
         ({"entries": [3]}, r"x.json: entries\[0\] is 3; an object { } is needed"),
-        ({"entries": [{"id": "a"}]}, r"x.json: entries\[0\]: count is missing"),
+        ({"entries": [{"id": "a"}]}, r"x.json: entries\[0\] has no 'count'"),
         ({"entries": [{"id": "../a", "count": 1}]}, r"entries\[0\]: id is '../a'; a name of letters"),
         ({"entries": [{"id": "a", "count": True}]}, r"count is True; input should be a valid int"),
         ({"entries": [{"id": None, "count": "1"}]}, r"id is null; fill it in \(and 1 more\)"),
