@@ -14,7 +14,7 @@ from PIL import Image
 from safetensors.torch import load_file
 from skimage.data import astronaut
 
-from facerf_cli.image.metrics import Interval
+from facerf_cli.evaluation.metrics import Interval
 from facerf_cli.synth.bank.heads import Bank
 from facerf_cli.synth.bank.texture_samples import head_fields
 

@@ -24,10 +24,10 @@ import torch
 from _common import MAPS, arguments, photos, print_header, print_row
 from torch import Tensor
 
+from facerf_cli.evaluation.metrics import light_error_deg
 from facerf_cli.face.head import Head
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
-from facerf_cli.image.metrics import light_error_deg
 from facerf_cli.light.envmap import rotated_weights
 from facerf_cli.light.light import Light
 from facerf_cli.light.sh import rig_coefficients

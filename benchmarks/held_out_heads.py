@@ -28,8 +28,9 @@ import torch
 from _common import arguments, first_heads, interval_text, print_header, print_row, required
 from torch import Tensor
 
+from facerf_cli.evaluation.metrics import TONES, mean_interval, tone_drift_deg, tone_of
 from facerf_cli.face.topology import region_mask
-from facerf_cli.image.metrics import TONES, ita_deg, mean_interval, tone_drift_deg, tone_of
+from facerf_cli.image.colour import ita_deg
 from facerf_cli.relighting.models import load_models
 from facerf_cli.synth.appearance import skin
 from facerf_cli.synth.appearance.people import People, draw_people

@@ -64,5 +64,15 @@ def press_profile() -> bytes:
     return profile({**described("press"), b"A2B0": content}, b"CMYK", b"prtr", b"Lab ")
 
 
+def scanner_profile() -> bytes:
+    """A profile of RGB by a table of 2^3 corners in Lab."""
+    corners = [(5 + 30 * r + 50 * g + 15 * b, 60 * (r - g), 40 * (g - b))
+               for r in (0, 1) for g in (0, 1) for b in (0, 1)]  # fmt: skip
+    table = b"".join(bytes([round(light * 2.55), 128 + a, 128 + b]) for light, a, b in corners)
+    ramp, unit = bytes(range(256)), fixed(1, 0, 0, 0, 1, 0, 0, 0, 1)
+    content = b"mft1" + bytes(4) + bytes([3, 3, 2, 0]) + unit + 3 * ramp + table + 3 * ramp
+    return profile({**described("Scanner 9"), b"A2B0": content}, b"RGB ", b"scnr", b"Lab ")
+
+
 DISPLAY_P3 = rgb_profile("Display P3", _P3_COLORANTS, parametric(3, *_SRGB_CURVE))
 PROPHOTO = rgb_profile("ProPhoto RGB", _PROPHOTO_COLORANTS, sampled(461))  # 1.8 in 256ths

@@ -34,7 +34,7 @@ _UNIT_M = 1e-3
 _TAKE = re.compile(r"ID\w*?(\d{3})")
 _DARK_TAKES, _DARK_PEOPLE, _DARK_STOPS = "ID2", range(88, 117), -1.0  # one stop darker than the others
 _FARTHEST_M = 10.0  # of a camera from the middle of the lights, if both have the same axes and unit
-_MOST_FRAMES, _MATRIX_LIMIT_BYTES = 4096, 1 << 16
+_MOST_FRAMES = 4096
 _GAMMA = "Gamma 2.2 Encoded Rec.709"
 _LICENCE = "FaceOLAT: academic use, on request (B R et al. 2025)"
 
@@ -151,7 +151,7 @@ def _colours(path: Path) -> tuple[np.ndarray, BlackLevel]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; {advice}")
     try:
-        numbers = np.array(read_text(path, _MATRIX_LIMIT_BYTES, advice).replace(",", " ").split(), np.float64)
+        numbers = np.array(read_text(path, advice).replace(",", " ").split(), np.float64)
         matrix = numbers.reshape(3, 4)
     except ValueError:
         matrix = np.full((3, 4), np.nan)

@@ -14,7 +14,6 @@ import numpy as np
 from facerf_cli.errors import InputError
 from facerf_cli.files.texts import read_text
 
-_LIMIT_BYTES = 64 << 20
 _ADVICE = "give the XML of Metashape's Export Cameras"
 _LEAST_TERM = 1e-9  # of b2 in pixels and of k4: what the model of a capture lacks
 _TERMS = ("cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
@@ -26,7 +25,7 @@ def read_metashape(path: Path, unit_m: float = 1.0) -> dict[str, dict[str, Any]]
     `unit_m` is the length of the chunk's unit in metres. Raises InputError for another file, and for lenses
     that are not those of a frame camera.
     """
-    text = read_text(path, _LIMIT_BYTES, _ADVICE)
+    text = read_text(path, _ADVICE)
     if "<!" in text.replace("<!--", ""):
         raise InputError(f"{path}: declares entities; {_ADVICE}")
     try:

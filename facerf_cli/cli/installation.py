@@ -16,7 +16,6 @@ from facerf_cli.training.settings import KINDS
 from facerf_cli.work.installed import MISSING, Facts, installation
 
 GLOBAL = "global"  # the table of options before the verb
-_LIMIT_BYTES = 1 << 20
 _NO_BREAK = "\N{NO-BREAK SPACE}"
 _WIDTH, _HEAD = 100, 13  # columns of the screen, and of a section's or part's name
 log = logging.getLogger(LOGGER_NAME)
@@ -107,7 +106,7 @@ def read_config(path: Path, group: Any) -> dict[str, Any]:
     Raises UsageError for a file that is no TOML, and for verbs and options that do not exist.
     """
     try:
-        tables = read_toml(path, _LIMIT_BYTES, "mend it")
+        tables = read_toml(path, "mend it")
     except InputError as error:
         raise UsageError(f"--config {error}") from None
     of_all = tables.pop(GLOBAL, {})

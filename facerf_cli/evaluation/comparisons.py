@@ -25,13 +25,13 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.folders import CaseFiles, read_pixels
 from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.metrics import light_error_deg, tone_drift_deg
 from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.evaluation.people import Bench, HeadView, Portrait, common_mask
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.colour import luminance
-from facerf_cli.image.metrics import light_error_deg, tone_drift_deg
 from facerf_cli.light.forms import rig_to_latlong
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel

@@ -32,7 +32,6 @@ CASES, SOURCE, TRUTH, MASK, LIGHT = "cases.csv", "source", "truth", "mask", "lig
 SUFFIXES = PHOTO_SUFFIXES | {".npy"}
 _PARTS = 64  # most items
 _NAMED_AT_MOST = 3  # names of files in an error
-_LARGEST_BYTES = 64 * 2**20  # of a CSV file
 _CSV_ADVICE = "begin with a header such as name,person,..."
 
 
@@ -156,7 +155,7 @@ def read_facts(path: Path) -> dict[str, Case]:
     A column whose cells are all numbers holds numbers; an empty cell is no fact.
     """
     try:
-        text = read_text(path, _LARGEST_BYTES, _CSV_ADVICE)
+        text = read_text(path, _CSV_ADVICE)
         lines = [[cell.strip() for cell in line] for line in csv.reader(io.StringIO(text)) if any(line)]
     except csv.Error as error:
         raise InputError(f"{path}: not CSV ({error}); save it in that format") from None

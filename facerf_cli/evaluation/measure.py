@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from facerf_cli.errors import InputError, UsageError
+from facerf_cli.evaluation.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
 from facerf_cli.evaluation.options import Measures, Space
 from facerf_cli.face.descriptor import face_descriptor
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
-from facerf_cli.image.metrics import mse, psnr_of, si_mse, si_mse_channels, si_mse_clipped, ssim
 from facerf_cli.network.checkpoint import read_tensors
 from facerf_cli.network.features import SMALLEST_PX, Lpips
 from facerf_cli.network.vgg import load_vgg

@@ -18,6 +18,7 @@ from facerf_cli.dataset.pairs import Pair, image_path, load_pairs, pair_weights,
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.folders import case_of, read_facts
 from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.metrics import tone_of
 from facerf_cli.evaluation.options import EvaluateOptions
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit, Geometry, fit_from_arrays
@@ -25,7 +26,6 @@ from facerf_cli.face.head import Head, unwrap_face
 from facerf_cli.face.topology import grid_triangles, grid_uv, interior_mask, region_mask
 from facerf_cli.files.olat_stack import StackHeader, read_olat_header
 from facerf_cli.files.read import LinearImage, read_image
-from facerf_cli.image.metrics import tone_of
 from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight

@@ -18,13 +18,13 @@ from pydantic import BeforeValidator
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation.measure import METRICS, Comparison, Row
+from facerf_cli.evaluation.metrics import best_scale
 from facerf_cli.evaluation.summary import Summary
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import read_document
 from facerf_cli.files.image_metadata import Attributes, xmp_packet
 from facerf_cli.files.sheets import filled_page
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.image.metrics import best_scale
 from facerf_cli.run.logs import json_line
 
 Format = Literal["facerf-evaluation-4"]

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from facerf_cli.evaluation.measure import METRICS, NEAR_BLACK, Row
-from facerf_cli.image.metrics import Interval, mean_interval
+from facerf_cli.evaluation.metrics import Interval, mean_interval
 from facerf_cli.run.logs import counted
 
 ALL = "all images"

@@ -11,7 +11,6 @@ from facerf_cli.files.texts import read_json, read_text, require_regular
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from facerf_cli.image.strips import strips
 
-_MAX_BYTES = 1 << 20  # of a landmark file
 _BLOCK_PX = 1 << 16  # converted at a time, so that they stay in the processor's cache
 _ADVICE = "give 68 landmarks as .pts or JSON"
 _PTS_FIRST_PIXEL = 0.5  # .pts counts pixels from 1: the first pixel's centre is 1.0 there and 0.5 here
@@ -49,7 +48,7 @@ def read_landmarks(path: Path) -> np.ndarray:
     try:
         if path.suffix.lower() == ".pts":
             return check_landmarks(_read_pts(path))
-        content = read_json(path, _ADVICE, _MAX_BYTES)
+        content = read_json(path, _ADVICE)
         points = (
             checked(_LandmarksDocument, content, str(path)).landmarks
             if isinstance(content, dict)
@@ -67,7 +66,7 @@ class _LandmarksDocument(Document):
 
 def _read_pts(path: Path) -> np.ndarray:
     try:
-        _, opening, rest = read_text(path, _MAX_BYTES, _ADVICE).partition("{")
+        _, opening, rest = read_text(path, _ADVICE).partition("{")
         body, closing, _ = rest.partition("}")
         if not opening or not closing:
             raise ValueError("it has no points between { and }")

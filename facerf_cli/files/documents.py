@@ -1,4 +1,4 @@
-"""JSON documents: each is a pydantic model, read within limits, and written as strict JSON.
+"""JSON documents and TOML rigs: pydantic validates them; JSON is written strictly.
 
 An error is one line with the file and the path to the entry, as in `stage.json: lights[2]: id is 3; ...`.
 Import this module where a document is read alone: pydantic takes a tenth of a second.
@@ -7,26 +7,36 @@ Import this module where a document is read alone: pydantic takes a tenth of a s
 import hashlib
 import json
 import re
+import reprlib
 from collections.abc import Mapping
 from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, PlainValidator, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    PlainValidator,
+    TypeAdapter,
+    ValidationError,
+)
 from pydantic_core import ErrorDetails
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.texts import LIMIT_BYTES, read_json
+from facerf_cli.files.texts import read_json, read_toml
 
 # Names become parts of paths: no separators, no hidden files, no way out of a folder.
 _NAME = re.compile(r"[A-Za-z0-9_+@=-][A-Za-z0-9_+@=. -]{0,99}")
 _RESERVED_ENDS = (" ", ".", ".json", ".jsonl")  # a dataset's own files end in the last two
+MOST_RIG_LIGHTS = 32
 _LARGEST = 1e12  # magnitude of a number; keeps products of two finite
 _UNIT_TOLERANCE = 1e-3  # a direction's length may differ from 1 by this
-_SHOWN = 60  # characters of a wrong value that an error quotes
-_WANTED = {"model_type": "an object { }", "dict_type": "an object { }", "list_type": "a list [ ]"}
+_AN_OBJECT = "an object { } is needed"
+_WANTED = {"model_type": _AN_OBJECT, "dict_type": _AN_OBJECT, "list_type": "a list [ ] is needed"}
 
 Kind = TypeVar("Kind")
 
@@ -34,12 +44,12 @@ Kind = TypeVar("Kind")
 class Document(BaseModel):
     """An object of a document; further keys are ignored, and no value is converted to another type."""
 
-    model_config = ConfigDict(strict=True, frozen=True, protected_namespaces=())
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False, protected_namespaces=())
 
 
-def read_document(path: Path, kind: type[Kind], missing: str, limit_bytes: int = LIMIT_BYTES) -> Kind:
+def read_document(path: Path, kind: type[Kind], missing: str) -> Kind:
     """Read a JSON document of a model or another type; `missing` says what to do without the file."""
-    return checked(kind, read_json(path, missing, limit_bytes), str(path))
+    return checked(kind, read_json(path, missing), str(path))
 
 
 def checked(kind: type[Kind], value: Any, where: str) -> Kind:
@@ -58,27 +68,46 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
 
 
 def _said(error: ErrorDetails, where: str) -> str:
-    """An error of pydantic in the words of ours."""
-    kind, path, value = error["type"], list(error["loc"]), error["input"]
+    """Describe an error of pydantic by the path to its entry."""
+    kind, value, path = error["type"], error["input"], error["loc"]
+    for part in path[:-1] if kind == "missing" else path:
+        where += f"[{part}]" if isinstance(part, int) else f": {part}"
     if kind == "missing":
-        advice = "give a file that facerf wrote, or add it" if path == ["format"] else "add it"
-        return f"{_place(where, path[:-1])} has no {path[-1]!r}; {advice}"
-    place = _place(where, path)
+        return f"{where} has no {path[-1]!r}; add it"
     if value is None:
-        return f"{place} is null; fill it in"
+        return f"{where} is null; fill it in"
     said = error["msg"].removeprefix("Value error, ")
-    wanted = f"{_WANTED[kind]} is needed" if kind in _WANTED else said[:1].lower() + said[1:]
+    wanted = _WANTED.get(kind, said[:1].lower() + said[1:])
     if kind == "value_error" and isinstance(value, dict):  # of several entries at once
-        return f"{place}: {said}"
-    text = json.dumps(value, default=str)
-    shown = text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
-    return f"{place} is {shown}; {wanted}"
+        return f"{where}: {said}"
+    try:
+        return f"{where} is {reprlib.repr(value)}; {wanted}"
+    except ValueError:  # a number of thousands of digits
+        return f"{where} is too large; {wanted}"
 
 
-def _place(where: str, path: list[int | str]) -> str:
-    for part in path:
-        where += f"[{part}]" if isinstance(part, int) else f": {'a key' if part == '[key]' else part}"
-    return where
+def read_rig(path: Path) -> dict[str, dict[str, str]]:
+    """Read the settings of each light by its name, as the text that an option would have.
+
+    [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
+    """
+    kind = dict[str, dict[str, Annotated[str, BeforeValidator(_text_of_option)]]]
+    lights = checked(kind, read_toml(path, "see docs/lights.md"), str(path))
+    if not 1 <= len(lights) <= MOST_RIG_LIGHTS:
+        raise InputError(f"{path}: {len(lights)} lights; give 1 to {MOST_RIG_LIGHTS}")
+    return lights
+
+
+def _text_of_option(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    parts = value if isinstance(value, list) else [value]
+    try:
+        if all(type(part) in (int, float) for part in parts):
+            return ",".join(f"{float(part)!r}" for part in parts)
+    except OverflowError:
+        pass
+    raise ValueError("give numbers, lists of them, or text such as '0:360:24'")
 
 
 def write_document(path: Path, content: Mapping[str, Any]) -> None:

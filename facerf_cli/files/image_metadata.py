@@ -19,14 +19,13 @@ from xml.sax.saxutils import quoteattr
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files import isobmff
-from facerf_cli.files.read import metadata_of, open_image, shown_size, utf8_path
+from facerf_cli.files.quirks import utf8_path
+from facerf_cli.files.read import metadata_of, open_image, shown_size
 from facerf_cli.files.spaces import default_space, is_floating, stated_space
 from facerf_cli.image.colour import ColourSpace
 
 Attributes = Mapping[str, str | int | float]
 
-_HEIF_LIMIT_PX = 100_000_000  # of a photo that is decoded for its header alone
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
 _JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
@@ -65,14 +64,8 @@ def read_header(path: Path) -> Header | None:
     if not path.is_file():
         return None
     try:
-        kind = isobmff.kind_of(path)
-        if kind == "avif":
-            _, spec = isobmff.open_avif(path)
-        elif kind == "heif":
-            _, spec = isobmff.decode_heif(path, _HEIF_LIMIT_PX)
-        else:
-            with open_image(path) as opened:
-                spec = opened.spec
+        with open_image(path) as opened:
+            spec = opened.spec
     except InputError:  # no image, damaged, or pi-heif is not there
         return None
     space = default_space(spec)

@@ -1,8 +1,8 @@
-"""Tables of arrays in pickles, as FLAME's are: Python's unpickler with names from an allow-list.
+"""Tables of arrays in pickles, as FLAME's are: Python's unpickler with an allow-list of names.
 
-The classes and functions of other packages become stand-ins, which only keep what they are given; arrays are
-then read over the file's own bytes. So no code of a file runs, and FLAME opens without chumpy. Damage can
-still exhaust or crash the unpickler: read a user's file in a process of its own (`files/apart.py`).
+Only arrays of numpy and scipy, and plain containers, are made; classes of chumpy and torch become stand-ins.
+Damage can still exhaust or crash the unpickler: read a user's file in a process of
+its own (`files/apart.py`).
 """
 
 import pickle
@@ -13,88 +13,71 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-_BUILT = re.compile(
-    r"(copy_reg|copyreg)\._reconstructor|_codecs\.encode|__builtin__\.(bytes|object|set)"
-    r"|builtins\.(object|set)|collections\.OrderedDict"
+_ALLOWED = re.compile(
+    r"numpy\.(_core\.(multiarray\.(_reconstruct|scalar)|numeric\._frombuffer)|dtype|ndarray)"
+    r"|scipy\.sparse\._cs[cr]\.cs[cr]_(matrix|array)|_codecs\.encode|copyreg\._reconstructor"
+    r"|builtins\.(bytes|object|set)|collections\.OrderedDict"
 )
-_KEPT = re.compile(
-    r"numpy\.(_?core\.multiarray\.(_reconstruct|scalar)|_?core\.numeric\._frombuffer|dtype|ndarray)"
-    r"|(chumpy|torch|scipy\.sparse)\..*"
-)
-_NUMBERS = re.compile(r"f[248]|[iu][1248]|b1")  # types that are read: no objects, text or records
+# The names of Python 2, and of older numpy and scipy.
+_MOVED = {"numpy.core": "numpy._core", "scipy.sparse.cs": "scipy.sparse._cs", "copy_reg": "copyreg"}
+_MOVED["__builtin__"] = "builtins"
 
 
-class _StandIn:
-    """An object that is not made: the name of its class, what that is called with, and the state."""
+class _Unread:
+    """Stands for what is not made, such as tensors of torch."""
 
-    name = ""
-    arguments: tuple[Any, ...] = ()
-    state: Any = None
+    x: Any = None
 
-    def __new__(cls, *arguments: Any) -> "_StandIn":
-        made = super().__new__(cls)
-        made.arguments = arguments
-        return made
+    def __new__(cls, *_: Any) -> "_Unread":
+        return super().__new__(cls)
 
     def __setstate__(self, state: Any) -> None:
-        self.state = state
+        pass
+
+
+class _Chumpy(_Unread):
+    """Stands for an array of chumpy, whose values are `x` of its state."""
+
+    def __setstate__(self, state: Any) -> None:
+        self.x = state["x"]
 
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return what an allowed name stands for."""
-        whole = f"{module}.{name}"
-        if _BUILT.fullmatch(whole):
+        """Return what an allowed name stands for; raises ValueError for any other."""
+        if module.startswith(("chumpy.", "torch.")):
+            return _Chumpy if (module, name) == ("chumpy.ch", "Ch") else _Unread
+        for old, new in _MOVED.items():
+            module = new + module.removeprefix(old) if module.startswith(old) else module
+        if _ALLOWED.fullmatch(f"{module}.{name}"):
             return super().find_class(module, name)
-        if _KEPT.fullmatch(whole):
-            return type("StandIn", (_StandIn,), {"name": whole})
-        raise ValueError(f"it names {whole[:80]}, which is not part of a face model; nothing of it was run")
+        whole = f"{module}.{name}"[:80]
+        raise ValueError(f"it names {whole}, which is not part of a face model; nothing of it was run")
 
 
 def pickled_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The numbers of a pickled table, or of a table in an .npy, by name; empty for a value without any."""
+    """Return the numbers of a pickled table, or of a table in an .npy, by name; empty for other values."""
     with path.open("rb") as file:
         if path.suffix == ".npy":
             np.lib.format.read_magic(file)
             np.lib.format.read_array_header_1_0(file)
         table = _Unpickler(file, encoding="latin-1").load()
-    match table:
-        case _StandIn(state=(_, _, _StandIn(arguments=("O8" | "O", *_)), _, [entry])):  # by np.save
-            table = entry
+    if isinstance(table, np.ndarray) and table.dtype == object and table.size == 1:  # by np.save
+        table = table.item()
     if not isinstance(table, dict):
         raise ValueError(f"it holds a {type(table).__name__}, not a table of arrays")
     return {name: _numbers(value) for name, value in table.items() if isinstance(name, str)}
 
 
 def _numbers(value: Any) -> np.ndarray:
-    """The numbers in an array of numpy, chumpy or scipy.sparse, a scalar or a list."""
-    match value:
-        case _StandIn(name="chumpy.ch.Ch", state={"x": inner}):
-            return _numbers(inner)
-        case _StandIn(state={"indptr": starts, "indices": indices, "data": data, **state}):
-            kind = sparse.csc_matrix if "csc" in value.name else sparse.csr_matrix
-            parts = _numbers(data), _numbers(indices), _numbers(starts)
-            matrix = kind(parts, state["_shape" if "_shape" in state else "shape"])
-            matrix.check_format(full_check=True)
-            return np.asarray(matrix.toarray())
-        case _StandIn(state=(_, shape, _StandIn() as kind, fortran, raw)):
-            return _array_over(raw, kind, shape, "F" if fortran else "C")
-        case _StandIn(arguments=(raw, _StandIn() as kind, shape, order)):  # _frombuffer
-            return _array_over(raw, kind, shape, order)
-        case _StandIn(arguments=(_StandIn() as kind, raw)):  # scalar
-            return _array_over(raw, kind, (), "C")
-        case int() | float():
-            return np.array(value)
-        case [*entries] if all(isinstance(entry, (int, float)) for entry in entries):
-            return np.array(entries)
-    return np.zeros(0)
-
-
-def _array_over(raw: Any, kind: _StandIn, shape: Any, order: Any) -> np.ndarray:
-    """A view of a pickle's bytes, which Python 2 may have stored as text; empty for other than numbers."""
-    code = str(kind.arguments[0])
-    if not _NUMBERS.fullmatch(code):
+    """Return the numbers in an array of numpy, chumpy or scipy.sparse, a scalar or a list."""
+    value = value.x if isinstance(value, _Chumpy) else value
+    if sparse.issparse(value):
+        value.check_format(full_check=True)
+        value = value.toarray()
+    if isinstance(value, list) and not all(isinstance(entry, int | float) for entry in value):
         return np.zeros(0)
-    dtype = np.dtype(code).newbyteorder(kind.state[1])
-    data = raw.encode("latin-1") if isinstance(raw, str) else bytes(raw)
-    return np.frombuffer(data, dtype).reshape(shape, order=order)
+    array = (
+        np.asarray(value) if isinstance(value, np.ndarray | np.generic | list | int | float) else np.zeros(0)
+    )
+    return array.astype(array.dtype.newbyteorder("=")) if array.dtype.kind in "biuf" else np.zeros(0)

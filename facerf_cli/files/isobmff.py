@@ -1,4 +1,4 @@
-"""Images in ISO boxes (ISO 14496-12): HEIC and AVIF, which OpenImageIO does not read, and JPEG XL's alpha.
+"""Images in ISO boxes (ISO 14496-12), which OpenImageIO does not read: HEIC and AVIF.
 
 HEIC and HEIF, as phones store them, are decoded by pi-heif, an extra (`facerf[heic]`); some damaged files
 crash it, so it runs in a process of its own (`apart.py`). AVIF is decoded by Pillow in 8 bits; 10 and 12 bits
@@ -9,16 +9,15 @@ import importlib.util
 import io
 import logging
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.apart import arrays_apart
-from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
@@ -32,9 +31,15 @@ _UNKNOWN, _BT601 = 2, 5  # matrices (ITU-T H.273), and
 _MATRICES = (1, 4, _BT601, 6, 7, 9)  # those that FFmpeg converts
 _FULL = 1  # range, to which pi-heif and Pillow decode
 _MOST = np.iinfo(np.uint16).max
-_JXL_HEADER_BYTES, _JXL_ALPHA = 4096, 0  # more than a header has; the kind of an extra channel
 
 log = logging.getLogger(LOGGER_NAME)
+
+
+class Boxed(NamedTuple):
+    """An open image: its header, and what decodes its pixels [H, W, C] once there is room for them."""
+
+    spec: oiio.ImageSpec
+    decode: Callable[[], np.ndarray]
 
 
 def kind_of(path: Path) -> str:
@@ -60,55 +65,48 @@ def _state(spec: oiio.ImageSpec, is_associated: bool, profile: Any, codes: Any) 
         spec.attribute("CICP", oiio.TypeDesc("int[4]"), (*map(int, codes), 0, _FULL))
 
 
-def heif_arrays(path: Path, limit_px: int, most_px: int) -> dict[str, np.ndarray]:
-    """The main image, upright, `pixels` [H, W, C], and its ICC `profile`, or `codes` of its colour space.
+def heif_arrays(path: Path, most_px: int) -> dict[str, np.ndarray]:
+    """The main image, upright: its `shape` [H, W, C], `bits`, and ICC `profile`, or `codes` of its space.
 
-    Of an image of more than `most_px` pixels only the `size` (W, H); over `limit_px` is a ValueError.
+    Its `pixels` [H, W, C] only if there are at most `most_px`.
     """
     import pi_heif
 
     image = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
     width, height = image.size
-    if width * height > limit_px:
-        most = f"at most {limit_px / 1e6:.0f} megapixels are read"
-        raise ValueError(f"{width} x {height} pixels; {most}, so make it smaller")
-    if width * height > most_px:
-        return {"size": np.array([width, height])}
-    pixels = np.array(image)  # a copy: the memory of pi-heif ends with its image
-    is_associated = np.array(bool(image.premultiplied_alpha))
-    arrays = {"pixels": pixels.reshape(height, width, -1), "is_associated": is_associated}
+    channels, _, depth = image.mode.partition(";")
+    arrays = {
+        "shape": np.array([height, width, len(channels)]),
+        "bits": np.array(16 if depth else 8),
+        "is_associated": np.array(bool(image.premultiplied_alpha)),
+    }
     if profile := image.info.get("icc_profile"):
         arrays["profile"] = np.frombuffer(profile, np.uint8)
     elif code := image.info.get("nclx_profile"):
         arrays["codes"] = np.array([code["color_primaries"], code["transfer_characteristics"]])
+    if width * height <= most_px:
+        arrays["pixels"] = np.array(image).reshape(height, width, -1)  # a copy: its memory is pi-heif's
     return arrays
 
 
-def decode_heif(path: Path, limit_px: int, bytes_px: int = HEIF_BYTES) -> tuple[np.ndarray, oiio.ImageSpec]:
-    """Decode the main image, upright, and describe it.
-
-    The size is checked, and the budget of memory asked for `bytes_px` bytes a pixel, before it is decoded.
-    """
+def open_heif(path: Path, most_px: int) -> Boxed:
+    """Open the main image, upright; one of more than `most_px` pixels cannot be decoded."""
     if importlib.util.find_spec("pi_heif") is None:
         raise InputError(
             f"{path}: HEIC and HEIF need the package pi-heif; pip install 'facerf[heic]', or save it as JPEG"
         )
     try:
-        arrays = arrays_apart(heif_arrays, path, limit_px, memory.left_bytes() // bytes_px)
+        arrays = arrays_apart(heif_arrays, path, most_px)
     except ValueError as error:
         raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
-    if "size" in arrays:
-        width, height = arrays["size"].tolist()
-        memory.require(f"{path}: {width} x {height} pixels", width * height * bytes_px, "make it smaller")
-    values = arrays["pixels"]
-    height, width, channels = values.shape
-    spec = oiio.ImageSpec(width, height, channels, str(values.dtype))
+    height, width, channels = arrays["shape"].tolist()
+    spec = oiio.ImageSpec(width, height, channels, f"uint{arrays['bits']}")
     _state(spec, bool(arrays["is_associated"]), arrays.get("profile"), arrays.get("codes"))
-    return values, spec
+    return Boxed(spec, lambda: arrays["pixels"])
 
 
-def open_avif(path: Path) -> tuple[Any, oiio.ImageSpec]:
-    """Open the main image by Pillow without decoding it, and describe it; it need not be upright."""
+def open_avif(path: Path) -> Boxed:
+    """Open the main image, which need not be upright, by Pillow."""
     try:
         from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
     except ImportError:
@@ -126,10 +124,10 @@ def open_avif(path: Path) -> tuple[Any, oiio.ImageSpec]:
     _state(spec, is_associated, image.info.get("icc_profile") or None, codes)
     spec.attribute("oiio:BitsPerSample", bits)
     spec.attribute("Orientation", orientation if orientation in range(1, 9) else 1)
-    return image, spec
+    return Boxed(spec, lambda: _decode_avif(path, image, spec))
 
 
-def decode_avif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
+def _decode_avif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
     """Decode an opened image, in 16 bits where it is deeper than 8."""
     shape, bits = (spec.height, spec.width, -1), spec.get_int_attribute("oiio:BitsPerSample")
     if bits > 8 and (values := _deep_values(image)) is not None:
@@ -197,87 +195,17 @@ def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
-    """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12."""
+    """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12.
+
+    The properties of the main image come before those of its alpha and thumbnails.
+    """
     try:
         meta = dict(_boxes(dict(_boxes(content))[b"meta"][4:]))
-        properties = dict(_properties(meta[b"pitm"], dict(_boxes(meta[b"iprp"]))))
-        flags = properties.get(b"av1C", bytes(4))[2]
+        properties = list(_boxes(dict(_boxes(meta[b"iprp"]))[b"ipco"]))
+        flags = next((body for kind, body in properties if kind == b"av1C"), bytes(4))[2]
+        codes = [body for kind, body in properties if kind == b"colr" and body[:4] == b"nclx"]
         bits = (12 if flags & _TWELVE else 10) if flags & _DEEP else 8
-        bits = max([bits, *properties.get(b"pixi", b"")[5:]])
-        colours = properties.get(b"colr", b"")
-        codes = struct.unpack_from(">HH", colours, 4) if colours[:4] == b"nclx" else None
-        return bits, codes, b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
+        is_associated = b"prem" in dict(_boxes(meta.get(b"iref", b"")[4:]))
+        return bits, struct.unpack_from(">HH", codes[0], 4) if codes else None, is_associated
     except (KeyError, IndexError, struct.error):
         return 8, None, False
-
-
-def _properties(primary: bytes, inside: dict[bytes, bytes]) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the properties of the primary item, by the boxes `ipco` and `ipma`."""
-    every, table = list(_boxes(inside[b"ipco"])), inside[b"ipma"]
-    main = int.from_bytes(primary[4 : 8 if primary[0] else 6], "big")
-    of_item, of_index = (4 if table[0] else 2), 1 + (table[3] & 1)
-    at = 8
-    while at < len(table):
-        item, count = int.from_bytes(table[at : at + of_item], "big"), table[at + of_item]
-        at += of_item + 1
-        for place in range(at, at + of_index * count, of_index) if item == main else ():
-            index = int.from_bytes(table[place : place + of_index], "big") & ((1 << 8 * of_index - 1) - 1)
-            yield every[index - 1]
-        at += of_index * count
-
-
-def multiplies_alpha(path: Path) -> bool:
-    """Return whether the colour is multiplied by alpha; False for the header of an animation or a preview."""
-    content = path.read_bytes()
-    if not content.startswith(b"\xff\x0a"):  # in a container, whole or in numbered parts
-        parts = [
-            body[4 * (kind == b"jxlp") :] for kind, body in _boxes(content) if kind in (b"jxlc", b"jxlp")
-        ]
-        content = b"".join(parts)
-    rest = int.from_bytes(content[2:_JXL_HEADER_BYTES], "little")  # zeros follow it
-
-    def read(count: int) -> int:
-        nonlocal rest
-        value, rest = rest & ((1 << count) - 1), rest >> count
-        return value
-
-    def choose(*choices: tuple[int, int]) -> int:
-        """Read a number of so many bits above an offset; two bits say which."""
-        count, offset = choices[read(2)]
-        return offset + read(count)
-
-    def skip_size() -> None:
-        is_small = read(1)
-        for skips_ratio in (True, False):
-            if is_small:
-                read(5)
-            else:
-                choose((9, 1), (13, 1), (18, 1), (30, 1))
-            if skips_ratio and read(3):  # by which the width follows
-                return
-
-    def skip_depth() -> None:
-        if read(1):  # floats
-            choose((0, 32), (0, 16), (0, 24), (6, 1))
-            read(4)
-        else:
-            choose((0, 8), (0, 10), (0, 12), (6, 1))
-
-    skip_size()
-    if read(1):  # all is as by default, without alpha
-        return False
-    if read(1):  # extra fields
-        read(3)  # orientation
-        if read(1):
-            skip_size()
-        if read(2):  # a preview, an animation
-            return False
-    skip_depth()
-    read(1)
-    if not choose((0, 0), (0, 1), (4, 2), (12, 1)) or read(1):  # no extra channel, or alpha as by default
-        return False
-    kind = choose((0, 0), (0, 1), (4, 2), (6, 18))
-    skip_depth()
-    choose((0, 0), (0, 3), (0, 4), (3, 1))
-    read(8 * choose((0, 0), (4, 0), (5, 16), (10, 48)))  # its name
-    return kind == _JXL_ALPHA and read(1) == 1

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
-from facerf_cli.files.read import oiio_error, utf8_path
+from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
 from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, writing
 from facerf_cli.image.colour import REC709_CHROMATICITIES
@@ -35,7 +35,6 @@ COMPRESSION = "zip"  # the smallest lossless compression, and the fastest
 _LIGHT_BYTES = 6  # of a pixel: half floats
 _SUM_BYTES = 30  # of a pixel of a light that is summed: half floats, floats, and a copy of them
 _AT_ONCE = 16  # lights that are summed
-_OPEN = 256  # lights that are read before a stack is opened again
 _SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
 _MOST_LIGHTS = 4096
 _MOST_CHANNELS = 16  # of a part; other programs may add some
@@ -202,11 +201,8 @@ def stream_olats(path: Path) -> Iterator[Tensor]:
         memory.require(what, height * width * (_SUM_BYTES + _SOURCE_BYTES), "a stack of fewer pixels")
         fit = (memory.left_bytes() // 2 // (height * width) - _SOURCE_BYTES) // _SUM_BYTES
         at_once = max(1, min(_AT_ONCE, fit))
-    for first in range(0, lights, _OPEN):  # OpenEXR holds some memory for each part that was read
-        last = min(first + _OPEN, lights)
-        with _opened(path) as stack:
-            for start in range(first, last, at_once):
-                yield _read_lights(stack, range(start, min(start + at_once, last))).float()
+    for first in range(0, lights, at_once):  # OpenEXR holds some memory for each part that an open file read
+        yield read_olats(path, range(first, min(first + at_once, lights))).float()
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:

@@ -1,42 +1,95 @@
-"""Formats that OpenImageIO reads in part, or otherwise than meant: PNG, TIFF, inks, PSD, Cineon, Radiance.
+"""What OpenImageIO leaves to its caller: refusing rare kinds of files, finding damage, parts of headers.
 
 A header of Radiance's .hdr, lines `NAME=value`, ends with an empty line and the resolution, `-Y 512 +X 1024`.
-EXPOSURE and COLORCORR, of which there may be several, have multiplied the values. HEIC and AVIF are in
-`isobmff.py`.
+HEIC and AVIF are in `isobmff.py`.
 """
 
-import io
+import logging
+import math
+import re
 import struct
 import warnings
 import zlib
-from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.run import memory
+from facerf_cli.image.colour import unit_floats
+from facerf_cli.run.logs import LOGGER_NAME, one_line
 
-WHITE_IS_ZERO, SEPARATED, CIELAB = 0, 5, 8  # a TIFF's photometric interpretations
-_RAW_COLOURS = (32803, 34892)  # of a colour filter array, of linear raw
-ALPHA = ASSOCIATED, _UNASSOCIATED = 1, 2  # kinds of a TIFF's extra channels, by this tag:
-_EXTRA_SAMPLES = 338
+_RAW = (
+    ".3fr .arw .cr2 .cr3 .crw .dcr .dng .erf .fff .iiq .kdc .mef .mos .mrw .nef .nrw .orf .pef .raf .raw .rw2"
+    " .rwl .sr2 .srf .srw .x3f"
+)
+RAW_SUFFIXES = frozenset(_RAW.split())
+UNDEVELOPED = (  # OpenImageIO reads its thumbnail
+    "a raw file of a camera, or a thumbnail first, is not read; develop it to EXR, TIFF or JPEG, as with"
+    " darktable or RawTherapee"
+)
+_NO_COMPOSITE = (
+    "a PSD without a composite of its layers is not read; save it with Maximize Compatibility, or as PNG"
+)
+ASSOCIATED = 1  # kind of a TIFF's extra channel: alpha that the colour is multiplied by
+_EXTRA_SAMPLES = 338  # the tag of these kinds
+# A TIFF's photometric interpretations.
+_WHITE_IS_ZERO, _SEPARATED, _CIELAB, _RAW_COLOURS = 0, 5, 8, (32803, 34892)
 _THUMBNAIL = 1  # bit of a TIFF's NewSubfileType
+_FILM_CURVES = ("Logarithmic", "Printing density")  # of a DPX
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_CINEON_LITTLE = b"\xd7\x5f\x2a\x80"  # the first four bytes of a little-endian Cineon file
 _PSD_VERSION, _HAS_COMPOSITE = 1057, 4  # a PSD's resource, and the place of a byte in it
-_LIMIT_BYTES = 1 << 16  # of a header
-# The Exif orientation of each order of the axes: the first is that of rows in the file.
-_ORIENTATIONS = {
-    order: number
-    for number, order in enumerate(("-Y+X", "-Y-X", "+Y-X", "+Y+X", "+X-Y", "-X-Y", "-X+Y", "+X+Y"), 1)
-}
-_EXPONENT_BIAS = 128 + 8
-_RUNS_BYTES = 60  # of a pixel while runs are decoded
-_REPEAT = (1, 1, 1)  # a pixel that says how often the one before it is repeated
+_HEADER_BYTES = 1 << 16  # of a Radiance file
+_NOISE, _MOST_ABOVE = 0.01, 0.02  # of multiplied colours: how far, and how many pixels, exceed alpha
+_UNSUPPORTED = re.compile(
+    r"unsupported|not (supported|configured|implemented|available)|unknown compression", re.I
+)
+
+log = logging.getLogger(LOGGER_NAME)
+
+
+def refuse_rare(path: Path, form: str, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) -> None:
+    """Raise InputError for kinds of files that few people have; the error names the conversion.
+
+    `form` is OpenImageIO's name of the format, `spec` the header of the image that would be read, and
+    `following` the header of a TIFF's second page.
+    """
+    meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
+    is_log = form == "cineon" or spec.get_string_attribute("dpx:Transfer") in _FILM_CURVES
+    is_turned = form == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5
+    for is_found, message in (
+        (spec.deep, "a deep image is not read; flatten it, as with oiiotool --flatten"),
+        (form == "tiff" and _is_raw(path, spec, following), UNDEVELOPED),
+        (meaning == _WHITE_IS_ZERO, "a TIFF whose zero is white is not read; save it as PNG"),
+        (meaning == _CIELAB, "a TIFF in CIELAB is not read; convert it to RGB"),
+        (form == "psd" and _lacks_composite(path), _NO_COMPOSITE),
+        (is_log, "a film scan in Cineon log is not read; convert it to linear values, as EXR"),
+        (is_turned, "a DPX file that lies on its side is not read; save it upright"),
+    ):
+        if is_found:
+            raise InputError(f"{path}: {message}")
+
+
+def has_inks(spec: oiio.ImageSpec) -> bool:
+    """Return whether a JPEG or TIFF holds inks (CMYK)."""
+    is_separated = spec.get_int_attribute("tiff:PhotometricInterpretation", -1) == _SEPARATED
+    return is_separated or spec.get_string_attribute("jpeg:ColorSpace") in ("CMYK", "YCbCrK")
+
+
+def _is_raw(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) -> bool:
+    """Return whether a TIFF has a thumbnail first, before its next image, or the values of a sensor."""
+    is_thumbnail = bool(spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL)
+    is_smaller = following is not None and 2 * spec.width <= following.width
+    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
+    return starts_with(path, b"CR", 8) or is_thumbnail or is_smaller or colours in _RAW_COLOURS
+
+
+def _lacks_composite(path: Path) -> bool:
+    """Return whether a PSD says that it has white in place of its layers."""
+    resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
+    return bool(resources.get(_PSD_VERSION, b"")[_HAS_COMPOSITE:][:1] == b"\0")
 
 
 def starts_with(path: Path, start: bytes, at: int = 0) -> bool:
@@ -58,16 +111,14 @@ def by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
         return None
 
 
-def require_whole_png(path: Path) -> None:
-    """Check the chunks and checksums of a PNG file to its end; a file of another kind passes.
+def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
+    """Yield the kind and the content of each chunk of a PNG file; nothing for a file of another kind.
 
-    OpenImageIO does not report such damage reliably.
+    Raises InputError for missing bytes and wrong checksums, which OpenImageIO does not report reliably.
     """
     size = path.stat().st_size
     with path.open("rb") as stream:
-        if stream.read(len(_PNG_SIGNATURE)) != _PNG_SIGNATURE:
-            return
-        kind = b""
+        kind = b"" if stream.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE else b"IEND"
         while kind != b"IEND":
             head = stream.read(8)
             length, kind = struct.unpack(">I4s", head) if len(head) == 8 else (0, b"")
@@ -76,46 +127,14 @@ def require_whole_png(path: Path) -> None:
                 raise InputError(f"{path}: damaged or cut short: the PNG file ends too early; copy it again")
             if zlib.crc32(kind + body) != int.from_bytes(checksum, "big"):
                 raise InputError(f"{path}: damaged: a checksum of the PNG file is wrong; copy it again")
-
-
-def kinds_of_chunks(path: Path) -> set[bytes]:
-    """The kinds of a PNG's chunks before its pixels; of a file of another kind none."""
-    kinds: set[bytes] = set()
-    with path.open("rb") as stream:
-        if stream.read(len(_PNG_SIGNATURE)) == _PNG_SIGNATURE:
-            while len(head := stream.read(8)) == 8 and head[4:] != b"IDAT":
-                kinds.add(head[4:])
-                stream.seek(int.from_bytes(head[:4], "big") + 4, 1)  # with a checksum
-    return kinds
-
-
-def require_whole_cineon(path: Path, spec: oiio.ImageSpec) -> None:
-    """Raise InputError where 10-bit pixels are missing, three in 32 bits, which OpenImageIO leaves black."""
-    with path.open("rb") as stream:
-        magic, at = stream.read(4), stream.read(4)
-    start = int.from_bytes(at, "little" if magic == _CINEON_LITTLE else "big")
-    if path.stat().st_size < start + 4 * -(-spec.width * spec.height * spec.nchannels // 3):
-        raise InputError(f"{path}: damaged or cut short; copy it again (pixels are missing)")
-
-
-def require_composite(path: Path) -> None:
-    """Raise InputError for a PSD that says that it has white in place of its layers."""
-    resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
-    if resources.get(_PSD_VERSION, b"")[_HAS_COMPOSITE:][:1] == b"\0":
-        advice = "save it with Maximize Compatibility, or as PNG"
-        raise InputError(f"{path}: a PSD without a composite of its layers is not read; {advice}")
-
-
-def is_raw_tiff(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None = None) -> bool:
-    """Return whether a TIFF has a thumbnail first, before its next image, or the values of a sensor."""
-    is_thumbnail = bool(spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL)
-    is_smaller = following is not None and 2 * spec.width <= following.width
-    colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
-    return starts_with(path, b"CR", 8) or is_thumbnail or is_smaller or colours in _RAW_COLOURS
+            yield kind, body
 
 
 def extra_channel(path: Path) -> int:
-    """The kind of a TIFF's first channel after its colours, such as `ASSOCIATED` alpha; 0 says nothing."""
+    """Return the kind of a TIFF's first channel after its colours, such as `ASSOCIATED`; 0 if none is stated.
+
+    Pillow opens few of the files with such a channel, but reads their directory.
+    """
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     with path.open("rb") as stream:
@@ -126,121 +145,92 @@ def extra_channel(path: Path) -> int:
         return int(directory.get(_EXTRA_SAMPLES, (0,))[0])
 
 
-def black_is_zero(values: np.ndarray, alpha: int | None) -> np.ndarray:
-    """Undo white-is-zero [H, W, C]; OpenImageIO has done it to 8 bits, of alpha, too."""
-    white = np.iinfo(values.dtype).max if values.dtype.kind == "u" else 1
-    channels = [
-        channel for channel in range(values.shape[-1]) if (channel == alpha) == (values.dtype == np.uint8)
-    ]
-    values[..., channels] = white - values[..., channels]
-    return values
+def radiance_exposure(path: Path, spec: oiio.ImageSpec) -> float:
+    """Return what the values of a Radiance file were multiplied by, and set the primaries that it states.
 
-
-def rgb_of_inks(inks: np.ndarray, extra: int) -> np.ndarray:
-    """Turn inks and an extra channel [H, W, 5 or more] into RGB and that, as OpenImageIO does without it."""
-    alpha = inks[..., 4]
-    if extra == ASSOCIATED:
-        inks = inks / np.where(alpha > 0, alpha, 1)[..., None]
-    return np.dstack([(1 - inks[..., :3]).clip(0, 1) * (1 - inks[..., 3:4]).clip(0, 1), alpha])
-
-
-def by_profile_of_inks(path: Path, spec: oiio.ImageSpec) -> np.ndarray | None:
-    """Convert a JPEG or TIFF of four inks to sRGB [H, W, 3] uint8 by its profile; None where it has none.
-
-    OpenImageIO multiplies the inks, without the profile. As Photoshop does: relative colorimetric, with
-    compensation of the black point.
-    """
-    profile = spec.getattribute("ICCProfile")
-    stated = [spec.getattribute(f"{kind}:ColorSpace") for kind in ("jpeg", "tiff")]
-    if profile is None or "CMYK" not in stated:
-        return None
-    from PIL import ImageCms  # few files need it
-
-    def converted(image: Any) -> np.ndarray:
-        source = ImageCms.getOpenProfile(io.BytesIO(bytes(profile)))
-        intent, flags = ImageCms.Intent.RELATIVE_COLORIMETRIC, ImageCms.Flags.BLACKPOINTCOMPENSATION
-        target = ImageCms.createProfile("sRGB")
-        return np.asarray(ImageCms.profileToProfile(image, source, target, intent, "RGB", flags=flags))
-
-    found: np.ndarray | None = by_pillow(path, converted)
-    return found
-
-
-class RadianceHeader(NamedTuple):
-    """The place where pixels begin, rows in the file and pixels in each, and their divisor [3]."""
-
-    values_from: int
-    size: tuple[int, int]
-    scale: np.ndarray
-
-
-def read_radiance_header(path: Path, spec: oiio.ImageSpec) -> RadianceHeader:
-    """Parse the header of a Radiance file, and set the attributes that OpenImageIO has otherwise.
-
-    Raises InputError for what is damaged in it.
+    Raises InputError for a damaged header, and for a file that OpenImageIO reads otherwise than meant.
     """
     with path.open("rb") as stream:
-        start = stream.read(_LIMIT_BYTES)
-    lines, _, rest = start.partition(b"\n\n")
-    resolution = rest.partition(b"\n")[0]
-    fields = defaultdict(list)
-    for line in lines.decode("latin-1").split("\n"):
-        name, _, text = line.partition("=")
-        fields[name.strip()].append(text)
+        start = stream.read(_HEADER_BYTES)
+    header, _, rest = start.partition(b"\n\n")
+    resolution, _, values = rest.partition(b"\n")
+    exposure, primaries = 1.0, list[float]()
     try:
-        exposures = [[float(text)] * 3 for text in fields["EXPOSURE"]]
-        colours = [[float(word) for word in text.split()] for text in fields["COLORCORR"]]
-        scale = np.prod(np.array([[1.0] * 3, *exposures, *colours]), 0).astype(np.float32)
-        aspect = 1 / float(np.prod([float(text) for text in fields["PIXASPECT"]]))
-        primaries = tuple(float(word) for text in fields["PRIMARIES"][-1:] for word in text.split())
-        if not any(primaries):  # of the maps of Poly Haven, all 0
-            primaries = ()
-        slow, rows, fast, columns = resolution.decode("ascii").split()
-        orientation, size = _ORIENTATIONS[slow + fast], (int(rows), int(columns))
-        if not (np.isfinite(scale).all() and (scale > 0).all()) or len(primaries) not in (0, 8):
+        for name, text in re.findall(r"^\s*(\w+)\s*=(.*)$", header.decode("latin-1"), re.MULTILINE):
+            if name == "EXPOSURE":
+                exposure *= float(text)
+            elif name == "PRIMARIES":
+                primaries = [float(word) for word in text.split()]
+            elif name in ("COLORCORR", "PIXASPECT") and any(float(word) != 1 for word in text.split()):
+                raise ValueError(f"{name} is not read; save it as EXR without it")
+        if not 0 < exposure < math.inf or (any(primaries) and len(primaries) != 8):
             raise ValueError("a number in it is out of range")
-    except (ValueError, KeyError, ZeroDivisionError) as error:
-        raise InputError(f"{path}: damaged: the header of a Radiance file is wrong ({error})") from None
-    spec.attribute("Orientation", orientation)
-    spec.attribute("PixelAspectRatio", aspect)
-    if primaries:
-        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), primaries)
-    return RadianceHeader(len(lines) + len("\n\n") + len(resolution) + len("\n"), size, scale)
+        if re.match(rb"\+X +\d+ +\+Y|-X +\d+ +-Y", resolution):  # which OpenImageIO turns wrong
+            raise ValueError("columns of this order are not read; turn it with Radiance's protate")
+    except ValueError as error:
+        raise InputError(f"{path}: the header of a Radiance file is wrong: {error}") from None
+    if any(primaries):  # not all 0, as in the maps of Poly Haven
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(primaries))
+    stored = path.stat().st_size - (len(start) - len(values))
+    has_runs = values.startswith(b"\2\2" + (spec.width & 0xFFFF).to_bytes(2, "big"))
+    if stored < 4 * spec.width * spec.height and not has_runs:
+        kind = "a Radiance file in old-style runs, or cut short,"
+        raise InputError(f"{path}: {kind} is not read; save it as EXR with an image editor")
+    return exposure
 
 
-def require_rgb_radiance(path: Path) -> None:
-    """Raise InputError for a Radiance file of CIE XYZ, which OpenImageIO does not read."""
-    with path.open("rb") as stream:
-        header = stream.read(_LIMIT_BYTES).partition(b"\n\n")[0]
-    if header.startswith(b"#?") and b"FORMAT=32-bit_rle_xyze" in header:
-        raise InputError(f"{path}: a Radiance file in XYZ is not read; convert it, as by ra_xyze -r")
+def read_in_one_thread() -> None:
+    """Let images be read by the thread that asks, also in processes that are forked from now on.
 
-
-def read_old_runs(path: Path, header: RadianceHeader) -> np.ndarray | None:
-    """Decode values [H, W, 3] float32 of runs of pixels; None for the forms that OpenImageIO reads.
-
-    These are pixels without runs, and runs by channel, of which each row begins with 2, 2 and its length.
+    A forked process has none of the threads that OpenImageIO has begun; on a machine of many cores it would
+    wait for them without end.
     """
-    height, width = header.size
-    pixels = height * width
-    with path.open("rb") as stream:
-        stream.seek(header.values_from)
-        stored = stream.read(4 * pixels)
-    if len(stored) == 4 * pixels or stored[:4] == bytes([2, 2, width >> 8 & 255, width & 255]):
-        return None
-    memory.require(f"{path}: {width} x {height} pixels", _RUNS_BYTES * pixels, "make it smaller")
-    records = np.frombuffer(stored[: len(stored) // 4 * 4], np.uint8).reshape(-1, 4)
-    if not len(records):
-        return None
-    is_run = (records[:, :3] == _REPEAT).all(1)
-    is_run[0] = False
-    place = np.arange(len(records))
-    pixel = np.maximum.accumulate(np.where(is_run, 0, place))  # whose record each run repeats
-    shift = np.clip(8 * (place - pixel - 1), 0, 24)  # of runs in a row each counts 256 times as much
-    count = np.where(is_run, np.minimum(records[:, 3].astype(np.int64) << shift, pixels), 1)
-    if count.sum() < pixels:
-        raise InputError(f"{path}: damaged or cut short: the Radiance file has too few pixels; copy it again")
-    ends = int(np.searchsorted(np.cumsum(count), pixels)) + 1
-    rgbe = np.repeat(records[pixel[:ends]], count[:ends], 0)[:pixels]
-    values = np.ldexp(rgbe[:, :3].astype(np.float32), rgbe[:, 3:].astype(np.int32) - _EXPONENT_BIAS)
-    return values.reshape(height, width, 3)
+    oiio.attribute("threads", 1)
+
+
+def utf8_path(path: Path) -> str:
+    """Return the path for OpenImageIO, which takes only UTF-8; raise an InputError for any other name."""
+    try:
+        path.as_posix().encode()
+    except UnicodeEncodeError:
+        raise InputError(
+            f"{str(path)!a}: the name is not UTF-8; rename the file, or the folder that it is in"
+        ) from None
+    return str(path)
+
+
+def oiio_error(stream: Any = oiio) -> str:
+    """Take the pending error of OpenImageIO, or of one of its streams, which need not be UTF-8.
+
+    OpenImageIO prints an error that nobody took when the program ends.
+    """
+    try:
+        return str(stream.geterror())
+    except UnicodeDecodeError as error:
+        return error.object.decode(errors="replace")
+
+
+def reason(path: Path, message: str) -> str:
+    """Shorten OpenImageIO's error message to its first line, without the path."""
+    line = (message.strip().splitlines() or [""])[0]
+    line = re.sub(r' \("?' + re.escape(str(path)) + r'"?\)', "", line).replace(f'"{path}"', "it")
+    return one_line(re.sub(r"\bEXR_ERR_\w+ |: magic 0x.*| Is it a file format .*", "", line))
+
+
+def require_whole(path: Path, values: np.ndarray | None, said: str) -> None:
+    """Raise InputError unless values were decoded; `said` is what OpenImageIO reported as it did."""
+    message = reason(path, said)
+    if values is None and _UNSUPPORTED.search(message):
+        raise InputError(f"{path}: its compression is not supported; save it with another ({message})")
+    if values is None or "premature end" in said.lower():  # a JPEG cut short decodes to grey
+        raise InputError(f"{path}: damaged or cut short; copy it again ({message or 'no pixels in it'})")
+    if message:
+        log.warning("%s: %s", path, message)
+
+
+def looks_multiplied(values: np.ndarray, colour: list[int], alpha: int) -> bool:
+    """Return whether the colour of [H, W, C] hardly exceeds alpha where that is neither 0 nor 1."""
+    cover = unit_floats(values[..., alpha])
+    soft = (cover > 0) & (cover < 1)
+    above = unit_floats(values[soft][:, colour].max(-1)) > cover[soft] + _NOISE
+    return bool(soft.any()) and float(above.mean()) < _MOST_ABOVE

@@ -1,8 +1,7 @@
-"""Files that other people wrote, read within limits: text, JSON, TOML, and lists and rigs of lights.
+"""Files that other people wrote, read within limits: text, JSON, TOML, and lists of lights.
 
-Only regular files are opened: a pipe or a device could be waited for without end. In JSON a key that occurs
-twice and a number that is not finite are errors. The module imports nothing heavy, since the index of a
-finished folder is read with it.
+Only regular files are opened: a pipe or a device could be waited for without end. The module imports nothing
+heavy, since the index of a finished folder is read with it.
 """
 
 import codecs
@@ -13,22 +12,14 @@ import os
 import re
 import stat
 import tomllib
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from facerf_cli.errors import InputError
 
-LIMIT_BYTES = 64 << 20  # of a document
-_MOST_VALUES = 4_000_000  # takes about half a gigabyte
-_MOST_DEPTH = 64
-_LARGEST = 1 << 63  # magnitude of an integer; a longer one overflows where it meets an array
-_OPENING = (",", "[", "{")  # there are at most as many values as these, and one
-MOST_RIG_LIGHTS = 32
-_RIG_LIMIT_BYTES, _LIST_LIMIT_BYTES = 1 << 16, 4 << 20
+LIMIT_BYTES = 64 << 20  # of any text
 _ENDS_IN_NUMBER = re.compile(r"(.*\s)?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
-Settings = dict[str, str]
 Vector = list[float]
 ListedLight = tuple[str, Vector]  # name of an image, empty in a list without names
 
@@ -63,16 +54,16 @@ def require_regular(path: Path, advice: str = "check the path") -> None:
         raise InputError(f"{path}: is a pipe or a device, not a regular file; {advice}")
 
 
-def read_bytes(path: Path, limit_bytes: int, advice: str) -> bytes:
-    """Read a regular file of at most `limit_bytes`; an InputError for any other gives the advice."""
+def read_bytes(path: Path, advice: str) -> bytes:
+    """Read a regular file of at most `LIMIT_BYTES`; an InputError for any other gives the advice."""
     require_regular(path, advice)
     try:
         with path.open("rb") as stream:
-            content = stream.read(limit_bytes + 1)
+            content = stream.read(LIMIT_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
-    if len(content) > limit_bytes:
-        raise InputError(f"{path}: larger than {limit_bytes / (1 << 20):.4g} MiB; {advice}")
+    if len(content) > LIMIT_BYTES:
+        raise InputError(f"{path}: larger than {LIMIT_BYTES >> 20} MiB; {advice}")
     return content
 
 
@@ -82,9 +73,9 @@ def text_of(content: bytes, errors: str = "strict") -> str:
     return content.decode("utf-16" if is_utf16 else "utf-8-sig", errors)
 
 
-def read_text(path: Path, limit_bytes: int, advice: str) -> str:
-    """Read a text file of at most `limit_bytes`; bytes that are no text are replaced."""
-    return text_of(read_bytes(path, limit_bytes, advice), "replace")
+def read_text(path: Path, advice: str) -> str:
+    """Read a text file; bytes that are no text are replaced."""
+    return text_of(read_bytes(path, advice), "replace")
 
 
 def file_sha256(path: Path) -> str:
@@ -94,96 +85,33 @@ def file_sha256(path: Path) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text; raises ValueError for anything else and beyond the limits."""
-    text = text_of(text) if isinstance(text, bytes) else text
-    if sum(map(text.count, _OPENING)) >= _MOST_VALUES:
-        raise ValueError(f"more than {_MOST_VALUES} values")
+    """Return the value of a JSON text; raises ValueError for anything else, and for NaN and Infinity."""
     try:
-        value = json.loads(text, parse_constant=_not_finite, object_pairs_hook=_unique_keys)
+        return json.loads(text_of(text) if isinstance(text, bytes) else text, parse_constant=_refuse_constant)
     except RecursionError:
         raise ValueError("nested too deeply") from None
-    _check(value)
-    return value
 
 
-def read_json(path: Path, missing: str, limit_bytes: int = LIMIT_BYTES) -> Any:
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is not a finite number")
+
+
+def read_json(path: Path, missing: str) -> Any:
     """Read a JSON file; `missing` says what to do if the file does not exist, or is none of ours."""
-    content = read_bytes(path, limit_bytes, missing)
+    content = read_bytes(path, missing)
     try:
         return parse_json(content)
     except ValueError as error:
         raise InputError(f"{path}: not JSON ({error}); {missing}") from None
 
 
-def _check(value: Any) -> None:
-    """Raise ValueError for a deep value or a number that is too large, a level of the document at a time."""
-    level = [value]
-    for _ in range(_MOST_DEPTH):
-        if not all(_fits(entry) for entry in level if isinstance(entry, int | float)):
-            raise ValueError("a number in it is too large")
-        level = [
-            entry
-            for parent in level
-            if isinstance(parent, dict | list)
-            for entry in (parent.values() if isinstance(parent, dict) else parent)
-        ]
-        if not level:
-            return
-    raise ValueError(f"nested more than {_MOST_DEPTH} deep")
-
-
-def _fits(number: int | float) -> bool:
-    return abs(number) < _LARGEST if isinstance(number, int) else math.isfinite(number)
-
-
-def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    table = dict(pairs)
-    if len(table) < len(pairs):
-        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
-        raise ValueError(f"{twice[:60]!r} occurs twice in an object")
-    return table
-
-
-def _not_finite(text: str) -> float:
-    raise ValueError(f"{text} is not a finite number")
-
-
-def read_toml(path: Path, limit_bytes: int, advice: str) -> dict[str, Any]:
+def read_toml(path: Path, advice: str) -> dict[str, Any]:
     """Read the tables of a TOML file; an InputError for any other gives the advice."""
-    content = read_bytes(path, limit_bytes, advice)
+    content = read_bytes(path, advice)
     try:
         return tomllib.loads(text_of(content))
     except (ValueError, RecursionError) as error:  # also of the decoding
         raise InputError(f"{path}: not TOML ({error}); {advice}") from None
-
-
-def read_rig(path: Path) -> dict[str, Settings]:
-    """Read the settings of each light by its name, as the text that an option would have.
-
-    [0.5, 0.3, 1] is "0.5,0.3,1". Raises InputError for a file that holds no lights.
-    """
-    tables = read_toml(path, _RIG_LIMIT_BYTES, "see docs/lights.md")
-    if not 1 <= len(tables) <= MOST_RIG_LIGHTS:
-        raise InputError(f"{path}: {len(tables)} lights; give 1 to {MOST_RIG_LIGHTS}")
-    return {name: _settings(table, f"{path}: {name}") for name, table in tables.items()}
-
-
-def _settings(table: Any, where: str) -> Settings:
-    if not isinstance(table, dict):
-        raise InputError(f"{where}: not a light; write [NAME], and its keys below")
-    return {key: _text(value, f"{where}: {key}") for key, value in table.items()}
-
-
-def _text(value: Any, where: str) -> str:
-    parts = value if isinstance(value, list) else [value]
-    if isinstance(value, str):
-        return value
-    try:
-        if all(type(part) in (int, float) for part in parts):
-            return ",".join(f"{float(part)!r}" for part in parts)
-    except OverflowError:
-        pass
-    raise InputError(f"{where}: not a number; give numbers, lists of them, or text such as '0:360:24'")
 
 
 def read_light_list(path: Path) -> list[ListedLight]:
@@ -193,7 +121,7 @@ def read_light_list(path: Path) -> list[ListedLight]:
     with the number of lights. A JSON file holds a list of [x, y, z], or {name: [x, y, z]}, either of them
     maybe under "light_positions".
     """
-    text = read_text(path, _LIST_LIMIT_BYTES, "write lines `name x y z`")
+    text = read_text(path, "write lines `name x y z`")
     try:
         rows = _rows_of_json(text) if path.suffix.lower() == ".json" else _rows_of_text(text)
     except ValueError as error:

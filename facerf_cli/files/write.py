@@ -5,7 +5,6 @@ that tools which want four channels find four.
 """
 
 import logging
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,8 +17,9 @@ import torch
 
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
+from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import Attributes, embed_xmp, set_attribute
-from facerf_cli.files.read import oiio_error, utf8_path
+from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.spaces import OCIO_SPACE
 from facerf_cli.image.colour import (
     ACES,
@@ -30,11 +30,9 @@ from facerf_cli.image.colour import (
     PLAIN_VIEW,
     ColourSpace,
     View,
-    adaptation,
     auto_exposure_ev,
     encode_display,
     from_linear_rec709,
-    rgb_to_xyz,
 )
 from facerf_cli.image.strips import Rows, rows_of, strips
 from facerf_cli.run.logs import LOGGER_NAME, one_line
@@ -44,8 +42,6 @@ log = logging.getLogger(LOGGER_NAME)
 
 HALF_MAX = 65504.0  # the largest finite half float
 JPEG_QUALITY = 95
-_D50_XYZ = np.array([0.9642, 1.0, 0.8249])  # of the connection space of ICC profiles
-_FIXED = 65536  # s15Fixed16Number
 _PNG_LEVEL = 4  # of zlib: half the time of 6 for two hundredths more bytes
 _PNG_FILTER = 32  # libpng's PNG_FILTER_UP: half the time of a choice for each row, and no more bytes
 _OIIO_NAMES = {
@@ -215,34 +211,6 @@ def write_tiff(
             if alpha is not None:
                 values = np.dstack([values, rows_of(alpha, rows)])
             file.write(rows, values.astype(np.float32, copy=False))
-
-
-def linear_profile(space: ColourSpace) -> bytes:
-    """Return an ICC profile (version 2.4) of a linear space, for files that have no other way to state it."""
-    assert space.chromaticities is not None and space.decode is None
-    matrix = rgb_to_xyz(space.chromaticities)
-    colorants = adaptation(matrix.sum(1), _D50_XYZ) @ matrix
-    text = space.name.encode("ascii") + b"\0"
-    description = b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(4 + 4 + 2 + 1 + 67)
-    line = b"curv\0\0\0\0" + bytes(4)  # without entries: the identity
-    tags = {b"desc": description, b"cprt": b"text\0\0\0\0No copyright\0", b"wtpt": _xyz(_D50_XYZ)}
-    for letter, column in zip((b"r", b"g", b"b"), colorants.T, strict=True):
-        tags[letter + b"XYZ"], tags[letter + b"TRC"] = _xyz(column), line
-    table, body, start = b"", b"", 132 + 12 * len(tags)
-    for signature, content in tags.items():
-        table += signature + struct.pack(">II", start + len(body), len(content))
-        body += content + bytes(-len(content) % 4)
-    header = bytearray(128)
-    header[8:12], header[12:24], header[36:40] = b"\x02\x40\0\0", b"mntrRGB XYZ ", b"acsp"
-    struct.pack_into(">6H", header, 24, 2026, 1, 1, 0, 0, 0)  # fixed, so that files are reproducible
-    header[68:80] = _xyz(_D50_XYZ)[8:]
-    whole = bytes(header) + struct.pack(">I", len(tags)) + table + body
-    return struct.pack(">I", len(whole)) + whole[4:]
-
-
-def _xyz(values: np.ndarray) -> bytes:
-    """Return an XYZType."""
-    return b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(float(value) * _FIXED) for value in values))
 
 
 def write_display(

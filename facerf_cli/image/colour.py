@@ -111,11 +111,6 @@ def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
     return np.copysign(decoded, encoded).astype(np.float32)
 
 
-def _cineon_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Invert Kodak's Cineon curve, of code values 0..1023 as 0..1; black is 0 and diffuse white 1."""
-    return np.asarray(colour_science().models.log_decoding_Cineon(encoded), np.float32)
-
-
 @dataclass(frozen=True)
 class ColourSpace:
     """A colour space by its primaries and decoding curve; without primaries OpenColorIO converts it."""
@@ -141,7 +136,6 @@ LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
 LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
 ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
 PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _romm_to_linear)
-CINEON = ColourSpace("Cineon log", REC709_CHROMATICITIES, _cineon_to_linear)
 
 # Compared without case, spaces and punctuation; includes the interchange names that OpenImageIO uses.
 _ALIASES = {
@@ -155,7 +149,6 @@ _ALIASES = {
     LINEAR_P3: "linearp3 linp3d65 linp3d65scene linearp3d65",
     ACES: "aces20651 linap0 linap0scene",
     PROPHOTO: "prophoto prophotorgb romm rommrgb",
-    CINEON: "cineon cineonlog kodaklog",
 }
 _BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
 
@@ -313,6 +306,16 @@ def lab_d65(linear: np.ndarray) -> np.ndarray:
     root = np.where(relative > (6 / 29) ** 3, np.cbrt(relative), relative / (3 * (6 / 29) ** 2) + 4 / 29)
     x, y, z = np.moveaxis(root, -1, 0)
     return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
+def ita_deg(linear: np.ndarray) -> np.ndarray:
+    """Return the individual typology angle in degrees [...] of linear Rec.709 albedo [..., 3].
+
+    atan((L* - 50) / b*) under D65, higher for lighter skin (Chardon et al., *Skin colour typology and
+    suntanning pathways*, 1991).
+    """
+    lab = lab_d65(linear)
+    return np.degrees(np.arctan2(lab[..., 0] - 50, lab[..., 2]))
 
 
 def without_fireflies(linear: np.ndarray) -> np.ndarray:

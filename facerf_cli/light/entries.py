@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.texts import read_light_list, read_rig, read_text
+from facerf_cli.files.texts import read_light_list, read_text
 
 MOST_LIGHTS = 4096
 MOST_FRAMES = 9999
-_LIGHTS_FILE_LIMIT_BYTES = 1 << 20
 _DIRECTIONS_HELP = (
     "pass a number, 'az,el;az,el;...' in degrees, or a file with az,el, x y z or name x y z on each line"
 )
@@ -155,7 +154,7 @@ def parse_lights(text: str) -> int | list[tuple[float, float]]:
 
 def _lines(path: Path) -> list[str]:
     """Read az,el in degrees from the lines of a file that are neither empty nor comments, or its vectors."""
-    text = read_text(path, _LIGHTS_FILE_LIMIT_BYTES, "pass a text file")
+    text = read_text(path, "pass a text file")
     lines = (line.partition("#")[0].replace(",", " ").split() for line in text.splitlines())
     pairs = [fields for fields in lines if fields]
     if pairs and (len(pairs[0]) != 2 or path.suffix.lower() in (".lp", ".json")):
@@ -385,6 +384,8 @@ def _rig_path(text: str) -> Path | None:
 
 def _rig(path: Path) -> LitImage:
     """The lights of a rig file, whose image has its name; paths of maps begin at the file's folder."""
+    from facerf_cli.files.documents import read_rig  # pydantic takes a tenth of a second
+
     lights = []
     try:
         for name, table in read_rig(path).items():

@@ -75,7 +75,7 @@ OPENERS = {
     "a stack": read_olat_stack,
     "landmarks": read_landmarks,
     "a list of lights": read_light_list,
-    "TOML": lambda path: read_toml(path, 100, ""),
+    "TOML": lambda path: read_toml(path, ""),
     "a fit": load_fit,
     "an array": read_array,
 }

@@ -295,7 +295,6 @@ CONFIGURATIONS = {
     "[evaluate.olat]\nx = 1": "see `facerf evaluate olat --help-all`",
     "[relight": "not TOML",
     "a = " + "[" * 5000: "not TOML",
-    "#" * (1 << 20): "larger than 1 MiB",
     "[global]\nseed = -1": "--seed",
     "[relight]\noverwrite = 'x'": "--overwrite",
 }

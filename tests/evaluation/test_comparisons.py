@@ -33,6 +33,7 @@ from facerf_cli.evaluation.comparisons import (
     turn_class,
 )
 from facerf_cli.evaluation.measure import Case, Comparison
+from facerf_cli.evaluation.metrics import si_mse
 from facerf_cli.evaluation.options import FaceOptions
 from facerf_cli.evaluation.people import Bench, DatasetPerson
 from facerf_cli.evaluation.selection import couples_of, evenly, olat_pairs
@@ -40,7 +41,6 @@ from facerf_cli.face.crop import from_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry, fit_landmarks
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.files.olat_stack import read_olats
-from facerf_cli.image.metrics import si_mse
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction

@@ -8,9 +8,9 @@ import pytest
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import measure as module
 from facerf_cli.evaluation.measure import METRICS, SOURCE, Case, Comparison, measure, shown
+from facerf_cli.evaluation.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
 from facerf_cli.evaluation.options import Measures
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
-from facerf_cli.image.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
 from tests.refusals import refused
 
 LANDMARKS = np.random.default_rng(5).uniform(5, 20, (68, 2))

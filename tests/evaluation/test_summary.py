@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.evaluation.measure import Row
+from facerf_cli.evaluation.metrics import Interval
 from facerf_cli.evaluation.summary import (
     Cell,
     Layout,
@@ -15,7 +16,6 @@ from facerf_cli.evaluation.summary import (
     print_tables,
     summarise,
 )
-from facerf_cli.image.metrics import Interval
 from tests.refusals import refused
 
 LAYOUT = Layout("Toy", ("si_mse", "psnr"), ("pose",))

@@ -39,7 +39,7 @@ def test_arrays_are_those_that_were_pickled(tmp_path: Path, protocol: int) -> No
     found = pickled_arrays(written(tmp_path / "a.pkl", pickle.dumps(ARRAYS, protocol)))
     for name, array in ARRAYS.items():
         np.testing.assert_array_equal(found[name], array)
-        assert found[name].dtype == array.dtype
+        assert found[name].dtype == array.dtype.newbyteorder("=")
 
 
 def test_what_python_2_and_numpy_wrote_is_read(tmp_path: Path) -> None:

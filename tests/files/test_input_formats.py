@@ -17,7 +17,7 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.run import memory
 from tests import icc_profiles
-from tests.files.made import LEVELS, levels_of, write_cineon, write_oiio, write_png, write_psd
+from tests.files.made import LEVELS, levels_of, write_oiio, write_png, write_psd
 
 ULTRA_HDR = Path(__file__).with_name("ultra_hdr.jpg")  # examples/astronaut.jpg, with a gain map
 QUADS = Path(__file__).with_name("quads.heic")  # 600 x 400: its pixels outgrow what a small allocation keeps
@@ -38,8 +38,6 @@ def save(path: Path, levels: np.ndarray) -> Path:
         shutil.copy(HEIC, path)
     elif suffix == ".psd":
         write_psd(path, levels)
-    elif suffix == ".cin":
-        write_cineon(path, levels.astype(int) * 4)
     elif suffix == ".jp2":
         Image.fromarray(levels).save(path)  # OpenImageIO writes files that it does not read
     elif suffix == ".avif":
@@ -122,20 +120,6 @@ def test_every_orientation_is_another_image(tmp_path: Path) -> None:
             expected = np.asarray(ImageOps.exif_transpose(stored))
         found = np.rint(levels_of(path)).astype(int)
         np.testing.assert_array_equal(found, expected)
-
-
-def test_film_scans_are_decoded_by_the_cineon_curve(tmp_path: Path) -> None:
-    """Code values of black, of 18 % grey and of white."""
-    codes = np.broadcast_to([95, 445, 685], (6, 9, 3))
-    image = read_image(write_cineon(tmp_path / "a.cin", codes))
-    assert image.colourspace_name == "Cineon log"
-    np.testing.assert_allclose(image.pixels[0, 0], [0, 0.15, 1], atol=0.003)
-    values = (codes / 1023).astype(np.float32)
-    for transfer in ("Logarithmic", "Printing density"):
-        path = write_oiio(
-            tmp_path / "a.dpx", values, "uint16", oiio__BitsPerSample=10, dpx__Transfer=transfer
-        )
-        np.testing.assert_allclose(read_image(path).pixels, image.pixels, atol=2e-3)
 
 
 def test_a_psd_has_its_profile_and_its_composite(tmp_path: Path) -> None:

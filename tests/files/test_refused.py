@@ -18,6 +18,7 @@ from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.olat_stack import is_olat_stack, read_olats
 from facerf_cli.files.read import PHOTO_LIMIT_PX, read_image
 from facerf_cli.files.write import write_display, write_exr
+from tests import icc_profiles
 from tests.files import made
 from tests.files.made import GREY, LEVELS, LINEAR, MAP, QUADS, write_oiio, write_png
 from tests.kinds import Log, Patch, Said
@@ -26,6 +27,8 @@ from tests.refusals import refused
 HERE = Path(__file__).parent
 HEIC, DEEP_AVIF = HERE / "phone.heic", HERE / "deep.avif"
 NOT_READABLE, DAMAGED = "not a readable image", r"damaged or cut short; copy it again"
+LOG_SCAN = "a film scan in Cineon log is not read; convert it to linear values"
+WHITE = "a TIFF whose zero is white is not read; save it as PNG"
 PSD_VERSION = struct.pack(">IB", 1, 0) + bytes(12)  # of one without its composite
 
 
@@ -80,6 +83,12 @@ def xyz(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b"rgbe", b"xyze"))
 
 
+def inks_with_alpha(path: Path) -> None:
+    values = np.full((6, 9, 5), 99, np.uint8)
+    profile = icc_profiles.press_profile()
+    tifffile.imwrite(path, values, photometric="separated", extrasamples=["unassalpha"], iccprofile=profile)
+
+
 def hdr_png(transfer: int) -> Callable[[Path], object]:
     return lambda path: write_png(path, QUADS, (b"cICP", bytes([9, transfer, 0, 1])))
 
@@ -92,7 +101,26 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
     "empty.jpg": (Path.touch, "the file is empty"),
     "missing.png": (lambda path: None, "no such file"),
     "folder.png": (Path.mkdir, "is a folder"),
-    "deep.exr": (made.write_deep, "a deep image is not read; flatten it, as by oiiotool"),
+    "deep.exr": (made.write_deep, "a deep image is not read; flatten it, as with oiiotool"),
+    "a.cin": (lambda path: made.write_cineon(path, LEVELS.astype(int)), LOG_SCAN),
+    **{
+        f"{curve}.dpx": (
+            lambda path, curve=curve: write_oiio(path, LEVELS, "uint16", dpx__Transfer=curve),
+            LOG_SCAN,
+        )
+        for curve in ("Logarithmic", "Printing density")
+    },
+    "runs.hdr": (made.long_runs, "old-style runs, or cut short, is not read; save it as EXR"),
+    "white8.tif": (lambda path: tifffile.imwrite(path, GREY, photometric="miniswhite"), WHITE),
+    "white16.tif": (
+        lambda path: tifffile.imwrite(path, GREY.astype(np.uint16), photometric="miniswhite"),
+        WHITE,
+    ),
+    "inks.tif": (inks_with_alpha, "inks .* with alpha, are not read; convert the image to RGB"),
+    **{
+        name: (copied(HERE / name), "multiplied by alpha is not read; save it as PNG")
+        for name in ("multiplied.jxl", "multiplied16.jxl")
+    },
     "last.jpg": (cut(noise, -1), "cut short"),
     # Its reader says so when the file is opened, since all scans are read at once.
     **{f"{share}scans.jpg": (cut(noise, share), DAMAGED) for share in (0.3, 0.9)},
@@ -102,8 +130,6 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         for name in ("a.jpg", "a.png", "16.png", "a.exr", "a.hdr", "a.tif", "a.pgm")
     },
     "bit.png": (flipped, "a checksum of the PNG file is wrong; copy it again"),
-    "word.cin": (cut(lambda path: made.write_cineon(path, LEVELS.astype(int)), -1), "damaged or cut short"),
-    "runs.hdr": (cut(made.long_runs, -12), "too few pixels; copy it again"),
     **{f"{size}.heic": (cut(copied(HEIC), size), f"({NOT_READABLE}|damaged)") for size in (13, 200, -300)},
     **{f"{size}.avif": (cut(copied(DEEP_AVIF), size), DAMAGED) for size in (30, 150, -30, -1)},
     "PQ.avif": (copied(DEEP_AVIF, CODES, b"nclx\0\x09\0\x10"), r"is an HDR image \(PQ\); convert it to SDR"),
@@ -113,7 +139,15 @@ REFUSED: dict[str, tuple[Callable[[Path], object], str]] = {
         f"{line}.hdr": (lambda path, line=line: made.write_hdr(path, MAP, f"{line}\n"), HDR_LINE)
         for line in ("EXPOSURE=no", "EXPOSURE=0", "COLORCORR=1 2", "PRIMARIES=.3 .3", "EXPOSURE=nan")
     },
-    "xyz.hdr": (xyz, "a Radiance file in XYZ is not read; convert it"),
+    "wide.hdr": (lambda path: made.write_hdr(path, MAP, "PIXASPECT=0.5\n"), "PIXASPECT is not read; save it"),
+    **{
+        f"{order}.hdr": (
+            lambda path, order=order: made.write_hdr(path, MAP, "", order),
+            "with Radiance's protate",
+        )
+        for order in ("-X -Y", "+X +Y")
+    },
+    "xyz.hdr": (xyz, NOT_READABLE),
     "lab.tif": (lambda path: tifffile.imwrite(path, QUADS, photometric="cielab"), "in CIELAB is not read"),
     **{f"{n}.tif": (compressed(n), "not supported; save it with another") for n in (50000, 34925, 50002)},
     "side.dpx": (lambda path: write_oiio(path, LEVELS, "uint8", Orientation=6), "on its side is not read"),

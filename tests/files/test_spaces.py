@@ -1,18 +1,21 @@
 """ICC profiles, against littleCMS in Pillow."""
 
 import io
+import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image, ImageCms
 
+from facerf_cli.errors import InputError
+from facerf_cli.files.icc import linear_profile, space_of_profile
 from facerf_cli.files.read import read_image
-from facerf_cli.files.spaces import space_of_profile
-from facerf_cli.files.write import linear_profile
 from facerf_cli.image import colour
 from tests import icc_profiles
 from tests.kinds import Log
+from tests.refusals import refused
 
 COLOURS = np.random.default_rng(5).integers(30, 226, (12, 17, 3), np.uint8)
 SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB"))
@@ -131,7 +134,25 @@ def test_broken_profiles_are_no_space() -> None:
         space_of_profile(bytes(damaged), "x")
 
 
-def test_a_profile_of_tables_is_one_line_that_says_what_is_assumed(tmp_path: Path, caplog: Log) -> None:
+def test_tables_are_applied_to_eight_bits_and_refused_for_more(tmp_path: Path, caplog: Log) -> None:
+    """As littleCMS does, but for the compensation of the black point."""
+    caplog.set_level(logging.INFO, "facerf")
+    scanner, alpha = icc_profiles.scanner_profile(), COLOURS[..., :1]
+    for suffix in ("png", "tif", "webp"):
+        path = tmp_path / f"a.{suffix}"
+        Image.fromarray(np.dstack([COLOURS, alpha])).save(path, icc_profile=scanner, lossless=True)
+        image = read_image(path)
+        assert image.colourspace_name == "sRGB" and image.alpha == pytest.approx(alpha[..., 0] / 255)
+        shown = 255 * colour.linear_to_srgb(image.pixels)
+        assert np.abs(shown - by_littlecms(COLOURS, scanner)).max() < 12
+        assert np.abs(shown - COLOURS).max() > 40
+        assert caplog.records[-1].getMessage().endswith("converted to sRGB by its profile 'Scanner 9'")
+    tifffile.imwrite(path := tmp_path / "b.tif", 257 * COLOURS.astype(np.uint16), iccprofile=scanner)
+    refused(InputError, "'Scanner 9' has tables ... convert the image to sRGB", read_image, path)
+    assert read_image(path, "Display P3").colourspace_name == "Display P3"
+
+
+def test_a_broken_profile_is_one_line_that_says_what_is_assumed(tmp_path: Path, caplog: Log) -> None:
     tables = icc_profiles.DISPLAY_P3.replace(b"rTRC", b"A2B0").replace(*(
         name.encode("utf-16-be") for name in ("Display P3", "Scanner 77")
     ))  # fmt: skip

@@ -1,4 +1,4 @@
-"""The one reader of JSON: what passes every limit is read as the standard library reads it."""
+"""Texts, JSON and TOML: documents are read within one limit, and validated."""
 
 import json
 from pathlib import Path
@@ -7,18 +7,16 @@ from typing import Any
 import pytest
 
 from facerf_cli.errors import InputError
-from facerf_cli.files import texts as json_reader
-from facerf_cli.files.documents import Document, Name, checked, distinct
-from facerf_cli.files.texts import MOST_RIG_LIGHTS, parse_json, read_json, read_rig, read_text, read_toml
+from facerf_cli.files import texts
+from facerf_cli.files.documents import MOST_RIG_LIGHTS, Document, Name, checked, distinct, read_rig
+from facerf_cli.files.texts import parse_json, read_json, read_text, read_toml
 from facerf_cli.light.entries import parse_lights
 from tests.refusals import refused
 
 
-def test_documents_within_the_limits_are_read() -> None:
+def test_documents_are_read() -> None:
     content = {"a": [1, 2.5, -3e8, "é", None, True], "b": {"c": [[[]]]}, "": 2**62}
     assert parse_json(json.dumps(content)) == content and parse_json(json.dumps(content).encode()) == content
-    assert parse_json("[" * 63 + "]" * 63)
-    assert parse_json(f"[{2**63 - 1}, 1e308]") == [2**63 - 1, 1e308]
     assert distinct(["a", "b"], "light") == ["a", "b"]
     refused(ValueError, "light 'b' occurs twice", distinct, ["a", "b", "b"], "light")
 
@@ -26,21 +24,15 @@ def test_documents_within_the_limits_are_read() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("1" + "0" * 400, "too large"),
-        ("[9223372036854775808]", "too large"),
-        ('{"a": [1e400]}', "too large"),
         ("1" * 5000, "digits"),
         ("[NaN]", "NaN is not"),
         ("-Infinity", "not a finite"),
-        ("[" * 65 + "]" * 65, "64 deep"),
         ("[" * 100_000, "deep"),
-        ('{"a": 1, "b": 2, "a": 3}', "'a' occurs twice"),
-        ('{"a": {"b": 1, "b": 1}}', "'b' occurs twice"),
         ("{}x", "Extra data"),
         (b"\xff", "utf-8"),
     ],
 )
-def test_what_is_beyond_them_is_refused(text: str | bytes, said: str) -> None:
+def test_what_is_no_json_is_refused(text: str | bytes, said: str) -> None:
     refused(ValueError, said, parse_json, text)
 
 
@@ -54,23 +46,16 @@ def test_byte_order_marks_are_no_part_of_a_text(tmp_path: Path, encoding: str) -
         return path
 
     assert read_json(written('{"é": 1}'), "") == {"é": 1}
-    assert read_toml(written('key = "é"'), 99, "") == {"key": "é"}
-    assert read_text(written("é"), 99, "") == "é"
+    assert read_toml(written('key = "é"'), "") == {"key": "é"}
+    assert read_text(written("é"), "") == "é"
     assert parse_lights(str(written("0,10\n20,30\n"))) == [(0, 10), (20, 30)]
 
 
-def test_the_number_of_values_is_bounded_before_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_reader, "_MOST_VALUES", 100)
-    assert len(parse_json(json.dumps([0] * 99))) == 99
-    monkeypatch.setattr(json_reader.json, "loads", lambda *a, **k: pytest.fail("it was parsed"))
-    for text in (json.dumps([0] * 101), "[" * 101, json.dumps({str(i): 0 for i in range(101)})):
-        refused(ValueError, "more than 100 values", parse_json, text)
-
-
-def test_files_are_bounded_and_named(tmp_path: Path) -> None:
+def test_files_are_bounded_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(texts, "LIMIT_BYTES", 1 << 20)
     path = tmp_path / "a.json"
     path.write_bytes(b" " * 2_000_000)
-    refused(InputError, "a.json: larger than 1 MiB; mend it", read_json, path, "mend it", 1 << 20)
+    refused(InputError, "a.json: larger than 1 MiB; mend it", read_json, path, "mend it")
     refused(InputError, "b.json: no such file; mend it", read_json, tmp_path / "b.json", "mend it")
     refused(InputError, "no such file", read_rig, tmp_path / "none.toml")
 
@@ -87,12 +72,12 @@ class Root(Document):
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({}, "x.json has no 'entries'"),
+        ({}, "x.json has no 'entries'; add it"),
         ({"entries": 3}, r"x.json: entries is 3; a list \[ \] is needed"),
         ({"entries": [3]}, r"x.json: entries\[0\] is 3; an object { } is needed"),
         ({"entries": [{"id": "a"}]}, r"x.json: entries\[0\] has no 'count'"),
-        ({"entries": [{"id": "../a", "count": 1}]}, r'entries\[0\]: id is "../a"; a name of letters'),
-        ({"entries": [{"id": "a", "count": True}]}, r"count is true; input should be a valid int"),
+        ({"entries": [{"id": "../a", "count": 1}]}, r"entries\[0\]: id is '../a'; a name of letters"),
+        ({"entries": [{"id": "a", "count": True}]}, r"count is True; input should be a valid int"),
         ({"entries": [{"id": None, "count": "1"}]}, r"id is null; fill it in \(and 1 more\)"),
     ],
 )
@@ -114,13 +99,12 @@ def test_values_become_the_text_of_an_option(tmp_path: Path) -> None:
     [
         (b"", "0 lights; give 1 to 32"),
         (b"\n".join(b"[l%d]\naz = 1" % k for k in range(MOST_RIG_LIGHTS + 1)), "33 lights"),
-        (b"# " + b"x" * 70000, "larger than 0.0625 MiB"),
-        (b"key = 3", "key: not a light"),
-        (b"[key]\naz = true", "key: az: not a number"),
-        (b"[key]\naz = [1, 'a']", "az: not a number"),
-        (b"[key]\naz = {b = 1}", "az: not a number"),
-        (b"[key]\naz = 1979-05-27", "az: not a number"),
-        (b"[key]\naz = 0x" + b"f" * 4000, "az: not a number"),
+        (b"key = 3", "key is 3; an object { } is needed"),
+        (b"[key]\naz = true", "key: az is True; give numbers"),
+        (b"[key]\naz = [1, 'a']", "az is [1, 'a']; give numbers"),
+        (b"[key]\naz = {b = 1}", "az: give numbers"),
+        (b"[key]\naz = 1979-05-27", "give numbers"),
+        (b"[key]\naz = 0x" + b"f" * 4000, "give numbers"),
         (b"[key]\naz = " + b"9" * 5000, "not TOML"),
         (b"a = " + b"[" * 30000, "not TOML"),
         (b"[key", "not TOML"),

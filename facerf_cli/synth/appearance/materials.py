@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.image.metrics import ita_deg
+from facerf_cli.image.colour import ita_deg
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.synth import tables_of
 from facerf_cli.synth.appearance.people import (

@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from facerf_cli.face.topology import LANDMARK_UV
-from facerf_cli.image.colour import lab_d65
-from facerf_cli.image.metrics import ita_deg
+from facerf_cli.image.colour import ita_deg, lab_d65
 from facerf_cli.image.skin import WAVELENGTHS_NM, observer_weights, skin_albedo, skin_reflectance
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.appearance.people import RANDOM_TEXTURES, People, draw_people, hair_albedo

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.image.metrics import (
+from facerf_cli.evaluation.metrics import (
     PSNR_HIGHEST_DB,
     best_scale,
-    ita_deg,
     light_error_deg,
     mean_interval,
     mse,
@@ -23,6 +22,7 @@ from facerf_cli.image.metrics import (
     tone_drift_deg,
     tone_of,
 )
+from facerf_cli.image.colour import ita_deg
 from facerf_cli.training.losses import si_mse as training_si_mse
 from tests.conftest import SHARED
 from tests.oracles import metrics as slow

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from facerf_cli.image.colour import lab_d65, luminance
+from facerf_cli.image.colour import ita_deg, luminance
 
 PSNR_HIGHEST_DB = 100.0  # reported for equal images, whose PSNR is infinite
 _SMALLEST = 1e-12  # of a denominator; avoids 0 / 0 for a black prediction
@@ -117,16 +117,6 @@ def light_error_deg(direction: np.ndarray, truth: np.ndarray) -> float:
         raise ValueError(f"directions of lengths {lengths[0]} and {lengths[1]} have no angle")
     # From both products, since the cosine alone is inaccurate for small angles.
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(direction, truth)), np.dot(direction, truth))))
-
-
-def ita_deg(linear: np.ndarray) -> np.ndarray:
-    """Return the individual typology angle in degrees [...] of linear Rec.709 albedo [..., 3].
-
-    atan((L* - 50) / b*) under D65, higher for lighter skin (Chardon et al., *Skin colour typology and
-    suntanning pathways*, 1991).
-    """
-    lab = lab_d65(linear)
-    return np.degrees(np.arctan2(lab[..., 0] - 50, lab[..., 2]))
 
 
 def tone_of(ita: float) -> str:
