@@ -33,7 +33,7 @@ from facerf_cli.portrait.given_normals import unit_normals, with_normals
 from facerf_cli.portrait.parse import LANDMARKS
 from facerf_cli.portrait.person import SIDE_PX
 from facerf_cli.relighting.models import Networks
-from facerf_cli.relighting.shade import even_shade_of
+from facerf_cli.relighting.white import even_shade_of
 from facerf_cli.run.workers import in_shards, one_thread
 from facerf_cli.synth.bank.parsing import PortraitCrops
 from facerf_cli.synth.bank.transport import person_in

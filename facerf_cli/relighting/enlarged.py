@@ -20,9 +20,8 @@ from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
 from facerf_cli.relighting.cast_shadows import CastShadow, change
 from facerf_cli.relighting.detail import finer_detail
-from facerf_cli.relighting.edges import EdgeFill, colours_of, places, trust_in
+from facerf_cli.relighting.edges import EdgeFill, Rims, colours_of, places, trust_in
 from facerf_cli.relighting.portrait_field import PortraitLight, PortraitView
-from facerf_cli.relighting.rims import Rims
 from facerf_cli.relighting.white import BARE
 
 VIEW_LAYERS = ("albedo", "normal", "shadow", "specular")

@@ -31,14 +31,12 @@ from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
 from facerf_cli.raster.texture import bake_attributes, blurred
-from facerf_cli.relighting.baked_in import without_baked_in
 from facerf_cli.relighting.detail import FLOOR, NOISE, contrast, finer_detail, lost_detail, mean_colour
+from facerf_cli.relighting.edges import from_behind
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
-from facerf_cli.relighting.rims import from_behind
-from facerf_cli.relighting.shade import even_shade_of
 from facerf_cli.relighting.source_light import SourceLight, share_of_lamp
-from facerf_cli.relighting.white import BARE, Balance
+from facerf_cli.relighting.white import BARE, Balance, even_shade_of, without_baked_in
 from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees

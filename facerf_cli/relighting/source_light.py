@@ -19,9 +19,9 @@ from facerf_cli.light.envmap import lights_around
 from facerf_cli.light.estimate import estimate_lamps, lamp_error
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.portrait.correction import Quotient
-from facerf_cli.relighting.baked_in import without_baked_in
 from facerf_cli.relighting.field import SEEN_WELL, Field, shrunk, weighted_sum
 from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.white import without_baked_in
 
 _AROUND = 32  # lights of the rig from around
 _RINGS_DEG = (14.0, 6.0)  # of the search for the lamp, each around the best place so far

@@ -18,8 +18,7 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import far_samples
 from facerf_cli.portrait.mesh import SeenEyes
 from facerf_cli.relighting import detail as module
-from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
-from facerf_cli.relighting.iris import blur_px, opening, outlined
+from facerf_cli.relighting.eyes import Eyes, blur_px, mirrored_in_cornea, opening, outlined
 from tests import astronaut
 
 SIDE, IRIS = 40, np.array([[20.0, 18.0, 10.0]])
