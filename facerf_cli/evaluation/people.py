@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines import RelightKind
+from facerf_cli.baselines import RelightKind, explain_by_baseline
 from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.batch.inputs import Item
 from facerf_cli.dataset.dataset import Dataset
@@ -36,7 +36,7 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import Models, Sides, load_models
-from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, explain
+from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, estimate_light
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.light_of_photo import feature_network
@@ -64,7 +64,10 @@ class Method:
         """Reflectance and light of a head's photo."""
         if self.kind == "portrait":
             raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
-        return explain(self.models, head, self.kind, self.network_alone, self.estimator)
+        if self.kind != "field":
+            return explain_by_baseline(self.models, head, self.kind)
+        light = estimate_light(self.models, head, estimator=self.estimator).light
+        return Explained(reflectance_of(self.models, head, self.kind, self.network_alone), light)
 
     def image(
         self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit | None = None

@@ -35,7 +35,7 @@ from facerf_cli.relighting.detail import FLOOR, NOISE, contrast, finer_detail, l
 from facerf_cli.relighting.edges import from_behind
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
-from facerf_cli.relighting.source_light import SourceLight, share_of_lamp
+from facerf_cli.relighting.photo_light import SourceLight, share_of_lamp
 from facerf_cli.relighting.white import BARE, Balance, even_shade_of, without_baked_in
 from facerf_cli.run.threads import in_threads
 

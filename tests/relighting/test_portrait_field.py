@@ -26,10 +26,10 @@ from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.photo_light import source_light
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView, maps_of
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
-from facerf_cli.relighting.source_light import source_light
 from tests import astronaut
 
 NAMES = ("albedo", "specular", "normal", "position", "depth", "shadow")

@@ -13,8 +13,7 @@ from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.heads import fit_photo
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.photo_light import estimate_light
-from facerf_cli.relighting.source_light import light_of_frames, over_rig, source_light
+from facerf_cli.relighting.photo_light import estimate_light, light_of_frames, over_rig, source_light
 from tests import astronaut
 
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
