@@ -21,8 +21,8 @@ from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.person import Target, fit
-from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.portrait_samples import StoredView, load_view

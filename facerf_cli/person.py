@@ -33,9 +33,9 @@ from facerf_cli.light.light import (
 )
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.portrait import find
-from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import Face, face_with
-from facerf_cli.portrait.given_normals import unit_normals
+from facerf_cli.portrait.parse import CLASSES
+from facerf_cli.portrait.person import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
 from facerf_cli.relighting import White

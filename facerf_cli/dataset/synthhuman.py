@@ -29,9 +29,8 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.inputs import Batch
 from facerf_cli.network.portrait import PortraitInputs, mirrored_x
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.given_normals import unit_normals, with_normals
 from facerf_cli.portrait.parse import LANDMARKS
-from facerf_cli.portrait.person import SIDE_PX
+from facerf_cli.portrait.person import SIDE_PX, unit_normals, with_normals
 from facerf_cli.relighting.models import Networks
 from facerf_cli.relighting.white import even_shade_of
 from facerf_cli.run.workers import in_shards, one_thread

@@ -1,4 +1,4 @@
-"""Squares of a photo, as the Parsing Network sees them."""
+"""Squares of a photo, as the Parsing Network sees them; its classes, and its landmarks beyond the 68."""
 
 import math
 from collections.abc import Sequence
@@ -13,14 +13,54 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.topology import MIRROR_68
 from facerf_cli.image.strips import block_means, enlarged
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
+CLASSES = (
+    "background",
+    "skin",
+    "brows",
+    "eyes",
+    "lips",
+    "mouth",
+    "hair",
+    "beard",
+    "ears",
+    "neck",
+    "glasses",
+    "headwear",
+    "garment",
+    "hand",
+)
+IRIS_POINTS = 8  # on the outline of an iris, from its right end counter-clockwise
+MORE_LANDMARKS = tuple(
+    f"{side} {name}"
+    for side in ("left", "right")  # of the image
+    for name in ("iris", *(f"iris {k}" for k in range(IRIS_POINTS)), "ear top", "ear lobe", "ear back")
+)
 LANDMARKS = 68 + len(MORE_LANDMARKS)
 LEAST_PRESENCE = 0.5  # from which on a head is there
 _POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
 _SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered
+
+
+def class_index(name: str) -> int:
+    """Index of a class."""
+    return CLASSES.index(name)
+
+
+def mirrored_landmarks() -> tuple[int, ...]:
+    """Index of the landmark of `MORE_LANDMARKS` that each one becomes in a mirrored image."""
+    return tuple(MORE_LANDMARKS.index(_mirrored(name)) for name in MORE_LANDMARKS)
+
+
+def _mirrored(name: str) -> str:
+    side, part, *point = name.split(" ")
+    if part == "iris" and point:
+        point = [str((IRIS_POINTS // 2 - int(point[0])) % IRIS_POINTS)]
+    return " ".join(["left" if side == "right" else "right", part, *point])
+
+
 MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
 
 
@@ -116,7 +156,7 @@ class SquareView:
     """View of a square by the network: logits [K, C, S, S] of the classes; landmarks [N, 2] in the photo.
 
     The logits are those of K looks at the square. error_px [N] are the landmarks' expected errors; presence,
-    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `mesh.py`.
+    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `find.py`.
     """
 
     square: Square

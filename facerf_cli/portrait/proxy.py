@@ -27,7 +27,7 @@ from facerf_cli.light.estimate import least_non_negative
 from facerf_cli.light.transport import build_scene, occluded, on_disc, places_on_disc, tangents
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.portrait import SKIN
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import blurred, inpaint, vertex_normals

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.light.transport import first_hits_m, on_disc, places_on_disc
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.proxy import OFF_M, RADIUS_DEG, Proxy, ProxyMaps
 from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.portrait_field import PortraitView

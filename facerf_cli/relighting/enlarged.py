@@ -15,7 +15,7 @@ from torch import Tensor
 
 from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Window
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import blurred, inpaint
 from facerf_cli.relighting.cast_shadows import CastShadow, change

@@ -24,8 +24,7 @@ from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.stored_graph import ASSET, PeopleNetworks, mediapipe_networks
-from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS
 
 TEXTURE_SIDE, LARGEST_TEXTURE = 256, 2048  # texels: by default, and at most
 _CPU = torch.device("cpu")

@@ -19,9 +19,8 @@ from facerf_cli.face.view import photo_camera, rows_of_camera, view_face
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Window, enlarged
 from facerf_cli.light.light import Light
-from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.matte import PersonColours
-from facerf_cli.portrait.parse import UncoveredRows
+from facerf_cli.portrait.parse import UncoveredRows, class_index
 from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.raster.rasterize import front_facing, rasterize

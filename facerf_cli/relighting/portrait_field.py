@@ -24,8 +24,8 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import MEAN_RADIANCE, is_grey
 from facerf_cli.network.portrait import HAIRY, PortraitInputs, PortraitMaps, PortraitNetwork
-from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation

@@ -8,8 +8,13 @@ from facerf_cli.baselines import RelightKind, explain_by_baseline
 from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
-from facerf_cli.portrait.given_normals import maps_with_normals, with_normals
-from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
+from facerf_cli.portrait.person import (
+    SeenPerson,
+    look_at_person,
+    maps_with_normals,
+    wider_square,
+    with_normals,
+)
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import Field, balance_of
 from facerf_cli.relighting.models import Models

@@ -28,7 +28,7 @@ from facerf_cli.image.colour import luminance
 from facerf_cli.image.skin import skin_table
 from facerf_cli.light.estimate import clipped
 from facerf_cli.network.inputs import is_grey
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.raster.texture import blurred, blurred_within, smoothstep
 from facerf_cli.relighting import White
 

@@ -25,7 +25,7 @@ from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.person import Person
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView
 from facerf_cli.relighting.relightable import Relit

@@ -25,10 +25,9 @@ from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
 from facerf_cli.network.files import read_metadata, serving_files
 from facerf_cli.person import find_faces
-from facerf_cli.portrait.confidence import SCALES, confidence_of, face_facts
+from facerf_cli.portrait.confidence import SCALES, confidence_of, face_facts, given_matte_facts
 from facerf_cli.portrait.find import Face, face_with
-from facerf_cli.portrait.given import given_matte_facts
-from facerf_cli.portrait.given_normals import unit_normals
+from facerf_cli.portrait.person import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.heads import head_of

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS, Square, SquareView, class_index
 
 SIDE = 64
 

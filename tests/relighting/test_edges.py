@@ -12,7 +12,7 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Window
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.raster.texture import blurred
 from facerf_cli.relighting.edges import EdgeFill, Rims, colours_of, from_behind, places, trust_in
 from facerf_cli.relighting.enlarged import Enlarged

@@ -16,7 +16,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import far_samples
-from facerf_cli.portrait.mesh import SeenEyes
+from facerf_cli.portrait.find import SeenEyes
 from facerf_cli.relighting import detail as module
 from facerf_cli.relighting.eyes import Eyes, blur_px, mirrored_in_cornea, opening, outlined
 from tests import astronaut

@@ -20,8 +20,8 @@ from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.portrait import PortraitInputs
 from facerf_cli.person import Person, Target, fit
-from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models

@@ -10,7 +10,7 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.topology import region_mask
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.skin import skin_albedo
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.photo_light import estimate_light

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from facerf_cli.dataset.synthhuman import LICENCE, SynthHuman
 from facerf_cli.errors import InputError
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS, class_index
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.parsing import ParsingObjective
 from tests.refusals import refused

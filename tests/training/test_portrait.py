@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from facerf_cli.dataset.synthhuman import LICENCE, SeenNormals, SynthHuman, SynthHumanNormals
 from facerf_cli.errors import InputError
 from facerf_cli.network.portrait import PortraitInputs, PortraitMaps, PortraitNetwork, PortraitSettings
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from facerf_cli.training.portrait import PortraitObjective
