@@ -301,9 +301,9 @@ def with_cloth(classes: Tensor, image: Tensor, head: HeadPlace) -> Tensor:
     """Return shares [C, h, w] of the classes in which parts of skin that cannot be skin are garments.
 
     The Parsing Network takes collars and elbows of dark suits for skin or a hand, which would be lit as such.
-    The photo's colours tell them from the person's own skin. A part ends at edges of the photo. It is cloth if
-    most of its chromaticities lie outside those of all of the face, lit and shaded, it is large enough, and
-    little of its outline borders certain skin.
+    The photo's colours tell them from the person's own skin. A part ends at edges of the photo. It is cloth
+    if most of its chromaticities lie outside those of all of the face, lit and shaded, it is large enough,
+    and little of its outline borders certain skin.
 
     Args:
         classes: Shares of the classes, which sum to 1.
