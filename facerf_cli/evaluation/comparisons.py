@@ -32,7 +32,7 @@ from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.metrics import light_error_deg, tone_drift_deg
-from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.envmap import rig_to_latlong
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel
 from facerf_cli.person import Target

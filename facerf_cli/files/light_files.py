@@ -21,8 +21,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import Document, json_text, read_document
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, LINEAR_BYTES, LinearImage, read_image
-from facerf_cli.light.envmap import check_envmap
-from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.envmap import check_envmap, rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, positive_latlong
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.run import memory

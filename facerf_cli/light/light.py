@@ -12,8 +12,14 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.envmap import NO_KEYS, check_envmap, envmap_weights, turned, without_keys
-from facerf_cli.light.picture import FOV_DEG, light_of_picture
+from facerf_cli.light.envmap import (
+    NO_KEYS,
+    check_envmap,
+    envmap_weights,
+    rig_to_latlong,
+    turned,
+    without_keys,
+)
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import KeyLight, PointLights, far_samples, has_edges
 
@@ -98,12 +104,14 @@ class Light:
         )
 
     @staticmethod
-    def from_picture(picture: Array, fov_deg: float = FOV_DEG, lights: int = 150) -> "Light":
+    def from_picture(picture: Array, fov_deg: float = 60.0, lights: int = 150) -> "Light":
         """The light in a picture [H, W, 3] behind the person, scene-linear: a guess, on the picture's scale.
 
         `fov_deg` is the angle of view across its width, 1 to 170 degrees. `light.picture.light_of_picture`
         also gives the map and its expected error. Raises ValueError for another picture or angle.
         """
+        from facerf_cli.light.picture import light_of_picture  # a network of its own
+
         guess = light_of_picture(linear_pixels("picture", picture).detach(), fov_deg)
         return Light.from_envmap(guess.envmap.numpy(), lights=lights)
 
@@ -111,8 +119,6 @@ class Light:
         """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""
         if self.own_rgb is not None:
             raise UsageError("to_envmap: the photo's own light has no directions; take person.light")
-        from facerf_cli.light.forms import rig_to_latlong
-
         light = RigLight(*(values.detach() for values in self._tensors()))
         return rig_to_latlong(light, height).numpy()
 
