@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -298,6 +298,14 @@ def linear_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> Tensor:
     return linear
 
 
+def uncopied_pixels(name: str, photo: Array) -> np.ndarray:
+    """A photo's pixels [H, W, 3], which are not copied; raises ValueError for others."""
+    check_kind(name, photo)
+    pixels = np.asarray(photo.detach().cpu() if isinstance(photo, Tensor) else photo, np.float32)
+    check_finite(name, pixels)
+    return pixels
+
+
 def check_kind(name: str, pixels: Any, shape: str = "[H, W, 3]") -> None:
     """Raise an error, with their name, for what is no array [H, W, 3] or [H, W] of floats."""
     if not isinstance(pixels, np.ndarray | Tensor):
@@ -312,6 +320,12 @@ def check_finite(name: str, values: np.ndarray) -> None:
     """Raise ValueError for pixels that are no numbers."""
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds values that are not finite")
+
+
+def one_of(choices: Any, name: str, value: str) -> None:
+    """Raise ValueError for a word that is not one of a Literal's."""
+    if value not in get_args(choices):
+        raise ValueError(f"{name} is {value!r}, not one of {', '.join(get_args(choices))}")
 
 
 def as_tensor(values: Any) -> Tensor:

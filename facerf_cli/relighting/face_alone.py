@@ -135,13 +135,13 @@ class FaceInPhoto:
         """Share [h, W] of the face in rows of the photo."""
         return self.matte[rows]
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Relit, Sequence[str]]:
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Sequence[str]]:
         """Compute all that does not depend on rows; raises UsageError for layers of whole people."""
         require_face_layers(layers)
-        return self._detail.ready(relit.texture), relit, layers
+        return self._detail.ready(relit.texture), layers
 
     def render(
-        self, window: Window, own: np.ndarray, lights: Sequence[tuple[Tensor, Relit, Sequence[str]]]
+        self, window: Window, own: np.ndarray, lights: Sequence[tuple[Tensor, Sequence[str]]]
     ) -> Iterator[dict[str, np.ndarray]]:
         """Yield rows of the photo, whose person has its `own` colours [h, W, 3], under each light.
 
@@ -149,10 +149,8 @@ class FaceInPhoto:
         """
         part = window.common(self.view.window)
         lit = self._detail.over(part, own[part.inside(window)])
-        for maps, relit, layers in lights:
+        for maps, layers in lights:
             image = {"rgb": window.framed(lit(maps), part)}
-            if relit.own is not None and relit.own.any():
-                image["rgb"] = image["rgb"] + relit.own.detach().numpy() * own
             for name in layers:
                 image |= face_layer(self.view, name, window)
             yield image

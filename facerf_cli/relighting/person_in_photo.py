@@ -98,7 +98,6 @@ class PersonLight:
     mirrored: list[np.ndarray]
     layers: Sequence[str]
     keys: list[tuple["PersonLight | None", CastShadow]]  # each light alone; None: it is all of this light
-    own: Tensor | None
 
 
 class PersonInPhoto:
@@ -189,7 +188,6 @@ class PersonInPhoto:
             self._eyes.ready(relit.mirrored),
             layers,
             [(None if key.texture is relit.texture else self.ready(key), cast) for key, cast in relit.keys],
-            relit.own,
         )
 
     def render(
@@ -210,8 +208,6 @@ class PersonInPhoto:
                 alone = whole if key is None else by_maps(key)["rgb"]
                 pixels[part] += alone[part] * change
             pixels = self._eyes.lit(window.framed(pixels, among), light.mirrored, window)
-            if light.own is not None and light.own.any():
-                pixels = pixels + light.own.detach().numpy() * own
             shown = {name: window.framed(found[name], among) for name in VIEW_LAYERS if name in found}
             image = {"rgb": pixels}
             for name in light.layers:

@@ -311,11 +311,6 @@ class PortraitField:
         return PortraitField(views, field, _texels_in_square(model, head, seen[0][0]))
 
     @property
-    def balance(self) -> Balance | None:
-        """The balance of the person's white."""
-        return self.field.balance
-
-    @property
     def person(self) -> SeenPerson:
         """The person in the square around head and shoulders."""
         return self.views[0].person

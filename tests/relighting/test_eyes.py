@@ -193,7 +193,7 @@ def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest
     lights = torch.stack([azel_to_direction(*light) for light in ((0.0, 0.0), (0.0, 55.0), (-70.0, 0.0))])
 
     def shown(lights: Light) -> list[np.ndarray]:
-        return [people.image(relit).pixels[teeth] for relit in people.relit(lights)]
+        return [people.image(relit)[teeth] for relit in people.relit(lights)]
 
     each, (both,) = shown(Light.each(lights)), shown(Light(lights, torch.ones(1, 3, 3)))
     np.testing.assert_allclose(both, sum(each), rtol=1e-3)

@@ -19,11 +19,12 @@ from facerf_cli.image.strips import Window, strips
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.person import Person, Target, fit
+from facerf_cli.person import Person, fit
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.enlarged import Enlarged
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.photo_light import source_light
@@ -80,7 +81,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     models, head = person.models, person.head
-    image = person.image(source_light(models, head.face).light).pixels
+    image = person.image(source_light(models, head.face).light)
     inside = field.person.segmentation.matte > 0.9
     error = ((image - photo)[inside] ** 2).mean()
     assert 10 * np.log10(1 / error) > 30  # the maps are coarse, and grain is of a photo without light
@@ -98,11 +99,8 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
     face = find_faces(SHIPPED_NETWORKS.people, grey, "grey")[0]
-    image = (
-        fit(models, grey, face=face, texture_side=64, white=None)
-        .image(lamp(60), Target(background="none"))
-        .pixels
-    )
+    person = fit(models, grey, face=face, texture_side=64, white=None)
+    image = person.image(lamp(60), Target(background="none"))
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
 
 
@@ -208,7 +206,7 @@ def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
 ) -> None:
     """Hair, neck and garment, too: halves of the person beside the head's middle."""
     target = Target(background="none")
-    right, left = (person.image(lamp(azimuth), target).pixels.mean(-1) for azimuth in (75, -75))
+    right, left = (person.image(lamp(azimuth), target).mean(-1) for azimuth in (75, -75))
     matte = field.person.segmentation.matte > 0.5
     columns = np.arange(photo.shape[1])
     middle = field.person.square.x0_px + field.person.square.side_px / 2
@@ -218,7 +216,7 @@ def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
         on_left = region & (columns < middle - 15)
         assert right[on_right].mean() > 1.3 * left[on_right].mean()
         assert left[on_left].mean() > 1.3 * right[on_left].mean()
-    behind, ahead = (person.image(lamp(azimuth, 10), target).pixels for azimuth in (180, 0))
+    behind, ahead = (person.image(lamp(azimuth, 10), target) for azimuth in (180, 0))
     skin = field.person.segmentation.layer("skin")[:] > 0.9
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
 
@@ -231,7 +229,7 @@ def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: Person
     relit = list(people.relit(Light(directions, weights)))
     ahead, behind = relit[0][0].texture, relit[2][0].texture
     assert behind.abs().max() < 1e-4 * ahead.max()
-    *each, together = (people.image(one).pixels for one in relit)
+    *each, together = (people.image(one) for one in relit)
     np.testing.assert_allclose(sum(each), together, atol=1e-4 * together.max())
     assert min(one.min() for one in each) > -1e-12  # rounding
 
