@@ -144,7 +144,7 @@ class PeopleInPhoto(Relightable):
 def _with_own_light(
     images: Sequence[dict[str, np.ndarray]], relit: Sequence[Relit], owns: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
-    """Pixels [h, W, 3] of people, with the share of the photo's own light, in which each has `owns` colours."""
+    """Pixels [h, W, 3] of people, with the share of the photo's own light, in which they have `owns`."""
     found = []
     for image, one, own in zip(images, relit, owns, strict=True):
         lit = one.own is not None and one.own.any()
