@@ -8,7 +8,7 @@ directions are in camera space (docs/design.md).
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -92,22 +92,18 @@ class Relighting:
         return Case(f"{subject}/{self.source}/{self.light}", subject, facts)
 
 
-@dataclass(frozen=True, eq=False)
 class YaleSubject:
-    """A subject of the database: its images under flashes, and the sums of these. Grey, in 0..1."""
+    """A subject of the database: images under the `flashes` that have an undamaged one, and their sums.
 
-    database: YaleB
-    name: str
+    `olats` [L, 192, 168] are those images, grey, in 0..1.
+    """
 
-    @cached_property
-    def flashes(self) -> list[Flash]:
-        """The flashes with an undamaged image of the subject."""
-        return self.database.flashes(self.name)
-
-    @cached_property
-    def olats(self) -> np.ndarray:
-        """The subject's images under each of the flashes [L, 192, 168]."""
-        return self.database.images(self.name)
+    def __init__(self, database: YaleB, name: str) -> None:
+        self._folder, self.flashes, self.olats = (
+            database.folder / name,
+            database.flashes(name),
+            database.images(name),
+        )
 
     def image(self, light: str) -> np.ndarray:
         """The subject's image [192, 168], float32, under a flash by name, 'frontal', or an environment.
@@ -118,9 +114,7 @@ class YaleSubject:
         if flash is None:
             return self._exposed(light)
         if flash not in self.flashes:
-            raise InputError(
-                f"{self.database.folder / self.name}: no undamaged image under {flash.name}; leave it out"
-            )
+            raise InputError(f"{self._folder}: no undamaged image under {flash.name}; leave it out")
         return self.olats[self.flashes.index(flash)]
 
     def _exposed(self, environment: str) -> np.ndarray:

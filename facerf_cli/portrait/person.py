@@ -73,7 +73,7 @@ class SeenPerson:
     eyes: SeenEyes
     normals: np.ndarray | None = None
 
-    @cached_property
+    @property
     def exposure(self) -> float:
         """Radiance of the photo over that of the network's input."""
         return float(skin_exposure(self.image[None], self.classes[None]))

@@ -42,6 +42,7 @@ class Enlarged:
         self._view = view
         classes = view.person.classes
         self.own = view.person.own_pixels
+        self._unit, self._typical_skin = view.person.exposure, view.typical_skin
         self._colours = colours_of(view.person.exposed)
         hair, solid = (
             classes[[class_index(name) for name in names]].sum(0, keepdim=True) for names in (_HAIR, _SOLID)
@@ -130,11 +131,10 @@ class Enlarged:
 
         They are the albedo with the photo's detail, and that detail, a factor of what is relit.
         """
-        unit = self._view.person.exposure
-        grid = places(self._colours, self._trust, self._grid(window), torch.from_numpy(pixels), unit)
+        grid = places(self._colours, self._trust, self._grid(window), torch.from_numpy(pixels), self._unit)
         albedo, source, skin = torch.split(_enlarged(self._fixed_maps, grid), [3, 3, 1])
         source, skin = (maps.permute(1, 2, 0) for maps in (source, skin))
-        detail = finer_detail(torch.from_numpy(pixels / unit), source, skin, self._view.typical_skin)
+        detail = finer_detail(torch.from_numpy(pixels / self._unit), source, skin, self._typical_skin)
         detail = detail.permute(2, 0, 1)
         return grid, albedo * detail, detail
 

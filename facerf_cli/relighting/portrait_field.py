@@ -9,7 +9,6 @@ photo back.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -150,7 +149,7 @@ class PortraitView:
         """The view whose albedo is multiplied by gains [3, S, S]."""
         return replace(self, maps=self.maps._replace(albedo=self.maps.albedo * gains))
 
-    @cached_property
+    @property
     def typical_skin(self) -> Tensor:
         """Mean radiance [3] of the skin, in the units of the network's input."""
         return mean_colour(self.person.image, self.person.classes[_SKIN]) / self.person.exposure
