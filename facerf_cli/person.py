@@ -470,7 +470,7 @@ def _refuse_gradients(lights: Sequence[Light], people: Sequence[Person]) -> None
     taken = [array for one in lights for array in (one.directions, one.weights, one.own_rgb)]
     for person in people:
         taken.append(person.face.texture)
-        networks = person.models.networks  # each is loaded already
+        networks: Any = person.models.networks  # each is loaded already
         taken += networks.reflectance.parameters() if isinstance(person.field, Field) else []
         taken += networks.portrait.parameters() if isinstance(person.reflectance, PortraitField) else []
     if torch.is_grad_enabled() and any(isinstance(one, Tensor) and one.requires_grad for one in taken):

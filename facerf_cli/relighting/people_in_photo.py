@@ -147,8 +147,10 @@ def _with_own_light(
     """Pixels [h, W, 3] of people, with the share of the photo's own light, in which they have `owns`."""
     found = []
     for image, one, own in zip(images, relit, owns, strict=True):
-        lit = one.own is not None and one.own.any()
-        found.append(image["rgb"] + one.own.detach().numpy() * own if lit else image["rgb"])
+        pixels = image["rgb"]
+        if one.own is not None and one.own.any():
+            pixels = pixels + one.own.detach().numpy() * own
+        found.append(pixels)
     return found
 
 
