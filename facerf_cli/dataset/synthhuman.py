@@ -150,7 +150,7 @@ def _look(
     layers = torch.from_numpy(person.square.apply(np.dstack([person.normals, alpha])))
     layers = layers.permute(2, 0, 1)[None] * torch.from_numpy(person.square.valid(*photo.shape[:2]))
     true = layers[:, :3]
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     tensors = {field.name: getattr(inputs, field.name) for field in fields(inputs)}
     known = true.norm(dim=1, keepdim=True) > 0.5
     tensors |= {"true_normals": F.normalize(true, dim=1), "alpha": layers[:, 3:].clamp(0, 1) * known}

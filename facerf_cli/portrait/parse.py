@@ -11,7 +11,7 @@ from torch import Tensor
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.topology import MIRROR_68
-from facerf_cli.image.strips import block_means, enlarged
+from facerf_cli.image.strips import block_means
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -243,20 +243,9 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
     return _bare(classes, _places(crop) / (size_px[1], size_px[0]))
 
 
-class UncoveredRows:
-    """The same share [H, W] of a photo's pixels, by rows, by the classes [C, h, w] of the whole photo."""
-
-    def __init__(self, classes: Tensor, size_px: tuple[int, int]) -> None:
-        self._covered, self._size_px = covering(classes)[None].numpy(), size_px
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Some rows [h, W]."""
-        return _share_bare(enlarged(self._covered, self._size_px, rows)[0])
-
-
 def uncovered_by(matte: np.ndarray, crop: Crop) -> np.ndarray:
     """The share of `uncovered` by a matte [H, W] of the photo: what is not its person covers the face."""
-    return _share_bare(1 - crop.apply(matte[..., None])[..., 0])
+    return share_bare(1 - crop.apply(matte[..., None])[..., 0])
 
 
 def _places(crop: Crop) -> np.ndarray:
@@ -269,7 +258,7 @@ def _bare(classes: Tensor, shares: np.ndarray) -> np.ndarray:
     """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
     grid = torch.from_numpy(2 * shares - 1).float()[None]
     sampled = F.grid_sample(covering(classes)[None, None], grid, align_corners=False)[0, 0]
-    return _share_bare(sampled.numpy())
+    return share_bare(sampled.numpy())
 
 
 def covering(classes: Tensor) -> Tensor:
@@ -278,6 +267,7 @@ def covering(classes: Tensor) -> Tensor:
     return classes[~own].sum(0).float()
 
 
-def _share_bare(covered: np.ndarray) -> np.ndarray:
+def share_bare(covered: np.ndarray) -> np.ndarray:
+    """Share of the face itself in pixels that other things cover by a share."""
     low, high = _SURE
     return (1 - (covered - low) / (high - low)).clip(0, 1)

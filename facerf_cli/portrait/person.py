@@ -88,14 +88,6 @@ class SeenPerson:
         """1 where the person covers most of a pixel [S, S], else 0."""
         return (1 - self.classes[0] > 0.5).float()
 
-    def visibility(self, directions: Tensor) -> Tensor:
-        """Share [L, s, s] of lights [L, 3] that reaches the person, at half the square's side."""
-        return self.shadows.along(directions)
-
-    def visibility_of_points(self, places_m: Tensor) -> Tensor:
-        """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
-        return self.shadows.toward(places_m)
-
     def around_iris(self, number: int) -> tuple[Shadows, Tensor]:
         """The lights that reach the pixels around an iris, and the places [h, w, 2] of these in -1..1."""
         x_px, y_px, radius_px = self.eyes.irises_px[number]
@@ -138,8 +130,9 @@ class SeenPerson:
         fine = replace(self.square, size_px=self.square.size_px * times)
         return proxy_maps(self.proxy, square_camera(self.fit, fine), filled=False)
 
-    def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
-        """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
+    def inputs(self, rig: Tensor) -> PortraitInputs:
+        """The network's inputs [1, ...], by the visibility of a rig [L, 3] all around."""
+        visible = self.shadows.along(rig)
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible, self.sides)
         reached = reached_by(rig, visible, self.square.size_px)
         sides = torch.full((1, 1, 1, 1), self.sides)

@@ -48,10 +48,10 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     person, size = view.person, view.person.image.shape[1:]
     if isinstance(light, PointLights):
         ends, (lights, strength) = light.places_m, light.arriving(person.maps.positions_m)
-        coarse, middle = person.visibility_of_points(ends), -light.toward
+        coarse, middle = person.shadows.toward(ends), -light.toward
     else:
         ends, lights, strength = light, light, torch.full((len(light), 1, 1), 1 / len(light))
-        coarse, middle = person.visibility(light), F.normalize(light.mean(0), dim=0)
+        coarse, middle = person.shadows.along(light), F.normalize(light.mean(0), dim=0)
     shades = []
     for arrives in (0.0, 1.0):
         shade, glow, _ = view.maps.shaded(lights[None], torch.full((1, len(coarse), *size), arrives))

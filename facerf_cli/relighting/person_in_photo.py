@@ -20,7 +20,7 @@ from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Window, enlarged
 from facerf_cli.light.light import Light
 from facerf_cli.portrait.matte import PersonColours
-from facerf_cli.portrait.parse import UncoveredRows, class_index
+from facerf_cli.portrait.parse import class_index, covering, share_bare
 from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.raster.rasterize import front_facing, rasterize
@@ -112,7 +112,7 @@ class PersonInPhoto:
         self.vertices_m = head.fit.vertices_camera(model)
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
-        self._bare_face = UncoveredRows(field.person.segmentation.classes, self.size_px)
+        self._covered = covering(field.person.segmentation.classes)[None].numpy()
         self._views = [Enlarged(view) for view in field.views]
         self._detail = FaceDetail(head.face, self.view)
 
@@ -265,7 +265,7 @@ class PersonInPhoto:
 
     def _face_share(self, part: Window) -> np.ndarray:
         """Share [h, w] that the field of the face has in a part of its window."""
-        bare = self._bare_face[part.rows][:, part.columns]
+        bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
         return np.asarray(self.view.mask[part.inside(self.view.window)].numpy() * bare)
 
     def _layer(self, name: str, window: Window, shown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

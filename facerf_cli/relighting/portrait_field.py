@@ -168,7 +168,7 @@ class PortraitView:
         """The view in the units of the photo's light, corrected to give the photo back under it."""
         used = source.light.weights.sum(1) > 0
         directions, weights = source.light.directions[used], source.light.weights[used]
-        shade, glow, _ = self._shaded(directions, self.person.visibility(directions))
+        shade, glow, _ = self._shaded(directions, self.person.shadows.along(directions))
         olats = self.maps.albedo * shade[:, None] + glow[:, None]
         skin = self.person.classes[_SKIN]
         explained = torch.einsum("lc,lcij->cij", weights, olats)
@@ -206,7 +206,7 @@ class PortraitView:
                 torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
                 strict=True,
             ):
-                maps = self._shaded(lights, self.person.visibility(lights.detach()))
+                maps = self._shaded(lights, self.person.shadows.along(lights.detach()))
                 sent = torch.ones(len(lights), 1, 1)
                 yield _Some(*maps, sent, some, from_behind(lights), lights[..., None, None])
 
@@ -217,7 +217,7 @@ class PortraitView:
         for first in range(0, len(toward), _LIGHTS_AT_ONCE):
             batch = slice(first, first + _LIGHTS_AT_ONCE)
             sent = irradiance[batch]
-            visible = self.person.visibility_of_points(points.places_m[batch])
+            visible = self.person.shadows.toward(points.places_m[batch])
             shade, glow, arrives = self._shaded(toward[batch], visible)
             some = weights[:, None].expand(-1, len(sent), -1)
             share, along = behind.expand(len(sent)), toward[batch].permute(0, 3, 1, 2)
@@ -356,7 +356,7 @@ def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     It is the mean of the network's maps and of those that it sees in a mirror, whose errors differ.
     """
     rig = rig_directions(_SUMMARY_LIGHTS)
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     even = even_shade_of(inputs.image[0], inputs.classes[0])
     inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device

@@ -91,7 +91,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     shown = copy(person.in_photo())
     height, width = shown.size_px
     half = np.tile(np.arange(width) < width // 2, (height, 1))
-    shown._bare_face = half  # type: ignore[assignment]
+    shown._covered = (~half)[None].astype(np.float32)
     share = shown._face_share(shown.view.window)
     np.testing.assert_array_equal(share, shown.view.mask.numpy() * half[shown.view.window])
 
@@ -108,7 +108,7 @@ def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarra
 def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more: bool) -> None:
     """Of cloth the photo shows at least half of the albedo."""
     rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     classes = torch.zeros_like(inputs.classes)
     classes[:, class_index(name)] = 1
     maps = maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, classes=classes))))
@@ -126,7 +126,7 @@ def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: Portrai
     torch.testing.assert_close(found, shown, atol=0.05, rtol=0)
     # The few values that a dark neck has are saturated; with gain and bias it would glow.
     rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     image, classes = inputs.image.clone(), inputs.classes.clone()
     neck = slice(3 * image.shape[-1] // 4, None)
     image[:, :, neck] = torch.tensor([0.004, 0.001, 0.0])[:, None, None]
@@ -138,7 +138,7 @@ def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: Portrai
     found = maps.bias[0, :, neck].mean((1, 2))
     torch.testing.assert_close(found / found.mean(), skin / skin.mean(), atol=0.15, rtol=0)
     # A dark, saturated neck beside a lit chin becomes no orange neck under a light from below.
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     neck = inputs.classes[:, [class_index("neck")]]
     cast_on_neck = torch.tensor([0.15, 0.06, 0.03])[:, None, None] * neck + 1 - neck
     maps = maps_of(
@@ -153,7 +153,7 @@ def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: Portrai
 def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: PortraitField) -> None:
     """The albedo is the photo, with the shade's colour, times the gain, plus the bias."""
     rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     side = inputs.image.shape[-1]
     cast_in_shade = torch.ones(3, 1, side)
     cast_in_shade[..., : side // 2] = torch.tensor([0.2, 0.1, 0.4])[:, None, None]
@@ -183,7 +183,7 @@ def halves_of(side: int) -> tuple[slice, slice]:
 
 def test_left_and_right_are_treated_alike_and_without_light_all_is_black(field: PortraitField) -> None:
     rig = rig_directions(48)
-    given = field.person.inputs(rig, field.person.visibility(rig))
+    given = field.person.inputs(rig)
     seen, in_mirror = (
         maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(inputs))) for inputs in (given, given.mirrored())
     )
