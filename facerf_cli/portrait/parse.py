@@ -153,9 +153,9 @@ def whole_photo(image_srgb: np.ndarray, turn_rad: float = 0.0) -> Square:
 
 @dataclass(frozen=True, eq=False)
 class SquareView:
-    """View of a square by the network: logits [K, C, S, S] of the classes; landmarks [N, 2] in the photo.
+    """View of a square by the network: logits [C, S, S] of the classes; landmarks [N, 2] in the photo.
 
-    The logits are those of K looks at the square. error_px [N] are the landmarks' expected errors; presence,
+    error_px [N] are the landmarks' expected errors; presence,
     in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `find.py`.
     """
 
@@ -169,8 +169,8 @@ class SquareView:
 
     @property
     def classes(self) -> Tensor:
-        """Shares [C, S, S] of the classes, which sum to 1: the mean of all looks; computed each time."""
-        return self.logits.softmax(1).mean(0)
+        """Shares [C, S, S] of the classes, which sum to 1; computed each time."""
+        return self.logits.softmax(0)
 
     @property
     def extent_px(self) -> float:
@@ -202,25 +202,17 @@ def _box_mean(grey: Tensor, reach: int) -> Tensor:
 
 
 @torch.inference_mode()
-def look(
-    network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False
-) -> list[SquareView]:
-    """Look at squares of an sRGB uint8 image [H, W, 3]; `mirrored` averages with their mirror images."""
+def look(network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[SquareView]:
+    """Look at squares of an sRGB uint8 image [H, W, 3]."""
     device = next(network.parameters()).device
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
     sharpness = sharpness_of(crops)
     found = Parsing(*(part.cpu() for part in network(crops.to(device))))
-    logits, places, log_error = found.logits[:, None], found.landmarks.double(), found.log_error.double()
-    if mirrored:
-        other = Parsing(*(part.cpu() for part in network(crops.flip(-1).to(device))))
-        logits = torch.cat([logits, other.logits.flip(-1)[:, None]], 1)
-        flipped = other.landmarks.double()[:, MIRROR] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
-        places = (places + flipped) / 2
-        log_error = (log_error + other.log_error.double()[:, MIRROR]) / 2
+    places, log_error = found.landmarks.double(), found.log_error.double()
     return [
         SquareView(
             square,
-            logits[index].float(),
+            found.logits[index].float(),
             square.to_photo(places[index].numpy()),
             log_error[index].exp().numpy() * square.side_px,
             float(found.presence[index].sigmoid()),

@@ -27,12 +27,11 @@ from facerf_cli.raster.rasterize import front_facing, rasterize
 from facerf_cli.raster.texture import blurred, inpaint, smoothstep
 from facerf_cli.relighting.cast_shadows import CastShadow, cast_shadow
 from facerf_cli.relighting.detail import FaceDetail
-from facerf_cli.relighting.edges import Rims, from_behind
-from facerf_cli.relighting.enlarged import VIEW_LAYERS, Enlarged, Maps
+from facerf_cli.relighting.enlarged import VIEW_LAYERS, Enlarged, Maps, Rims
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.face_alone import FACE_LAYERS, face_layer
 from facerf_cli.relighting.field import near_texture
-from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.portrait_field import PortraitField, from_behind
 from facerf_cli.relighting.relightable import Relit
 from facerf_cli.run.threads import both
 

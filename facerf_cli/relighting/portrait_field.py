@@ -29,9 +29,8 @@ from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
-from facerf_cli.raster.texture import bake_attributes, blurred
+from facerf_cli.raster.texture import bake_attributes, blurred, smoothstep
 from facerf_cli.relighting.detail import FLOOR, NOISE, contrast, finer_detail, lost_detail, mean_colour
-from facerf_cli.relighting.edges import from_behind
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
 from facerf_cli.relighting.photo_light import SourceLight, share_of_lamp
@@ -46,6 +45,7 @@ _SKIN = class_index("skin")
 _APART = 0.01  # blur of what is no skin, in sides: skin near to it keeps its make-up and its hair
 _CLOTH = ("garment", "headwear")
 _DETAIL_PX = 2.0  # standard deviation of the blur of detail, in pixels of the maps
+_BEHIND = (0.35, 0.75)  # -z of the directions from which on light is partly, and wholly, from behind
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
 
@@ -348,6 +348,11 @@ class PortraitField:
         albedo = sampled(view.maps.albedo) * detail.movedim(-1, 0)
         own = (albedo * sampled(lit.shading) + sampled(lit.highlights)) * view.exposure
         return torch.lerp(textures, own, _SHARE)
+
+
+def from_behind(directions: Tensor) -> Tensor:
+    """Share [...] of lights from unit directions [..., 3] that comes from behind."""
+    return smoothstep((-directions[..., 2] - _BEHIND[0]) / (_BEHIND[1] - _BEHIND[0]))
 
 
 def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:

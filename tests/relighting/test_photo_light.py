@@ -31,7 +31,7 @@ def models() -> Models:
 def face() -> FaceTexture:
     """The face as the Parsing Network's landmarks fit it; there the field explains its own images best."""
     photo, around = to_display(astronaut.photo()), Square.around(astronaut.face().landmarks_px, 1.7)
-    view = look(astronaut.models().networks.parsing, photo, [around], mirrored=True)[0]
+    view = look(astronaut.models().networks.parsing, photo, [around])[0]
     head = fit_photo(astronaut.models(), astronaut.photo(), view.landmarks_px[:68])
     small = shrunk(head.face)
     return replace(small, visible=torch.ones_like(small.visible))

@@ -14,9 +14,8 @@ from facerf_cli.image.strips import Window
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.raster.texture import blurred
-from facerf_cli.relighting.edges import EdgeFill, Rims, colours_of, from_behind, places, trust_in
-from facerf_cli.relighting.enlarged import Enlarged
-from facerf_cli.relighting.portrait_field import PortraitLight
+from facerf_cli.relighting.enlarged import EdgeFill, Enlarged, Rims, colours_of, places, trust_in
+from facerf_cli.relighting.portrait_field import PortraitLight, from_behind
 from tests import astronaut
 
 SIDE, SCALE = 48, 5  # pixels of the maps, and of the photo along each of them
