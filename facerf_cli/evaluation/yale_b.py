@@ -8,7 +8,6 @@ directions are in camera space (docs/design.md).
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -99,11 +98,9 @@ class YaleSubject:
     """
 
     def __init__(self, database: YaleB, name: str) -> None:
-        self._folder, self.flashes, self.olats = (
-            database.folder / name,
-            database.flashes(name),
-            database.images(name),
-        )
+        self._folder = database.folder / name
+        self.flashes, self.olats = database.flashes(name), database.images(name)
+        self._weights = {light: environment_weights(light, self.flashes) for light in _RADIANCES}
 
     def image(self, light: str) -> np.ndarray:
         """The subject's image [192, 168], float32, under a flash by name, 'frontal', or an environment.
@@ -125,8 +122,8 @@ class YaleSubject:
 
     def weights(self, light: str) -> np.ndarray:
         """The weight [L] of each flash in a target, which is a flash or an environment; they sum to 1."""
-        if light in _RADIANCES:
-            return environment_weights(light, tuple(self.flashes))
+        if light in self._weights:
+            return self._weights[light]
         return np.array([float(flash.name == light) for flash in self.flashes])
 
     def relightings(self) -> Iterator[Relighting]:
@@ -141,8 +138,7 @@ class YaleSubject:
             yield from (Relighting("environment", source, environment) for environment in ENVIRONMENTS)
 
 
-@cache  # cells of many points on the sphere
-def environment_weights(name: str, flashes: tuple[Flash, ...]) -> np.ndarray:
+def environment_weights(name: str, flashes: Sequence[Flash]) -> np.ndarray:
     """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L]; the sum is 1."""
     # Directions on a golden spiral about +y, as in the benchmark: the cells depend on them.
     index = np.arange(_SPHERE_POINTS) + 0.5

@@ -196,10 +196,11 @@ def parsed(
     near = [Square.around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
     views = look(parsing, image_srgb, [body, chest, *near])
+    background = torch.eye(len(CLASSES))[0, :, None, None]
     (wide, inside), (middle, feather), *close = (
         one.square.laid_over(one.classes, size, image_srgb.shape, _FEATHER) for one in views
     )
-    classes = torch.lerp(torch.where(inside > 0, wide, _only_background()), middle, feather)
+    classes = torch.lerp(torch.where(inside > 0, wide, background), middle, feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
     for (one, feather), sides in zip(close, _NEAR_SIDES, strict=True):
         weighed = feather * sides**-_STEEPNESS
@@ -254,12 +255,6 @@ def _with_likelier_hair(classes: Tensor) -> Tensor:
     person[hair] *= _HAIR
     kept = classes[1:].sum(0) / person.sum(0).clamp_min(1e-6)
     return torch.cat([classes[:1], person * kept])
-
-
-def _only_background() -> Tensor:
-    shares = torch.zeros(len(CLASSES), 1, 1)
-    shares[0] = 1
-    return shares
 
 
 def with_ears(classes: Tensor, view: SquareView, places_px: np.ndarray) -> Tensor:

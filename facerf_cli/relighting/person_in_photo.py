@@ -140,7 +140,8 @@ class PersonInPhoto:
         def arriving(toward: Tensor, weights: Tensor) -> Tensor:
             """Weights of all light on the face, then of what of it falls into the mouth."""
             front = weights * (1 - from_behind(toward))[..., None]
-            return torch.cat([front, front * _into_mouth(toward, forward)[..., None]])
+            into_mouth = smoothstep(toward @ forward / _LIPS)  # between the lips of a face that looks forward
+            return torch.cat([front, front * into_mouth[..., None]])
 
         textures = field.field.relit(directions, arriving(directions, weights))
         for points, rgb in near:
@@ -314,8 +315,3 @@ def seen_columns(shown: np.ndarray) -> slice:
     """Columns in which a part of an image [h, W] is not 0; at least one."""
     at = np.flatnonzero(shown.any(0))
     return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
-
-
-def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
-    """Share [...] of lights from directions [..., 3] that falls between lips; the face looks `forward`."""
-    return smoothstep(directions @ forward / _LIPS)

@@ -80,7 +80,7 @@ def test_cases_and_lights_are_the_benchmarks(
     theirs = np.stack([reference[0].light_dir(*angles) for angles in named])
     np.testing.assert_allclose([flash.direction for flash in flashes], theirs, atol=1e-9)
     for environment in reference[0].ENV:
-        weights = environment_weights(environment, tuple(flashes))
+        weights = environment_weights(environment, flashes)
         np.testing.assert_allclose(weights, reference[0].env_weights(environment, named), atol=1e-9)
     np.testing.assert_array_equal(face_mask(), reference[0].MASK)
 
