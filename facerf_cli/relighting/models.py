@@ -184,7 +184,7 @@ def load_models(
         face=load_face_model(face_model),
         networks=Networks(files, device),
         trained_sides=Sides(side, _side(path, metadata, "crop_px", CROP_PER_TEXTURE * side)),
-        default_geometry=default_geometry(metadata),
+        default_geometry="network" if metadata.get("geometry") == "network" else "landmarks",
         source_colours=_source_colours(path, metadata),
     )
 
@@ -194,11 +194,6 @@ def _side(path: Path, metadata: dict[str, Any], name: str, default: int) -> int:
     if type(side) is not int or not 16 <= side <= CROP_PER_TEXTURE * LARGEST_TEXTURE:
         raise InputError(f"{path}: invalid {name} in its metadata; train it again")
     return side
-
-
-def default_geometry(metadata: dict[str, Any]) -> Geometry:
-    """Geometry of a checkpoint's training, by default that of photos, too."""
-    return "network" if metadata.get("geometry") == "network" else "landmarks"
 
 
 def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | None:
