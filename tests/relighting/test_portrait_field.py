@@ -62,10 +62,7 @@ class Seen:
 
     given: PortraitInputs
 
-    def visibility(self, rig: Tensor) -> Tensor:
-        return rig
-
-    def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
+    def inputs(self, rig: Tensor) -> PortraitInputs:
         return self.given
 
 
