@@ -41,6 +41,7 @@ from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.photo_light import Estimator, estimate_light
 from facerf_cli.relighting.reflectance import reflectance_of
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.training.losses import load_features
 
 TURNS_DEG = (0, 120)  # of each map
@@ -123,7 +124,7 @@ def estimates(
         for method, found in by_both(models, replace(head, face=face), features):
             yield light, ("texture", method, found)
         ev = people.exposure_ev([relit], "auto")
-        relit_photo = through_png(people.image([relit], ev).pixels * np.float32(2.0**ev))
+        relit_photo = through_png(people.rendered(RenderRequest([relit], ev=ev))["rgb"] * np.float32(2.0**ev))
         seen_px = find_faces(SHIPPED_NETWORKS.people, relit_photo, light.name)[0].landmarks_px
         if np.linalg.norm(seen_px.mean(0) - landmarks_px.mean(0)) > _MOVED_PX:
             print(f"PNG {path.stem} {light.name}: left out, another face was detected")

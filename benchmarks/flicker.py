@@ -83,7 +83,7 @@ def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | N
     """Relight a frame by the target's light."""
     reflectance = reflectance_of(models, head, "portrait", photo=frame, steady=steady)
     light = RigLight(rig_directions(LIGHTS), TARGET)
-    return Person(models, frame, head, reflectance).image(light).pixels
+    return Person(models, frame, head, reflectance).image(light)
 
 
 def exposed(results: list[np.ndarray], clip: Clip) -> np.ndarray:

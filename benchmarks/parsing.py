@@ -38,8 +38,8 @@ from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.read import read_image
-from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import Face, detect_faces, face_at
+from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.portrait.segment import segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS

@@ -20,9 +20,10 @@ from facerf_cli.image.colour import ExposureRule, luminance
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.person import Target, fit
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.person import fit
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.parse import class_index
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.portrait_samples import StoredView, load_view
@@ -95,7 +96,7 @@ def measured(
     shown = {}
     lit = composition.relit(Light(rig, torch.cat([lamp, natural[1:]])))
     for light, relit in zip(("lamp", "daylight"), lit, strict=True):
-        face = tones(composition.image(relit).pixels, skin)
+        face = tones(composition.image(relit), skin)
         for rule in RULES:
             shown[f"{light} {rule}"] = face * 2 ** composition.exposure_ev(relit, rule)
     return albedo_of_skin(view, look), tones(photo, skin), shown

@@ -48,7 +48,7 @@ def main() -> None:
             continue
         for pair in (pair for pair in pairs if pair[:2] == (subject, source)):
             light = RigLight(azel_to_direction(*portrait.angles_deg(pair[2]))[None], torch.ones(1, 3))
-            relit[pair] = person.image(light).pixels.mean(-1)
+            relit[pair] = person.image(light).mean(-1)
     methods = {
         "the photo left as it is": lambda *pair: portrait.frame(data, *pair[:2]),
         "relit": lambda *pair: relit[pair],

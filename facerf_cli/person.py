@@ -3,21 +3,19 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from facerf_cli.baselines import RelightKind
-from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import check_landmarks
-from facerf_cli.face.fit import FaceFit, Geometry
-from facerf_cli.face.head import FaceTexture, Head
+from facerf_cli.face.fit import Geometry
+from facerf_cli.face.head import Head
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
-from facerf_cli.face.view import photo_camera
 from facerf_cli.image.strips import covering, in_strips
 from facerf_cli.light.envmap import Backdrop, check_envmap
 from facerf_cli.light.light import (
@@ -25,39 +23,36 @@ from facerf_cli.light.light import (
     Light,
     as_light,
     as_tensor,
-    check_finite,
-    check_kind,
     directions_of,
     linear_pixels,
+    one_of,
     stacked,
+    uncopied_pixels,
 )
-from facerf_cli.light.sphere import RigLight, rig_directions
+from facerf_cli.light.sphere import rig_directions
 from facerf_cli.portrait import find
-from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.find import Face, face_with
-from facerf_cli.portrait.given_normals import unit_normals
-from facerf_cli.portrait.segment import Segmentation, segment
-from facerf_cli.raster.camera import Camera, pose_to_rotation, rays_of_rows
+from facerf_cli.portrait.parse import CLASSES
+from facerf_cli.portrait.person import unit_normals
+from facerf_cli.raster.camera import pose_to_rotation, rays_of_rows
 from facerf_cli.relighting import White
-from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone, FaceInPhoto
+from facerf_cli.relighting.face_alone import FACE_LAYERS
 from facerf_cli.relighting.field import Field
+from facerf_cli.relighting.fitted import FittedPerson, olat_images
 from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import LARGEST_TEXTURE, Models
-from facerf_cli.relighting.people_in_photo import Background as Behind
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
-from facerf_cli.relighting.person_in_photo import PERSON_LAYERS, PersonInPhoto
+from facerf_cli.relighting.person_in_photo import PERSON_LAYERS
 from facerf_cli.relighting.photo_light import estimate_light
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame
 from facerf_cli.relighting.reflectance import reflectance_of
-from facerf_cli.relighting.relightable import Relightable, RelitImage, RenderRequest
-from facerf_cli.relighting.white import Balance
+from facerf_cli.relighting.relightable import RenderRequest
 
 if TYPE_CHECKING:
     import trimesh
 
 Pose = tuple[float, float, float] | Tensor  # yaw, pitch, roll in degrees (docs/design.md)
 Background = Literal["photo", "none"] | Array | tuple[float, float, float]
-_LIGHTS_AT_ONCE, _PIXELS_AT_ONCE = 8, 1 << 23  # of OLAT images, at most
 
 
 def find_faces(
@@ -76,7 +71,7 @@ def find_faces(
 
     Raises InputError where no face is found.
     """
-    return find.find_faces(models.networks.people, _pixels_of(name, photo), name, which)
+    return find.find_faces(models.networks.people, uncopied_pixels(name, photo), name, which)
 
 
 @torch.no_grad()
@@ -131,7 +126,7 @@ def fit(
         raise UsageError("network_alone: is for the fields; leave it out, or use reflectance='field'")
     if landmarks_px is not None and geometry == "network":
         raise UsageError("geometry: 'network' uses no landmarks; leave one out")
-    pixels = _pixels_of("photo", photo)
+    pixels = uncopied_pixels("photo", photo)
     if matte is not None:
         matte = linear_pixels("matte", matte, "[H, W]").detach().numpy().clip(0, 1)
         if matte.shape != pixels.shape[:2]:
@@ -163,81 +158,22 @@ class PhotoCamera(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
-    """The pose and the surroundings in which a relit head is shown.
-
-    `fit` is the head's pose and shape as shown; None: as in the photo. `composite` is the photo with its
-    person relit, or the rendered face alone. A `matte` [H, W] in 0..1 says what is relit, by default all;
-    it is multiplied by the `alpha` [H, W] of the photo itself. Behind it stays the photo, or nothing, or
-    what is given with each light.
-    """
-
-    fit: FaceFit | None = None
-    composite: Literal["photo", "face"] = "photo"
-    matte: np.ndarray | None = None
-    alpha: np.ndarray | None = None
-    background: Behind = "photo"
-
-
-AS_IN_PHOTO = Target()
-
-
-class PersonOrGroup:
-    """A person, or a group: gives arrays of numpy, or of torch where it was given such."""
-
-    models: Any
-    tensors: Any
-
-    def _answer(
-        self,
-        light: Any,
-        lights: Sequence[Light],
-        given: Sequence[Any],
-        shown: Iterator[Any],
-        layers: Sequence[str],
-    ) -> Any:
-        """The images that a caller asked for, or dicts with layers; one for a light, a list for a list.
-
-        `given` are what gradients may reach beside the lights.
-        """
-        given = [*given, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
-        with _gradients(*given):
-            images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
-        found = images if layers else [one["image"] for one in images]
-        return found if isinstance(light, Sequence) else found[0]
-
-    def _out(self, values: Array, *given: Any) -> Any:
-        """Values as arrays, or as tensors on the models' device where the photo or what was given is one."""
-        if self.tensors or any(isinstance(one, Tensor) for one in given):
-            return torch.as_tensor(values).to(self.models.device)
-        return values.detach().numpy() if isinstance(values, Tensor) else values
-
-
-@dataclass(frozen=True, eq=False)
-class Person(PersonOrGroup):
+class Person(FittedPerson):
     """One person of a photo, as `fit` gives it; each light then costs what a light costs.
 
+    Its arrays are numpy's, or torch's on the models' device where the photo or what a method is given is one.
+
     Attributes:
-        models: The networks and the face model.
-        photo: Scene-linear [H, W, 3]; None: the face alone, in the frame of its crop.
-        head: The fitted face model, and the face's texture.
-        reflectance: The person under any lights.
-        given_matte: Share [H, W] of the photo, if it was given.
         kind: Which reflectance it is.
-        tensors: True of a photo that was given as a tensor: all arrays are tensors on the models' device.
+        tensors: True of a photo that was given as a tensor.
     """
 
-    models: Models
-    photo: np.ndarray | None
-    head: Head
-    reflectance: Reflectance
-    given_matte: np.ndarray | None = None
     kind: RelightKind = "portrait"
     tensors: bool = False
 
     def __repr__(self) -> str:
         """A line for a notebook."""
-        camera = self._photo_camera
+        camera = self.photo_camera
         return f"<facerf.Person in {camera.width_px} x {camera.height_px} pixels, {self.kind}>"
 
     def relight(
@@ -278,14 +214,14 @@ class Person(PersonOrGroup):
         `lights` are unit directions [L, 3], or the size of a uniform rig, `facerf.rig(lights)`.
         """
         with torch.no_grad():
-            images = list(olat_images(self._group.composed_once, directions_of(lights)))
+            images = list(olat_images(self._group.composed, directions_of(lights)))
         return self._out(np.concatenate(images), lights)
 
     def uv_olat(self, lights: int | Array = 150, pose: Pose | None = None) -> Array:
         """The face's UV texture under each light alone [L, T, T, 3], by the neural field; see `olat`."""
         directions = directions_of(lights)
         turn = None if pose is None else self.head.fit.turn_to(_rotation(pose))
-        field = self._field
+        field = self.field
         given = lights, pose, self._wanted
         with _gradients(*given):
             if isinstance(field, Field):
@@ -310,66 +246,16 @@ class Person(PersonOrGroup):
 
         `rotate_deg` is added to every azimuth; `blur` is that of a lens, as a share of the longer side.
         """
-        linear, camera = linear_pixels("map", envmap).detach(), self._photo_camera
+        linear, camera = linear_pixels("map", envmap).detach(), self.photo_camera
         check_envmap(linear)
         size = camera.height_px, camera.width_px
         seen = Backdrop(linear, size, partial(rays_of_rows, camera), rotate_deg, blur)
         return self._out(seen[0 : size[0]], envmap)
 
-    @cached_property
-    def segmentation(self) -> Segmentation:
-        """Classes and matte of the person in the photo."""
-        assert self.photo is not None
-        if isinstance(self.reflectance, PortraitField):
-            return self.reflectance.person.segmentation
-        landmarks_px = self.head.fit.crop.to_photo(self.head.landmarks_px)
-        people, matte, others = self.models.networks.people, self.given_matte, self.head.others
-        return segment(people, to_display(self.photo), landmarks_px, matte, others)
-
-    @property
-    def share(self) -> np.ndarray:
-        """The person's share [H, W] of the photo."""
-        return self.segmentation.matte if self.given_matte is None else self.given_matte
-
-    def composed(self, target: Target = AS_IN_PHOTO) -> Relightable:
-        """Prepare images of the person in a pose, before a background, that differ by their light alone."""
-        if self.photo is None or target.composite == "face":
-            photo_px = None if self.photo is None else (self.photo.shape[0], self.photo.shape[1])
-            return FaceAlone(self.models.face, self.head, self.reflectance, target.fit, photo_px)
-        return self._group.composed(target)
-
-    def in_photo(self, target: Target = AS_IN_PHOTO) -> PersonInPhoto | FaceInPhoto:
-        """Prepare the person in its photo; the target's matte says which part of it changes."""
-        assert self.photo is not None
-        matte = self.share
-        for part in (target.matte, target.alpha):
-            matte = matte if part is None else (matte * part).astype(np.float32, copy=False)
-        if isinstance(self.reflectance, PortraitField):
-            return PersonInPhoto(self.models.face, self.photo, self.head, self.reflectance, matte)
-        size_px = self.photo.shape[0], self.photo.shape[1]
-        face = FaceAlone(self.models.face, self.head, self.reflectance, photo_px=size_px)
-        return FaceInPhoto(face, self.photo, matte)
-
-    def image(self, light: RigLight, target: Target = AS_IN_PHOTO) -> RelitImage:
-        """The person under one light (paper, 'Relighting')."""
-        subject = self.composed(target)
-        return subject.image(next(subject.relit(Light(light.directions, light.weights[None]))))
-
     @property
     def even(self) -> Light:
         """Even light from all around, under which the skin is as bright as in the photo."""
         return self.even_brightness * Light.around()
-
-    @property
-    def even_brightness(self) -> float:
-        """Brightness of even light, from all around, under which the skin is as bright as in the photo."""
-        return 1.0 if self.balance is None else self.balance.even
-
-    @property
-    def balance(self) -> Balance | None:
-        """The balance of the person's white; the paper's baselines have none."""
-        reflectance = self.reflectance
-        return reflectance.balance if isinstance(reflectance, Field | PortraitField) else None
 
     @cached_property
     def light(self) -> Light:
@@ -410,7 +296,7 @@ class Person(PersonOrGroup):
     @property
     def camera(self) -> PhotoCamera:
         """The photo's camera and the pose of the head."""
-        camera = self._photo_camera
+        camera = self.photo_camera
         focal = camera.focal_px
         matrix = np.array([[focal, 0, camera.cx_px], [0, focal, camera.cy_px], [0, 0, 1]])
         return PhotoCamera(self._out(matrix), self._out(self.head.fit.head_to_camera))
@@ -422,7 +308,7 @@ class Person(PersonOrGroup):
         from PIL import Image
 
         fit, (u, v) = self.head.fit, grid_uv().numpy().T
-        texture = Image.fromarray(to_display(_by_pixel(self._face.texture).detach().numpy()))
+        texture = Image.fromarray(to_display(self.face.texture.permute(1, 2, 0).detach().numpy()))
         vertices = self.models.face.vertices(fit.alpha[None], fit.beta[None])[0].numpy()
         visual = trimesh.visual.TextureVisuals(np.stack([u, 1 - v], -1), image=texture)
         return trimesh.Trimesh(vertices, grid_triangles().numpy(), visual=visual, process=False)
@@ -435,12 +321,12 @@ class Person(PersonOrGroup):
     @property
     def texture(self) -> Array:
         """The photo's texture [T, T, 3] of the face, scene-linear, or another; hidden texels are filled."""
-        return self._out(_by_pixel(self._face.texture))
+        return self._out(self.face.texture.permute(1, 2, 0).contiguous())
 
     def with_texture(self, texture: Array) -> "Person":
         """The person with another texture [T, T, 3] of the face, to which gradients flow; the rest stays."""
-        planes, found, field = as_tensor(texture).permute(2, 0, 1), self.reflectance, self._field
-        if planes.shape != self._face.texture.shape:
+        planes, found, field = as_tensor(texture).permute(2, 0, 1), self.reflectance, self.field
+        if planes.shape != self.face.texture.shape:
             raise ValueError(f"texture has shape {list(texture.shape)}, not {list(self.texture.shape)}")
         if not isinstance(field, Field):
             raise UsageError(f"with_texture: is for the fields, not for {self.kind}")
@@ -450,10 +336,7 @@ class Person(PersonOrGroup):
 
     def _faces(self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]) -> Iterator[Any]:
         """The face alone under each light; gradients reach all that it is made of."""
-        fit = self.head.fit
-        posed = None if pose is None else replace(fit, rotation=_rotation(pose))
-        face = self.composed(Target(posed, "face"))
-        assert isinstance(face, FaceAlone)
+        face = self.face_alone(None if pose is None else replace(self.head.fit, rotation=_rotation(pose)))
         view = face.view
         for (one,) in face.relit_images(lambda part: stacked(lights[part]), [1] * len(lights)):
             image = torch.zeros(*face.size_px, 4)
@@ -462,29 +345,35 @@ class Person(PersonOrGroup):
             del arrays["rgb"]
             yield {"image": image, **arrays}
 
+    def _answer(
+        self,
+        light: Any,
+        lights: Sequence[Light],
+        given: Sequence[Any],
+        shown: Iterator[Any],
+        layers: Sequence[str],
+    ) -> Any:
+        """The images that a caller asked for, or dicts with layers; one for a light, a list for a list.
+
+        `given` are what gradients may reach beside the lights.
+        """
+        given = [*given, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
+        with _gradients(*given):
+            images = [{name: self._out(values, *given) for name, values in one.items()} for one in shown]
+        found = images if layers else [one["image"] for one in images]
+        return found if isinstance(light, Sequence) else found[0]
+
+    def _out(self, values: Array, *given: Any) -> Any:
+        """Values as arrays, or as tensors where the photo or what was given is one."""
+        if self.tensors or any(isinstance(one, Tensor) for one in given):
+            return torch.as_tensor(values).to(self.models.device)
+        return values.detach().numpy() if isinstance(values, Tensor) else values
+
     @property
     def _wanted(self) -> Tensor | None:
         """The texture, if its gradient is wanted."""
-        texture = self._face.texture
+        texture = self.face.texture
         return texture if texture.requires_grad else None
-
-    @property
-    def _field(self) -> Reflectance:
-        """The reflectance of the face."""
-        return self.reflectance.field if isinstance(self.reflectance, PortraitField) else self.reflectance
-
-    @property
-    def _face(self) -> FaceTexture:
-        """The face as it is relit: the photo's, or that of `with_texture`."""
-        return self._field.face if isinstance(self._field, Field) else self.head.face
-
-    @property
-    def _has_gradients(self) -> bool:
-        """If a gradient of the texture or of a network is wanted."""
-        if isinstance(self._field, Field) and self._field.has_gradients:
-            return True
-        portrait = isinstance(self.reflectance, PortraitField)  # others do not load its network
-        return portrait and any(one.requires_grad for one in self.models.networks.portrait.parameters())
 
     @cached_property
     def _group(self) -> "Group":
@@ -493,19 +382,14 @@ class Person(PersonOrGroup):
     def _layer(self, name: str) -> Any:
         if name == "albedo" and self.kind != "portrait":
             raise UsageError("albedo: is of the portrait field; fit with reflectance='portrait'")
-        people = self._group.composed_once
+        people = self._group.composed
         with torch.no_grad():
             relit = next(people.relit(Light.each(torch.tensor([[0.0, 0.0, 1.0]]))))
             return self._out(people.rendered(RenderRequest(relit, layers=[name]))[name])
 
-    @property
-    def _photo_camera(self) -> Camera:
-        assert self.photo is not None
-        return photo_camera(self.head.fit.crop, self.photo.shape[0], self.photo.shape[1])
-
 
 @dataclass(frozen=True, eq=False)
-class Group(PersonOrGroup):
+class Group:
     """People of one photo, relit together; those whose faces are larger stand in front.
 
     Attributes:
@@ -535,39 +419,26 @@ class Group(PersonOrGroup):
         _check_layers(layers, [*FACE_LAYERS, *(PERSON_LAYERS if kinds == {"portrait"} else ())])
         _refuse_gradients(lights, self.people)
         with torch.no_grad():
-            return self._answer(light, lights, [], self._photos(lights, background, layers), layers)
+            shown = self._photos(lights, background, layers)
+            return self.people[0]._answer(light, lights, [], shown, layers)
 
     @property
     def matte(self) -> Array:
         """The people's share [H, W] of the photo."""
-        return self._out(self.composed_once.matte)
-
-    @property
-    def models(self) -> Models:
-        """The networks and the face model."""
-        return self.people[0].models
-
-    @property
-    def tensors(self) -> bool:
-        """True of a photo that was given as a tensor."""
-        return self.people[0].tensors
-
-    def composed(self, target: Target = AS_IN_PHOTO) -> PeopleInPhoto:
-        """Prepare images of the people before a background that differ by their light alone."""
-        nearest_first = sorted(self.people, key=lambda person: -person.head.fit.crop.side_px)
-        return PeopleInPhoto([person.in_photo(target) for person in nearest_first], target.background)
+        return self.people[0]._out(self.composed.matte)
 
     @cached_property
-    def composed_once(self) -> PeopleInPhoto:
+    def composed(self) -> PeopleInPhoto:
         """The people in their photo, with all that does not depend on the light."""
+        nearest_first = sorted(self.people, key=lambda person: -person.head.fit.crop.side_px)
         with torch.no_grad():
-            return self.composed()
+            return PeopleInPhoto([person.in_photo() for person in nearest_first])
 
     def _photos(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
     ) -> Iterator[Any]:
         """The photo under each light, as dicts of arrays."""
-        people, behind = self.composed_once, None
+        people, behind = self.composed, None
         if not isinstance(background, str):
             pixels = np.array(background)[None, None] if isinstance(background, tuple) else background
             behind = covering(linear_pixels("background", pixels).detach().numpy(), *people.size_px)
@@ -584,20 +455,6 @@ class Group(PersonOrGroup):
             yield {"image": image, **found}
 
 
-def olat_images(subject: Relightable, directions: Tensor) -> Iterator[np.ndarray]:
-    """Yield images [l, H, W, 3] of a subject over black under each of the lights [L, 3] alone."""
-    height, width = subject.size_px
-    at_once = max(1, min(_LIGHTS_AT_ONCE, _PIXELS_AT_ONCE // (height * width)))
-    return (_under_each(subject, some) for some in torch.split(directions, at_once))
-
-
-def _under_each(subject: Relightable, directions: Tensor) -> np.ndarray:
-    images = np.empty((len(directions), *subject.size_px, 3), np.float32)
-    lights = {str(number): one for number, one in enumerate(subject.relit(Light.each(directions)))}
-    subject.rendered(RenderRequest(lights=lights), lambda number, shape: images[int(number)])
-    return images
-
-
 def _lights_of(light: Any, room: float) -> list[Light]:
     return [as_light(one, room) for one in (light if isinstance(light, Sequence) else [light])]
 
@@ -610,9 +467,13 @@ def _check_layers(layers: Sequence[str], known: Sequence[str]) -> None:
 
 def _refuse_gradients(lights: Sequence[Light], people: Sequence[Person]) -> None:
     """Raise UsageError where a gradient through an image in the photo is wanted."""
-    arrays = (array for one in lights for array in (one.directions, one.weights, one.own_rgb))
-    wanted = any(isinstance(array, Tensor) and array.requires_grad for array in arrays)
-    if torch.is_grad_enabled() and (wanted or any(person._has_gradients for person in people)):
+    taken = [array for one in lights for array in (one.directions, one.weights, one.own_rgb)]
+    for person in people:
+        taken.append(person.face.texture)
+        networks: Any = person.models.networks  # each is loaded already
+        taken += networks.reflectance.parameters() if isinstance(person.field, Field) else []
+        taken += networks.portrait.parameters() if isinstance(person.reflectance, PortraitField) else []
+    if torch.is_grad_enabled() and any(isinstance(one, Tensor) and one.requires_grad for one in taken):
         raise UsageError(
             "gradients: do not go through images in the photo; give alone=True, weigh the images of olat, or "
             "use torch.no_grad()"
@@ -624,20 +485,6 @@ def _gradients(*given: Any) -> torch.set_grad_enabled:
     return torch.set_grad_enabled(torch.is_grad_enabled() and any(isinstance(one, Tensor) for one in given))
 
 
-def one_of(choices: Any, name: str, value: str) -> None:
-    """Raise ValueError for a word that is not one of a Literal's."""
-    if value not in get_args(choices):
-        raise ValueError(f"{name} is {value!r}, not one of {', '.join(get_args(choices))}")
-
-
-def _pixels_of(name: str, photo: Array) -> np.ndarray:
-    """A photo's pixels [H, W, 3], which are not copied; raises ValueError for others."""
-    check_kind(name, photo)
-    pixels = np.asarray(photo.detach().cpu() if isinstance(photo, Tensor) else photo, np.float32)
-    check_finite(name, pixels)
-    return pixels
-
-
 def _rotation(pose: Pose) -> Tensor:
     """The head_to_camera rotation [3, 3] of a pose in degrees, to which gradients flow."""
     each = pose if isinstance(pose, Sequence | Tensor | np.ndarray) else [pose]
@@ -645,7 +492,3 @@ def _rotation(pose: Pose) -> Tensor:
     if angles.shape != (3,) or not angles.isfinite().all():
         raise ValueError(f"pose is {pose}, not yaw, pitch and roll in degrees")
     return pose_to_rotation(*angles)
-
-
-def _by_pixel(texture: Tensor) -> Tensor:
-    return texture.permute(1, 2, 0).contiguous()

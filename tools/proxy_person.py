@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from facerf_cli.face.morphable import BUILTIN, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_uv, region_mask
 from facerf_cli.network.checkpoint import save_checkpoint
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.proxy import ASSET
 from facerf_cli.raster.texture import sample_texture
 from facerf_cli.synth.head.body import chin_height_m, draw_body

@@ -106,7 +106,7 @@ def draft_stage(folder: Path, suffixes: Collection[str], pattern: str) -> dict[s
         raise UsageError(f"{folder}: {error}") from None
     directions, about_lights = _read_directions(folder, lists, frames)
     ambient, name = frames.ambient.most_common(1), folder.resolve().name
-    content = {
+    content: dict[str, Any] = {
         "colour_space": None,
         "black_level": 0.0,
         "axes": "opencv",

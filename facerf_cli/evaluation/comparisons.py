@@ -32,13 +32,13 @@ from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import fit_from_arrays
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.image.colour import luminance
-from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.envmap import rig_to_latlong
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel
-from facerf_cli.person import Target
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.face_alone import FaceAlone
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.relightable import Relit
 
@@ -104,7 +104,7 @@ def _lambert(models: Models, light: Tensor, view: HeadView) -> np.ndarray:
     turn = head.fit.turn_to(view.fit.rotation)
     cosine = torch.einsum("c,cd,dij->ij", light, turn, head.face.normals).clamp_min(0)
     face = FaceAlone(models.face, head, fit=view.fit)
-    return face.image(Relit(head.face.texture * cosine)).pixels
+    return face.image(Relit(head.face.texture * cosine))
 
 
 def olat_facts(light: Tensor, view: HeadView, same: bool) -> dict[str, str | float]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.baselines import RelightKind
+from facerf_cli.baselines import RelightKind, explain_by_baseline
 from facerf_cli.baselines.base import Explained, Reflectance
 from facerf_cli.batch.inputs import Item
 from facerf_cli.dataset.dataset import Dataset
@@ -30,13 +30,13 @@ from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.files import checkpoint_file
-from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face, NoFaceError, find_faces
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
+from facerf_cli.relighting.fitted import FittedPerson, Target
 from facerf_cli.relighting.heads import head_of
 from facerf_cli.relighting.models import Models, Sides, load_models
-from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, explain
+from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, estimate_light
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.light_of_photo import feature_network
@@ -64,22 +64,25 @@ class Method:
         """Reflectance and light of a head's photo."""
         if self.kind == "portrait":
             raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
-        return explain(self.models, head, self.kind, self.network_alone, self.estimator)
+        if self.kind != "field":
+            return explain_by_baseline(self.models, head, self.kind)
+        light = estimate_light(self.models, head, estimator=self.estimator).light
+        return Explained(reflectance_of(self.models, head, self.kind, self.network_alone), light)
 
     def image(
         self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit | None = None
     ) -> np.ndarray:
         """The face alone [S, S, 3] under one light, in the pose and the crop of a fit, else in its own."""
-        return Person(self.models, None, head, reflectance).image(light, Target(fit, "face")).pixels
+        return FittedPerson(self.models, None, head, reflectance).image(light, Target(fit, "face"))
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Light, target: Target
     ) -> Iterator[np.ndarray]:
         """Yield an image under each weighted sum of lights; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
-        composition = Person(self.models, photo, head, reflectance).composed(target)
+        composition = FittedPerson(self.models, photo, head, reflectance).composed(target)
         for relit in composition.relit(lights):
-            yield composition.image(relit).pixels
+            yield composition.image(relit)
 
 
 @dataclass(frozen=True, eq=False)

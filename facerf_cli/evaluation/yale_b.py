@@ -8,7 +8,6 @@ directions are in camera space (docs/design.md).
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import far_samples
-from facerf_cli.person import Target
+from facerf_cli.relighting.fitted import Target
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
 ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera
@@ -92,22 +91,16 @@ class Relighting:
         return Case(f"{subject}/{self.source}/{self.light}", subject, facts)
 
 
-@dataclass(frozen=True, eq=False)
 class YaleSubject:
-    """A subject of the database: its images under flashes, and the sums of these. Grey, in 0..1."""
+    """A subject of the database: images under the `flashes` that have an undamaged one, and their sums.
 
-    database: YaleB
-    name: str
+    `olats` [L, 192, 168] are those images, grey, in 0..1.
+    """
 
-    @cached_property
-    def flashes(self) -> list[Flash]:
-        """The flashes with an undamaged image of the subject."""
-        return self.database.flashes(self.name)
-
-    @cached_property
-    def olats(self) -> np.ndarray:
-        """The subject's images under each of the flashes [L, 192, 168]."""
-        return self.database.images(self.name)
+    def __init__(self, database: YaleB, name: str) -> None:
+        self._folder = database.folder / name
+        self.flashes, self.olats = database.flashes(name), database.images(name)
+        self._weights = {light: environment_weights(light, self.flashes) for light in _RADIANCES}
 
     def image(self, light: str) -> np.ndarray:
         """The subject's image [192, 168], float32, under a flash by name, 'frontal', or an environment.
@@ -118,9 +111,7 @@ class YaleSubject:
         if flash is None:
             return self._exposed(light)
         if flash not in self.flashes:
-            raise InputError(
-                f"{self.database.folder / self.name}: no undamaged image under {flash.name}; leave it out"
-            )
+            raise InputError(f"{self._folder}: no undamaged image under {flash.name}; leave it out")
         return self.olats[self.flashes.index(flash)]
 
     def _exposed(self, environment: str) -> np.ndarray:
@@ -131,8 +122,8 @@ class YaleSubject:
 
     def weights(self, light: str) -> np.ndarray:
         """The weight [L] of each flash in a target, which is a flash or an environment; they sum to 1."""
-        if light in _RADIANCES:
-            return environment_weights(light, tuple(self.flashes))
+        if light in self._weights:
+            return self._weights[light]
         return np.array([float(flash.name == light) for flash in self.flashes])
 
     def relightings(self) -> Iterator[Relighting]:
@@ -147,8 +138,7 @@ class YaleSubject:
             yield from (Relighting("environment", source, environment) for environment in ENVIRONMENTS)
 
 
-@cache  # cells of many points on the sphere
-def environment_weights(name: str, flashes: tuple[Flash, ...]) -> np.ndarray:
+def environment_weights(name: str, flashes: Sequence[Flash]) -> np.ndarray:
     """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L]; the sum is 1."""
     # Directions on a golden spiral about +y, as in the benchmark: the cells depend on them.
     index = np.arange(_SPHERE_POINTS) + 0.5

@@ -18,8 +18,7 @@ from torch import Tensor
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, read_document, write_document
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, read_image
-from facerf_cli.light.envmap import check_envmap
-from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.envmap import check_envmap, rig_to_latlong
 from facerf_cli.light.sh import CONVENTION, positive_latlong
 from facerf_cli.light.sphere import RigLight
 

@@ -8,7 +8,6 @@ import os.path
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -365,7 +364,6 @@ def _is_place(value: str) -> bool:
     return "," in value or value in WORDS or value in preset_names() or value.endswith(".toml")
 
 
-@cache
 def preset_names() -> tuple[str, ...]:
     """The names of the rigs that facerf ships."""
     return tuple(sorted(path.stem for path in _RIGS.glob("*.toml")))

@@ -33,6 +33,8 @@ _SMOOTH, _SHORT = 0.1, 0.01
 _SMOOTH_CHANNEL, _SHORT_CHANNEL = 1.0, 0.1
 _STANDS_OUT = 3.0  # mean weights by which a light differs from its neighbours if it is a lone bright light
 _NEIGHBOURHOOD = 1.5  # standard deviation of the neighbourhood of a light, in mean spacings of the lights
+_STEPS, _RATE = 150, 1.0  # of Adadelta, at most, and its learning rate, which is its own
+_PATIENCE, _SETTLED = 20, 0.002  # steps that end the search where they lower the loss by less than this share
 _TINY = 1e-12  # avoids divisions by 0
 
 
@@ -300,19 +302,6 @@ def _difference_from_neighbours(directions: np.ndarray) -> np.ndarray:
     return np.eye(len(directions)) - near / np.maximum(near.sum(1, keepdims=True), _TINY)
 
 
-@dataclass(frozen=True)
-class RefineSettings:
-    """Steps and learning rate of Adadelta (its own rate is 1).
-
-    The search ends once `patience` steps have lowered the loss by less than the share `settled`.
-    """
-
-    steps: int = 150
-    learning_rate: float = 1.0
-    patience: int = 20
-    settled: float = 0.002
-
-
 @dataclass(frozen=True, eq=False)
 class RefinedLight:
     """Weights [L, 3], the losses of the start and of the result, and the number of steps."""
@@ -329,9 +318,8 @@ def refine_light(
     start: Tensor,
     features: Features,
     non_negative: bool = True,
-    settings: RefineSettings = RefineSettings(),
 ) -> RefinedLight:
-    """Minimise the feature loss of a light; the result is never worse than the start.
+    """Minimise the feature loss of a light by Adadelta; the result is never worse than the start.
 
     Clipped texels have no error where they are bright enough.
 
@@ -340,20 +328,19 @@ def refine_light(
         start: First weights [L, 3].
         features: Of textures.
         non_negative: Keep weights from 0 up, by projection.
-        settings: Steps and their size.
     """
     loss_of = _feature_loss(evidence, features)
     unit = float(start.square().mean().sqrt()) or 1.0  # makes the size of a step the same for all photos
     scaled = (start / unit).requires_grad_()
-    optimizer = torch.optim.Adadelta([scaled], lr=settings.learning_rate)
+    optimizer = torch.optim.Adadelta([scaled], lr=_RATE)
     best, first, least, losses = start, 0.0, float("inf"), []
-    for _ in range(settings.steps + 1):
+    for _ in range(_STEPS + 1):
         loss = loss_of(scaled * unit)
         losses.append(float(loss.detach()))
         first = losses[0]
         if losses[-1] < least:
             best, least = scaled.detach() * unit, losses[-1]
-        if not first > 0 or _has_settled(losses, settings):
+        if not first > 0 or _has_settled(losses):
             break
         optimizer.zero_grad()
         (loss / first).backward()  # type: ignore[no-untyped-call]
@@ -378,7 +365,7 @@ def _feature_loss(evidence: LightEvidence, features: Features) -> Callable[[Tens
     return loss_of
 
 
-def _has_settled(losses: list[float], settings: RefineSettings) -> bool:
-    if len(losses) <= settings.patience:
+def _has_settled(losses: list[float]) -> bool:
+    if len(losses) <= _PATIENCE:
         return False
-    return min(losses) > (1 - settings.settled) * min(losses[: -settings.patience])
+    return min(losses) > (1 - _SETTLED) * min(losses[:-_PATIENCE])

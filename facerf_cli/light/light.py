@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -12,8 +12,14 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.image.colour import luminance
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.envmap import NO_KEYS, check_envmap, envmap_weights, turned, without_keys
-from facerf_cli.light.picture import FOV_DEG, light_of_picture
+from facerf_cli.light.envmap import (
+    NO_KEYS,
+    check_envmap,
+    envmap_weights,
+    rig_to_latlong,
+    turned,
+    without_keys,
+)
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import KeyLight, PointLights, far_samples, has_edges
 
@@ -98,12 +104,14 @@ class Light:
         )
 
     @staticmethod
-    def from_picture(picture: Array, fov_deg: float = FOV_DEG, lights: int = 150) -> "Light":
+    def from_picture(picture: Array, fov_deg: float = 60.0, lights: int = 150) -> "Light":
         """The light in a picture [H, W, 3] behind the person, scene-linear: a guess, on the picture's scale.
 
         `fov_deg` is the angle of view across its width, 1 to 170 degrees. `light.picture.light_of_picture`
         also gives the map and its expected error. Raises ValueError for another picture or angle.
         """
+        from facerf_cli.light.picture import light_of_picture  # a network of its own
+
         guess = light_of_picture(linear_pixels("picture", picture).detach(), fov_deg)
         return Light.from_envmap(guess.envmap.numpy(), lights=lights)
 
@@ -111,8 +119,6 @@ class Light:
         """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""
         if self.own_rgb is not None:
             raise UsageError("to_envmap: the photo's own light has no directions; take person.light")
-        from facerf_cli.light.forms import rig_to_latlong
-
         light = RigLight(*(values.detach() for values in self._tensors()))
         return rig_to_latlong(light, height).numpy()
 
@@ -292,6 +298,14 @@ def linear_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> Tensor:
     return linear
 
 
+def uncopied_pixels(name: str, photo: Array) -> np.ndarray:
+    """A photo's pixels [H, W, 3], which are not copied; raises ValueError for others."""
+    check_kind(name, photo)
+    pixels = np.asarray(photo.detach().cpu() if isinstance(photo, Tensor) else photo, np.float32)
+    check_finite(name, pixels)
+    return pixels
+
+
 def check_kind(name: str, pixels: Any, shape: str = "[H, W, 3]") -> None:
     """Raise an error, with their name, for what is no array [H, W, 3] or [H, W] of floats."""
     if not isinstance(pixels, np.ndarray | Tensor):
@@ -306,6 +320,12 @@ def check_finite(name: str, values: np.ndarray) -> None:
     """Raise ValueError for pixels that are no numbers."""
     if not np.isfinite(values).all():
         raise ValueError(f"{name} holds values that are not finite")
+
+
+def one_of(choices: Any, name: str, value: str) -> None:
+    """Raise ValueError for a word that is not one of a Literal's."""
+    if value not in get_args(choices):
+        raise ValueError(f"{name} is {value!r}, not one of {', '.join(get_args(choices))}")
 
 
 def as_tensor(values: Any) -> Tensor:

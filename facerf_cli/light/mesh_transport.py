@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from embreex import rtcore_scene
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
@@ -98,9 +97,7 @@ def bake_mesh(
     baked = ~nothing if wanted is None else wanted
     strand = nothing if two_sided is None else two_sided
     clearance_m = np.zeros(count) if clearance_m is None else clearance_m
-    surface = MeshSurface.of(
-        vertices[curve], normals[curve], rank[triangles], strand[curve], clearance_m[curve]
-    )
+    surface = MeshSurface(vertices[curve], normals[curve], rank[triangles], strand[curve], clearance_m[curve])
     shifts = np.random.default_rng(seed).random((count, 2), np.float32)[curve]
     strands, traced_strands = rank[np.flatnonzero(strand)], rank[np.flatnonzero(strand)[::_STRAND_STRIDE]]
     near = _nearest_of(surface.vertices, strands, traced_strands)
@@ -130,59 +127,32 @@ def bake_mesh(
     )
 
 
-@dataclass(frozen=True, eq=False)
 class MeshSurface:
-    """A mesh from and at which rays are cast: vertices, unit normals [V, 3], triangles [F, 3].
+    """A mesh from and at which rays are cast: vertices, in metres, unit normals [V, 3], triangles [F, 3].
 
-    `two_sided` [V] bool vertices are strands of hair.
+    `two_sided` [V] bool vertices are strands of hair, lit on both sides; rays start off the surface by at
+    least `clearance_m` [V].
     """
 
-    scene: rtcore_scene.EmbreeScene
-    solid: rtcore_scene.EmbreeScene  # without hair
-    vertices: np.ndarray
-    normals: np.ndarray
-    triangles: np.ndarray
-    two_sided: np.ndarray
-    edges: np.ndarray  # [E, 2], each once, without those of hair
-    neighbours: csr_matrix  # the edges as a matrix [V, V] of ones
-    offset_m: np.ndarray  # [V, 1] of ray origins off the surface
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         vertices: np.ndarray,
         normals: np.ndarray,
         triangles: np.ndarray,
         two_sided: np.ndarray,
         clearance_m: np.ndarray,
-    ) -> "MeshSurface":
-        """Find the edges of a mesh and build its embree scene.
-
-        Args:
-            vertices: [V, 3], in metres.
-            normals: Unit [V, 3].
-            triangles: [F, 3].
-            two_sided: Vertices [V] bool that are lit on both sides.
-            clearance_m: Distance [V] off the surface at which rays start.
-        """
+    ) -> None:
         vertices, normals = vertices.astype(np.float32), normals.astype(np.float32)
+        self.vertices, self.normals, self.triangles, self.two_sided = vertices, normals, triangles, two_sided
+        self.scene = build_scene(vertices, triangles)
+        self.solid = build_scene(vertices, triangles[~two_sided[triangles[:, 0]]])  # without hair
         edges = _edges(triangles, len(vertices))
         offset_m = np.maximum(_mesh_offset_m(vertices, normals, edges), clearance_m)[:, None]
-        offset_m = offset_m.astype(np.float32)
-        edges = edges[~two_sided[edges[:, 0]]]
-        both_ways = np.concatenate([edges, edges[:, ::-1]]).T
-        ones = np.ones(2 * len(edges), np.float32)
-        return cls(
-            build_scene(vertices, triangles),
-            build_scene(vertices, triangles[~two_sided[triangles[:, 0]]]),
-            vertices,
-            normals,
-            triangles,
-            two_sided,
-            edges,
-            csr_matrix((ones, tuple(both_ways)), shape=(len(vertices), len(vertices))),
-            offset_m,
-        )
+        self.offset_m = offset_m.astype(np.float32)  # [V, 1] of ray origins off the surface
+        self.edges = edges[~two_sided[edges[:, 0]]]  # [E, 2], each once, without those of hair
+        both_ways = np.concatenate([self.edges, self.edges[:, ::-1]]).T
+        ones = np.ones(2 * len(self.edges), np.float32)
+        self.neighbours = csr_matrix((ones, tuple(both_ways)), shape=(len(vertices), len(vertices)))
 
 
 def _edges(triangles: np.ndarray, count: int) -> np.ndarray:

@@ -9,7 +9,6 @@ is positive and on the picture's scale.
 
 import math
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -148,9 +147,8 @@ def _encoded(linear: Tensor) -> Tensor:
     )
 
 
-@cache
 def network() -> PictureLightNetwork:
-    """The trained network, read once a process."""
+    """The trained network."""
     trained = PictureLightNetwork().eval().requires_grad_(False)
     trained.load_state_dict({name: values.float() for name, values in load_file(ASSET).items()})
     return trained

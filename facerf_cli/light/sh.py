@@ -82,14 +82,13 @@ def rig_coefficients(light: RigLight, order: int) -> Tensor:
     return (math.pi * basis.T @ light.weights.double()).float()
 
 
-def coefficients_to_rig(coefficients: Tensor, directions: Tensor | None = None) -> RigLight:
-    """The weights of least norm of a rig with directions [L, 3] that have these coefficients [K, 3].
+def coefficients_to_rig(coefficients: Tensor) -> RigLight:
+    """The weights of least norm of the rig of the paper's 150 lights that have these coefficients [K, 3].
 
-    The default rig has the paper's 150 lights. Weights are signed, by the pseudo-inverse. `rig_coefficients`
-    gives the coefficients back exactly if the rig has enough lights that are spread over the sphere (150 are
-    enough up to order 11), and the nearest possible ones otherwise.
+    Weights are signed, by the pseudo-inverse. `rig_coefficients` gives the coefficients back exactly up to
+    order 11, and the nearest possible ones otherwise.
     """
-    directions = rig_directions() if directions is None else directions
+    directions = rig_directions()
     basis = sh_basis(directions.double(), order_of(coefficients))
     weights = torch.linalg.pinv(math.pi * basis.T) @ coefficients.double()
     return RigLight(directions, weights.float())

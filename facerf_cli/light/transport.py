@@ -16,14 +16,13 @@ OFFSET_M = 2e-4  # by which rays start off the surface: more than a step of floa
 
 @dataclass(frozen=True)
 class Transport:
-    """Transport of each light and texel, for lights of rgb 1 from `directions` [L, 3].
+    """Transport of each light and texel, for lights of rgb 1.
 
     visibility [L, T, T]: the share of the area light that is visible, 0 where the texel faces away.
     bounce [L, T, T]: irradiance after one diffuse bounce off surroundings of albedo 1, in units where a
     surface that faces an unoccluded light receives 1.
     """
 
-    directions: np.ndarray
     visibility: np.ndarray
     bounce: np.ndarray
 
@@ -76,7 +75,7 @@ def bake_transport(
     shape = (len(directions), *positions.shape[:2])
     blur = settings.bounce_blur_texels
     smooth_bounce = gaussian_filter(bounce.reshape(shape), (0, blur, blur), mode="nearest")
-    return Transport(directions, visibility.reshape(shape), smooth_bounce)
+    return Transport(visibility.reshape(shape), smooth_bounce)
 
 
 def _light_visibility(

@@ -1,35 +1,56 @@
 """People in a photo: their faces, each with landmarks, and what is seen around them.
 
-The photo is searched as a whole, then in parts and turned (`mesh.py`). The Parsing Network looks at each
-face that is found.
+The photo is searched as a whole, then in parts and turned. MediaPipe's two detectors (Bazarevsky et al.,
+*BlazeFace*, 2019) look at its squares. Around each face that they propose, a network finds a mesh
+(Grishchenko et al., *Attention Mesh*, 2020), twice; it also says if a face is there. The Parsing Network
+looks at each face that is found.
 """
 
 import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, check_in_photo, from_landmarks
 from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import check_display, to_display
-from facerf_cli.face.topology import OUTER_EYE_CORNERS
-from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.given import check_seen, lie_on_one
-from facerf_cli.portrait.mesh import (
-    FaceMesh,
-    distinct,
-    find_meshes,
-    first_squares,
-    mesh_near,
-    parts_of,
-    unsteadiness,
-)
+from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
+from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
+from facerf_cli.portrait.confidence import check_seen, lie_on_one
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
 from facerf_cli.run.logs import LOGGER_NAME, step
+from facerf_cli.run.threads import in_threads
 
+_IRISES = [range(468, 473), range(473, 478)]  # points of each
+_LIDS = [  # points around the opening of each eye
+    [33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246],
+    [263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466],
+]
+_AROUND_68 = 1.8  # side of the square around the 68 landmarks, in their extents
+_MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
+_MESH_PX = 192
+_AFAR = 2.5  # side of the square that shows a photo from afar, in sides of the photo
+_OVERLAP = 1.5  # how many parts along a side cover the photo, over those that just would
+_LEAST_MESH_SCORE, _LEAST_PX = 0.5, 8.0  # of a face; noise has smaller ones
+_SAME = 0.5  # distance of the middles of two boxes below which they hold one face, in sides of the larger
+_EYES = (33, 263)  # outer corners, the picture's left one first
+# MediaPipe's 468 points that stand for the 68 landmarks (Multi-PIE order).
+_OF_68 = np.array(
+    [
+        *(127, 234, 93, 132, 58, 136, 150, 176, 152, 400, 379, 365, 288, 361, 323, 454, 356),  # jaw
+        *(70, 63, 105, 66, 107, 336, 296, 334, 293, 300),  # brows
+        *(168, 197, 5, 4, 75, 97, 2, 326, 305),  # nose
+        *(33, 160, 158, 133, 153, 144, 362, 385, 387, 263, 373, 380),  # eyes
+        *(61, 39, 37, 0, 267, 269, 291, 405, 314, 17, 84, 181),  # outer lips
+        *(78, 82, 13, 312, 308, 317, 14, 87),  # inner lips
+    ]
+)
 log = logging.getLogger(LOGGER_NAME)
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
@@ -38,6 +59,230 @@ _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
 _DARK = 100  # of 255: brightest percentile of a photo that is brightened before it is searched
 _UNCLEAR = 0.05  # relative error of given landmarks from which on they may lie off the face
 _FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
+
+
+@dataclass(frozen=True)
+class _Detector:
+    """A detector: the side of its input, cells a side and anchors a cell of its scales, least score."""
+
+    side_px: int
+    scales: tuple[tuple[int, int], ...]
+    least_score: float
+
+    def anchors(self) -> np.ndarray:
+        """Middles [N, 2] of the anchors, in sides of the input."""
+        middles = []
+        for cells, each in self.scales:
+            at = (np.arange(cells) + 0.5) / cells
+            middles.append(np.repeat(np.stack(np.meshgrid(at, at), -1).reshape(-1, 2), each, 0))
+        return np.concatenate(middles)
+
+
+_NEAR = _Detector(128, ((16, 2), (8, 6)), 0.5)
+_FAR = _Detector(192, ((48, 1),), 0.6)
+
+
+@dataclass(frozen=True, eq=False)
+class FaceMesh:
+    """A face: points [478, 3] in the photo's pixels (z on the same scale, smaller toward the camera).
+
+    `score` in 0..1 says how surely a face is there, `square` where its mesh was found.
+    """
+
+    points_px: np.ndarray
+    score: float
+    square: Square
+
+    @property
+    def landmarks_px(self) -> np.ndarray:
+        """The 68 landmarks [68, 2]."""
+        return self.points_px[_OF_68, :2]
+
+
+@dataclass(frozen=True, eq=False)
+class SeenEyes:
+    """N eyes in a photo's pixels: irises [N, 3], centres and radii, and the lids around them [N, 16, 2]."""
+
+    irises_px: np.ndarray
+    lids_px: np.ndarray
+
+    def scaled(self, scale: float) -> "SeenEyes":
+        """The eyes in the photo at another size."""
+        return SeenEyes(self.irises_px * scale, self.lids_px * scale)
+
+
+@dataclass(frozen=True, eq=False)
+class _Box:
+    """A proposed face: its square, level with the eyes, and score."""
+
+    square: Square
+    score: float
+
+
+_Proposed = TypeVar("_Proposed", _Box, FaceMesh)
+
+
+def first_squares(image_srgb: np.ndarray) -> list[Square]:
+    """Squares of an image [H, W, 3] to search first: all of it, it from afar, and parts of two thirds.
+
+    A face that fills the photo is known from afar alone; nearer its eyes look like faces.
+    """
+    side_px = float(max(image_srgb.shape[:2]))
+    whole = whole_photo(image_srgb)
+    return [whole, replace(whole, side_px=_AFAR * side_px), *parts_of(image_srgb, side_px / 1.5)]
+
+
+def parts_of(image: np.ndarray, side_px: float) -> list[Square]:
+    """Overlapping squares that cover the photo."""
+    rows, columns = (
+        np.linspace(
+            min(side_px, length) / 2,
+            length - min(side_px, length) / 2,
+            max(1, math.ceil(_OVERLAP * length / side_px - 0.5)) if length > side_px else 1,
+        )
+        for length in image.shape[:2]
+    )
+    return [Square(float(x), float(y), side_px) for y in rows for x in columns]
+
+
+def find_meshes(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[FaceMesh]:
+    """Find faces in squares of an sRGB uint8 image [H, W, 3], the surest first."""
+    found: list[FaceMesh] = []
+    for box in distinct(detected(people, image_srgb, squares)):
+        if mesh := mesh_near(people, image_srgb, box.square):
+            found.append(mesh)
+    return distinct(found)
+
+
+def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) -> FaceMesh | None:
+    """The mesh of a face that is expected in a square; None where there is none."""
+    mesh = mesh_in(people.face_mesh, image_srgb, square)
+    if mesh.score > _LEAST_MESH_SCORE:
+        mesh = mesh_in(people.face_mesh, image_srgb, face_square(mesh.points_px))
+    extent_px = float(np.ptp(mesh.landmarks_px, axis=0).max())
+    return mesh if mesh.score > _LEAST_MESH_SCORE and extent_px > _LEAST_PX else None
+
+
+def eyes_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> SeenEyes:
+    """Both eyes of a face, by its landmarks [68, 2]; or none."""
+    mesh = mesh_near(people, image_srgb, Square.around(landmarks_px, _AROUND_68, above=0.1))
+    if mesh is None:
+        return SeenEyes(np.zeros((0, 3)), np.zeros((0, len(_LIDS[0]), 2)))
+    irises = mesh.points_px[_IRISES, :2]  # [2, 5, 2]: the middle, and four points of the outline
+    radii = np.linalg.norm(irises[:, 1:] - irises[:, :1], axis=-1).mean(1)
+    return SeenEyes(np.concatenate([irises[:, 0], radii[:, None]], 1), mesh.points_px[_LIDS, :2])
+
+
+def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -> float:
+    """Mean distance of a mesh's landmarks from those that the mirrored image shows, in their extent."""
+    square, width = mesh.square, image_srgb.shape[1]
+    mirrored = replace(square, x_px=width - square.x_px, turn_rad=-square.turn_rad)
+    other_px = mesh_in(network, image_srgb[:, ::-1], mirrored).landmarks_px[MIRROR_68]
+    apart_px = np.linalg.norm(mesh.landmarks_px - other_px * (-1, 1) - (width, 0), axis=-1)
+    return float(apart_px.mean() / np.ptp(mesh.landmarks_px, axis=0).max())
+
+
+def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[_Box]:
+    """Boxes that the detectors propose in squares; one face has many."""
+    detectors = (people.near_faces, _NEAR), (people.far_faces, _FAR)
+
+    def seen(one: tuple[StoredGraph, _Detector]) -> dict[str, Tensor]:
+        network, detector = one
+        images = [square.cut(image_srgb, detector.side_px, outside=0.0) for square in squares]
+        found: dict[str, Tensor] = network(torch.stack(images) * 2 - 1)
+        return found
+
+    boxes: list[_Box] = []
+    for (_, detector), out in zip(detectors, in_threads(seen, detectors), strict=True):
+        anchors = detector.anchors()
+        scores = out["scores"][..., 0].sigmoid().numpy()
+        all_values = out["boxes"].reshape(len(squares), -1, 8, 2).numpy() / detector.side_px
+        for square, score, values in zip(squares, scores, all_values, strict=True):
+            likely = score > detector.least_score
+            for middle, size, eyes, its_score in zip(
+                values[likely, 0] + anchors[likely],
+                values[likely, 1],
+                values[likely, 2:4] + anchors[likely, None],
+                score[likely],
+                strict=True,
+            ):
+                boxes.append(_Box(_level(square, middle, float(size.max()), eyes), float(its_score)))
+    return boxes
+
+
+def mesh_in(network: StoredGraph, image_srgb: np.ndarray, square: Square) -> FaceMesh:
+    """The mesh of a face in a square around it."""
+    out = {
+        name: value.reshape(-1).numpy()
+        for name, value in network(square.cut(image_srgb, _MESH_PX, outside=0.0)[None]).items()
+    }
+    points = np.concatenate([out["mesh"].reshape(-1, 3), np.zeros((10, 3), np.float32)])
+    for name, numbers in _REFINED.items():
+        points[numbers, :2] = out[name].reshape(-1, 2)
+    for name, first in (("left_iris", 468), ("right_iris", 473)):
+        points[first : first + 5, :2] = out[name].reshape(-1, 2)
+        points[first : first + 5, 2] = points[_REFINED[f"{name[:-5]}_eye"][:16], 2].mean()
+    depth_px = points[:, 2:] * (square.side_px / _MESH_PX)
+    placed = np.concatenate([square.to_photo(points[:, :2] / _MESH_PX), depth_px], 1)
+    return FaceMesh(placed, float(1 / (1 + np.exp(-out["score"][0]))), square)
+
+
+def face_square(points_px: np.ndarray) -> Square:
+    """The square, level with the eyes, in which a mesh is found again from its points [478, 3]."""
+    left, right = points_px[list(_EYES), :2]
+    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    level = Square(0.0, 0.0, 1.0, turn_rad)
+    along = level.to_share(points_px[:468, :2])
+    low, high = along.min(0), along.max(0)
+    x_px, y_px = level.to_photo((low + high) / 2)
+    return Square(float(x_px), float(y_px), _MESH_SIDES * float((high - low).max()), turn_rad)
+
+
+def _level(square: Square, middle: np.ndarray, size: float, eyes: np.ndarray) -> Square:
+    """The square for the mesh of a face; its middle and eyes [2, 2] are in sides of a square around it."""
+    left, right = square.to_photo(eyes)
+    x_px, y_px = square.to_photo(middle)
+    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    return Square(float(x_px), float(y_px), _MESH_SIDES * size * square.side_px, turn_rad)
+
+
+def distinct(found: list[_Proposed]) -> list[_Proposed]:
+    """The surest of what lies on each other."""
+    kept: list[_Proposed] = []
+    for one in sorted(found, key=lambda one: -one.score):
+        if all(_apart(one.square, other.square) for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _apart(first: Square, second: Square) -> bool:
+    side_px = max(first.side_px, second.side_px) / _MESH_SIDES
+    return math.hypot(first.x_px - second.x_px, first.y_px - second.y_px) > _SAME * side_px
+
+
+# Numbers of the mesh's points that the network finds again, finer, in a crop around lips and eyes.
+_REFINED = {
+    "lips": [
+        *(61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 185, 40, 39, 37, 0, 267, 269, 270, 409),
+        *(78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 191, 80, 81, 82, 13, 312, 311, 310, 415),
+        *(76, 77, 90, 180, 85, 16, 315, 404, 320, 307, 306, 184, 74, 73, 72, 11, 302, 303, 304, 408),
+        *(62, 96, 89, 179, 86, 15, 316, 403, 319, 325, 292, 183, 42, 41, 38, 12, 268, 271, 272, 407),
+    ],
+    "left_eye": [
+        *(33, 7, 163, 144, 145, 153, 154, 155, 133, 246, 161, 160, 159, 158, 157, 173),
+        *(130, 25, 110, 24, 23, 22, 26, 112, 243, 247, 30, 29, 27, 28, 56, 190),
+        *(226, 31, 228, 229, 230, 231, 232, 233, 244, 113, 225, 224, 223, 222, 221, 189),
+        *(35, 124, 46, 53, 52, 65, 143, 111, 117, 118, 119, 120, 121, 128, 245),
+        *(156, 70, 63, 105, 66, 107, 55, 193),
+    ],
+    "right_eye": [
+        *(263, 249, 390, 373, 374, 380, 381, 382, 362, 466, 388, 387, 386, 385, 384, 398),
+        *(359, 255, 339, 254, 253, 252, 256, 341, 463, 467, 260, 259, 257, 258, 286, 414),
+        *(446, 261, 448, 449, 450, 451, 452, 453, 464, 342, 445, 444, 443, 442, 441, 413),
+        *(265, 353, 276, 283, 282, 295, 372, 340, 346, 347, 348, 349, 350, 357, 465),
+        *(383, 300, 293, 334, 296, 336, 285, 417),
+    ],
+}
 
 
 class NoFaceError(InputError):

@@ -1,4 +1,4 @@
-"""Squares of a photo, as the Parsing Network sees them."""
+"""Squares of a photo, as the Parsing Network sees them; its classes, and its landmarks beyond the 68."""
 
 import math
 from collections.abc import Sequence
@@ -11,16 +11,56 @@ from torch import Tensor
 
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.topology import MIRROR_68
-from facerf_cli.image.strips import block_means, enlarged
+from facerf_cli.image.strips import block_means
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, mirrored_landmarks
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
+CLASSES = (
+    "background",
+    "skin",
+    "brows",
+    "eyes",
+    "lips",
+    "mouth",
+    "hair",
+    "beard",
+    "ears",
+    "neck",
+    "glasses",
+    "headwear",
+    "garment",
+    "hand",
+)
+IRIS_POINTS = 8  # on the outline of an iris, from its right end counter-clockwise
+MORE_LANDMARKS = tuple(
+    f"{side} {name}"
+    for side in ("left", "right")  # of the image
+    for name in ("iris", *(f"iris {k}" for k in range(IRIS_POINTS)), "ear top", "ear lobe", "ear back")
+)
 LANDMARKS = 68 + len(MORE_LANDMARKS)
 LEAST_PRESENCE = 0.5  # from which on a head is there
 _POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
 _SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered
+
+
+def class_index(name: str) -> int:
+    """Index of a class."""
+    return CLASSES.index(name)
+
+
+def mirrored_landmarks() -> tuple[int, ...]:
+    """Index of the landmark of `MORE_LANDMARKS` that each one becomes in a mirrored image."""
+    return tuple(MORE_LANDMARKS.index(_mirrored(name)) for name in MORE_LANDMARKS)
+
+
+def _mirrored(name: str) -> str:
+    side, part, *point = name.split(" ")
+    if part == "iris" and point:
+        point = [str((IRIS_POINTS // 2 - int(point[0])) % IRIS_POINTS)]
+    return " ".join(["left" if side == "right" else "right", part, *point])
+
+
 MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
 
 
@@ -113,10 +153,10 @@ def whole_photo(image_srgb: np.ndarray, turn_rad: float = 0.0) -> Square:
 
 @dataclass(frozen=True, eq=False)
 class SquareView:
-    """View of a square by the network: logits [K, C, S, S] of the classes; landmarks [N, 2] in the photo.
+    """View of a square by the network: logits [C, S, S] of the classes; landmarks [N, 2] in the photo.
 
-    The logits are those of K looks at the square. error_px [N] are the landmarks' expected errors; presence,
-    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `mesh.py`.
+    error_px [N] are the landmarks' expected errors; presence,
+    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `find.py`.
     """
 
     square: Square
@@ -129,8 +169,8 @@ class SquareView:
 
     @property
     def classes(self) -> Tensor:
-        """Shares [C, S, S] of the classes, which sum to 1: the mean of all looks; computed each time."""
-        return self.logits.softmax(1).mean(0)
+        """Shares [C, S, S] of the classes, which sum to 1; computed each time."""
+        return self.logits.softmax(0)
 
     @property
     def extent_px(self) -> float:
@@ -162,25 +202,17 @@ def _box_mean(grey: Tensor, reach: int) -> Tensor:
 
 
 @torch.inference_mode()
-def look(
-    network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square], mirrored: bool = False
-) -> list[SquareView]:
-    """Look at squares of an sRGB uint8 image [H, W, 3]; `mirrored` averages with their mirror images."""
+def look(network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[SquareView]:
+    """Look at squares of an sRGB uint8 image [H, W, 3]."""
     device = next(network.parameters()).device
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
     sharpness = sharpness_of(crops)
     found = Parsing(*(part.cpu() for part in network(crops.to(device))))
-    logits, places, log_error = found.logits[:, None], found.landmarks.double(), found.log_error.double()
-    if mirrored:
-        other = Parsing(*(part.cpu() for part in network(crops.flip(-1).to(device))))
-        logits = torch.cat([logits, other.logits.flip(-1)[:, None]], 1)
-        flipped = other.landmarks.double()[:, MIRROR] * torch.tensor([-1.0, 1.0]) + torch.tensor([1.0, 0.0])
-        places = (places + flipped) / 2
-        log_error = (log_error + other.log_error.double()[:, MIRROR]) / 2
+    places, log_error = found.landmarks.double(), found.log_error.double()
     return [
         SquareView(
             square,
-            logits[index].float(),
+            found.logits[index].float(),
             square.to_photo(places[index].numpy()),
             log_error[index].exp().numpy() * square.side_px,
             float(found.presence[index].sigmoid()),
@@ -203,20 +235,9 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
     return _bare(classes, _places(crop) / (size_px[1], size_px[0]))
 
 
-class UncoveredRows:
-    """The same share [H, W] of a photo's pixels, by rows, by the classes [C, h, w] of the whole photo."""
-
-    def __init__(self, classes: Tensor, size_px: tuple[int, int]) -> None:
-        self._covered, self._size_px = covering(classes)[None].numpy(), size_px
-
-    def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Some rows [h, W]."""
-        return _share_bare(enlarged(self._covered, self._size_px, rows)[0])
-
-
 def uncovered_by(matte: np.ndarray, crop: Crop) -> np.ndarray:
     """The share of `uncovered` by a matte [H, W] of the photo: what is not its person covers the face."""
-    return _share_bare(1 - crop.apply(matte[..., None])[..., 0])
+    return share_bare(1 - crop.apply(matte[..., None])[..., 0])
 
 
 def _places(crop: Crop) -> np.ndarray:
@@ -229,7 +250,7 @@ def _bare(classes: Tensor, shares: np.ndarray) -> np.ndarray:
     """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
     grid = torch.from_numpy(2 * shares - 1).float()[None]
     sampled = F.grid_sample(covering(classes)[None, None], grid, align_corners=False)[0, 0]
-    return _share_bare(sampled.numpy())
+    return share_bare(sampled.numpy())
 
 
 def covering(classes: Tensor) -> Tensor:
@@ -238,6 +259,7 @@ def covering(classes: Tensor) -> Tensor:
     return classes[~own].sum(0).float()
 
 
-def _share_bare(covered: np.ndarray) -> np.ndarray:
+def share_bare(covered: np.ndarray) -> np.ndarray:
+    """Share of the face itself in pixels that other things cover by a share."""
     low, high = _SURE
     return (1 - (covered - low) / (high - low)).clip(0, 1)

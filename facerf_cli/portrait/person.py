@@ -1,5 +1,12 @@
-"""A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry."""
+"""A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry.
 
+Its normals may come from another method, such as DAViD or Sapiens, in place of the networks'
+(`with_normals`). In camera space x is to the image's right. y is up and z toward the camera, as here
+(OpenGL), or y is down and z away from it (OpenCV), and few methods say which: each axis gets the sign by
+which the normals agree with those of the fitted face.
+"""
+
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +24,11 @@ from facerf_cli.face.head import OtherHead
 from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.image.colour import without_fireflies
-from facerf_cli.network.portrait import PortraitInputs, reached_by, skin_exposure
+from facerf_cli.image.strips import resized
+from facerf_cli.network.portrait import SKIN, PortraitInputs, PortraitMaps, reached_by, skin_exposure
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.mesh import SeenEyes, eyes_of
+from facerf_cli.portrait.find import SeenEyes, eyes_of
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.proxy import (
     Proxy,
     ProxyMaps,
@@ -32,7 +40,7 @@ from facerf_cli.portrait.proxy import (
 )
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
-from facerf_cli.run.logs import step
+from facerf_cli.run.logs import LOGGER_NAME, step
 
 SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network is trained on
 SEEN_PX = 224  # and in which it sees a photo: face and hair come out better, ears and neck a little worse
@@ -41,13 +49,18 @@ _WIDEST = 7.0  # and the largest side of the square around the whole person
 _NEAR_IRIS = 1.5  # reach of the pixels whose light an iris mirrors, in its radii
 _FINEST = 3  # pixels along one of the maps, up to which shadows are traced
 _OVERHANG = 0.03  # of a person over the square, in sides, that needs no wider one; and its margin
+_LENGTHS = (0.5, 1.5)  # of what is a normal; black in a PNG is longer
+_SURE = 0.5  # share of skin from which on a pixel has a say in the axes
+_AGREED = 0.7  # mean cosine to the fitted face from which on normals are the photo's
+
+log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
 class SeenPerson:
     """A person of a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy.
 
-    `normals` [H, W, 3] of the photo are given (`given_normals.py`), 0 where there are none.
+    `normals` [H, W, 3] of the photo are given (`with_normals`), 0 where there are none.
     """
 
     square: Crop
@@ -60,7 +73,7 @@ class SeenPerson:
     eyes: SeenEyes
     normals: np.ndarray | None = None
 
-    @cached_property
+    @property
     def exposure(self) -> float:
         """Radiance of the photo over that of the network's input."""
         return float(skin_exposure(self.image[None], self.classes[None]))
@@ -74,14 +87,6 @@ class SeenPerson:
     def own_pixels(self) -> Tensor:
         """1 where the person covers most of a pixel [S, S], else 0."""
         return (1 - self.classes[0] > 0.5).float()
-
-    def visibility(self, directions: Tensor) -> Tensor:
-        """Share [L, s, s] of lights [L, 3] that reaches the person, at half the square's side."""
-        return self.shadows.along(directions)
-
-    def visibility_of_points(self, places_m: Tensor) -> Tensor:
-        """Share [P, s, s] of lights at places [P, 3], camera space, that reaches the person."""
-        return self.shadows.toward(places_m)
 
     def around_iris(self, number: int) -> tuple[Shadows, Tensor]:
         """The lights that reach the pixels around an iris, and the places [h, w, 2] of these in -1..1."""
@@ -125,8 +130,9 @@ class SeenPerson:
         fine = replace(self.square, size_px=self.square.size_px * times)
         return proxy_maps(self.proxy, square_camera(self.fit, fine), filled=False)
 
-    def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
-        """The network's inputs [1, ...]; `visible` [L, s, s] is the visibility of a rig [L, 3] all around."""
+    def inputs(self, rig: Tensor) -> PortraitInputs:
+        """The network's inputs [1, ...], by the visibility of a rig [L, 3] all around."""
+        visible = self.shadows.along(rig)
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible, self.sides)
         reached = reached_by(rig, visible, self.square.size_px)
         surface = surface_of(self.maps)
@@ -226,3 +232,50 @@ def _classes_in(segmentation: Segmentation, square: Crop) -> Tensor:
     found = F.grid_sample(segmentation.classes[None], grid, align_corners=False)[0]
     found[0] += (1 - found.sum(0)).clamp_min(0)
     return found
+
+
+def unit_normals(normals: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
+    """Unit normals [H, W, 3] of a photo's size, from those of its aspect [h, w, 3]; 0 where none are."""
+    (height, width), (rows, columns) = size_px, normals.shape[:2]
+    if abs(width - height / rows * columns) > 2 * max(1.0, height / rows):  # sides were rounded
+        raise InputError(
+            f"the normals have {columns} x {rows} pixels, the photo {width} x {height}; give its own"
+        )
+    if (rows, columns) != size_px:
+        normals = resized(normals, height, width)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    known = (length > _LENGTHS[0]) & (length < _LENGTHS[1])
+    return np.where(known, normals / np.maximum(length, _LENGTHS[0]), 0).astype(np.float32)
+
+
+def with_normals(person: SeenPerson, normals: np.ndarray) -> SeenPerson:
+    """The person with unit normals [H, W, 3] of its photo, whose axes the fitted face tells.
+
+    Raises InputError where they do not agree with it.
+    """
+    given = _in_square(person, normals)
+    sure = (person.classes[SKIN] > _SURE) & (person.maps.covered > 0) & (given.norm(dim=0) > _LENGTHS[0])
+    products = (given * person.maps.normals)[:, sure].sum(1)
+    agreed = float(products.abs().sum() / max(1, int(sure.sum())))
+    if agreed < _AGREED:
+        raise InputError(
+            f"the normals are not those of the face (mean cosine {agreed:.2f}); give the photo's own, in "
+            "camera space, x in the red channel"
+        )
+    if turned := [name for name, product in zip("xyz", products, strict=True) if product < 0]:
+        log.info("given normals: %s turned, by the fitted face", " and ".join(turned))
+    return replace(person, normals=normals * np.where(products.numpy() < 0, -1, 1).astype(np.float32))
+
+
+def maps_with_normals(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:
+    """The maps of a person with its given normals, if there are any, as far as the person is seen."""
+    if person.normals is None:
+        return maps
+    given = _in_square(person, person.normals)
+    share = (1 - person.classes[0]) * (given.norm(dim=0) > _LENGTHS[0])
+    return maps._replace(normals=F.normalize(torch.lerp(maps.normals, given[None], share), dim=1))
+
+
+def _in_square(person: SeenPerson, normals: np.ndarray) -> Tensor:
+    """Means [3, S, S] of normals of the photo over the pixels of the person's square."""
+    return torch.from_numpy(person.square.apply(normals)).permute(2, 0, 1)

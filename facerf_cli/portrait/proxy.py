@@ -7,7 +7,6 @@ that explains the photo best is a first guess of the photo's light, from which t
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,7 @@ from facerf_cli.light.estimate import least_non_negative
 from facerf_cli.light.transport import build_scene, occluded, on_disc, places_on_disc, tangents
 from facerf_cli.network.checkpoint import load_checkpoint
 from facerf_cli.network.portrait import SKIN
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import blurred, inpaint, vertex_normals
@@ -71,16 +70,13 @@ class Proxy:
     vertices: Tensor
     normals: Tensor
     triangles: Tensor
-
-    @cached_property
-    def scene(self) -> Any:
-        """The mesh for tracing of rays."""
-        return build_scene(self.vertices.numpy(), self.triangles.numpy())
+    scene: Any  # for tracing of rays
 
     @staticmethod
     def of(vertices: Tensor, triangles: Tensor) -> "Proxy":
-        """Compute the normals."""
-        return Proxy(vertices, vertex_normals(vertices, triangles), triangles)
+        """Compute the normals and the scene."""
+        scene = build_scene(vertices.numpy(), triangles.numpy())
+        return Proxy(vertices, vertex_normals(vertices, triangles), triangles, scene)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +224,6 @@ def _reach(offset_px: Tensor, chosen: Tensor) -> np.ndarray:
     return reach
 
 
-@cache  # an asset that every photo needs
 def _mean_person() -> _MeanPerson:
     tensors, metadata = load_checkpoint(ASSET)
     if metadata.get("layout_version") != LAYOUT_VERSION:

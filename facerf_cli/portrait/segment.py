@@ -11,19 +11,26 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_gradient_magnitude, label
 from torch import Tensor
 
 from facerf_cli.face.head import OtherHead
+from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import enlarged, fitted
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
-from facerf_cli.portrait.cloth import with_cloth
 from facerf_cli.portrait.confidence import matte_facts
+from facerf_cli.portrait.find import find_meshes, first_squares
 from facerf_cli.portrait.matte import shrunk, solid
-from facerf_cli.portrait.mesh import find_meshes, first_squares
-from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look
+from facerf_cli.portrait.parse import (
+    CLASSES,
+    LEAST_PRESENCE,
+    MORE_LANDMARKS,
+    Square,
+    SquareView,
+    class_index,
+    look,
+)
 from facerf_cli.portrait.people import HeadPlace, PersonShares, matte_of, person_among
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
@@ -49,6 +56,18 @@ _EAR_LINES = [
     [68 + MORE_LANDMARKS.index(f"{side} ear {part}") for part in ("top", "back", "lobe")]
     for side in ("left", "right")
 ]
+_SKIN_CLASSES = [class_index(name) for name in ("skin", "neck", "hand")]
+_FACE_CLASSES = [class_index(name) for name in ("skin", "neck", "ears", "lips", "beard")]
+_HAND, _GARMENT = class_index("hand"), class_index("garment")
+_MAYBE = 0.3  # share of skin in a pixel from which it is looked at
+_CERTAIN, _SURE_BESIDE = 0.9, 0.8  # shares of certain skin, in the face and beside a part
+_FACE_REACH = 0.7  # of certain skin of the face from its middle, in heights of the head
+_CLOTH_EDGE = 0.12  # change of log brightness over a pixel, at which parts end
+_EDGE_PX = 3  # half the width of such an edge
+_BLACK, _NOISE = 5e-4, 2e-3  # linear light that hides the chromaticity of the face, and of other parts
+_DARK = 0.03  # of sRGB, below which edges are noise
+_MARGIN = 1.16  # by which a ratio of channels must lie outside those of the face
+_LEAST_PART, _TOUCHES = 0.005, 0.25  # share of the person, and of the outline that borders certain skin
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,10 +196,11 @@ def parsed(
     near = [Square.around(landmarks_px, sides, _NEAR_ABOVE) for sides in _NEAR_SIDES]
     size = (small.shape[1], small.shape[2])
     views = look(parsing, image_srgb, [body, chest, *near])
+    background = torch.eye(len(CLASSES))[0, :, None, None]
     (wide, inside), (middle, feather), *close = (
         one.square.laid_over(one.classes, size, image_srgb.shape, _FEATHER) for one in views
     )
-    classes = torch.lerp(torch.where(inside > 0, wide, _only_background()), middle, feather)
+    classes = torch.lerp(torch.where(inside > 0, wide, background), middle, feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
     for (one, feather), sides in zip(close, _NEAR_SIDES, strict=True):
         weighed = feather * sides**-_STEEPNESS
@@ -237,12 +257,6 @@ def _with_likelier_hair(classes: Tensor) -> Tensor:
     return torch.cat([classes[:1], person * kept])
 
 
-def _only_background() -> Tensor:
-    shares = torch.zeros(len(CLASSES), 1, 1)
-    shares[0] = 1
-    return shares
-
-
 def with_ears(classes: Tensor, view: SquareView, places_px: np.ndarray) -> Tensor:
     """Classes [C, h, w] with likelier ears at pixels that lie at places [h, w, 2] in the photo.
 
@@ -276,3 +290,51 @@ def _distance(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndar
     along = end - start
     share = (((places - start) @ along) / max(float(along @ along), 1e-9)).clip(0, 1)
     return np.asarray(np.linalg.norm(places - start - share[..., None] * along, axis=-1))
+
+
+def with_cloth(classes: Tensor, image: Tensor, head: HeadPlace) -> Tensor:
+    """Return shares [C, h, w] of the classes in which parts of skin that cannot be skin are garments.
+
+    The Parsing Network takes collars and elbows of dark suits for skin or a hand, which would be lit as such.
+    The photo's colours tell them from the person's own skin. A part ends at edges of the photo. It is cloth
+    if most of its chromaticities lie outside those of all of the face, lit and shaded, it is large enough,
+    and little of its outline borders certain skin.
+
+    Args:
+        classes: Shares of the classes, which sum to 1.
+        image: sRGB [3, h, w] in 0..1.
+        head: The person's head, in pixels of the image.
+    """
+    shares = classes.numpy()
+    red, green, blue = srgb_to_linear(image.numpy())
+    face = (shares[_SKIN_CLASSES[0]] > _CERTAIN) & (head.distance(green.shape) < _FACE_REACH)
+    if not face.any():
+        return classes
+    outside = np.zeros_like(face)
+    for channel in (red, blue):
+        ratio = (channel[face] + _BLACK) / (green[face] + _BLACK)
+        darkest, brightest = (
+            (green * bound + _NOISE) / (green + _NOISE) for bound in np.quantile(ratio, (0.02, 0.98))
+        )
+        ratio = (channel + _NOISE) / (green + _NOISE)
+        outside |= (ratio < darkest / _MARGIN) | (ratio > brightest * _MARGIN)
+    person = 1 - shares[0]
+    skin = shares[_SKIN_CLASSES].sum(0) > _MAYBE * np.maximum(person, _MAYBE)
+    edges = gaussian_gradient_magnitude(np.log(image.numpy().mean(0) + _DARK), 1.0) > _CLOTH_EDGE
+    certain = (shares[_FACE_CLASSES].sum(0) > _SURE_BESIDE) | (shares[_HAND] > _SURE_BESIDE)
+    parts, _ = label(skin & ~edges)
+    sizes = np.bincount(parts.ravel())
+    sizes[0] = 0
+    cloth = np.zeros_like(skin)
+    for number in np.flatnonzero(sizes > _LEAST_PART * person.sum()):
+        part = parts == number
+        if outside[part].mean() > 0.5:
+            part |= binary_dilation(part, iterations=_EDGE_PX, mask=skin & outside)
+            outline = binary_dilation(part) & ~part
+            if certain[outline].mean() < _TOUCHES:
+                cloth |= part
+    given = classes.clone()
+    moved = classes[_SKIN_CLASSES] * torch.from_numpy(cloth)
+    given[_SKIN_CLASSES] -= moved
+    given[_GARMENT] += moved.sum(0)
+    return given

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.light.transport import first_hits_m, on_disc, places_on_disc
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.proxy import OFF_M, RADIUS_DEG, Proxy, ProxyMaps
 from facerf_cli.raster.texture import inpaint, smoothstep
 from facerf_cli.relighting.portrait_field import PortraitView
@@ -48,10 +48,10 @@ def cast_shadow(view: PortraitView, light: Tensor | PointLights) -> CastShadow:
     person, size = view.person, view.person.image.shape[1:]
     if isinstance(light, PointLights):
         ends, (lights, strength) = light.places_m, light.arriving(person.maps.positions_m)
-        coarse, middle = person.visibility_of_points(ends), -light.toward
+        coarse, middle = person.shadows.toward(ends), -light.toward
     else:
         ends, lights, strength = light, light, torch.full((len(light), 1, 1), 1 / len(light))
-        coarse, middle = person.visibility(light), F.normalize(light.mean(0), dim=0)
+        coarse, middle = person.shadows.along(light), F.normalize(light.mean(0), dim=0)
     shades = []
     for arrives in (0.0, 1.0):
         shade, glow, _ = view.maps.shaded(lights[None], torch.full((1, len(coarse), *size), arrives))

@@ -4,8 +4,7 @@ See the paper, 'Relighting'.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 import torch
@@ -30,7 +29,6 @@ FACE_LAYERS = ("normal", "position", "depth", "uv", "face")
 _FACE_ALPHA = "face.A"
 
 
-@dataclass(frozen=True, eq=False)
 class FaceAlone(Relightable):
     """A head in a pose, before nothing: in its photo's frame, or without one in its crop's.
 
@@ -42,32 +40,28 @@ class FaceAlone(Relightable):
         photo_px: Height and width of the photo.
     """
 
-    model: MorphableModel
-    head: Head
-    reflectance: Reflectance | None = None
-    fit: FaceFit | None = None
-    photo_px: tuple[int, int] | None = None
-
-    @cached_property
-    def vertices_m(self) -> Tensor:
-        """The mesh [V, 3] as shown, camera space."""
-        return (self.fit or self.head.fit).vertices_camera(self.model)
-
-    @cached_property
-    def view(self) -> FaceView:
-        """The mesh in the frame."""
-        crop = (self.fit or self.head.fit).crop
-        if self.photo_px is None:
+    def __init__(
+        self,
+        model: MorphableModel,
+        head: Head,
+        reflectance: Reflectance | None = None,
+        fit: FaceFit | None = None,
+        photo_px: tuple[int, int] | None = None,
+    ) -> None:
+        self.head, self.reflectance, self.fit = head, reflectance, fit
+        crop = (fit or head.fit).crop
+        if photo_px is None:
             crop = Crop(0.0, 0.0, float(crop.size_px), crop.size_px)
-        size_px = self.photo_px or (crop.size_px, crop.size_px)
-        return view_face(self.vertices_m, photo_camera(crop, *size_px), crop.side_px)
+        self.vertices_m = (fit or head.fit).vertices_camera(model)  # [V, 3] as shown, camera space
+        camera = photo_camera(crop, *(photo_px or (crop.size_px, crop.size_px)))
+        self.view = view_face(self.vertices_m, camera, crop.side_px)
 
     @property
     def size_px(self) -> tuple[int, int]:
         """Height and width of the frame."""
         return self.view.size_px
 
-    @cached_property
+    @property
     def matte(self) -> np.ndarray:
         """Share [H, W] of the face, with a soft border."""
         return self.view.full(self.view.mask)
@@ -135,13 +129,13 @@ class FaceInPhoto:
         """Share [h, W] of the face in rows of the photo."""
         return self.matte[rows]
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Relit, Sequence[str]]:
+    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Sequence[str]]:
         """Compute all that does not depend on rows; raises UsageError for layers of whole people."""
         require_face_layers(layers)
-        return self._detail.ready(relit.texture), relit, layers
+        return self._detail.ready(relit.texture), layers
 
     def render(
-        self, window: Window, own: np.ndarray, lights: Sequence[tuple[Tensor, Relit, Sequence[str]]]
+        self, window: Window, own: np.ndarray, lights: Sequence[tuple[Tensor, Sequence[str]]]
     ) -> Iterator[dict[str, np.ndarray]]:
         """Yield rows of the photo, whose person has its `own` colours [h, W, 3], under each light.
 
@@ -149,10 +143,8 @@ class FaceInPhoto:
         """
         part = window.common(self.view.window)
         lit = self._detail.over(part, own[part.inside(window)])
-        for maps, relit, layers in lights:
+        for maps, layers in lights:
             image = {"rgb": window.framed(lit(maps), part)}
-            if relit.own is not None and relit.own.any():
-                image["rgb"] = image["rgb"] + relit.own.detach().numpy() * own
             for name in layers:
                 image |= face_layer(self.view, name, window)
             yield image

@@ -23,8 +23,7 @@ from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting import White
 from facerf_cli.relighting.detail import NOISE, contrast, lost_detail
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.shade import without_colour_of_shade
-from facerf_cli.relighting.white import Balance
+from facerf_cli.relighting.white import Balance, without_colour_of_shade
 from facerf_cli.run.memory import limit_bytes
 from facerf_cli.run.threads import count, in_threads
 

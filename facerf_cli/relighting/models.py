@@ -24,8 +24,7 @@ from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.stored_graph import ASSET, PeopleNetworks, mediapipe_networks
-from facerf_cli.portrait.classes import CLASSES
-from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS
 
 TEXTURE_SIDE, LARGEST_TEXTURE = 256, 2048  # texels: by default, and at most
 _CPU = torch.device("cpu")
@@ -41,13 +40,23 @@ class Sides:
 
 
 class Networks:
-    """The trained networks, each loaded when it is first needed, and kept on the device.
+    """The trained networks by name, each loaded when it is first read, and kept on the device.
+
+    Reading one raises InputError for a file that is damaged or of another version.
 
     Args:
         files: File of each network, by its name.
         device: Where they compute.
         given: Networks in place of those of files.
     """
+
+    reflectance: ReflectanceNetwork
+    geometry: nn.Module
+    diffuse_sh: DiffuseNetwork
+    light_features: LightNetwork  # S_f
+    parsing: ParsingNetwork
+    portrait: PortraitNetwork
+    people: PeopleNetworks  # that find people and cut them out
 
     def __init__(
         self,
@@ -56,7 +65,7 @@ class Networks:
         given: Mapping[str, nn.Module] | None = None,
     ) -> None:
         self.files, self.device, self._given = dict(files), device, dict(given or {})
-        self._loaded: dict[str, Any] = dict(self._given)
+        vars(self).update(self._given)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send the files to another process, which loads each network once, or the given networks."""
@@ -64,61 +73,28 @@ class Networks:
             return Networks, (self.files, self.device, self._given)
         return _networks_once, (tuple(self.files.items()), self.device)
 
-    @property
-    def reflectance(self) -> ReflectanceNetwork:
-        """The Reflectance Network."""
-        return self._get("reflectance")
-
-    @property
-    def geometry(self) -> nn.Module:
-        """The Geometry Network."""
-        return self._get("geometry")
-
-    @property
-    def diffuse_sh(self) -> DiffuseNetwork:
-        """The network of the baseline of this name."""
-        return self._get("diffuse_sh")
-
-    @property
-    def light_features(self) -> LightNetwork:
-        """S_f, frozen."""
-        return self._get("light_features")
-
-    @property
-    def parsing(self) -> ParsingNetwork:
-        """The Parsing Network."""
-        return self._get("parsing")
-
-    @property
-    def portrait(self) -> PortraitNetwork:
-        """The Portrait Network."""
-        return self._get("portrait")
-
-    @property
-    def people(self) -> PeopleNetworks:
-        """The networks that find people and cut them out."""
-        if "people" not in self._loaded:
-            self._loaded["people"] = PeopleNetworks(self.parsing, *mediapipe_networks(self.device))
-        return self._loaded["people"]
-
-    def _get(self, name: str) -> Any:
-        """A network; raises InputError for a file that is damaged or of another version."""
-        if name not in self._loaded:
+    def __getattr__(self, name: str) -> Any:
+        """Load a network that has not been read before."""
+        if name == "people":
+            self.people = PeopleNetworks(self.parsing, *mediapipe_networks(self.device))
+        elif name in SHIPPED:
             path = self.files[name]
             network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
             if name in _CHECKS:
                 _CHECKS[name](path, network)
-            self._loaded[name] = network.to(self.device).eval().requires_grad_(False)
-        return self._loaded[name]
+            setattr(self, name, network.to(self.device).eval().requires_grad_(False))
+        else:
+            raise AttributeError(name)
+        return vars(self)[name]
 
     def load(self, names: Iterable[str]) -> None:
-        """Load networks by name; raises InputError for a file that is damaged or of another version."""
+        """Load networks by name."""
         for name in names:
-            self._get(name)
+            getattr(self, name)
 
     def with_networks(self, **networks: nn.Module) -> "Networks":
         """Return the same networks with others in place of some."""
-        loaded = {name: network for name, network in self._loaded.items() if name in SHIPPED}
+        loaded = {name: network for name, network in vars(self).items() if name in SHIPPED}
         return Networks(self.files, self.device, {**loaded, **networks})
 
     def sha256(self, name: str) -> str:
@@ -127,8 +103,8 @@ class Networks:
 
     def served(self) -> dict[str, dict[str, str]]:
         """File and SHA-256 of each network that was needed so far, for reports."""
-        files = {name: self.files[name] for name in SHIPPED if name in self._loaded}
-        if "people" in self._loaded:
+        files = {name: self.files[name] for name in SHIPPED if name in vars(self)}
+        if "people" in vars(self):
             files["mediapipe"] = ASSET
         return {name: described_file(path) for name, path in files.items()}
 
@@ -208,7 +184,7 @@ def load_models(
         face=load_face_model(face_model),
         networks=Networks(files, device),
         trained_sides=Sides(side, _side(path, metadata, "crop_px", CROP_PER_TEXTURE * side)),
-        default_geometry=default_geometry(metadata),
+        default_geometry="network" if metadata.get("geometry") == "network" else "landmarks",
         source_colours=_source_colours(path, metadata),
     )
 
@@ -218,11 +194,6 @@ def _side(path: Path, metadata: dict[str, Any], name: str, default: int) -> int:
     if type(side) is not int or not 16 <= side <= CROP_PER_TEXTURE * LARGEST_TEXTURE:
         raise InputError(f"{path}: invalid {name} in its metadata; train it again")
     return side
-
-
-def default_geometry(metadata: dict[str, Any]) -> Geometry:
-    """Geometry of a checkpoint's training, by default that of photos, too."""
-    return "network" if metadata.get("geometry") == "network" else "landmarks"
 
 
 def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | None:

@@ -95,10 +95,11 @@ class PeopleInPhoto(Relightable):
         under_each, found = zip(*images, strict=True), dict[str, np.ndarray]()
         if request.image is not None:
             each = next(under_each)
-            found["rgb"] = self._image(request, shares, owns, [one["rgb"] for one in each], rows)
+            pixels = _with_own_light(each, [request.image[number] for number in numbers], owns)
+            found["rgb"] = self._image(request, shares, owns, pixels, rows)
             found |= _layers(shares, each)
-        for name, each in zip(request.lights, under_each, strict=True):
-            found[name] = _over(shares, [one["rgb"] for one in each])
+        for (name, relit), each in zip(request.lights.items(), under_each, strict=True):
+            found[name] = _over(shares, _with_own_light(each, [relit[number] for number in numbers], owns))
         return request.wrapped(found, rows)
 
     def _present(self, rows: slice) -> tuple[list[int], Shares]:
@@ -138,6 +139,19 @@ class PeopleInPhoto(Relightable):
         if len(shares) == 1:
             return pixels[0]
         return _over(shares, pixels) / np.maximum(_alpha(shares), _TINY)  # not multiplied by alpha
+
+
+def _with_own_light(
+    images: Sequence[dict[str, np.ndarray]], relit: Sequence[Relit], owns: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Pixels [h, W, 3] of people, with the share of the photo's own light, in which they have `owns`."""
+    found = []
+    for image, one, own in zip(images, relit, owns, strict=True):
+        pixels = image["rgb"]
+        if one.own is not None and one.own.any():
+            pixels = pixels + one.own.detach().numpy() * own
+        found.append(pixels)
+    return found
 
 
 def _over(shares: Shares, pixels: Sequence[np.ndarray], below: Any = _BLACK) -> np.ndarray:

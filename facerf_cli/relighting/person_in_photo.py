@@ -15,29 +15,77 @@ from torch import Tensor
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.face.view import photo_camera, view_face
+from facerf_cli.face.view import photo_camera, rows_of_camera, view_face
 from facerf_cli.image.colour import ExposureRule
-from facerf_cli.image.strips import Window
+from facerf_cli.image.strips import Window, enlarged
 from facerf_cli.light.light import Light
 from facerf_cli.portrait.matte import PersonColours
-from facerf_cli.portrait.parse import UncoveredRows
-from facerf_cli.raster.texture import smoothstep
+from facerf_cli.portrait.parse import class_index, covering, share_bare
+from facerf_cli.portrait.person import SeenPerson
+from facerf_cli.raster.camera import Camera, rays_of_rows
+from facerf_cli.raster.rasterize import front_facing, rasterize
+from facerf_cli.raster.texture import blurred, inpaint, smoothstep
 from facerf_cli.relighting.cast_shadows import CastShadow, cast_shadow
 from facerf_cli.relighting.detail import FaceDetail
-from facerf_cli.relighting.enlarged import VIEW_LAYERS, Enlarged, Maps
+from facerf_cli.relighting.enlarged import VIEW_LAYERS, Enlarged, Maps, Rims
 from facerf_cli.relighting.eyes import Eyes
 from facerf_cli.relighting.face_alone import FACE_LAYERS, face_layer
 from facerf_cli.relighting.field import near_texture
-from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.portrait_field import PortraitField, from_behind
 from facerf_cli.relighting.relightable import Relit
-from facerf_cli.relighting.rims import Rims, from_behind
-from facerf_cli.relighting.surface import Surface
 from facerf_cli.run.threads import both
 
+_BODY = [class_index(name) for name in ("neck", "garment", "hand")]
+_STEADY_PX = 1.5  # blur of their shares, pixels of the classes
+_OTHERS = 1e-6  # weight of head for body, and of body for head: counts where nothing else is near
 PERSON_LAYERS = ("albedo", "normal", "position", "depth", "shadow", "specular", "classes")
 COLOURS = ("albedo", "specular")  # layers that are radiance
 _LIPS = 0.7  # cosine to the face's front from which on lips keep no light from the teeth
 _LEAST = 0.02  # share of the person in a pixel that has layers: the matte's tail is noise
+
+
+class Surface:
+    """Depth of a person at the resolution of its photo.
+
+    Where the proxy covers a pixel, it is the proxy's: it jumps at chin and nose, and lies between no two
+    surfaces. Hair, hats and cloth beyond the proxy continue it, head and body apart: hair next to the neck is
+    as far away as the head, a sleeve as the bust. The background gives nothing.
+    """
+
+    def __init__(self, person: SeenPerson, size_px: tuple[int, int]) -> None:
+        self._proxy, self._size_px = person.proxy, size_px
+        self._camera = photo_camera(person.fit.crop, *size_px)
+        outside = front_facing(person.proxy.vertices, person.proxy.triangles)
+        self._outside = person.proxy.triangles[outside]
+        self._beyond = self._continued(person.segmentation.classes)
+
+    def depth_m(self, rows: slice) -> np.ndarray:
+        """Distance [h, W, 1] along the camera's axis in some rows of the photo."""
+        seen = self._seen(rows_of_camera(self._camera, rows))
+        head, body, lead = enlarged(self._beyond.numpy(), self._size_px, rows)
+        return np.where(seen.isfinite(), seen, np.where(lead > 0, head, body))[..., None]
+
+    def position_m(self, rows: slice) -> np.ndarray:
+        """Places [h, W, 3] in camera space in some rows of the photo."""
+        return self.depth_m(rows) * rays_of_rows(self._camera, self._size_px, rows).numpy()
+
+    def _seen(self, camera: Camera) -> Tensor:
+        """Depth of the proxy's outer side [h, w]; infinite where nothing of it is seen."""
+        return rasterize(self._proxy.vertices, self._outside, camera).depth_m
+
+    def _continued(self, classes: Tensor) -> Tensor:
+        """Depth of head and of body, continued, and the lead of the head in the classes [3, h, w]."""
+        height, width = classes.shape[1:]
+        scale = width / self._size_px[1], height / self._size_px[0]
+        whole = self._camera
+        seen = self._seen(
+            Camera(whole.focal_px * scale[0], width, height, whole.cx_px * scale[0], whole.cy_px * scale[1])
+        )
+        body = classes[_BODY].sum(0)
+        head = 1 - classes[0] - body
+        weights = torch.stack([head + _OTHERS * body, body + _OTHERS * head]).clamp(0, 1) * seen.isfinite()
+        depth = seen.nan_to_num(posinf=0).expand(2, 1, -1, -1)
+        return torch.cat([inpaint(depth, weights)[:, 0], blurred((head - body)[None], _STEADY_PX)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +97,6 @@ class PersonLight:
     mirrored: list[np.ndarray]
     layers: Sequence[str]
     keys: list[tuple["PersonLight | None", CastShadow]]  # each light alone; None: it is all of this light
-    own: Tensor | None
 
 
 class PersonInPhoto:
@@ -64,7 +111,7 @@ class PersonInPhoto:
         self.vertices_m = head.fit.vertices_camera(model)
         crop = head.fit.crop
         self.view = view_face(self.vertices_m, photo_camera(crop, *self.size_px), crop.side_px)
-        self._bare_face = UncoveredRows(field.person.segmentation.classes, self.size_px)
+        self._covered = covering(field.person.segmentation.classes)[None].numpy()
         self._views = [Enlarged(view) for view in field.views]
         self._detail = FaceDetail(head.face, self.view)
 
@@ -93,7 +140,8 @@ class PersonInPhoto:
         def arriving(toward: Tensor, weights: Tensor) -> Tensor:
             """Weights of all light on the face, then of what of it falls into the mouth."""
             front = weights * (1 - from_behind(toward))[..., None]
-            return torch.cat([front, front * _into_mouth(toward, forward)[..., None]])
+            into_mouth = smoothstep(toward @ forward / _LIPS)  # between the lips of a face that looks forward
+            return torch.cat([front, front * into_mouth[..., None]])
 
         textures = field.field.relit(directions, arriving(directions, weights))
         for points, rgb in near:
@@ -140,7 +188,6 @@ class PersonInPhoto:
             self._eyes.ready(relit.mirrored),
             layers,
             [(None if key.texture is relit.texture else self.ready(key), cast) for key, cast in relit.keys],
-            relit.own,
         )
 
     def render(
@@ -161,8 +208,6 @@ class PersonInPhoto:
                 alone = whole if key is None else by_maps(key)["rgb"]
                 pixels[part] += alone[part] * change
             pixels = self._eyes.lit(window.framed(pixels, among), light.mirrored, window)
-            if light.own is not None and light.own.any():
-                pixels = pixels + light.own.detach().numpy() * own
             shown = {name: window.framed(found[name], among) for name in VIEW_LAYERS if name in found}
             image = {"rgb": pixels}
             for name in light.layers:
@@ -220,7 +265,7 @@ class PersonInPhoto:
 
     def _face_share(self, part: Window) -> np.ndarray:
         """Share [h, w] that the field of the face has in a part of its window."""
-        bare = self._bare_face[part.rows][:, part.columns]
+        bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
         return np.asarray(self.view.mask[part.inside(self.view.window)].numpy() * bare)
 
     def _layer(self, name: str, window: Window, shown: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -270,8 +315,3 @@ def seen_columns(shown: np.ndarray) -> slice:
     """Columns in which a part of an image [h, W] is not 0; at least one."""
     at = np.flatnonzero(shown.any(0))
     return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
-
-
-def _into_mouth(directions: Tensor, forward: Tensor) -> Tensor:
-    """Share [...] of lights from directions [..., 3] that falls between lips; the face looks `forward`."""
-    return smoothstep(directions @ forward / _LIPS)

@@ -9,7 +9,6 @@ photo back.
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -24,21 +23,18 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import MEAN_RADIANCE, is_grey
 from facerf_cli.network.portrait import HAIRY, PortraitInputs, PortraitMaps, PortraitNetwork
-from facerf_cli.portrait.classes import class_index
 from facerf_cli.portrait.correction import Correction
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.portrait.proxy import square_camera
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.raster.camera import project
-from facerf_cli.raster.texture import bake_attributes, blurred
-from facerf_cli.relighting.baked_in import without_baked_in
+from facerf_cli.raster.texture import bake_attributes, blurred, smoothstep
 from facerf_cli.relighting.detail import FLOOR, NOISE, contrast, finer_detail, lost_detail, mean_colour
 from facerf_cli.relighting.eyes import mirrored_in_cornea
 from facerf_cli.relighting.field import Field, shining
-from facerf_cli.relighting.rims import from_behind
-from facerf_cli.relighting.shade import even_shade_of
-from facerf_cli.relighting.source_light import SourceLight, share_of_lamp
-from facerf_cli.relighting.white import BARE, Balance
+from facerf_cli.relighting.photo_light import SourceLight, share_of_lamp
+from facerf_cli.relighting.white import BARE, Balance, even_shade_of, without_baked_in
 from facerf_cli.run.threads import in_threads
 
 _SUMMARY_LIGHTS = 48  # of the rig whose shadows the network sees
@@ -49,6 +45,7 @@ _SKIN = class_index("skin")
 _APART = 0.01  # blur of what is no skin, in sides: skin near to it keeps its make-up and its hair
 _CLOTH = ("garment", "headwear")
 _DETAIL_PX = 2.0  # standard deviation of the blur of detail, in pixels of the maps
+_BEHIND = (0.35, 0.75)  # -z of the directions from which on light is partly, and wholly, from behind
 _DARK = 0.1  # of the mean of a person: what is darker has no colour of its own
 
 
@@ -152,7 +149,7 @@ class PortraitView:
         """The view whose albedo is multiplied by gains [3, S, S]."""
         return replace(self, maps=self.maps._replace(albedo=self.maps.albedo * gains))
 
-    @cached_property
+    @property
     def typical_skin(self) -> Tensor:
         """Mean radiance [3] of the skin, in the units of the network's input."""
         return mean_colour(self.person.image, self.person.classes[_SKIN]) / self.person.exposure
@@ -171,7 +168,7 @@ class PortraitView:
         """The view in the units of the photo's light, corrected to give the photo back under it."""
         used = source.light.weights.sum(1) > 0
         directions, weights = source.light.directions[used], source.light.weights[used]
-        shade, glow, _ = self._shaded(directions, self.person.visibility(directions))
+        shade, glow, _ = self._shaded(directions, self.person.shadows.along(directions))
         olats = self.maps.albedo * shade[:, None] + glow[:, None]
         skin = self.person.classes[_SKIN]
         explained = torch.einsum("lc,lcij->cij", weights, olats)
@@ -209,7 +206,7 @@ class PortraitView:
                 torch.split(weights[:, used], _LIGHTS_AT_ONCE, 1),
                 strict=True,
             ):
-                maps = self._shaded(lights, self.person.visibility(lights.detach()))
+                maps = self._shaded(lights, self.person.shadows.along(lights.detach()))
                 sent = torch.ones(len(lights), 1, 1)
                 yield _Some(*maps, sent, some, from_behind(lights), lights[..., None, None])
 
@@ -220,7 +217,7 @@ class PortraitView:
         for first in range(0, len(toward), _LIGHTS_AT_ONCE):
             batch = slice(first, first + _LIGHTS_AT_ONCE)
             sent = irradiance[batch]
-            visible = self.person.visibility_of_points(points.places_m[batch])
+            visible = self.person.shadows.toward(points.places_m[batch])
             shade, glow, arrives = self._shaded(toward[batch], visible)
             some = weights[:, None].expand(-1, len(sent), -1)
             share, along = behind.expand(len(sent)), toward[batch].permute(0, 3, 1, 2)
@@ -313,11 +310,6 @@ class PortraitField:
         return PortraitField(views, field, _texels_in_square(model, head, seen[0][0]))
 
     @property
-    def balance(self) -> Balance | None:
-        """The balance of the person's white."""
-        return self.field.balance
-
-    @property
     def person(self) -> SeenPerson:
         """The person in the square around head and shoulders."""
         return self.views[0].person
@@ -358,13 +350,18 @@ class PortraitField:
         return torch.lerp(textures, own, _SHARE)
 
 
+def from_behind(directions: Tensor) -> Tensor:
+    """Share [...] of lights from unit directions [..., 3] that comes from behind."""
+    return smoothstep((-directions[..., 2] - _BEHIND[0]) / (_BEHIND[1] - _BEHIND[0]))
+
+
 def maps_of(network: PortraitNetwork, person: SeenPerson) -> PortraitMaps:
     """The light transport of a person, as the Portrait Network sees it.
 
     It is the mean of the network's maps and of those that it sees in a mirror, whose errors differ.
     """
     rig = rig_directions(_SUMMARY_LIGHTS)
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     even = even_shade_of(inputs.image[0], inputs.classes[0])
     inputs = replace(inputs, image=inputs.image * even)
     device = next(network.parameters()).device

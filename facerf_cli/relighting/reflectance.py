@@ -4,17 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from facerf_cli.baselines import Kind, RelightKind
-from facerf_cli.baselines.base import Explained, Reflectance
+from facerf_cli.baselines import RelightKind, explain_by_baseline
+from facerf_cli.baselines.base import Reflectance
 from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
-from facerf_cli.portrait.given_normals import maps_with_normals, with_normals
-from facerf_cli.portrait.person import SeenPerson, look_at_person, wider_square
+from facerf_cli.portrait.person import (
+    SeenPerson,
+    look_at_person,
+    maps_with_normals,
+    wider_square,
+    with_normals,
+)
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import Field, balance_of
 from facerf_cli.relighting.models import Models
+from facerf_cli.relighting.photo_light import SourceLight, source_light
 from facerf_cli.relighting.portrait_field import PortraitField, SteadyFrame, maps_of
-from facerf_cli.relighting.source_light import SourceLight, source_light
 from facerf_cli.run.logs import step
 from facerf_cli.run.threads import both
 
@@ -80,14 +85,3 @@ def reflectance_of(
     (source, field), views = both(of_face, of_person)
     seen = [(one, maps_with_normals(maps_of(models.networks.portrait, one), one)) for one in views]
     return PortraitField.of(models.face, head, field, source, seen)
-
-
-def explain_by_baseline(models: Models, head: Head, kind: Kind) -> Explained:
-    """Estimate the reflectance and the light of a head's photo by one of the paper's baselines."""
-    if kind == "diffuse-sh":  # relighting by the fields loads none of these
-        from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh as explained
-    elif kind == "specular-sh":
-        from facerf_cli.baselines.specular_sh import explain_by_specular_sh as explained
-    else:
-        from facerf_cli.baselines.prt import explain_by_prt as explained
-    return explained(models, head.fit, head.face)

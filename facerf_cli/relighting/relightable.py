@@ -74,14 +74,6 @@ class RenderRequest:
         return found
 
 
-@dataclass(frozen=True, eq=False)
-class RelitImage:
-    """An image [H, W, 3], scene-linear, not multiplied by alpha [H, W], which images without gaps lack."""
-
-    pixels: np.ndarray
-    alpha: np.ndarray | None = None
-
-
 class Relightable(ABC):
     """A subject that can be relit in a frame."""
 
@@ -146,10 +138,9 @@ class Relightable(ABC):
         """
         return in_strips(self.renderer(request), *self.size_px, empty)
 
-    def image(self, relit: Any, ev: float = 0.0, background: Rows | None = None) -> RelitImage:
-        """The image under one sum of lights."""
-        pixels = self.rendered(RenderRequest(relit, ev=ev, background=background))["rgb"]
-        return RelitImage(pixels, self.alpha(background))
+    def image(self, relit: Any) -> np.ndarray:
+        """The image [H, W, 3] under one sum of lights, not multiplied by alpha."""
+        return self.rendered(RenderRequest(relit))["rgb"]
 
     def alpha(self, background: Rows | None = None) -> np.ndarray | None:
         """The matte where nothing is behind the subject, else None."""

@@ -35,8 +35,8 @@ from facerf_cli.portrait.segment import (
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import balance_of
 from facerf_cli.relighting.models import Models, Sides
+from facerf_cli.relighting.photo_light import light_of_frames, source_light
 from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
-from facerf_cli.relighting.source_light import light_of_frames, source_light
 from facerf_cli.relighting.tracking import Sighting, path_of
 from facerf_cli.relighting.white import Balance
 

@@ -17,7 +17,7 @@ from facerf_cli.face.topology import CONTOUR, RAYS_PER_LANDMARK, silhouette_ids
 from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.light.sh import sh_basis
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.portrait.classes import MORE_LANDMARKS
+from facerf_cli.portrait.parse import MORE_LANDMARKS
 from facerf_cli.raster.camera import project
 from facerf_cli.synth.appearance.materials import Appearance, sample
 from facerf_cli.synth.head.mesh import PARTS

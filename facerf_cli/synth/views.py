@@ -10,7 +10,7 @@ import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor
 
-from facerf_cli.portrait.classes import CLASSES, IRIS_POINTS, class_index
+from facerf_cli.portrait.parse import CLASSES, IRIS_POINTS, class_index
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.synth.appearance.materials import Appearance, sample

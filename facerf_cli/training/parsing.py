@@ -16,7 +16,7 @@ from facerf_cli.face.topology import OUTER_EYE_CORNERS
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled

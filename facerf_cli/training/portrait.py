@@ -15,7 +15,7 @@ from torch import Tensor
 
 from facerf_cli.network.inputs import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.bank.portrait_samples import SMALL, PortraitSample, PortraitSource
 from facerf_cli.training.objective import Objective, Validation, seeded
 from facerf_cli.training.sheets import tiled

@@ -24,8 +24,8 @@ from facerf_cli.image.colour import (
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.person import Person
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
+from facerf_cli.relighting.fitted import FittedPerson
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView
 from facerf_cli.relighting.relightable import Relit
@@ -147,7 +147,7 @@ def _linear(encoded: np.ndarray, white: float) -> np.ndarray:
     return np.asarray(srgb_to_linear(encoded.astype(np.float32) / 255) * np.float32(white))
 
 
-def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
+def basis_of_photo(person: FittedPerson, people: PeopleInPhoto) -> Basis:
     """The basis of a person, the only one of `people`, under the lights over which `relight` integrates maps.
 
     The images of single lights and of their mean, the last, are rendered small; the mean is rendered as large
@@ -157,7 +157,7 @@ def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
     assert photo is not None and isinstance(field, PortraitField)
     small_photo, small_head = shrunk_photo(photo, person.head, RATIO_PX)
     small_field = _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
-    small = PeopleInPhoto([Person(person.models, small_photo, small_head, small_field).in_photo()])
+    small = PeopleInPhoto([FittedPerson(person.models, small_photo, small_head, small_field).in_photo()])
     rig, view = rig_directions(), field.views[0]
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []

@@ -23,8 +23,7 @@ from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import labels
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
-from facerf_cli.light.envmap import ball, resampled
-from facerf_cli.light.forms import rig_to_latlong
+from facerf_cli.light.envmap import ball, resampled, rig_to_latlong
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import brightest_direction, direction_to_azel
 from facerf_cli.light.studio_points import rig_by_text

@@ -23,16 +23,15 @@ from facerf_cli.files.arrays import read_array
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.image.colour import named_space
 from facerf_cli.image.strips import resized
-from facerf_cli.network.files import read_metadata, serving_files
+from facerf_cli.network.files import serving_files
 from facerf_cli.person import find_faces
-from facerf_cli.portrait.confidence import SCALES, confidence_of, face_facts
+from facerf_cli.portrait.confidence import SCALES, confidence_of, face_facts, given_matte_facts
 from facerf_cli.portrait.find import Face, face_with
-from facerf_cli.portrait.given import given_matte_facts
-from facerf_cli.portrait.given_normals import unit_normals
+from facerf_cli.portrait.person import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.heads import head_of
-from facerf_cli.relighting.models import Models, default_geometry, load_models
+from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SteadyFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.run.threads import compute_apart
@@ -118,24 +117,18 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
     if options.colourspace is not None:
         named_space(options.colourspace, options.ocio_config)
     face_model(options)
-    settings, uses = options.settings, {*uses, *networks_of_geometry(options)}
+    settings, models = options.settings, load_models_once(options)
+    if (options.geometry or models.default_geometry) == "network":
+        if options.face_model != BUILTIN:
+            raise UsageError(
+                f"--face-model {options.face_model}: --geometry network regresses heads of the built-in one; "
+                "leave it out, or give --geometry landmarks"
+            )
+        uses = {*uses, "geometry"}
     if not settings.checkpoints_by_default:
         serving_files(settings.checkpoints, uses, "this line")
     if with_networks:
-        load_models_once(options).networks.load(uses)
-
-
-def networks_of_geometry(options: PhotoOptions) -> Collection[str]:
-    """The network that regresses heads, where they are not fitted; UsageError for another face model."""
-    trained = read_metadata(serving_files(options.settings.checkpoints)["reflectance"])
-    if (options.geometry or default_geometry(trained)) == "landmarks":
-        return ()
-    if options.face_model != BUILTIN:
-        raise UsageError(
-            f"--face-model {options.face_model}: --geometry network regresses heads of the built-in one; "
-            "leave it out, or give --geometry landmarks"
-        )
-    return ("geometry",)
+        models.networks.load(uses)
 
 
 @cache

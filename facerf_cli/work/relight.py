@@ -24,8 +24,9 @@ from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
 from facerf_cli.light.envmap import Backdrop
 from facerf_cli.light.light import Light
 from facerf_cli.light.studio_points import intensity_of
-from facerf_cli.person import Group, Person, Target, fit
+from facerf_cli.person import Person, fit
 from facerf_cli.raster.camera import Camera, rays_of_rows
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line, step
@@ -222,7 +223,7 @@ def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
     nearest = fitted[0][0]
     camera = photo_camera(nearest.fit.crop, *photo.shape[:2])
     return Scene(
-        subject=Group([person for _, person in fitted]).composed(target),
+        subject=PeopleInPhoto([person.in_photo(target) for _, person in fitted], target.background),
         setups=plan.setups,
         lights_of=_over_rig(plan),
         metadata=_metadata(item, plan),

@@ -19,9 +19,9 @@ from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import in_strips
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours
+from facerf_cli.portrait.parse import CLASSES, MORE_LANDMARKS
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE
 from facerf_cli.raster.texture import vertex_normals

@@ -13,7 +13,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb, luminance
 from facerf_cli.light.entries import EVEN, OWN, LitImage, lit_images
 from facerf_cli.light.light import Light
-from facerf_cli.person import Target
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.white import Balance
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
@@ -103,7 +103,7 @@ def test_two_people_in_their_own_light_are_the_photo() -> None:
     both = PeopleInPhoto([person.in_photo(Target(matte=side)) for side in (left, 1 - left)])
     dark = Light(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 1, 3), own_rgb=torch.ones(1, 3))
     (relit,) = both.relit([dark, dark])
-    assert np.abs(both.image(relit).pixels - photo).max() < 1e-5
+    assert np.abs(both.image(relit) - photo).max() < 1e-5
 
 
 def test_python_adds_lights_to_it() -> None:

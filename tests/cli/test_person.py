@@ -21,7 +21,7 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import resized
 from facerf_cli.main import main
-from facerf_cli.portrait.classes import CLASSES
+from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.relighting.heads import fit_photo
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.reflectance import reflectance_of

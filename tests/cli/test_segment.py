@@ -13,8 +13,8 @@ from facerf_cli.files.image_metadata import read_header
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display
 from facerf_cli.main import main
-from facerf_cli.portrait.classes import CLASSES
 from facerf_cli.portrait.confidence import SCALES
+from facerf_cli.portrait.parse import CLASSES
 from tests.exr_layers import exr_layers
 from tests.folders import only_row
 from tests.kinds import Folders, Patch, Said

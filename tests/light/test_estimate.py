@@ -6,9 +6,9 @@ import torch
 from scipy.optimize import nnls
 
 from facerf_cli.errors import InputError
+from facerf_cli.light import estimate
 from facerf_cli.light.estimate import (
     LightEvidence,
-    RefineSettings,
     estimate_lamps,
     estimate_signed_weights,
     estimate_smooth_weights,
@@ -220,21 +220,25 @@ def test_the_loss_falls_the_light_comes_nearer_and_the_caller_needs_no_gradients
     assert refined.loss_after < refined.loss_before
 
 
-def test_a_start_that_is_best_or_only_harmed_is_given_back() -> None:
+def test_a_start_that_is_best_or_only_harmed_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
     weights = some_weights()
     evidence = lit(shaded_ball(), weights)
     refined = refine_light(evidence, weights, edges)
     assert torch.equal(refined.weights, weights) and refined.loss_after == refined.loss_before
     start = some_weights() + 0.01
     evidence = lit(shaded_ball(), some_weights())
-    refined = refine_light(evidence, start, edges, settings=RefineSettings(steps=15, learning_rate=1e4))
+    monkeypatch.setattr(estimate, "_STEPS", 15)
+    monkeypatch.setattr(estimate, "_RATE", 1e4)
+    refined = refine_light(evidence, start, edges)
     assert torch.equal(refined.weights, start) and refined.loss_after == refined.loss_before > 0
 
 
-def test_it_ends_when_nothing_is_gained_and_starts_from_no_light() -> None:
+def test_it_ends_when_nothing_is_gained_and_starts_from_no_light(monkeypatch: pytest.MonkeyPatch) -> None:
     evidence = lit(shaded_ball(), some_weights())
-    settings = RefineSettings(steps=500, patience=5, settled=0.9)
-    assert refine_light(evidence, some_weights() + 0.1, edges, settings=settings).steps <= 10
+    with monkeypatch.context() as patch:
+        patch.setattr(estimate, "_PATIENCE", 5)
+        patch.setattr(estimate, "_SETTLED", 0.9)
+        assert refine_light(evidence, some_weights() + 0.1, edges).steps <= 10
     refined = refine_light(evidence, torch.zeros(LIGHTS, 3), edges)
     assert refined.loss_after < refined.loss_before and refined.weights.isfinite().all()
 

@@ -12,8 +12,7 @@ import torch
 from PIL import Image
 
 from facerf_cli.network.stored_graph import OPERATORS, StoredGraph
-from facerf_cli.portrait.find import detect_faces
-from facerf_cli.portrait.mesh import find_meshes
+from facerf_cli.portrait.find import detect_faces, find_meshes
 from facerf_cli.portrait.parse import whole_photo
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 

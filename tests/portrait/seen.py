@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from facerf_cli.network.stored_graph import PeopleNetworks
-from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS, Square, SquareView, class_index
 
 SIDE = 64
 
@@ -27,7 +26,7 @@ def seen_of(square: Square, regions: dict[str, torch.Tensor]) -> SquareView:
     classes = torch.nn.functional.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
     landmarks = square.to_photo(np.random.default_rng(0).uniform(0.3, 0.7, (LANDMARKS, 2)))
     error_px = np.full(LANDMARKS, 0.01 * square.side_px)
-    return SquareView(square, classes.clamp_min(1e-30).log()[None], landmarks, error_px, presence=1.0)
+    return SquareView(square, classes.clamp_min(1e-30).log(), landmarks, error_px, presence=1.0)
 
 
 class _White(torch.nn.Module):

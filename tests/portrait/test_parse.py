@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.portrait.classes import MORE_LANDMARKS, mirrored_landmarks
-from facerf_cli.portrait.parse import LANDMARKS, MIRROR, Square, uncovered
+from facerf_cli.portrait.parse import LANDMARKS, MIRROR, MORE_LANDMARKS, Square, mirrored_landmarks, uncovered
 from tests.portrait.seen import places, seen_of
 
 

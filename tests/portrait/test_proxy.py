@@ -16,7 +16,7 @@ from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.transport import build_scene
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait import proxy as module
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.portrait.proxy import Proxy, Shadows, own_shading, proxy_maps, proxy_of, square_camera
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import front_facing, rasterize

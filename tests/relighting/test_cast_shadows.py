@@ -12,9 +12,9 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light, stacked
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import KeyLight, far_samples
-from facerf_cli.person import Target
 from facerf_cli.portrait.proxy import OFF_M, Proxy, ProxyMaps
 from facerf_cli.relighting.cast_shadows import CastShadow, change, visibility
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from tests import astronaut
 

@@ -22,7 +22,7 @@ from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwra
 from facerf_cli.relighting.detail import FaceDetail
 from facerf_cli.relighting.face_alone import FaceAlone, FaceInPhoto
 from facerf_cli.relighting.people_in_photo import Background, PeopleInPhoto
-from facerf_cli.relighting.relightable import Relit, RelitImage
+from facerf_cli.relighting.relightable import Relit, RenderRequest
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)
@@ -104,7 +104,7 @@ def compose(
     crop: Crop = CROP,
 ) -> np.ndarray:
     """The photo with the scene's face relit."""
-    return PeopleInPhoto([in_photo(photo, source, seen, matte, crop)]).image([Relit(relit)]).pixels
+    return PeopleInPhoto([in_photo(photo, source, seen, matte, crop)]).image([Relit(relit)])
 
 
 def detailed(face: FaceTexture, screen: FaceView, photo: np.ndarray, texture: Tensor) -> np.ndarray:
@@ -159,10 +159,13 @@ HALF = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)  # whose right part is the pe
 HALF[:, 200:] = 1
 
 
-def in_half(background: Background, ev: float, behind: np.ndarray | None = None) -> RelitImage:
-    """The image with its right half cut out as the person."""
-    lit = [Relit(scene().lit(OTHER))]
-    return PeopleInPhoto([in_photo(*unwrapped(), HALF)], background).image(lit, ev, behind)
+def in_half(
+    background: Background, ev: float, behind: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """The image with its right half cut out as the person, and its alpha."""
+    people = PeopleInPhoto([in_photo(*unwrapped(), HALF)], background)
+    request = RenderRequest([Relit(scene().lit(OTHER))], ev=ev, background=behind)
+    return people.rendered(request)["rgb"], people.alpha(behind)
 
 
 def test_what_is_not_the_face_stays_the_photo_and_a_matte_says_what_may_change() -> None:
@@ -174,18 +177,18 @@ def test_what_is_not_the_face_stays_the_photo_and_a_matte_says_what_may_change()
     lit = people.light_layer([Relit(scene().lit(OTHER))])
     assert (face > 0.99).any() and abs(lit - of_face * photo)[face > 0.99].mean() > 0.1
     for ev in (0.0, 2.0):
-        image = in_half("photo", ev)
-        assert image.alpha is None
-        np.testing.assert_allclose(image.pixels, lit + rest * photo * 2**-ev, atol=1e-5)
-        np.testing.assert_allclose((image.pixels * 2**ev)[face == 0], photo[face == 0], rtol=1e-6)
-    nothing = in_half("none", 0.0)
-    assert nothing.alpha is not None
-    np.testing.assert_array_equal(nothing.alpha, face)
-    np.testing.assert_allclose(nothing.pixels * of_face, lit, atol=1e-5)
+        image, alpha = in_half("photo", ev)
+        assert alpha is None
+        np.testing.assert_allclose(image, lit + rest * photo * 2**-ev, atol=1e-5)
+        np.testing.assert_allclose((image * 2**ev)[face == 0], photo[face == 0], rtol=1e-6)
+    nothing, alpha = in_half("none", 0.0)
+    assert alpha is not None
+    np.testing.assert_array_equal(alpha, face)
+    np.testing.assert_allclose(nothing * of_face, lit, atol=1e-5)
     behind = np.full((HEIGHT_PX, WIDTH_PX, 3), 0.3, np.float32)
-    given = in_half("given", 3.0, behind)
-    assert given.alpha is None
-    np.testing.assert_allclose(given.pixels, lit + rest * behind, atol=1e-5)
+    given, alpha = in_half("given", 3.0, behind)
+    assert alpha is None
+    np.testing.assert_allclose(given, lit + rest * behind, atol=1e-5)
 
 
 def flat_face(source: Tensor) -> tuple[FaceTexture, FaceView, np.ndarray]:

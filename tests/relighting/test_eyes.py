@@ -16,10 +16,9 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.light.studio_points import far_samples
-from facerf_cli.portrait.mesh import SeenEyes
+from facerf_cli.portrait.find import SeenEyes
 from facerf_cli.relighting import detail as module
-from facerf_cli.relighting.eyes import Eyes, mirrored_in_cornea
-from facerf_cli.relighting.iris import blur_px, opening, outlined
+from facerf_cli.relighting.eyes import Eyes, blur_px, mirrored_in_cornea, opening, outlined
 from tests import astronaut
 
 SIDE, IRIS = 40, np.array([[20.0, 18.0, 10.0]])
@@ -194,7 +193,7 @@ def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest
     lights = torch.stack([azel_to_direction(*light) for light in ((0.0, 0.0), (0.0, 55.0), (-70.0, 0.0))])
 
     def shown(lights: Light) -> list[np.ndarray]:
-        return [people.image(relit).pixels[teeth] for relit in people.relit(lights)]
+        return [people.image(relit)[teeth] for relit in people.relit(lights)]
 
     each, (both,) = shown(Light.each(lights)), shown(Light(lights, torch.ones(1, 3, 3)))
     np.testing.assert_allclose(both, sum(each), rtol=1e-3)

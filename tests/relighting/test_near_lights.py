@@ -15,9 +15,10 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import PointLights, far_samples
-from facerf_cli.person import Person, Target
+from facerf_cli.person import Person
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.relighting.field import far_lights_of, near_texture
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.reflectance import reflectance_of

@@ -30,6 +30,16 @@ SIZE = (4, 6)
 POINTS = np.arange(136.0).reshape(68, 2)
 
 
+class Grey(float):
+    """A light, by the grey of a person under it."""
+
+    own = None
+
+
+def greys(*values: float) -> list[Any]:
+    return [Grey(value) for value in values]
+
+
 @dataclass
 class Plain:
     """A person of one grey, who covers some columns by a share, before a background of 0.5.
@@ -77,21 +87,21 @@ def group(background: Any = "photo") -> Any:
 
 def test_each_person_is_relit_over_the_photo_and_alpha_and_layers_hold_all() -> None:
     people = group()
-    image = people.rendered(RenderRequest([2.0, 8.0], ev=1.0))
+    image = people.rendered(RenderRequest(greys(2, 8), ev=1.0))
     assert set(image) == {"rgb"} and people.alpha() is None
     np.testing.assert_allclose(image["rgb"][0, :, 0], [2, 2, 0.25, 0.5 * 8 + 0.125, 0.5 * 8 + 0.125, 0.25])
     people = group("none")
-    pixels, alpha = people.rendered(RenderRequest([2.0, 8.0]))["rgb"], people.alpha()
+    pixels, alpha = people.rendered(RenderRequest(greys(2, 8)))["rgb"], people.alpha()
     np.testing.assert_allclose(alpha[0], [1, 1, 0, 0.5, 0.5, 0])
     np.testing.assert_allclose((pixels * alpha[..., None])[0, :, 0], [2, 2, 0, 4, 4, 0])
     assert pixels[0, 3, 0] == 8  # not premultiplied
     people = group()
-    one, other, both = (people.light_layer(lit) for lit in ([1.0, 3.0], [1.0, 5.0], [2.0, 8.0]))
+    one, other, both = (people.light_layer(lit) for lit in (greys(1, 3), greys(1, 5), greys(2, 8)))
     np.testing.assert_allclose(one + other, both)
     # Shares and colours add up, before others and the background; no depth lies between two people.
     far, near, faint = Plain(slice(0, 4), 1.0), Plain(slice(3, 5), 0.6), Plain(slice(1, 2), 0.4)
     people = PeopleInPhoto([far, near, faint])  # type: ignore[list-item]
-    layers = people.rendered(RenderRequest([2.0, 8.0, 4.0], layers=["all"]))
+    layers = people.rendered(RenderRequest(greys(2, 8, 4), layers=["all"]))
     for shares in (people.matte, layers["class.skin"]):
         np.testing.assert_allclose(shares[0], [1, 1, 1, 1, 0.6, 0])
     np.testing.assert_allclose(layers["depth"][0, :, 0], [2, 2, 2, 8, 8, 0])
@@ -166,7 +176,7 @@ def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
             return super().render(window, *given)
 
     people = PeopleInPhoto([Plain(slice(0, 2), 1.0), Below(slice(1, 4), 0.5)])  # type: ignore[list-item]
-    render = people.renderer(RenderRequest((0.2, 0.8), {"key": (0.2, 0.8)}))
+    render = people.renderer(RenderRequest(greys(0.2, 0.8), {"key": greys(0.2, 0.8)}))
     rows = [render(slice(row, row + 1)) for row in range(SIZE[0])]
     assert drawn == [2, 3]
     for name in ("rgb", "key"):

@@ -19,17 +19,18 @@ from facerf_cli.image.strips import Window, strips
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.person import Person, Target, fit
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.person import Person, fit
 from facerf_cli.portrait.find import find_faces
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SEEN_PX, wider_square
 from facerf_cli.relighting.enlarged import Enlarged
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.photo_light import source_light
 from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView, maps_of
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
-from facerf_cli.relighting.source_light import source_light
 from tests import astronaut
 
 NAMES = ("albedo", "specular", "normal", "position", "depth", "shadow")
@@ -61,10 +62,7 @@ class Seen:
 
     given: PortraitInputs
 
-    def visibility(self, rig: Tensor) -> Tensor:
-        return rig
-
-    def inputs(self, rig: Tensor, visible: Tensor) -> PortraitInputs:
+    def inputs(self, rig: Tensor) -> PortraitInputs:
         return self.given
 
 
@@ -80,7 +78,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
     models, head = person.models, person.head
-    image = person.image(source_light(models, head.face).light).pixels
+    image = person.image(source_light(models, head.face).light)
     inside = field.person.segmentation.matte > 0.9
     error = ((image - photo)[inside] ** 2).mean()
     assert 10 * np.log10(1 / error) > 30  # the maps are coarse, and grain is of a photo without light
@@ -90,7 +88,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     shown = copy(person.in_photo())
     height, width = shown.size_px
     half = np.tile(np.arange(width) < width // 2, (height, 1))
-    shown._bare_face = half  # type: ignore[assignment]
+    shown._covered = (~half)[None].astype(np.float32)
     share = shown._face_share(shown.view.window)
     np.testing.assert_array_equal(share, shown.view.mask.numpy() * half[shown.view.window])
 
@@ -98,11 +96,8 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
 def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarray) -> None:
     grey = np.repeat(photo.mean(2, keepdims=True), 3, 2)
     face = find_faces(SHIPPED_NETWORKS.people, grey, "grey")[0]
-    image = (
-        fit(models, grey, face=face, texture_side=64, white=None)
-        .image(lamp(60), Target(background="none"))
-        .pixels
-    )
+    person = fit(models, grey, face=face, texture_side=64, white=None)
+    image = person.image(lamp(60), Target(background="none"))
     np.testing.assert_allclose(image, np.repeat(image[..., 1:2], 3, 2), atol=1e-5)
 
 
@@ -110,7 +105,7 @@ def test_a_grey_photo_stays_grey_in_white_light(models: Models, photo: np.ndarra
 def test_dark_cloth_lies_in_no_haze(field: PortraitField, name: str, may_be_more: bool) -> None:
     """Of cloth the photo shows at least half of the albedo."""
     rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     classes = torch.zeros_like(inputs.classes)
     classes[:, class_index(name)] = 1
     maps = maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(replace(inputs, classes=classes))))
@@ -128,7 +123,7 @@ def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: Portrai
     torch.testing.assert_close(found, shown, atol=0.05, rtol=0)
     # The few values that a dark neck has are saturated; with gain and bias it would glow.
     rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     image, classes = inputs.image.clone(), inputs.classes.clone()
     neck = slice(3 * image.shape[-1] // 4, None)
     image[:, :, neck] = torch.tensor([0.004, 0.001, 0.0])[:, None, None]
@@ -140,7 +135,7 @@ def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: Portrai
     found = maps.bias[0, :, neck].mean((1, 2))
     torch.testing.assert_close(found / found.mean(), skin / skin.mean(), atol=0.15, rtol=0)
     # A dark, saturated neck beside a lit chin becomes no orange neck under a light from below.
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     neck = inputs.classes[:, [class_index("neck")]]
     cast_on_neck = torch.tensor([0.15, 0.06, 0.03])[:, None, None] * neck + 1 - neck
     maps = maps_of(
@@ -155,7 +150,7 @@ def test_the_bias_and_a_nearly_black_neck_have_the_photos_colours(field: Portrai
 def test_a_coloured_shade_leaves_the_albedo_and_the_photo_its_colour(field: PortraitField) -> None:
     """The albedo is the photo, with the shade's colour, times the gain, plus the bias."""
     rig, person = rig_directions(48), field.person
-    inputs = person.inputs(rig, person.visibility(rig))
+    inputs = person.inputs(rig)
     side = inputs.image.shape[-1]
     cast_in_shade = torch.ones(3, 1, side)
     cast_in_shade[..., : side // 2] = torch.tensor([0.2, 0.1, 0.4])[:, None, None]
@@ -185,7 +180,7 @@ def halves_of(side: int) -> tuple[slice, slice]:
 
 def test_left_and_right_are_treated_alike_and_without_light_all_is_black(field: PortraitField) -> None:
     rig = rig_directions(48)
-    given = field.person.inputs(rig, field.person.visibility(rig))
+    given = field.person.inputs(rig)
     seen, in_mirror = (
         maps_of(SHIPPED_NETWORKS.portrait, cast(Any, Seen(inputs))) for inputs in (given, given.mirrored())
     )
@@ -208,7 +203,7 @@ def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
 ) -> None:
     """Hair, neck and garment, too: halves of the person beside the head's middle."""
     target = Target(background="none")
-    right, left = (person.image(lamp(azimuth), target).pixels.mean(-1) for azimuth in (75, -75))
+    right, left = (person.image(lamp(azimuth), target).mean(-1) for azimuth in (75, -75))
     matte = field.person.segmentation.matte > 0.5
     columns = np.arange(photo.shape[1])
     middle = field.person.square.x0_px + field.person.square.side_px / 2
@@ -218,7 +213,7 @@ def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
         on_left = region & (columns < middle - 15)
         assert right[on_right].mean() > 1.3 * left[on_right].mean()
         assert left[on_left].mean() > 1.3 * right[on_left].mean()
-    behind, ahead = (person.image(lamp(azimuth, 10), target).pixels for azimuth in (180, 0))
+    behind, ahead = (person.image(lamp(azimuth, 10), target) for azimuth in (180, 0))
     skin = field.person.segmentation.layer("skin")[:] > 0.9
     assert behind[skin].mean() < 0.15 * ahead[skin].mean()
 
@@ -231,7 +226,7 @@ def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: Person
     relit = list(people.relit(Light(directions, weights)))
     ahead, behind = relit[0][0].texture, relit[2][0].texture
     assert behind.abs().max() < 1e-4 * ahead.max()
-    *each, together = (people.image(one).pixels for one in relit)
+    *each, together = (people.image(one) for one in relit)
     np.testing.assert_allclose(sum(each), together, atol=1e-4 * together.max())
     assert min(one.min() for one in each) > -1e-12  # rounding
 

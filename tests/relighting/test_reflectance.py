@@ -12,11 +12,12 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.light.estimate import estimate_signed_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
-from facerf_cli.person import Person, Target
+from facerf_cli.person import Person
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
+from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.heads import fit_photo
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import Estimator, estimate_light
@@ -88,7 +89,7 @@ def test_two_lights_apart_add_up_to_both_at_once(kind: Kind) -> None:
 
     def image(weights: torch.Tensor) -> np.ndarray:
         light = RigLight(directions, weights)
-        return person.image(light, Target(background="none")).pixels
+        return person.image(light, Target(background="none"))
 
     first = image(rgb * torch.tensor([[1.0], [0.0]]))
     second = image(rgb * torch.tensor([[0.0], [1.0]]))
@@ -105,9 +106,9 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     targets = [Target(fit, "face") for fit in (straight, turned)]
     person = Person(models, None, head, reflectance_of(models, head))
     images = [person.image(light, target) for target in targets]
-    for image in images:
-        assert image.alpha is not None and image.pixels.shape == (256, 256, 3)
-        assert (image.pixels[image.alpha == 0] == 0).mean() > 0.5
+    for image, target in zip(images, targets, strict=True):
+        assert image.shape == (256, 256, 3)
+        assert (image[person.composed(target).matte == 0] == 0).mean() > 0.5
     # the point nearest to the camera
     noses = [
         FaceAlone(models.face, head, fit=target.fit).view.surface(slice(0, 256))[..., 5] for target in targets

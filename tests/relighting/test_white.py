@@ -1,4 +1,4 @@
-"""The white of relit skin and cloth: the photo's, or that of skin."""
+"""White, shade and glare of relit skin and cloth: the colours of the photo, or those of skin."""
 
 from dataclasses import replace
 
@@ -10,13 +10,13 @@ from facerf_cli.face.head import Head
 from facerf_cli.face.topology import region_mask
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.skin import skin_albedo
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.photo_light import estimate_light
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.reflectance import reflectance_of
-from facerf_cli.relighting.white import SURE, Balance
+from facerf_cli.relighting.white import SURE, Balance, without_baked_in, without_colour_of_shade
 from tests import astronaut
 
 SIZE = (24, 30)
@@ -157,3 +157,87 @@ def test_the_light_of_a_balanced_photo_is_white_and_that_of_a_party_is_not() -> 
     assert ((white / white[1]).log().abs() < 0.1).all()
     orange = estimate_light(models, in_orange(), white="scene").light.weights.sum(0)
     assert orange[0] > 1.7 * orange[1] and orange[2] < 0.5 * orange[1]
+
+
+SKIN, PURPLE = torch.tensor([0.6, 0.35, 0.25]), torch.tensor([0.8, 0.7, 1.8])
+
+
+def half_in_shade(shade: float, cast: torch.Tensor) -> torch.Tensor:
+    """Skin [3, 64, 64] whose left half is in a shade of another colour."""
+    image = SKIN[:, None, None].expand(3, 64, 64).clone()
+    image[:, :, :32] *= shade * cast[:, None, None]
+    return image
+
+
+def chroma(image: torch.Tensor) -> torch.Tensor:
+    return image / image.mean(0)
+
+
+def test_shaded_skin_gets_the_colour_of_lit_skin_and_nothing_else_changes() -> None:
+    image = half_in_shade(0.2, PURPLE)
+    even = image * without_colour_of_shade(image, torch.ones(64, 64))
+    # the lit skin's mean holds a little of the shade's colour, by its brightness
+    torch.testing.assert_close(chroma(even)[:, :, :24], chroma(image)[:, :, 40:], rtol=0.12, atol=0)
+    assert (chroma(image)[2, 32, 10] / chroma(image)[2, 32, 50]) > 1.7
+    torch.testing.assert_close(even[:, :, :24].mean(0), image[:, :, :24].mean(0), rtol=0.05, atol=0)
+    assert torch.equal(even[:, :, 48:], image[:, :, 48:])
+    whole, none = torch.ones(64, 64), torch.zeros(64, 64)
+    for image, skin in (
+        (half_in_shade(1.3, PURPLE), whole),  # a bright lamp
+        (half_in_shade(0.2, PURPLE), none),
+        (half_in_shade(0.2, torch.ones(3)).mean(0).expand(3, -1, -1), whole),
+    ):
+        torch.testing.assert_close(without_colour_of_shade(image, skin), torch.ones_like(image))
+    image, skin = half_in_shade(0.2, PURPLE), torch.ones(64, 64)
+    factor = without_colour_of_shade(image, skin)
+    torch.testing.assert_close(without_colour_of_shade(100 * image, skin), factor)
+    assert without_colour_of_shade(0 * image, skin).isfinite().all()
+
+
+SIDE = 224
+SKIN_RGB = torch.tensor([0.5, 0.3, 0.22])
+WHOLE, SPOT = torch.ones(SIDE, SIDE), (slice(100, 116), slice(100, 116))
+
+
+def plain() -> Tensor:
+    """Skin [3, S, S] with freckles a pixel wide."""
+    image = SKIN_RGB[:, None, None].expand(3, SIDE, SIDE).clone()
+    image[:, 3::8, 3::8] *= 0.7
+    return image
+
+
+def test_what_the_key_does_not_reach_becomes_as_the_skin_around_and_keeps_its_freckles() -> None:
+    albedo, key = plain(), WHOLE.clone()
+    key[SPOT] = 0
+    albedo[:, *SPOT] *= torch.tensor([0.8, 0.6, 0.5])[:, None, None]
+    found = albedo * without_baked_in(albedo, plain() * key.clamp_min(0.05), WHOLE, key, 1.0)
+    middle = found[:, 104:112, 104:112]  # of which no pixel is near the border
+    wanted = plain()[:, 104:112, 104:112].mean((1, 2))
+    torch.testing.assert_close(middle.mean((1, 2)), wanted, rtol=0.03, atol=0)
+    assert (found[:, 107, 107] / found[:, 111, 111] < 0.8).all()  # a freckle
+    assert torch.equal(found[:, :, :64], albedo[:, :, :64])
+
+
+def test_what_is_brighter_and_whiter_than_the_skin_around_is_glare() -> None:
+    albedo, photo = plain(), plain()
+    photo[:, *SPOT] += 0.15
+    albedo[:, *SPOT] += 0.05
+    found = albedo * without_baked_in(albedo, photo, WHOLE, WHOLE, 1.0)
+    torch.testing.assert_close(found[:, 109, 109], SKIN_RGB, rtol=0.08, atol=0)
+
+
+def test_bright_skin_of_its_colour_grey_photos_and_what_is_no_skin_stay_and_all_in_soft_light() -> None:
+    one = torch.ones(3, SIDE, SIDE)
+    lit, white = plain(), plain()
+    lit[:, *SPOT] *= 1.6
+    white[:, *SPOT] += 0.15
+    grey = white.mean(0).expand(3, -1, -1)
+    part, unlit = WHOLE.clone(), WHOLE.clone()
+    part[SPOT], unlit[SPOT] = 0.5, 0
+    for photo, skin, key, share in (
+        (lit, WHOLE, WHOLE, 1.0),
+        (grey, WHOLE, WHOLE, 1.0),
+        (white, part, unlit, 1.0),
+        (white, WHOLE, WHOLE, 0.4),
+    ):
+        torch.testing.assert_close(without_baked_in(photo, photo, skin, key, share), one, rtol=0, atol=1e-4)

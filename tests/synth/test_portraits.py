@@ -10,7 +10,7 @@ from facerf_cli.face.topology import GRID
 from facerf_cli.light.mesh_transport import bake_mesh
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
+from facerf_cli.portrait.parse import MORE_LANDMARKS, class_index
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance

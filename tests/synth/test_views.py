@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.head.shell import shell_head

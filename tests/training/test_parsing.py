@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from facerf_cli.network.parsing import Parsing, ParsingNetwork
-from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS, class_index
 from facerf_cli.synth.bank.parsing import PortraitCrops, StoredPortraits
 from facerf_cli.training.parsing import ParsingObjective
 from tests.training.toy_parsing import SETTINGS, SIDE, TINY, Portraits, truth

@@ -5,8 +5,7 @@ from typing import Any
 import torch
 
 from facerf_cli.network.parsing import ParsingSettings
-from facerf_cli.portrait.classes import CLASSES, class_index
-from facerf_cli.portrait.parse import LANDMARKS
+from facerf_cli.portrait.parse import CLASSES, LANDMARKS, class_index
 from facerf_cli.synth.bank.parsing import PortraitCrops
 from facerf_cli.training.parsing import ParsingObjectiveSettings
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.bank.portrait_samples import PortraitSample
 from facerf_cli.training.portrait import PortraitObjectiveSettings
 

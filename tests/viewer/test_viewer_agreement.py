@@ -38,6 +38,7 @@ from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.relighting.reflectance import reflectance_of
+from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import lights_over_rig, with_room
@@ -71,7 +72,7 @@ class Shown:
         added = None
         if relit[0].own is not None:
             added = gain * self.whole.light_layer([replace(relit[0], own=None)])
-        exposed = gain * self.whole.image(relit, ev).pixels
+        exposed = gain * self.whole.rendered(RenderRequest(relit, ev=ev))["rgb"]
         return np.round(255 * encode_display(exposed, SOFT_VIEW, self.whole.matte, added))
 
     def errors(self, found: np.ndarray, relit: Any, ev: float) -> np.ndarray:
@@ -209,7 +210,7 @@ def test_the_command_makes_the_same_image(
 
 
 def test_the_photo_s_own_light_alone_gives_the_photo(images: dict[str, Drawn]) -> None:
-    photo = 255 * linear_to_srgb(shown().whole.image(next(shown().whole.relit(OWN_LIGHT))).pixels)
+    photo = 255 * linear_to_srgb(shown().whole.image(next(shown().whole.relit(OWN_LIGHT))))
     matte, kept = shown().whole.matte, photo_in(shown().text)
     assert np.abs(kept - photo).mean() < 1.5  # a JPEG of a grainy film
     for address in (OWN, DIMMED):

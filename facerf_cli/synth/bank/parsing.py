@@ -24,8 +24,7 @@ from torch import Tensor
 
 from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.network.inputs import Batch
-from facerf_cli.portrait.classes import class_index
-from facerf_cli.portrait.parse import MIRROR
+from facerf_cli.portrait.parse import MIRROR, class_index
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import texel_centres_uv
 from facerf_cli.synth.bank import files_in, split_people

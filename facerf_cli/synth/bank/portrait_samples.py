@@ -20,7 +20,7 @@ from facerf_cli.network.inputs import MEAN_RADIANCE, Batch
 from facerf_cli.network.portrait import SKIN, PortraitInputs, mirrored_x, reached_by
 from facerf_cli.portrait.person import SIDES
 from facerf_cli.portrait.proxy import own_shading
-from facerf_cli.relighting.shade import even_shade_of
+from facerf_cli.relighting.white import even_shade_of
 from facerf_cli.synth.bank import files_in, split_people
 from facerf_cli.synth.bank.face_crops import gaussian_blurred, turned
 from facerf_cli.synth.bank.portraits import Lamp, background_of, draw_photo_light

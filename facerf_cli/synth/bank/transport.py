@@ -287,6 +287,6 @@ def layers_of(person: SeenPerson, directions: Tensor) -> dict[str, Tensor]:
         "covered": (255 * covered[0]).byte(),
         "normals": normals[0].half().contiguous(),
         "depth": depth[0].half(),
-        "visible": (255 * person.visibility(directions)).round().byte(),
+        "visible": (255 * person.shadows.along(directions)).round().byte(),
         "sides": torch.tensor(person.sides),
     }

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.head.mesh import HeadMesh, smooth_normals, smoothstep, unit
 from facerf_cli.synth.random_fields import Random
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import LANDMARK_UV, cylinder_uv
 from facerf_cli.light.transport import build_scene, hits_within
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.head.arms import bend_arms
 from facerf_cli.synth.head.mesh import (
     GARMENTS,

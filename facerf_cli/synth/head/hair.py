@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 from facerf_cli.face.topology import LANDMARK_UV
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.appearance.facial_hair import beard_density
 from facerf_cli.synth.head.hair_styles import ROWS, HairStyle, draw_style, scalp_margin_m, tail_paths, tied
 from facerf_cli.synth.head.mesh import (

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from scipy.sparse import coo_matrix, csr_matrix
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, LANDMARK_UV, TOP_M, inside_mm
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.synth.random_fields import Random
 

@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from facerf_cli.face.topology import BOTTOM_M, HALF_ANGLE_DEG, TOP_M, UV_SIZE_MM, landmark_weights
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth import tables_of
 from facerf_cli.synth.head import mouth
 from facerf_cli.synth.head.cranium import Surroundings, average_head_mm, face_surface

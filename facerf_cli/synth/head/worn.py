@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.head.hair_styles import HairStyle
 from facerf_cli.synth.head.mesh import (
     HULL_RADIUS_M,

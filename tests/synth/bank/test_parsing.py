@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.portrait.classes import MORE_LANDMARKS, class_index
+from facerf_cli.portrait.parse import MORE_LANDMARKS, class_index
 from facerf_cli.synth.bank import parsing
 from facerf_cli.synth.bank.parsing import FeatureWarp, PortraitCrops, StoredPortraits
 from tests.kinds import Folders, Patch

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.portrait.classes import CLASSES, MORE_LANDMARKS, class_index
+from facerf_cli.portrait.parse import CLASSES, MORE_LANDMARKS, class_index
 from facerf_cli.synth import bank
 from facerf_cli.synth.bank import portraits
 from facerf_cli.synth.bank.portraits import PortraitBankSettings, add_portraits, photos_of

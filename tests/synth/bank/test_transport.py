@@ -19,8 +19,7 @@ from facerf_cli.network.inputs import MEAN_RADIANCE
 from facerf_cli.network.portrait import SKIN
 from facerf_cli.portrait.person import SIDES
 from facerf_cli.raster.camera import project
-from facerf_cli.relighting.shade import without_colour_of_shade
-from facerf_cli.relighting.white import BARE
+from facerf_cli.relighting.white import BARE, without_colour_of_shade
 from facerf_cli.synth import bank
 from facerf_cli.synth.bank import Files, portrait_samples, transport
 from facerf_cli.synth.bank.portrait_samples import (

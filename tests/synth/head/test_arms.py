@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.head import arms
 from facerf_cli.synth.head.arms import bend_arms
 from facerf_cli.synth.head.body import draw_body

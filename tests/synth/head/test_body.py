@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.raster.camera import Camera
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.synth.head import body, worn

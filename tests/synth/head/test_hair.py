@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from facerf_cli.face.topology import LANDMARKS_M, cylinder_uv
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.head.hair import MAX_VERTICES, draw_hair, grow_beard, grow_hair, grow_lashes
 from facerf_cli.synth.head.hair_styles import (
     ROWS,

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 
 from facerf_cli.face.topology import LANDMARKS_M
-from facerf_cli.portrait.classes import CLASSES, class_index
+from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh, loop_step, part_class, skin_classes
 
 

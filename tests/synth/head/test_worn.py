@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.portrait.classes import class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.bank.heads import mean_coefficients
 from facerf_cli.synth.head import glasses, worn
 from facerf_cli.synth.head.body import chin_height_m, draw_body

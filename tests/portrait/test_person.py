@@ -17,7 +17,7 @@ from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.main import main
 from facerf_cli.person import Person, fit
-from facerf_cli.portrait.given_normals import unit_normals
+from facerf_cli.portrait.person import unit_normals
 from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.portrait_field import PortraitField
 from facerf_cli.work.photos import read_normals

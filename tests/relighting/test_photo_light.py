@@ -13,8 +13,7 @@ from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk
 from facerf_cli.relighting.heads import fit_photo
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.photo_light import estimate_light
-from facerf_cli.relighting.source_light import light_of_frames, over_rig, source_light
+from facerf_cli.relighting.photo_light import estimate_light, light_of_frames, over_rig, source_light
 from tests import astronaut
 
 AROUND = RigLight(rig_directions(48), torch.full((48, 3), 4 / 48))
@@ -32,7 +31,7 @@ def models() -> Models:
 def face() -> FaceTexture:
     """The face as the Parsing Network's landmarks fit it; there the field explains its own images best."""
     photo, around = to_display(astronaut.photo()), Square.around(astronaut.face().landmarks_px, 1.7)
-    view = look(astronaut.models().networks.parsing, photo, [around], mirrored=True)[0]
+    view = look(astronaut.models().networks.parsing, photo, [around])[0]
     head = fit_photo(astronaut.models(), astronaut.photo(), view.landmarks_px[:68])
     small = shrunk(head.face)
     return replace(small, visible=torch.ones_like(small.visible))
