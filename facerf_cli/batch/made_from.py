@@ -51,7 +51,6 @@ _OPTIONS = {
     "ocio_config": "--ocio",
     "path": "the image of --background",
     "pattern": "the pattern of the capture",
-    "photo_of_stack": "--photo",
     "results": "facerf's version of results",
     "rig": "--lights",
     "sampling": "--envmap-sampling",
