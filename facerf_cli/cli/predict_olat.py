@@ -15,7 +15,7 @@ class PredictStacks(PredictOlat):
 
     def write(self, item: Item) -> Written:
         """Write the stack of every chosen face."""
-        from facerf_cli.work.stacks import write_stacks
+        from facerf_cli.work.predict_olat import write_stacks
 
         return write_stacks(item, self)
 

@@ -27,7 +27,6 @@ from facerf_cli.light.entries import (
     lit_images,
     named_entry,
     numbers,
-    preset_names,
     sweep,
 )
 from facerf_cli.option import LIGHT, option
@@ -190,8 +189,14 @@ def collect_setups(
     ]
     images = lit_images(sources.light or (), together)
     if images and images[-1].is_shared:
-        names = [setup.name for setup in setups] + [image.name for image in images[:-1]]
-        _say_apart([*dict.fromkeys(names)], images[-1].name)
+        names = dict.fromkeys([setup.name for setup in setups] + [image.name for image in images[:-1]])
+        if names:
+            log.warning(
+                "%s: not in the image of the lights that have names (%s); to add a light there, name it: "
+                "fill=40,20, fill=rembrandt or --envmap sky=MAP",
+                ", ".join(names),
+                images[-1].name,
+            )
     for image in images:
         for number, shining in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
@@ -204,21 +209,6 @@ def collect_setups(
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two images would be named {min(twice)}; give each light once")
     return tuple(setups)
-
-
-def _say_apart(names: Sequence[str], shared: str) -> None:
-    """Log in a line that maps and lights without names, of images `names`, are not in the shared image."""
-    if names:
-        preset = next((name for name in names if name in preset_names()), None)
-        log.warning(
-            "%s%s: an image each, since only lights with names share one (%s); to add it there give it a "
-            "name, as in %s or --envmap sky=MAP%s",
-            names[0],
-            f" and {len(names) - 1} more" if len(names) > 1 else "",
-            shared,
-            f"a={preset}" if preset else "fill=40,20, fill=rembrandt",
-            f" ({preset} alone is the preset, {preset}=AZ,EL a light of that name)" if preset else "",
-        )
 
 
 def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightSetup:

@@ -112,7 +112,7 @@ def test_the_light_of_another_photo_is_that_of_the_two_commands(
     )
     assert one.max() > 0 and (one == two).all()
     assert main([*relit, str(tmp_path / "no"), "--light-from", str(tmp_path / "none.jpg")]) == 1
-    assert "none.jpg: no such file" in capsys.readouterr().err
+    assert "none.jpg: cannot be read (No such file or directory)" in capsys.readouterr().err
 
 
 def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(
