@@ -155,11 +155,11 @@ def relight(
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
     refuse_read([film.path] if film else images, files_read((items, plan, sources), items))
+    for photo in () if batch.dry_run else plan.photos:  # before keys of outputs, which hold the maps' content
+        photo.estimate()
     recipes = film.recipes_of_new(items, taken, images, plan.recipes_of, batch) if film else []
     if film is not None and not recipes:
         return
-    for photo in () if batch.dry_run else plan.photos:
-        photo.estimate()
     code = run_items(RelightJob(plan), items, batch, plan.photo.settings)
     if film is not None:
         code = film.joined(items, images, taken, recipes, code)

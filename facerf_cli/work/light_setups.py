@@ -188,15 +188,14 @@ def collect_setups(
         for name, envmap in named
     ]
     images = lit_images(sources.light or (), together)
-    if images and images[-1].is_shared:
-        names = dict.fromkeys([setup.name for setup in setups] + [image.name for image in images[:-1]])
-        if names:
-            log.warning(
-                "%s: not in the image of the lights that have names (%s); to add a light there, name it: "
-                "fill=40,20, fill=rembrandt or --envmap sky=MAP",
-                ", ".join(names),
-                images[-1].name,
-            )
+    apart = dict.fromkeys([one.name for one in setups] + [image.name for image in images[:-1]])
+    if apart and images and images[-1].is_shared:
+        log.warning(
+            "%s: not in the image of the lights that have names (%s); to add a light there, name it: "
+            "fill=40,20, fill=rembrandt or --envmap sky=MAP",
+            ", ".join(apart),
+            images[-1].name,
+        )
     for image in images:
         for number, shining in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
