@@ -25,7 +25,8 @@ from facerf_cli.batch.settings import Settings, device_name, torch_device
 from facerf_cli.cli.brief import Verb, Verbs
 from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
-from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.errors import FacerfError, InputError, UsageError
+from facerf_cli.files.texts import read_toml
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals, leave
@@ -60,7 +61,6 @@ _LINES = {
     },
 }
 VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}
-_FILES = {"doctor": "installation"}  # of commands whose file has another name
 
 # The networks that verbs use; with some options they use fewer.
 _GEOMETRY = frozenset({"geometry"})  # of --geometry network
@@ -84,6 +84,14 @@ VALUED = frozenset({"--device", "--checkpoint", "--memory", "--seed", "--config"
 # Options that take every following file of these kinds, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
+# Options of earlier versions, and what replaces them.
+_REMOVED = {
+    "--ball": "`facerf estimate-light` and `facerf envmap` draw balls",
+    "--exposure-group": "pass one --exposure EV for all images",
+    "--match-tones": "use --light-wrap, and grade the EXR",
+    "--matte-from": "write mattes with `rembg p photos mattes`, and pass --person mattes",
+    "--photo": "relight the photo itself, without its stack",
+}
 _SPINS = (
     "20000"  # turns of a waiting thread of torch's before it sleeps; with more, other programs wait for it
 )
@@ -114,7 +122,7 @@ class _Commands(Mapping[str, Any]):
 
 def _command(name: str) -> Any:
     """The command of a verb; the file of a verb with subcommands has an app."""
-    file = import_module(f"facerf_cli.cli.{_FILES.get(name, name).replace('-', '_')}")
+    file = import_module(f"facerf_cli.cli.{name.replace('-', '_')}")
     verbs = getattr(file, "app", None)
     if verbs is None:
         verbs = typer.Typer(add_completion=False)
@@ -169,10 +177,41 @@ def _print_version(wanted: bool) -> None:
 
 def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     if path is not None:
-        from facerf_cli.cli.installation import read_config
-
         context.default_map = read_config(path, context.command)
     return path
+
+
+def read_config(path: Path, group: Any) -> dict[str, Any]:
+    """Read defaults from a TOML file, for typer: a table of options for each command, [global] for all.
+
+    Raises UsageError for a file that is not TOML, and for a command or an option that does not exist.
+    """
+    try:
+        tables = read_toml(path, "correct it")
+    except InputError as error:
+        raise UsageError(f"--config {error}") from None
+    if not isinstance(of_all := tables.pop("global", {}), dict):
+        raise UsageError(f"--config {path}: global is not a table; write [global]")
+    return _defaults(tables | of_all, group, f"--config {path}:", "facerf")
+
+
+def _defaults(table: Mapping[str, Any], command: Any, where: str, typed: str) -> dict[str, Any]:
+    """The values of a command's options by typer's names, and those of its subcommands."""
+    from facerf_cli.training.settings import KINDS  # tables of [train], which it reads itself
+
+    options = (one for one in command.params if not one.is_eager)
+    names = {word.lstrip("-"): one.name for one in options for word in one.opts}
+    names |= {name: name for name in KINDS if typed == "facerf train"}
+    commands = getattr(command, "commands", {})
+    values = {}
+    for name, value in table.items():
+        if name in commands and isinstance(value, Mapping):
+            values[name] = _defaults(value, commands[name], where, f"{typed} {name}")
+        elif name in names:
+            values[names[name]] = value
+        else:
+            raise UsageError(f"{where} {name}: no such command or option; see `{typed} --help-all`")
+    return values
 
 
 @app.callback()
@@ -391,8 +430,9 @@ def _see_help(error: Any) -> str:
     context = getattr(error, "ctx", None)
     path = context.command_path if context else "facerf"
     is_no_verb = path == "facerf" and "No such command" in error.format_message()
-    advice = f"a verb comes first, as in {examples_of('relight')[0]}; " if is_no_verb else ""
-    return f"({advice}see '{path} --help')"
+    advice = f"a verb comes first, as in {examples_of('relight')[0]}" if is_no_verb else ""
+    advice = _REMOVED.get(getattr(error, "option_name", ""), advice)
+    return f"({advice}{'; ' if advice else ''}see '{path} --help')"
 
 
 def _fail(error: BaseException | None, message: str, code: int) -> int:

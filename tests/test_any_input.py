@@ -16,7 +16,6 @@ from facerf_cli.batch.inputs import Item, NamePattern
 from facerf_cli.batch.journal import Journal
 from facerf_cli.batch.run import write_report
 from facerf_cli.batch.settings import Shard
-from facerf_cli.cli.installation import read_config
 from facerf_cli.errors import FacerfError
 from facerf_cli.evaluation.folders import read_facts
 from facerf_cli.evaluation.report import images_csv, read_figures
@@ -40,7 +39,7 @@ from facerf_cli.files.olat_stack import is_olat_stack, read_olat_header, read_ol
 from facerf_cli.files.read import read_image
 from facerf_cli.files.texts import read_light_list
 from facerf_cli.light.entries import lit_images, parse_lights
-from facerf_cli.main import app
+from facerf_cli.main import app, read_config
 from facerf_cli.network.checkpoint import load_checkpoint, load_networks
 from facerf_cli.run.logs import escaped, json_line, printable_line
 from facerf_cli.work.output_options import parse_exposure

@@ -46,7 +46,7 @@ class EstimateLight(PhotoWork, LightOptions):
 
     def ready(self, dry_run: bool) -> Self:
         """Load what every photo needs, and the network whose features are compared."""
-        from facerf_cli.work.light_of_photo import feature_network
+        from facerf_cli.work.estimate_light import feature_network
 
         super().ready(dry_run)
         if self.refine == "features" and not dry_run:
@@ -55,7 +55,7 @@ class EstimateLight(PhotoWork, LightOptions):
 
     def write(self, item: Item) -> Written:
         """Estimate the light of every chosen face, or that of a shot."""
-        from facerf_cli.work.light_of_photo import write_lights, write_shot_light
+        from facerf_cli.work.estimate_light import write_lights, write_shot_light
 
         for shot in self.shots.all:
             if item.output_base == shot.base:

@@ -1,69 +1,46 @@
-"""Three examples of each verb, for its help and its man page."""
+"""One or two examples of each command, for its help and its man page."""
 
 _LINES = """
 facerf demo
-facerf demo -o sheet.png
-facerf demo --checkpoint run/ -o mine.jpg
 facerf relight me.jpg --light 40,20 -o relit.png
 facerf relight photos/ --envmap skies/ --rotate 0:360:24 -o relit/
-facerf relight me.jpg --background beach.jpg --light-from background --light-wrap 0.3 -o relit/
 facerf view me.jpg -o me.html
-facerf view photos/ -o pages/
 facerf view stacks/me_olat.exr -o me.html
 facerf estimate-light me.jpg -o light.exr
-facerf estimate-light me.jpg --width 1024 --sh-order 4 -o light/
 facerf estimate-light shot.mp4 -o light/
 facerf predict-olat me.jpg -o stacks/
 facerf predict-olat me.jpg --lights '40,20;-40,20' --frame uv -o stacks/
-facerf predict-olat me.jpg --page -o olat/
 facerf segment me.jpg -o cut.png
 facerf segment group.jpg --face all -o cut/
-facerf segment photos/ --jobs 4 -o cut/
 facerf fit-geometry me.jpg -o me.glb
-facerf fit-geometry me.jpg --face-model ict.npz -o fit/
 facerf fit-geometry photos/ --landmarks points/ -o fit/
-facerf envmap -o maps/
 facerf envmap --count 20 -o maps/
 facerf envmap --kind sun --seed 3 -o maps/
-facerf synth-stage --subjects 2 -o capture/
-facerf synth-stage --subjects 40 --jobs 2 -o capture/
-facerf synth-stage --subjects 8 --lights 64 -o capture/
+facerf synth-stage --subjects 40 --lights 64 --jobs 2 -o capture/
 facerf prepare-dataset capture/ --describe
-facerf prepare-dataset capture/ --checks only -o dataset/
 facerf prepare-dataset capture/ --split 0.8/0.1/0.1 --jobs 2 -o dataset/
 facerf relight-dataset dataset/ --envmaps skies/
-facerf relight-dataset dataset/ --envmaps procedural:500
 facerf relight-dataset dataset/ --envmaps procedural:500 --per-subject 1000 --lazy
-facerf train -o try/ --preset tiny --steps 50
 facerf train --dataset dataset/ -o run/ --max-time 2h
 facerf train -o run/ --resume
 facerf doctor
-facerf doctor --json
 facerf doctor --checkpoint run/
 facerf evaluate olat dataset/ -o report/
-facerf evaluate olat dataset/ --checkpoint run/ -o report/
 facerf evaluate olat dataset/ --against other.safetensors -o report/
 facerf evaluate reconstruction photos/ -o report/
 facerf evaluate reconstruction photos/ --reflectance prt -o report/
-facerf evaluate reconstruction dataset/ --jobs 2 -o report/
-facerf evaluate transfer dataset/ -o report/
-facerf evaluate transfer dataset/ --reflectance field --reflectance prt -o report/
 facerf evaluate transfer photos/ -o report/
+facerf evaluate transfer dataset/ --reflectance field --reflectance prt -o report/
 facerf evaluate geometry photos/ -o report/
 facerf evaluate geometry photos/ --face-model ict.npz -o report/
-facerf evaluate geometry dataset/ -o report/
 facerf evaluate yale-b CroppedYale/ -o report/
-facerf evaluate yale-b CroppedYale/ --jobs 2 -o report/
 facerf evaluate yale-b CroppedYale/ --checkpoint run/ --reflectance field -o report/
 facerf evaluate cases dataset/ -o cases/
-facerf evaluate cases dataset/ --same-pose -o cases/
-facerf evaluate cases dataset/ --split all --every 10 -o cases/
+facerf evaluate cases dataset/ --split all --every 10 --same-pose -o cases/
 facerf evaluate compare cases/ --reflectance field --method theirs=renders/ -o report/
-facerf evaluate compare cases/ --against mine.safetensors --form my_lab.networks:Net -o report/
 facerf evaluate compare truth/ --method mine/ --method theirs/ --masks masks/ -o report/
 facerf face-model import ICT-FaceKit.zip -o ict.npz
 facerf face-model import flame.pkl --landmarks embedding.npy -o flame.npz
-facerf face-model import model2019_bfm.h5 -o basel.npz
 """
 
 

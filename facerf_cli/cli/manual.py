@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterable, Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,10 @@ from facerf_cli.errors import UsageError
 from facerf_cli.main import app
 
 _EXIT_CODES = (
-    ("0", "All is done."),
-    ("1", "Some input failed; each is named in a line on standard error."),
-    ("2", "The command line is wrong, or there is nothing to work on."),
-    ("130", "Interrupted."),
+    ("", "0", "All is done."),
+    ("", "1", "Some input failed; each is named in a line on standard error."),
+    ("", "2", "The command line is wrong, or there is nothing to work on."),
+    ("", "130", "Interrupted."),
 )
 
 
@@ -25,9 +26,8 @@ def pages() -> dict[str, str]:
     """File name to troff source, for facerf and every verb."""
     root = typer.main.get_command(app)
     context = typer.Context(root, info_name="facerf")
-    return {
-        f"{'-'.join(path)}.1": _page(path, command) for path, command in _walk(context, root, ("facerf",))
-    }
+    walk = _walk(context, root, ("facerf",))
+    return {f"{'-'.join(path)}.1": "\n".join(_lines(path, command)) + "\n" for path, command in walk}
 
 
 def _walk(context: Any, command: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -36,41 +36,28 @@ def _walk(context: Any, command: Any, path: tuple[str, ...]) -> Iterator[tuple[t
         yield from _walk(context, command.commands[name], (*path, name))
 
 
-def _page(path: tuple[str, ...], command: Any) -> str:
-    context = typer.Context(command, info_name=" ".join(path))
-    summary, _, rest = (command.help or "").replace("\\[", "[").strip().partition("\n")
-    lines = [f'.TH "{"-".join(path).upper()}" "1" "" "facerf {__version__}" "facerf manual"']
-    lines += [".SH NAME", f"{_text('-'.join(path))} \\- {_text(summary.rstrip('.'))}"]
-    lines += [
-        ".SH SYNOPSIS",
-        f".B {_text(' '.join(path))}",
-        _text(" ".join(command.collect_usage_pieces(context))),
-    ]
-    lines += [".SH DESCRIPTION", _text(summary)]
-    for paragraph in filter(None, rest.replace("\b", "").split("\n\n")):
-        lines += [".PP", _text(" ".join(paragraph.split()))]
-    options = [
-        (_panel_of(parameter), record)
-        for parameter in command.get_params(context)
-        if (record := parameter.get_help_record(context))
-    ]
-    lines += _section("OPTIONS", options)
-    verbs = getattr(command, "commands", {})
-    listed = [(_panel_of(verb), (name, verb.get_short_help_str(200))) for name, verb in verbs.items()]
-    lines += _section("VERBS", listed)
+def _lines(path: tuple[str, ...], command: Any) -> Iterator[str]:
+    """The lines of a page."""
+    name, typed, verbs = "-".join(path), " ".join(path), getattr(command, "commands", {})
+    context = typer.Context(command, info_name=typed)
+    summary, *paragraphs = (command.help or "").replace("\\[", "[").replace("\b", "").strip().split("\n\n")
+    yield f'.TH "{name.upper()}" "1" "" "facerf {__version__}" "facerf manual"'
+    yield from (".SH NAME", f"{_text(name)} \\- {_text(summary.rstrip('.'))}")
+    yield from (".SH SYNOPSIS", f".B {_text(typed)}", _text(" ".join(command.collect_usage_pieces(context))))
+    yield from (".SH DESCRIPTION", _text(summary))
+    for paragraph in paragraphs:
+        yield from (".PP", _text(" ".join(paragraph.split())))
+    options = ((one, one.get_help_record(context)) for one in command.get_params(context))
+    yield from _section("OPTIONS", ((_panel_of(one), *record) for one, record in options if record))
+    listed = ((_panel_of(verb), name, verb.get_short_help_str(200)) for name, verb in verbs.items())
+    yield from _section("VERBS", listed)
     if not verbs:
-        lines += [
-            ".PP",
-            _text(EPILOG),
-            ".SH EXAMPLES",
-            ".nf",
-            *map(_text, examples_of(" ".join(path[1:]))),
-            ".fi",
-        ]
-    lines += [".SH EXIT STATUS", *_definitions(_EXIT_CODES)]
-    pages_nearby = ["-".join((*path, name)) for name in sorted(verbs)] or ["-".join(path[:-1])]
-    lines += [".SH SEE ALSO", ", ".join(f"\\fB{_text(name)}\\fR(1)" for name in pages_nearby)]
-    return "\n".join(lines) + "\n"
+        yield from (".PP", _text(EPILOG), ".SH EXAMPLES", ".nf")
+        yield from map(_text, examples_of(" ".join(path[1:])))
+        yield ".fi"
+    yield from _section("EXIT STATUS", _EXIT_CODES)
+    nearby = [f"{name}-{verb}" for verb in sorted(verbs)] or ["-".join(path[:-1])]
+    yield from (".SH SEE ALSO", ", ".join(f"\\fB{_text(one)}\\fR(1)" for one in nearby))
 
 
 def _panel_of(part: Any) -> str:
@@ -78,23 +65,16 @@ def _panel_of(part: Any) -> str:
     return getattr(part, "rich_help_panel", None) or ""
 
 
-def _section(title: str, entries: Iterable[tuple[str, tuple[str, str]]]) -> list[str]:
-    """A section of terms and meanings, with a subsection for each panel of the help, in its order."""
-    panels: dict[str, list[tuple[str, str]]] = {"": []}
-    for panel, entry in entries:
-        panels.setdefault(panel, []).append(entry)
-    lines = []
-    for panel, held in panels.items():
-        if held:
-            lines += [*([f".SS {_text(panel)}"] if panel else []), *_definitions(held)]
-    return [f".SH {title}", *lines] if lines else []
-
-
-def _definitions(entries: Iterable[tuple[str, str]]) -> list[str]:
-    lines = []
-    for term, meaning in entries:
-        lines += [".TP", f"\\fB{_text(term)}\\fR", _text(" ".join(meaning.split()))]
-    return lines
+def _section(title: str, entries: Iterable[tuple[str, str, str]]) -> Iterator[str]:
+    """A section of panels, terms and meanings, with a subsection for each panel; nothing without entries."""
+    found = list(entries)
+    panels = ["", *dict.fromkeys(panel for panel, _, _ in found)]
+    found.sort(key=lambda entry: panels.index(entry[0]))
+    for number, (panel, held) in enumerate(groupby(found, lambda entry: entry[0])):
+        yield from [f".SH {title}"] if number == 0 else []
+        yield from [f".SS {_text(panel)}"] if panel else []
+        for _, term, meaning in held:
+            yield from (".TP", f"\\fB{_text(term)}\\fR", _text(" ".join(meaning.split())))
 
 
 def _text(text: str) -> str:

@@ -15,7 +15,7 @@ class PredictStacks(PredictOlat):
 
     def write(self, item: Item) -> Written:
         """Write the stack of every chosen face."""
-        from facerf_cli.work.stacks import write_stacks
+        from facerf_cli.work.predict_olat import write_stacks
 
         return write_stacks(item, self)
 
@@ -24,8 +24,8 @@ def predict_olat(inputs: InputsArgument, work: PredictStacks, batch: FileOrFolde
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
     Each photo gives an OLAT stack (an OpenEXR file with a part for each light, the person over black;
-    `facerf relight` takes it in place of a photo, and with --photo puts it back on its photo) and a contact
-    sheet. Lights are fixed to the camera and of
-    unit intensity: AZ > 0 lights the image's right side, EL > 0 comes from above.
+    `facerf relight` takes it in place of a photo, unless it is of UV textures) and a contact sheet. Lights
+    are fixed to the camera and of unit intensity: AZ > 0 lights the image's right side, EL > 0 comes from
+    above.
     """
     raise typer.Exit(work.run(inputs, batch))

@@ -18,7 +18,7 @@ from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.option import Without
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.work.light_setups import LightSources, PhotoLight
+from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.output_options import NEEDS, STDOUT, SUFFIXES, check_stdout, format_of_file
 from facerf_cli.work.photo_options import networks_of
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
@@ -59,15 +59,15 @@ class RelightJob(Job):
         for picture in (*background.frames[:1], background.path):
             if picture and picture.is_file() and read_header(picture) is None:
                 raise UsageError(f"--background {picture}: not a readable image; pass an image")
-        maps = [setup.envmap.envmap for setup in self.plan.setups if setup.envmap]
-        lights = [envmap.options for envmap in maps if isinstance(envmap, PhotoLight)]
-        uses = networks_of([self.plan.options.reflectance]).union(*(light.networks for light in lights))
+        photos = self.plan.photos
+        uses = networks_of([self.plan.options.reflectance])
+        uses = uses.union(*(photo.options.networks for photo in photos))
         prepare_photos(self.plan.photo, uses, with_networks=not dry_run)
         if self.plan.shots.all and not dry_run:
             from facerf_cli.work.sequence import follow_all
 
             follow_all(self.plan.shots.all, self.plan.photo)
-        if lights and dry_run:
+        if dry_run and not all(photo.envmap.is_file() for photo in photos):
             return self
         setups = readable(self.plan.setups)
         if not setups:
@@ -151,15 +151,12 @@ def relight(
     items, taken = collect_frames(inputs, shots, batch, plan.photo)
     if taken and options.normals_from is not None:
         raise UsageError("--normals-from: is for photos, not for frames of a shot; leave it out")
-    if options.photo_of_stack is not None:
-        from facerf_cli.files.olat_stack import is_olat_stack
-
-        if not any(is_olat_stack(item.input_path) for item in items):
-            raise UsageError("--photo: is for OLAT stacks, and no input is one; leave it out")
     plan = plan.of_items(items, Shots(taken), output)
     batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if taken else 1, print_outputs=film is None)
     images = [path for item in items for path in plan.outputs_of(item)]
     refuse_read([film.path] if film else images, files_read((items, plan, sources), items))
+    for photo in () if batch.dry_run else plan.photos:  # before keys of outputs, which hold the maps' content
+        photo.estimate()
     recipe = film.recipe_if_new(items, taken, images, plan.recipes_of, batch) if film else ""
     if film is not None and not recipe:
         return
@@ -176,6 +173,8 @@ def _write_to_stdout(inputs: Sequence[str], plan: RelightPlan) -> None:
         images = len(items) * len(plan.setups)
         check_stdout(images if plan.photo.face != "all" else 2 * images, plan.options.output.formats)
         plan = plan.of_items(items, Shots(), output=Path(folder))
+        for photo in plan.photos:
+            photo.estimate()
         (path,) = RelightJob(plan).ready(dry_run=False).process(items[0]).outputs
         sys.stdout.buffer.write(path.read_bytes())
         sys.stdout.buffer.flush()

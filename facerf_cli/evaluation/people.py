@@ -39,7 +39,7 @@ from facerf_cli.relighting.models import Models, Sides, load_models
 from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, estimate_light
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.work.light_of_photo import feature_network
+from facerf_cli.work.estimate_light import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
 from facerf_cli.work.photos import fit_faces, load_models_once, read_photo
 

@@ -6,10 +6,10 @@ Wrong ones raise UsageError. Light to import, since the help does without numpy.
 import math
 import os.path
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import read_light_list, read_text
@@ -31,14 +31,6 @@ _DISTANCE_M = (0.15, 1e4)  # of a near light
 
 Sampling = Literal["cell", "smooth", "paper"]  # how lights of a rig sample a map
 Triple = tuple[float, float, float]
-
-
-class MapSource(Protocol):
-    """The source of a lat-long map: the path of a file, or what `work` draws or estimates."""
-
-    @property
-    def name(self) -> str:
-        """The name of the map."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,7 @@ class StudioLight:
     size_m: float = 0.0
     size_deg: float = 0.0
     spot_deg: float | None = None
-    envmap: MapSource | None = None
+    envmap: Path | None = None
     rotate_deg: float = 0.0
     face: int | None = None
     own: bool = False
@@ -412,13 +404,8 @@ def _together(image: str, lights: Sequence[LitImage], where: str) -> LitImage:
     return LitImage(frames, any(light.is_numbered for light in lights), names, image)
 
 
-def named_map(
-    entry: str, turns: Sequence[float], is_numbered: bool, source: Callable[[str], MapSource] = Path
-) -> LitImage | None:
-    """Parse `NAME=FILE`, a map that shines with the lights that have names; None for a path alone."""
+def named_entry(entry: str) -> tuple[str, str]:
+    """Split `NAME=FILE`, a map that shines with the lights that have names; no name of a path alone."""
     name, equals, path = entry.partition("=")
-    if not equals or not _NAME.fullmatch(name) or Path(entry).exists():
-        return None
-    envmap = source(path)
-    frames = tuple((StudioLight(envmap=envmap, rotate_deg=degrees),) for degrees in turns)
-    return LitImage(frames, is_numbered, (name,), name)
+    is_named = equals and _NAME.fullmatch(name) and not Path(entry).exists()
+    return (name, path) if is_named else ("", entry)

@@ -13,19 +13,21 @@ from facerf_cli.batch.inputs import (
     collect_items,
     split_frame,
 )
+from facerf_cli.batch.journal import file_row
+from facerf_cli.batch.recipe import RESULTS_VERSION, key_of, recipe_of
 from facerf_cli.errors import UsageError
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.light.entries import (
     MOST_FRAMES,
     ROOM_BEFORE_BRIGHT,
     ROOM_BEFORE_DARK,
-    MapSource,
+    LitImage,
     Sampling,
     StudioLight,
     is_sweep,
     lit_images,
-    named_map,
+    named_entry,
     numbers,
-    preset_names,
     sweep,
 )
 from facerf_cli.option import LIGHT, option
@@ -34,6 +36,8 @@ from facerf_cli.work.photo_options import LightOptions, fov_option
 
 DRAWN = "procedural:"
 BACKGROUND = "background"  # the picture behind the person, as --light-from names it
+_LIGHT = "_light"  # ends the name of the light of a photo
+_WIDTH_PX = 512  # of maps in the cache
 ROOM = "room"  # the name of a room's light, and of its layer
 _MOST_ROOM = 1.0
 log = logging.getLogger(LOGGER_NAME)
@@ -75,22 +79,30 @@ class LightSources:
 
 
 @dataclass(frozen=True)
-class DrawnMap:
-    """A procedural map, named as `facerf envmap` names its files."""
-
-    name: str
-    index: int
-    seed: int
-
-
-@dataclass(frozen=True)
 class PhotoLight:
-    """The light of a photo, estimated when it is read; its map is that of `facerf estimate-light`."""
+    """The light of a photo: a map in the user's cache, as `facerf estimate-light` writes it.
 
-    name: str
-    path: Path
+    Attributes:
+        photo: A photo, or the picture behind the person if `is_background`.
+        envmap: The map, whose folder is named by the content of the photo and by the options.
+        options: How the light is estimated.
+        layer: Name of the light in an image of several; '' for an image of its own.
+        is_background: True for a light on the scale of the background.
+    """
+
+    photo: Path
+    envmap: Path
     options: LightOptions
+    layer: str = ""
     is_background: bool = False
+
+    def estimate(self) -> None:
+        """Write the map if it is not there yet; raises InputError for a photo that cannot be used."""
+        if not self.envmap.is_file():
+            from facerf_cli.work.estimate_light import write_lights
+
+            base = self.envmap.with_name(self.envmap.name.removesuffix(f"{_LIGHT}.exr"))
+            write_lights(Item(self.photo, base, self.photo.stem), self.options, _WIDTH_PX, sh_order=2)
 
 
 @dataclass(frozen=True)
@@ -124,13 +136,6 @@ class LightSetup:
         return any(light.own for light in self.lights)
 
     @property
-    def has_scale(self) -> bool:
-        """True where the lights are as bright as the photo, or as the picture behind it."""
-        maps = (light.envmap for light in self.lights)
-        behind = any(isinstance(envmap, PhotoLight) and envmap.is_background for envmap in maps)
-        return behind or bool(self.by_photo)
-
-    @property
     def by_photo(self) -> list[StudioLight]:
         """The lights that are as bright as the photo."""
         return [light for light in self.lights if light.own or light.even]
@@ -145,56 +150,53 @@ class LightSetup:
 
 
 def collect_setups(
-    sources: LightSources,
-    output: Path,
-    seed: int = 0,
-    how: LightOptions | None = None,
-    background: Path | None = None,
+    sources: LightSources, output: Path, seed: int = 0, photos: Sequence[PhotoLight] = ()
 ) -> tuple[LightSetup, ...]:
-    """List the light setups that the options name; maps are read, drawn or estimated later.
+    """List the light setups that the options name; maps are read later.
 
     Args:
         sources: The options.
         output: The output folder, which is not searched for maps.
         seed: The seed of drawn maps.
-        how: How the lights of photos are estimated.
-        background: The picture behind the person.
+        photos: The lights of photos.
     """
-    envmaps, rotate = sources.envmap or (), sources.rotate
+    rotate = sources.rotate
     rotations = parse_rotations(rotate)
-    turns, is_numbered = [degrees for _, _, degrees in rotations], is_sweep(rotate or "")
-    together = {entry: named for entry in envmaps if (named := named_map(entry, turns, is_numbered))}
-    envmaps = [entry for entry in envmaps if entry not in together]
-    lit: list[PhotoLight] = []
-    if sources.light_from and how:
-        photo = _PhotoLights(replace(how, fov_deg=sources.fov_deg), background)
-        alone = [entry for entry in sources.light_from if entry not in (BACKGROUND, *together)]
-        with_names = {
-            entry: image for entry in alone if (image := named_map(entry, turns, is_numbered, photo.one))
-        }
-        together |= with_names
-        lit = [photo.one(BACKGROUND)] if BACKGROUND in sources.light_from else []
-        lit += photo.each([entry for entry in alone if entry not in with_names], output)
-    elif sources.fov_deg is not None:
-        raise UsageError("--fov: is for --light-from; add it, or leave --fov out")
-    words = [entry for entry in envmaps if entry.startswith(DRAWN)]
-    paths = [entry for entry in envmaps if entry not in words]
+    entries = [named_entry(entry) for entry in dict.fromkeys(sources.envmap or ())]
+    named = [(name, Path(path)) for name, path in entries if name]
+    named += [(photo.layer, photo.envmap) for photo in photos if photo.layer]
+    words = [path for name, path in entries if not name and path.startswith(DRAWN)]
+    paths = [path for name, path in entries if not name and path not in words]
     files = collect_items(paths, output, MAP_SUFFIXES) if paths else []
     short = map(split_frame, _short_names(files))
-    maps: list[tuple[str, str, MapSource]] = [
-        *((drawn.name, "", drawn) for drawn in drawn_maps(words, seed)),
+    maps = [
+        *((path.stem, "", path) for path in drawn_maps(words, seed)),
         *((name, frame, file.input_path) for (name, frame), file in zip(short, files, strict=True)),
-        *((photo.name, "", photo) for photo in lit),
+        *((photo.envmap.stem, "", photo.envmap) for photo in photos if not photo.layer),
     ]
     setups = [
         LightSetup(name + turn, frame + number, (StudioLight(envmap=envmap, rotate_deg=degrees),))
         for name, frame, envmap in maps
         for turn, number, degrees in rotations
     ]
-    images = lit_images(sources.light or (), [*together.values()])
-    if images and images[-1].is_shared:
-        names = [setup.name for setup in setups] + [image.name for image in images[:-1]]
-        _say_apart([*dict.fromkeys(names)], images[-1].name)
+    together = [
+        LitImage(
+            tuple((StudioLight(envmap=envmap, rotate_deg=degrees),) for _, _, degrees in rotations),
+            is_sweep(rotate or ""),
+            (name,),
+            name,
+        )
+        for name, envmap in named
+    ]
+    images = lit_images(sources.light or (), together)
+    apart = dict.fromkeys([one.name for one in setups] + [image.name for image in images[:-1]])
+    if apart and images and images[-1].is_shared:
+        log.warning(
+            "%s: not in the image of the lights that have names (%s); to add a light there, name it: "
+            "fill=40,20, fill=rembrandt or --envmap sky=MAP",
+            ", ".join(apart),
+            images[-1].name,
+        )
     for image in images:
         for number, shining in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
@@ -207,21 +209,6 @@ def collect_setups(
     if twice := {name for name in names if names.count(name) > 1}:
         raise UsageError(f"two images would be named {min(twice)}; give each light once")
     return tuple(setups)
-
-
-def _say_apart(names: Sequence[str], shared: str) -> None:
-    """Log in a line that maps and lights without names, of images `names`, are not in the shared image."""
-    if names:
-        preset = next((name for name in names if name in preset_names()), None)
-        log.warning(
-            "%s%s: an image each, since only lights with names share one (%s); to add it there give it a "
-            "name, as in %s or --envmap sky=MAP%s",
-            names[0],
-            f" and {len(names) - 1} more" if len(names) > 1 else "",
-            shared,
-            f"a={preset}" if preset else "fill=40,20, fill=rembrandt",
-            f" ({preset} alone is the preset, {preset}=AZ,EL a light of that name)" if preset else "",
-        )
 
 
 def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightSetup:
@@ -251,43 +238,69 @@ def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightS
     return replace(setup, room=share)
 
 
-def drawn_maps(words: Sequence[str], seed: int) -> list[DrawnMap]:
-    """Name the maps of `procedural:N`; of several such words the largest N counts."""
+def drawn_maps(words: Sequence[str], seed: int) -> list[Path]:
+    """Draw the maps of `procedural:N` into the user's cache; of several such words the largest N counts."""
     if not words:
         return []
-    from facerf_cli.synth.sky.skies import kind_of, parse_envmaps
+    from facerf_cli.files.write import write_exr
+    from facerf_cli.synth.sky.skies import draw_sky, kind_of, parse_envmaps
 
     most = max(len(parse_envmaps(word, seed)) for word in words)
     if most > MOST_FRAMES:
         raise UsageError(f"--envmap {DRAWN}{most}: {MOST_FRAMES} maps are the most; give fewer")
-    return [DrawnMap(f"{index:05d}_{kind_of(index, seed)}", index, seed) for index in range(most)]
+    folder = _cached("maps", f"{RESULTS_VERSION}-{seed}")
+    maps = [folder / f"{index:05d}_{kind_of(index, seed)}.exr" for index in range(most)]
+    for index, path in enumerate(maps):
+        if not path.is_file():
+            write_exr(path, draw_sky(index, seed, _WIDTH_PX)[0])
+    return maps
 
 
-@dataclass(frozen=True)
-class _PhotoLights:
-    """Lights of photos that --light-from names, as `estimate-light` names its maps."""
+def photo_lights(
+    sources: LightSources, how: LightOptions, background: Path | None, output: Path
+) -> tuple[PhotoLight, ...]:
+    """List the lights of photos that --light-from names, each once.
 
-    options: LightOptions
-    background: Path | None
+    Args:
+        sources: The options.
+        how: How the lights are estimated.
+        background: The picture behind the person.
+        output: The output folder, which is not searched for photos.
+    """
+    entries = dict.fromkeys(sources.light_from or ())
+    if sources.fov_deg is not None and not entries:
+        raise UsageError("--fov: is for --light-from; add it, or leave --fov out")
+    options = replace(how, fov_deg=sources.fov_deg)
 
-    def one(self, name: str) -> PhotoLight:
-        """The light of one photo, or of the picture behind the person."""
-        if name != BACKGROUND:
-            (item,) = collect_items([name], Path(), PHOTO_SUFFIXES)
-            return PhotoLight(f"{Path(item.name).name}_light", item.input_path, self.options)
-        if self.background is None:
-            raise UsageError(
-                "--light-from background: no picture is behind the person; add --background FILE, or give "
-                "./background for a file of that name"
-            )
-        name = f"{split_frame(self.background.stem)[0]}_light"
-        return PhotoLight(name, self.background, self.options, is_background=True)
+    def light(photo: Path, name: str, layer: str = "", is_background: bool = False) -> PhotoLight:
+        recipe = recipe_of(options, file_sha256) | {"photo": file_row(photo)["sha256"]}
+        envmap = _cached("lights", key_of(recipe), f"{name}{_LIGHT}.exr")
+        return PhotoLight(photo, envmap, options, layer, is_background)
 
-    def each(self, entries: Sequence[str], output: Path) -> list[PhotoLight]:
-        """The lights of photos (files, folders, quoted patterns)."""
-        items = collect_items(entries, output, PHOTO_SUFFIXES) if entries else []
-        paths = zip(_short_names(items), items, strict=True)
-        return [PhotoLight(f"{name}_light", item.input_path, self.options) for name, item in paths]
+    lights, alone = [], []
+    for layer, path in map(named_entry, entries):
+        if path == BACKGROUND:
+            if background is None:
+                raise UsageError(
+                    "--light-from background: no picture is behind the person; add --background FILE, or "
+                    "give ./background for a file of that name"
+                )
+            lights.append(light(background, split_frame(background.stem)[0], layer, is_background=True))
+        elif layer:
+            (item,) = collect_items([path], Path(), PHOTO_SUFFIXES)
+            lights.append(light(item.input_path, Path(item.name).name, layer))
+        else:
+            alone.append(path)
+    items = collect_items(alone, output, PHOTO_SUFFIXES) if alone else []
+    lights += [light(item.input_path, name) for item, name in zip(items, _short_names(items), strict=True)]
+    return tuple(lights)
+
+
+def _cached(*parts: str) -> Path:
+    """A path in the user's cache."""
+    from facerf_cli.files.downloads import cache_folder  # --help does without it
+
+    return cache_folder().joinpath(*parts)
 
 
 def _short_names(items: Sequence[Item]) -> list[str]:

@@ -1,4 +1,4 @@
-"""The lights of setups: maps read, drawn or estimated from a photo, and single lights; and their balls."""
+"""The lights of setups: maps and single lights."""
 
 import logging
 import math
@@ -13,16 +13,13 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
-from facerf_cli.light.entries import MapSource, Sampling, StudioLight
+from facerf_cli.light.entries import Sampling, StudioLight
 from facerf_cli.light.envmap import NO_KEYS, lights_around, rotated_weights, turned, without_keys
 from facerf_cli.light.light import Light
 from facerf_cli.light.studio_points import far_samples, intensity_of, is_narrow, rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, step
-from facerf_cli.work.light_setups import ROOM, DrawnMap, LightSetup, PhotoLight
-from facerf_cli.work.photo_options import LightOptions
+from facerf_cli.work.light_setups import ROOM, LightSetup
 
-_DRAWN_WIDTH_PX = 512  # of a procedural map
-_LIGHT_WIDTH_PX = 512  # of the map of a photo's light
 _CLIPPED = 2.0  # above what display values have in linear Rec.709, of any gamut
 LightsOf = Callable[[tuple[LightSetup, ...]], Light]  # gives the lights of M setups
 FarLight = tuple[int, Tensor, Tensor]  # its setup, directions [n, 3] and rgb weights [n, 3]
@@ -31,53 +28,37 @@ log = logging.getLogger(LOGGER_NAME)
 
 def readable(setups: Sequence[LightSetup]) -> tuple[LightSetup, ...]:
     """The setups whose maps can be read; each map that cannot is logged in one line."""
-    good = {one: _is_readable(one) for one in dict.fromkeys(_maps_of(setups))}  # type: ignore[arg-type]
+    good = {one: _is_readable(one) for one in dict.fromkeys(_maps_of(setups))}
     return tuple(setup for setup in setups if all(good[envmap] for envmap in _maps_of([setup])))
 
 
-def _maps_of(setups: Sequence[LightSetup]) -> list[MapSource]:
+def _maps_of(setups: Sequence[LightSetup]) -> list[Path]:
     return [light.envmap for setup in setups for light in setup.lights if light.envmap is not None]
 
 
 @cache  # an error is logged once
-def _is_readable(envmap: MapSource) -> bool:
+def _is_readable(envmap: Path) -> bool:
     try:
-        if not isinstance(envmap, DrawnMap):
-            brightest = float(read_map(envmap).max())
-            header = read_header(envmap) if isinstance(envmap, Path) else None
-            if header and not header.is_floating and brightest < _CLIPPED:
-                log.warning(
-                    "%s: its %d-bit values are clipped at white, so its highlights are missing and its light "
-                    "is too flat; use an .hdr or .exr map",
-                    envmap,
-                    header.bits,
-                )
+        brightest = float(read_map(envmap).max())
     except InputError as error:
         log.error("%s", error)
         return False
+    header = read_header(envmap)
+    if header and not header.is_floating and brightest < _CLIPPED:
+        log.warning(
+            "%s: its %d-bit values are clipped at white, so its highlights are missing and its light is too "
+            "flat; use an .hdr or .exr map",
+            envmap,
+            header.bits,
+        )
     return True
 
 
-def read_map(envmap: MapSource) -> Tensor:
+def read_map(envmap: Path) -> Tensor:
     """A lat-long map [H, W, 3], scene-linear; raises InputError that names what is wrong with it."""
-    if isinstance(envmap, PhotoLight):
-        return _map_of_photo(envmap.path, envmap.options)
-    if isinstance(envmap, DrawnMap):
-        from facerf_cli.synth.sky.skies import draw_sky
+    from facerf_cli.files.light_files import read_map_file  # single lights do without it
 
-        return torch.from_numpy(draw_sky(envmap.index, envmap.seed, _DRAWN_WIDTH_PX)[0])
-    from facerf_cli.files.light_files import read_map_file
-
-    assert isinstance(envmap, Path)
     return read_map_file(envmap)
-
-
-@cache
-def _map_of_photo(path: Path, options: LightOptions) -> Tensor:
-    """Estimated once a process, in the half floats of the file that `facerf estimate-light` writes."""
-    from facerf_cli.work.light_of_photo import map_of_photo
-
-    return map_of_photo(path, options, _LIGHT_WIDTH_PX // 2).half().float()
 
 
 @step("light")

@@ -148,7 +148,11 @@ def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
         from facerf_cli.files.olat_stack import is_olat_stack
 
         if is_olat_stack(item.input_path):
-            yield _scene_of_stack(item, plan)
+            from facerf_cli.work.relight_stack import open_stack
+
+            _check_faces(item, [0], plan)
+            setups = plan.setups if plan.has_room else tuple(replace(one, room=0.0) for one in plan.setups)
+            yield Scene(setups=setups, **open_stack(item, plan)._asdict())
             return
     _over_rig(plan)(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
     read = _read(item, plan)
@@ -160,18 +164,6 @@ def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
         return
     for face in reversed(read.faces):
         yield _scene_of_face(item, plan, read, face)
-
-
-def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
-    from facerf_cli.work.stack_composers import open_stack
-
-    _check_faces(item, [0], plan)
-    stack, options = open_stack(item, plan), plan.options
-    behind = (
-        None if stack.camera is None else _backdrop(options.background, options.background_blur, stack.camera)
-    )
-    setups = plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups)
-    return Scene(stack.subject, setups, stack.lights_of, stack.metadata, behind=behind, facts=stack.facts)
 
 
 class _Read(NamedTuple):

@@ -27,8 +27,10 @@ from facerf_cli.work.light_setups import (
     BACKGROUND,
     LightSetup,
     LightSources,
+    PhotoLight,
     collect_setups,
     in_room,
+    photo_lights,
 )
 from facerf_cli.work.output_options import (
     Exposure,
@@ -153,7 +155,6 @@ class RelightOptions:
             classes, face, uv.
         matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
             matte.
-        photo_of_stack: Put an OLAT stack back on its photo, at the photo's resolution.
         identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
             (an extra).
         fps: Set the frames per second of -o FILE.mp4, such as 25 or 24000/1001.
@@ -199,9 +200,6 @@ class RelightOptions:
         (), metavar="NAME,...", shown_default="none", default_text="", parse=parse_aov, panel=IMAGE
     )
     matte: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=IMAGE)
-    photo_of_stack: Path | None = option(
-        None, metavar=COMPANION, flags=("--photo",), shown_default=False, panel=IMAGE
-    )
     identity: bool = option(False, in_recipe=False, panel=METHOD)
     network_alone: bool = network_alone_option()
     white: White = white_option()
@@ -227,6 +225,7 @@ class RelightPlan:
         options: With what depends on other options.
         setups: The lights of each image; a recipe has its own.
         sampling: How maps give a rig's lights their weights.
+        photos: The lights of photos, whose maps are among the setups.
         keeps_photo: True by --composite photo, which no stack can have.
         has_room: True by --room; a stack has none else.
         shots: The films and sequences among the inputs.
@@ -236,6 +235,7 @@ class RelightPlan:
     options: RelightOptions
     setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)
     sampling: Sampling
+    photos: tuple[PhotoLight, ...] = field(default=(), metadata=NOT_IN_RECIPE)
     keeps_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)
     has_room: bool = field(default=False, metadata=NOT_IN_RECIPE)
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
@@ -343,7 +343,6 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     if options.identity and alone:
         raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
     check_companion(options.matte, "--matte")
-    check_companion(options.photo_of_stack, "--photo")
     check_companion(options.normals_from, "--normals-from")
     if options.normals_from is not None and (alone or options.reflectance != "portrait"):
         raise UsageError(
@@ -356,9 +355,8 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
         from_behind = any(entry.rpartition("=")[2] == BACKGROUND for entry in sources.light_from or ())
         if from_behind or is_pattern(str(background.path)):
             background = background.listed(output)
-    setups = collect_setups(
-        sources, output, photo.settings.seed, how, (*background.frames, background.path)[0]
-    )
+    photos = photo_lights(sources, how, (*background.frames, background.path)[0], output)
+    setups = collect_setups(sources, output, photo.settings.seed, photos)
     layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
     for name in (name for setup in setups for name in setup.names):
         if name in layers:
@@ -369,8 +367,14 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
     if by_photo and not is_field:
         word = OWN if by_photo[0].own else EVEN
         raise UsageError(f"--light {word}: is not for --reflectance {options.reflectance}; leave one out")
-    if options.exposure is None:
-        setups = tuple(replace(one, exposure_ev=0.0) if one.has_scale else one for one in setups)
+    if options.exposure is None:  # 0 under lights as bright as the photo, or as the picture behind it
+        behind_it = {light.envmap for light in photos if light.is_background}
+        setups = tuple(
+            replace(one, exposure_ev=0.0)
+            if one.by_photo or not behind_it.isdisjoint(light.envmap for light in one.lights)
+            else one
+            for one in setups
+        )
     if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
         raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
     sweeps = sources.rotate is not None and is_sweep(sources.rotate)
@@ -387,6 +391,7 @@ def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -
         filled,
         tuple(in_room(one, sources.room, alone or dark(one)) for one in setups),
         sources.sampling or ("smooth" if sweeps else "cell"),
+        photos,
         keeps_photo=options.composite == "photo",
         has_room=sources.room is not None,
     )

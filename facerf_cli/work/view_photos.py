@@ -36,7 +36,7 @@ from facerf_cli.work.photos import (
     read_photo,
     write_each,
 )
-from facerf_cli.work.stack_composers import face_in_stack
+from facerf_cli.work.relight_stack import face_in_stack
 
 _MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
 _HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face

@@ -31,7 +31,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def stack(given: Path) -> Path:
-    """The photo's face under 12 lights, in UV space."""
+    """The photo's face under 12 lights, in the frame of its crop."""
     line = [
         "predict-olat",
         str(astronaut.PATH),
@@ -41,5 +41,5 @@ def stack(given: Path) -> Path:
         "12",
     ]
     checkpoint = ["--checkpoint", str(given / "lambert.safetensors")]
-    assert main([*checkpoint, *line, "--frame", "uv", "-o", str(given / "olat")]) == 0
+    assert main([*checkpoint, *line, "--frame", "face", "-o", str(given / "olat")]) == 0
     return given / "olat/astronaut_olat.exr"

@@ -16,7 +16,7 @@ from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.main import main
 from tests.astronaut import PATH as PHOTO
 from tests.folders import rows
-from tests.kinds import Folders, Said
+from tests.kinds import Folders, Patch, Said
 
 
 def estimate(given: Path, output: Path, *line: str, photo: Path = PHOTO, lights: str = "12") -> int:
@@ -94,8 +94,8 @@ def test_a_face_that_is_not_to_be_seen_is_one_line(given: Path, tmp_path: Path, 
     assert "9 x 8" in capsys.readouterr().err
 
 
-def test_the_light_of_another_photo_is_that_of_the_two_commands(
-    given: Path, tmp_path: Path, capsys: Said
+def test_the_light_of_another_photo_is_that_of_the_two_commands_and_is_kept(
+    given: Path, tmp_path: Path, capsys: Said, monkeypatch: Patch
 ) -> None:
     other, places = tmp_path / "other.png", tmp_path / "places"
     write_display(other, read_image(PHOTO).pixels * np.float32([1.0, 0.8, 0.5]))
@@ -111,8 +111,12 @@ def test_the_light_of_another_photo_is_that_of_the_two_commands(
         read_image(tmp_path / name / "astronaut_other_light_rot90.exr").pixels for name in ("one", "two")
     )
     assert one.max() > 0 and (one == two).all()
+    monkeypatch.setattr(
+        "facerf_cli.work.estimate_light.write_lights", lambda *_: pytest.fail("estimated anew")
+    )
+    assert main([*relit, str(tmp_path / "one"), "--light-from", str(other), "--format", "png"]) == 0
     assert main([*relit, str(tmp_path / "no"), "--light-from", str(tmp_path / "none.jpg")]) == 1
-    assert "none.jpg: no such file" in capsys.readouterr().err
+    assert "none.jpg: cannot be read (No such file or directory)" in capsys.readouterr().err
 
 
 def test_a_picture_without_a_face_gives_a_guess_and_lights_as_one(

@@ -20,7 +20,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
-from facerf_cli.work import light_of_picture
+from facerf_cli.work import estimate_light
 from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.relight import with_background
@@ -113,7 +113,7 @@ def test_all_frames_have_the_one_light_of_the_picture_behind_them(
 ) -> None:
     """It is guessed once; a film in its place is refused."""
     guessed = []
-    monkeypatch.setattr(light_of_picture, "stated_fov_deg", lambda image: guessed.append(image))
+    monkeypatch.setattr(estimate_light, "stated_fov_deg", lambda image: guessed.append(image))
     ramp = np.linspace(20, 220, 60).astype(np.uint8)[None, :, None]
     Image.fromarray(np.broadcast_to(ramp, (40, 60, 3))).save(tmp_path / "beach.png")
     line = ("--background", tmp_path / "beach.png", "--light-from", "background", "--light-wrap", "0.3")

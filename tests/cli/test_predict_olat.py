@@ -91,7 +91,7 @@ def test_a_page_is_written_beside_the_stack(given: Path, tmp_path: Path, monkeyp
 def test_the_contact_sheet_does_not_grow_with_the_lights(
     frame: str, given: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
-    monkeypatch.setattr("facerf_cli.work.stacks._SHEET_PX", 9 * 20**2)
+    monkeypatch.setattr("facerf_cli.work.predict_olat._SHEET_PX", 9 * 20**2)
     assert predict(given, tmp_path, "--lights", "9", "--frame", frame, "--size", "64") == 0
     sheet = read_image(tmp_path / "astronaut_olat.png").pixels
     assert (

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from facerf_cli.errors import UsageError
-from facerf_cli.files.olat_stack import read_olat_header
+from facerf_cli.files.olat_stack import read_olat_header, write_olat_stack
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.main import main
@@ -28,6 +29,7 @@ from tests.exr_layers import exr_layers
 from tests.folders import only_row
 from tests.kinds import Patch, Said
 from tests.refusals import refused
+from tests.stacks import header_of
 
 
 def made(output: Path) -> list[str]:
@@ -194,8 +196,8 @@ def test_a_stack_gives_what_its_photo_gives(given: Path, stack: Path, tmp_path: 
     assert relight(given, tmp_path / "b", *envmap, photo=stack) == 0
     direct = face_sides(tmp_path / "a/astronaut_right.0007.exr")
     again = face_sides(next((tmp_path / "b").glob("*_right.0007.exr")))
-    assert again == pytest.approx(direct, rel=0.02)
-    assert relight(given, tmp_path / "c", *envmap, "--pose", "1,2,3", photo=stack) == 1
+    assert again == pytest.approx(direct, rel=0.1)  # the stack's coverage has no soft border
+    assert again[0] / again[1] == pytest.approx(direct[0] / direct[1], rel=0.01)
 
 
 def test_a_bad_map_harms_no_other(given: Path, tmp_path: Path, capsys: Said) -> None:
@@ -277,12 +279,12 @@ def test_the_network_alone(given: Path, tmp_path: Path, capsys: Said) -> None:
     assert "facerf:network_alone" in alone.metadata and "facerf:network_alone" not in corrected.metadata
     checkpoint, landmarks = str(given / "lambert.safetensors"), str(given / "astronaut.json")
     olat = ["predict-olat", str(PHOTO), "--landmarks", landmarks, "-o", str(tmp_path / "olat")]
-    olat += ["--lights", "4", "--frame", "uv", "--network-alone"]
+    olat += ["--lights", "4", "--frame", "face", "--network-alone"]
     assert main(["--checkpoint", checkpoint, *olat]) == 0
     stack_path = tmp_path / "olat/astronaut_olat.exr"
     assert "facerf:network_alone" in read_olat_header(stack_path).metadata
     assert relight(given, tmp_path / "c", "--light", "1,2", "--network-alone", photo=stack_path) == 1
-    assert "a stack holds the field as predicted" in capsys.readouterr().err
+    assert "--network-alone needs the photo, not its stack" in capsys.readouterr().err
 
 
 def test_a_dry_run_checks_what_a_run_would_load(given: Path, tmp_path: Path, capsys: Said) -> None:
@@ -333,18 +335,48 @@ def face_sides_of(path: Path) -> float:
     return float(image[60:200, :middle].sum() / image[60:200, middle:].sum())
 
 
-def test_near_lights_need_the_photo_or_a_pose_of_it(
-    given: Path, stack: Path, tmp_path: Path, capsys: Said
-) -> None:
-    near = ["--light", "at=0.6,0,0.4"]
-    assert relight(given, tmp_path / "pose", *near, "--pose", "20,0,0") == 0
+def test_near_lights_may_turn_the_head(given: Path, tmp_path: Path) -> None:
+    assert relight(given, tmp_path / "pose", "--light", "at=0.6,0,0.4", "--pose", "20,0,0") == 0
     left, right = face_sides(tmp_path / "pose/astronaut_light_at_0.6_0_0.4.exr")
     assert right > 1.5 * left
-    assert relight(given, tmp_path / "a", *near, photo=stack) == 1
-    assert "a stack holds far lights" in capsys.readouterr().err
-    assert relight(given, tmp_path / "a", "--light", "30,0", "--background", "0,0,0", photo=stack) == 1
-    assert "a stack shows its person alone; for --background give its photo" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("lights", "line"),
+    [
+        ("0,0", "--composite photo"),
+        ("0,0", "--pose 1,2,3"),
+        ("0,0", "--background 0,0,0"),
+        ("0,0", "--network-alone"),
+        ("0,0", "--white scene"),
+        ("own", "--light"),
+        ("even", "--light"),
+        ("at=0.6,0,0.4", "--light"),
+    ],
+)
+def test_what_only_a_photo_can_have_is_refused_of_a_stack(
+    given: Path, stack: Path, tmp_path: Path, capsys: Said, lights: str, line: str
+) -> None:
+    more = [] if line == "--light" else line.split()
+    assert relight(given, tmp_path / "a", "--light", lights, *more, photo=stack) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"{stack}: {line.split()[0]}" in said and "needs the photo, not its stack; give the photo" in said
+
+
+def test_a_stack_of_textures_is_refused_and_far_lights_are_not(
+    given: Path, stack: Path, tmp_path: Path, capsys: Said
+) -> None:
     assert relight(given, tmp_path / "b", "--light", "from=30,0;size_deg=20", photo=stack) == 0
+    write_olat_stack(
+        tmp_path / "uv.exr",
+        header_of(np.eye(3), np.ones((8, 8), np.float32), kind="texture"),
+        [torch.ones(3, 3, 8, 8)],
+    )
+    assert relight(given, tmp_path / "c", "--light", "0,0", photo=tmp_path / "uv.exr") == 1
+    assert (
+        "uv.exr: a stack of UV textures; give the photo, or predict it with --frame"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_light_from_behind_leaves_the_face_dark(given: Path, tmp_path: Path) -> None:

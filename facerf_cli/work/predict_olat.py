@@ -1,4 +1,4 @@
-"""OLAT stacks: one photo's, with its contact sheet, and composers of sums of a stack's lights."""
+"""What `facerf predict-olat` writes: the OLAT stack of a photo's person, and its contact sheet."""
 
 import math
 from collections.abc import Iterator

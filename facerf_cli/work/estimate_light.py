@@ -1,7 +1,11 @@
-"""The light of one photo: estimated, and written as a map, as JSON and as an image to look at."""
+"""What `facerf estimate-light` writes: the light of a photo as a map, as JSON and as an image to look at.
+
+The light of a photo is that on its face; the light of a picture without a face is a guess.
+"""
 
 import logging
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -23,9 +27,11 @@ from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import labels
 from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
-from facerf_cli.light.envmap import ball, resampled, rig_to_latlong
+from facerf_cli.image.strips import resized
+from facerf_cli.light.envmap import ball, envmap_weights, resampled, rig_to_latlong
+from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sh import rig_coefficients
-from facerf_cli.light.sphere import brightest_direction, direction_to_azel
+from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
 from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
@@ -33,12 +39,11 @@ from facerf_cli.network.inputs import resize
 from facerf_cli.portrait.confidence import confidence_of
 from facerf_cli.portrait.find import NoFaceError
 from facerf_cli.relighting.photo_light import Estimator, LightEstimate, estimate_light
-from facerf_cli.run.logs import LOGGER_NAME
+from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.work.photo_options import LightOptions
 from facerf_cli.work.photos import (
     FittedFace,
     facts_of_networks,
-    fit_faces,
     load_models_once,
     provenance,
     read_matte,
@@ -48,54 +53,12 @@ from facerf_cli.work.photos import (
 from facerf_cli.work.sequence import OpenShot
 from facerf_cli.work.shots import Shot
 
-TILE_PX = 256
-_LABEL_PX = 20
-_LABELS = ("photo", "explained", "red: too bright, blue: too dark", "mirror ball", "diffuse ball")
+_TILE_PX, _LABEL_PX = 256, 20
 _BALL_PX = 236  # within its tile
-
-
-def draw_estimate(head: Head, model: MorphableModel, explained: Tensor, envmap: Tensor) -> np.ndarray:
-    """Five tiles side by side [H, W, 3], linear, exposed for display; labels above.
-
-    `explained` [3, t, t] is the face's texture as its light explains it; `envmap` [H, 2 H, 3] that light.
-    """
-    whole = Crop(0.0, 0.0, float(len(head.cropped)), TILE_PX)
-    image, mask = _explained_in_crop(head, model, explained)
-    gain = np.float32(2 ** auto_exposure_ev(head.cropped, mask))
-    photo, remade = (
-        head.cropped * gain,
-        (mask[..., None] * image + (1 - mask[..., None]) * head.cropped) * gain,
-    )
-    faces = [whole.apply(tile.clip(0, 1)) for tile in (photo, remade, _difference(photo, remade, mask))]
-    both = np.stack([ball(envmap.clamp_min(0), _BALL_PX, kind).numpy() for kind in ("mirror", "diffuse")])
-    both *= np.float32(2 ** auto_exposure_ev(both[1], both[1].max(-1) > 0))
-    margin = (TILE_PX - _BALL_PX) // 2
-    balls = np.pad(both.clip(0, 1), ((0, 0), (margin, margin), (margin, margin), (0, 0)))
-    tiles = np.concatenate([*faces, *balls], 1)
-    return np.concatenate([labels(_LABELS, TILE_PX, _LABEL_PX), tiles])
-
-
-def _explained_in_crop(head: Head, model: MorphableModel, explained: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The explained face in the crop [S, S, 3], and how far it stands there for the photo [S, S] in 0..1."""
-    uv, coverage = see_face(head.fit.vertices_camera(model), head.fit.camera)
-    side = head.face.texture.shape[-1]
-    inside = (head.face.visible * region_mask("face", side))[None]
-    planes = torch.cat([resize(explained[None], side)[0], inside])
-    rendered = render_face(planes[None], uv, coverage)[0].permute(1, 2, 0).numpy()
-    return rendered[..., :3], rendered[..., 3].clip(0, 1)
-
-
-def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """On grey: red where the face was made too bright for the eye, blue where too dark."""
-    encoded = [linear_to_srgb(tile.clip(0, 1)).mean(-1) for tile in (remade, photo)]
-    error = 2 * (encoded[0] - encoded[1]) * mask
-    bright, dark = error.clip(0, 0.5), (-error).clip(0, 0.5)
-    shown = np.stack([0.5 + bright - dark, 0.5 - bright - dark, 0.5 - bright + dark], -1)
-    return np.asarray(srgb_to_linear(shown.astype(np.float32)))
-
-
+_FILM_MM = 36.0  # longer side of the frame that EXIF's focal length is of
 _UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
 _SOFT = 0.32  # share of one lamp below which the brightest direction was 15 to 120 degrees off
+Pictures = dict[str, np.ndarray]  # tiles [256, w, 3] of a sheet, linear, by their labels
 log = logging.getLogger(LOGGER_NAME)
 
 
@@ -113,40 +76,27 @@ def write_shot_light(
         take = followed.take_of(frames.start)
         image, face = followed.fitted(take.middle, portrait=False)
         face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
-        found = _write(item, image, face, options, width_px, sh_order, take.other_heads)
+        found = _write_estimate(item, image, face, options, width_px, sh_order, take.other_heads)
         tags.append(face.tag)
         facts.append(face.described() | found | {"frames": take.key_frames})
     return tags, (facts[0] if len(facts) == 1 else {"takes": facts}) | facts_of_networks(options.photo)
 
 
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
-    """Estimate and write the light of each chosen face of a photo; their tags, and facts for the report."""
+    """Estimate and write the light of each chosen face of a photo, or guess that of a picture without one.
+
+    Returns the faces' tags, and facts for the report.
+    """
     image = read_photo(item, options.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
         _require_light_on(face, options)
-        return {"light_from": "face"} | _write(item, image, face, options, width_px, sh_order)
+        return {"light_from": "face"} | _write_estimate(item, image, face, options, width_px, sh_order)
 
     try:
         return write_each(item, image, options.photo, write)
     except NoFaceError:
-        from facerf_cli.work.light_of_picture import write_guess
-
-        return [""], write_guess(item, image, options, width_px, sh_order)
-
-
-def map_of_photo(path: Path, options: LightOptions, height: int) -> Tensor:
-    """The light of the largest face of a photo, or of a picture without one: a map [height, 2 height, 3]."""
-    item = Item(path, Path(path.stem), path.stem)
-    image = read_photo(item, options.photo)
-    try:
-        face = fit_faces(item, image, options.photo)[0]
-        _require_light_on(face, options)
-    except NoFaceError:
-        from facerf_cli.work.light_of_picture import guessed_light
-
-        return resampled(guessed_light(item, image, options.fov_deg).envmap, height)
-    return rig_to_latlong(_estimate(item, image, face.head, options)[0].light, height)
+        return [""], _write_guess(item, image, options, width_px, sh_order)
 
 
 def _require_light_on(face: FittedFace, options: LightOptions) -> None:
@@ -237,7 +187,7 @@ def feature_network(options: LightOptions) -> tuple[FeatureNetwork, str]:
     return networks.light_features, f"S_f ({'shipped' if path == SHIPPED['light_features'] else path.name})"
 
 
-def _write(
+def _write_estimate(
     item: Item,
     image: LinearImage,
     face: FittedFace,
@@ -246,20 +196,120 @@ def _write(
     sh_order: int,
     more: Sequence[Head] = (),
 ) -> dict[str, Any]:
+    """Write the light of one fitted face, which `more` heads of its shot share; return facts."""
     estimate, facts = _estimate(item, image, face.head, options, more)
     models = load_models_once(options.photo)
-    said = {f"facerf:light_{name}": value for name, value in facts.items()}
-    for name, value in said.items():
-        if not isinstance(value, (int, float, str)):  # a file's header holds words and numbers
-            said[name] = " ".join(map(str, value or ["none"]))
-    metadata = provenance(item, options.photo, models.checkpoint_name()) | said
+    stamp = provenance(item, options.photo, models.checkpoint_name())
+    pictures = _explained(face.head, models.face, estimate.explained)
     envmap = rig_to_latlong(estimate.light, width_px // 2)
-    base = item.output(f"{face.tag}_light")
-    write_exr(base.with_name(base.name + ".exr"), envmap.numpy(), metadata=metadata)
-    light, rig = estimate.light, f"--lights {options.rig}"
-    harmonics = rig_coefficients(light, sh_order)
-    record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
-    write_light(base.with_name(base.name + ".json"), record)
-    shown = draw_estimate(face.head, models.face, estimate.explained, envmap)
-    write_display(base.with_name(base.name + ".png"), shown, metadata=metadata)
+    _write(
+        item.output(f"{face.tag}_light"), envmap, estimate.light, sh_order, pictures, options, stamp, facts
+    )
     return facts
+
+
+def _write_guess(
+    item: Item, image: LinearImage, options: LightOptions, width_px: int, sh_order: int
+) -> dict[str, Any]:
+    """Guess and write the light of a picture, with a warning of the error to expect; return facts."""
+    fov_deg = options.fov_deg or stated_fov_deg(image) or FOV_DEG
+    guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
+    log.warning(
+        "%s: has no face to find the light by, so the light is a guess from the picture, %.0f degrees wide "
+        "(--fov); the shading that it gives a matte white ball is expected to be wrong by %.0f %% (RMS)",
+        item.input_path,
+        fov_deg,
+        100 * guess.error,
+    )
+    facts: dict[str, Any] = {"light_from": "picture", "guess_error": round(guess.error, 3)}
+    directions = rig_by_text(options.rig)
+    light = RigLight(directions, envmap_weights(guess.envmap, directions))
+    height, width = image.pixels.shape[:2]
+    shown = resized(image.pixels, _TILE_PX, max(1, round(width * _TILE_PX / height)))
+    pictures = {"picture": shown * np.float32(2 ** auto_exposure_ev(image.pixels, None))}
+    stamp, envmap = Provenance(item.input_path.name, key=item.key), resampled(guess.envmap, width_px // 2)
+    _write(item.output("_light"), envmap, light, sh_order, pictures, options, stamp.attributes(), facts)
+    return facts
+
+
+def stated_fov_deg(image: LinearImage) -> float | None:
+    """The angle of view across a picture's width by its EXIF, of a frame of 36 mm; or None."""
+    focal_mm = image.metadata.get("Exif:FocalLengthIn35mmFilm")
+    if not isinstance(focal_mm, (int, float)) or not 4 <= focal_mm <= 2000:
+        return None
+    height, width = image.pixels.shape[:2]
+    return math.degrees(2 * math.atan(_FILM_MM / 2 / focal_mm * width / max(height, width)))
+
+
+def _write(
+    base: Path,
+    envmap: Tensor,
+    light: RigLight,
+    sh_order: int,
+    pictures: Pictures,
+    options: LightOptions,
+    stamp: Mapping[str, str | int],
+    facts: Mapping[str, Any],
+) -> None:
+    """Write a light as a map [H, 2 H, 3], as numbers, and as a sheet of pictures and balls under it."""
+    metadata: dict[str, Any] = dict(stamp)
+    for name, value in facts.items():  # a file's header holds words and numbers
+        said = value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))
+        metadata[f"facerf:light_{name}"] = said
+    write_exr(Path(f"{base}.exr"), envmap.numpy(), metadata=metadata)
+    harmonics, rig = rig_coefficients(light, sh_order), f"--lights {options.rig}"
+    record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
+    write_light(Path(f"{base}.json"), record)
+    write_display(Path(f"{base}.png"), _sheet(pictures, envmap), metadata=metadata)
+
+
+def _sheet(pictures: Pictures, envmap: Tensor) -> np.ndarray:
+    """Pictures, a mirror ball and a diffuse ball side by side [H, W, 3], linear, with their labels above."""
+    light = envmap.clamp_min(0)
+    both = np.stack([ball(light, _BALL_PX, "mirror").numpy(), ball(light, _BALL_PX, "diffuse").numpy()])
+    both *= np.float32(2 ** auto_exposure_ev(both[1], both[1].max(-1) > 0))
+    margin = (_TILE_PX - _BALL_PX) // 2
+    mirror, diffuse = np.pad(both, ((0, 0), (margin, margin), (margin, margin), (0, 0)))
+    tiles = pictures | {"mirror ball": mirror, "diffuse ball": diffuse}
+    labelled = [
+        np.concatenate([labels([label], tile.shape[1], _LABEL_PX), tile.clip(0, 1)])
+        for label, tile in tiles.items()
+    ]
+    return np.concatenate(labelled, 1)
+
+
+def _explained(head: Head, model: MorphableModel, explained: Tensor) -> Pictures:
+    """The photo's face, the face as its light explains it, and the difference, exposed for display.
+
+    `explained` [3, t, t] is the face's texture under that light.
+    """
+    whole = Crop(0.0, 0.0, float(len(head.cropped)), _TILE_PX)
+    image, mask = _explained_in_crop(head, model, explained)
+    gain = np.float32(2 ** auto_exposure_ev(head.cropped, mask))
+    photo = head.cropped * gain
+    remade = (mask[..., None] * image + (1 - mask[..., None]) * head.cropped) * gain
+    tiles = {
+        "photo": photo,
+        "explained": remade,
+        "red: too bright, blue: too dark": _difference(photo, remade, mask),
+    }
+    return {label: whole.apply(tile.clip(0, 1)) for label, tile in tiles.items()}
+
+
+def _explained_in_crop(head: Head, model: MorphableModel, explained: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The explained face in the crop [S, S, 3], and how far it stands there for the photo [S, S] in 0..1."""
+    uv, coverage = see_face(head.fit.vertices_camera(model), head.fit.camera)
+    side = head.face.texture.shape[-1]
+    inside = (head.face.visible * region_mask("face", side))[None]
+    planes = torch.cat([resize(explained[None], side)[0], inside])
+    rendered = render_face(planes[None], uv, coverage)[0].permute(1, 2, 0).numpy()
+    return rendered[..., :3], rendered[..., 3].clip(0, 1)
+
+
+def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """On grey: red where the face was made too bright for the eye, blue where too dark."""
+    encoded = [linear_to_srgb(tile.clip(0, 1)).mean(-1) for tile in (remade, photo)]
+    error = 2 * (encoded[0] - encoded[1]) * mask
+    bright, dark = error.clip(0, 0.5), (-error).clip(0, 0.5)
+    shown = np.stack([0.5 + bright - dark, 0.5 - bright - dark, 0.5 - bright + dark], -1)
+    return np.asarray(srgb_to_linear(shown.astype(np.float32)))
