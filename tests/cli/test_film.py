@@ -155,7 +155,7 @@ def test_each_frame_has_its_image_of_a_moving_background(given: Path, tmp_path: 
     assert "me_b_light.1003.png" in capsys.readouterr().out
     shutil.copy(tmp_path / "bg/b.8.png", tmp_path / "bg/b.9.png")
     assert made("bg/b.%d.png", *plates, *out, "--dry-run") == 0
-    assert "the images of --background" in capsys.readouterr().err
+    assert "3 to make again: options changed" in capsys.readouterr().err
     into = ("--light", "60,20", "--name", "b.{frame:1}", "-o", tmp_path / "bg")
     line = [tmp_path / f"plates/me.{number}.png" for number in (8, 9, 10)]
     for path in line:
@@ -370,11 +370,11 @@ def test_rates_that_headers_state(
     items, shots = collect_frames([str(tmp_path / "me_%d.exr")], ShotOptions(True), batch, PHOTO_OPTIONS)
     film = FilmOutput(tmp_path / "me.mp4", film_rate(given_rate) if given_rate else None)
     film.folder.mkdir()
-    recipes = film.recipes_of_new(items, shots, images, lambda digest_of: [], batch)
+    recipe = film.recipe_if_new(items, shots, images, lambda digest_of: [], batch)
     assert ("me.mp4: its frames state several rates" in caplog.text) == (len(set(stated)) > 1)
     slow = FilmOutput(film.path, Fraction(12))
-    assert slow.recipes_of_new(items, shots, images, lambda digest_of: [], batch) != recipes
-    assert film.joined(items, images, shots, recipes, 0) == 0
+    assert slow.recipe_if_new(items, shots, images, lambda digest_of: [], batch) != recipe
+    assert film.joined(items, images, shots, recipe, 0) == 0
     with av.open(str(film.path)) as container:
         (stream, *_) = container.streams
         assert (stream.average_rate, stream.metadata.get("timecode")) == expected

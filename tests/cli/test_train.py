@@ -135,7 +135,7 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert main([*line, "--steps", "3"]) == 2
     assert "holds a run already; give --resume" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
-    assert "the run began otherwise: other options: the data" in capsys.readouterr().err
+    assert "the run began with other data" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -89,7 +89,7 @@ def test_items_evaluated_otherwise_are_measured_again(tmp_path: Path, notes: Pat
         refused(UsageError, "leave out --overwrite never", evaluate, out, overwrite="never", **changed)
     assert evaluate(out, jobs=1, dry_run=True) == 0 and (out / "summary.json").exists()
     assert evaluate(out, Toy(cases=3, notes=notes), keep_eyes=True) == 0
-    assert "made from other options: --keep-eyes" in capsys.readouterr().err and taken(notes) == list(PEOPLE)
+    assert "options changed" in capsys.readouterr().err and taken(notes) == list(PEOPLE)
     assert json.loads((out / "summary.json").read_text())["pictures"] == 9
 
 
