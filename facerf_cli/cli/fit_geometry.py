@@ -22,7 +22,7 @@ class FitGeometry(PhotoWork):
 
     def write(self, item: Item) -> Written:
         """Fit every chosen face."""
-        from facerf_cli.work.segment_and_fit import write_fits
+        from facerf_cli.work.fit_geometry import write_fits
 
         return write_fits(item, self.photo)
 

@@ -28,7 +28,7 @@ class Segment(PhotoWork):
 
     def write(self, item: Item) -> Written:
         """Segment the person of every chosen face."""
-        from facerf_cli.work.segment_and_fit import write_segments
+        from facerf_cli.work.segment import write_segments
 
         return write_segments(item, self.photo, self.shots)
 

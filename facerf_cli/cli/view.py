@@ -42,7 +42,7 @@ class MakePage(PhotoWork):
 
     def write(self, item: Item) -> Written:
         """Write the page of every chosen face."""
-        from facerf_cli.work.view_photos import write_pages
+        from facerf_cli.work.view import write_pages
 
         return write_pages(item, self.photo, self.size_px, self.white, self.normals_from)
 
@@ -70,7 +70,7 @@ def view(
         raise InputError(refusal)
     code = work.run_on(items, batch)
     if many and not (refusal or batch.dry_run) and sums_up(items, work.outputs_of, batch):
-        from facerf_cli.work.view_photos import write_index
+        from facerf_cli.work.view import write_index
 
         write_index(output / _INDEX, items, photo)
         journal.own(output / _INDEX)

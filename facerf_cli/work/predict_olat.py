@@ -41,7 +41,7 @@ from facerf_cli.work.photos import (
 )
 from facerf_cli.work.plan import require_face
 from facerf_cli.work.verbs import PredictOlat, Written
-from facerf_cli.work.view_photos import write_page
+from facerf_cli.work.view import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
 

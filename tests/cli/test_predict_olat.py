@@ -58,7 +58,7 @@ def test_lights_fall_from_where_the_stack_says(given: Path, tmp_path: Path, kind
     assert sheet.shape[0] in (128, 258) and sheet.max() > 0.5
 
 
-def test_the_person_in_the_photos_frame_goes_back_on_the_photo(given: Path, tmp_path: Path) -> None:
+def test_a_stack_shows_the_person_in_the_photos_frame(given: Path, tmp_path: Path) -> None:
     line = ["--lights", SIDES, "--frame", "photo", "--size", "256"]
     stack = stack_of(given, tmp_path / "olat", *line)
     header = stack.header
@@ -67,14 +67,10 @@ def test_the_person_in_the_photos_frame_goes_back_on_the_photo(given: Path, tmp_
     right, left, _ = (side_of_light(stack, light) for light in range(3))
     assert right[0] > left[0] + 0.05
     path = tmp_path / "olat/astronaut_olat.exr"
-    lit = ["--light", "70,0", "--exposure", "0", "-o"]
-    assert main(["relight", str(path), "--photo", str(PHOTO), *lit, str(tmp_path / "on")]) == 0
-    whole = read_image(tmp_path / "on/astronaut_olat_light_70_0.exr")
-    photo = read_image(PHOTO).pixels
-    assert whole.pixels.shape == photo.shape and whole.alpha is None
-    np.testing.assert_allclose(whole.pixels[:20, -20:], photo[:20, -20:], atol=2e-3)  # the background
-    assert main(["relight", str(path), *lit, str(tmp_path / "alone")]) == 0
-    assert read_image(tmp_path / "alone/astronaut_olat_light_70_0.exr").alpha is not None
+    line = ["relight", str(path), "--light", "70,0", "--exposure", "0", "-o", str(tmp_path / "relit")]
+    assert main(line) == 0
+    relit = read_image(tmp_path / "relit/astronaut_olat_light_70_0.exr")
+    assert relit.alpha is not None and relit.pixels.shape[:2] == (256, 256)
 
 
 @pytest.mark.slow

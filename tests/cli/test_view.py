@@ -16,7 +16,7 @@ from facerf_cli.light.sphere import rig_directions
 from facerf_cli.main import main
 from facerf_cli.work.output_options import parse_exposure
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
-from facerf_cli.work.view_photos import write_index
+from facerf_cli.work.view import write_index
 from tests.kinds import Said
 from tests.stacks import header_of
 

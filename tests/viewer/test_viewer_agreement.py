@@ -42,7 +42,7 @@ from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import lights_over_rig, with_room
-from facerf_cli.work.view_photos import head_place, of_photo, page_maps
+from facerf_cli.work.view import head_place, of_photo, page_maps
 from tests.viewer.browser import Drawn, chromium, drawn, driven
 
 pytestmark = pytest.mark.slow
