@@ -21,7 +21,6 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.network.checkpoint import save_networks
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
-from facerf_cli.run.logs import progress_bar
 from tests.kinds import Patch, Said
 
 ROOT = Path(main.__file__).parents[1]
@@ -271,14 +270,3 @@ def test_a_signal_ends_the_process_without_what_libraries_say_at_its_end(monkeyp
     monkeypatch.setattr(os, "environ", dict(os.environ))  # `run` sets variables for its children
     main.run()
     assert left == [143]
-
-
-def test_the_time_left_is_known_after_the_first_of_two() -> None:
-    bar = progress_bar(shown=False)
-    bar.add_task("photos", total=2)
-    (task,) = bar.tasks
-    left = bar.columns[-1]
-    assert left.render(task) == "-:--:--"  # type: ignore[attr-defined]
-    task.start_time, task._get_time = 0.0, lambda: 90.0
-    task.completed = 1
-    assert left.render(task) == "0:01:30"  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 from facerf_cli.batch.inputs import Item, NamePattern, check_case, file_pattern, files_read, refuse_read
 from facerf_cli.batch.journal import Journal, Made, Row, Writes, file_row, json_rows, lines_of
@@ -34,15 +34,11 @@ from facerf_cli.run.logs import (
     escaped,
     named,
     printable_line,
-    progress_bar,
     unexpected,
 )
 from facerf_cli.run.machine import processors
 from facerf_cli.run.stopping import end_again
 from facerf_cli.run.workers import Workers, ending, process_died, spread
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
 
 REPORT_NAME = "report.jsonl"
 T = TypeVar("T")
@@ -367,13 +363,11 @@ def _results(
     work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
     memory.collect_as_usual()
     try:
-        with _progress(settings) as progress, ending(spread(work, todo, workers, _broken)) as results:
-            task = progress.add_task(job.verb, total=len(todo))
+        with ending(spread_with_bar(work, todo, job.verb, workers, settings, _broken)) as results:
             for result in results:
                 if result.stops_the_run is not None:
                     raise result.stops_the_run
                 yield result
-                progress.advance(task)
     finally:
         if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
             for folder in {path.parent for item in todo for path in job.outputs_of(item)}:
@@ -507,24 +501,19 @@ def print_path(text: object) -> None:
     print(escaped(str(text)) if sys.stdout.isatty() else text, flush=True)
 
 
-def _progress(settings: Settings) -> "Progress":
-    """A progress bar on stderr if that is a terminal."""
-    from rich.progress import MofNCompleteColumn  # --help does without it
-
-    return progress_bar(MofNCompleteColumn(), shown=settings.verbosity >= 0 and not settings.log_json)
-
-
-def with_bar(
+def spread_with_bar(
     work: Callable[[T], R],
     items: Sequence[T],
     title: str,
-    batch: BatchOptions,
+    workers: Workers,
     settings: Settings,
     died: Callable[[T, Exception], R],
 ) -> Iterator[R]:
-    """Map items by the workers of --jobs or --ray, with a progress bar."""
-    from rich.progress import track  # --help does without it
+    """Map items by workers, with a progress bar on stderr if that is a terminal."""
+    from rich.progress import Progress  # --help does without it
 
     shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-    results = spread(work, items, batch.workers(settings), died)
-    return iter(track(results, title, len(items), console=STDERR, transient=True, disable=not shown))
+    # rich would send what is printed to stdout to its console, stderr: right only if both are one terminal.
+    bar = Progress(console=STDERR, disable=not shown, redirect_stdout=sys.stdout.isatty())
+    with bar, ending(spread(work, items, workers, died)) as results:
+        yield from bar.track(results, total=len(items), description=title)

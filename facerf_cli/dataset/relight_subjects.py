@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facerf_cli.batch.inputs import MAP_SUFFIXES, Item, collect_items
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, with_bar
+from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, spread_with_bar
 from facerf_cli.batch.settings import Settings
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import (
@@ -125,7 +125,7 @@ def _spread_maps(
         raise UsageError(
             "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
         )
-    return with_bar(work, maps, "maps", batch, settings, _map_died)
+    return spread_with_bar(work, maps, "maps", batch.workers(settings), settings, _map_died)
 
 
 def _map_died(task: Any, error: Exception) -> Any:

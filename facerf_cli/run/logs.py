@@ -9,16 +9,12 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.console import Console
 
 from facerf_cli._version import __version__
-
-if TYPE_CHECKING:
-    from rich.progress import Progress, ProgressColumn
 
 # IPTC's digital source types (cv.iptc.org/newscodes/digitalsourcetype): changed by a trained model,
 COMPOSITE_SOURCE_TYPE = "http://cv.iptc.org/newscodes/digitalsourcetype/compositeWithTrainedAlgorithmicMedia"
@@ -154,28 +150,6 @@ def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
     logger.handlers[:] = [handler]
     logger.propagate = False
     logger.setLevel({-1: logging.ERROR, 0: logging.INFO}.get(verbosity, logging.DEBUG))
-
-
-def progress_bar(*columns: "ProgressColumn", shown: bool = True) -> "Progress":
-    """A bar on stderr if that is a terminal: the task, a bar, more columns, the time that remains."""
-    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn  # --help does without it
-
-    class TimeLeft(ProgressColumn):
-        """The mean time of what is done, for what is left: rich's own knows it from the second step on."""
-
-        def render(self, task: Task) -> str:
-            left_s = math.inf
-            if task.completed and task.total is not None and task.elapsed is not None:
-                left_s = task.elapsed / task.completed * (task.total - task.completed)
-            return str(timedelta(seconds=round(left_s))) if math.isfinite(left_s) else "-:--:--"
-
-    # rich would send what we print to stdout to its console, stderr: right only if both are one terminal.
-    return Progress(
-        *(TextColumn("{task.description}"), BarColumn(), *columns, TimeLeft()),
-        console=STDERR,
-        disable=not (shown and STDERR.is_terminal),
-        redirect_stdout=sys.stdout.isatty(),
-    )
 
 
 def log_to_queue(queue: Any, level: int) -> None:
