@@ -13,9 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import _path_tracer as path_tracer
 import numpy as np
 import torch
 from _common import arguments, print_header, print_row, required_package
+from _path_tracer import PathSettings
 from scipy.ndimage import binary_dilation
 from torch import Tensor
 
@@ -28,11 +30,10 @@ from facerf_cli.light.transport import BakeSettings
 from facerf_cli.raster.camera import Camera, pose_to_rotation
 from facerf_cli.raster.rasterize import rasterize
 from facerf_cli.raster.texture import unwrap
-from facerf_cli.synth import path_tracer, renderer
+from facerf_cli.synth import renderer
 from facerf_cli.synth.appearance.materials import Appearance, draw_appearance
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.head.shell import shell_head
-from facerf_cli.synth.path_tracer import PathSettings
 from facerf_cli.synth.renderer import RenderSettings
 from facerf_cli.synth.views import StageCamera
 
@@ -68,7 +69,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--images", type=Path, help="folder for both renderers' images")
     given = parser.parse_args()
-    required_package("mitsuba", "synth")
+    required_package("mitsuba", "dev")
     model = load_face_model(given.face_model)
     generator = torch.Generator().manual_seed(given.seed)
     alpha = 0.7 * torch.randn(len(model.identity), generator=generator)

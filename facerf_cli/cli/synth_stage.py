@@ -9,23 +9,20 @@ import typer
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
 from facerf_cli.cli.options import settings_of
-from facerf_cli.errors import UsageError
-from facerf_cli.option import IMAGE, Without
+from facerf_cli.option import Without
 from facerf_cli.synth.stage_settings import StageSettings
 
 
 @dataclass(frozen=True)
 class Photograph(Job):
-    """Photographs people; the baked transport of each is kept in a folder, if one is given."""
+    """Photographs people."""
 
     stage: StageSettings
-    transport: Path | None
     verb = "synth-stage"
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """The person's folder, and the baked transport if it is kept."""
-        transport = self._transport_path(item)
-        return [item.output_base] if transport is None else [item.output_base, transport]
+        """The person's folder."""
+        return [item.output_base]
 
     def __call__(self, item: Item) -> Outcome:
         """Draw and photograph a person."""
@@ -37,11 +34,8 @@ class Photograph(Job):
         model = cached_face_model(self.stage.face_model)
         with one_thread():
             subject = draw_subject(model, int(item.name), self.stage.seed, self.stage.size_px)
-            write_subject(item.output_base, subject, self.stage, self._transport_path(item))
+            write_subject(item.output_base, subject, self.stage)
         return Outcome(self.outputs_of(item), {"traits": subject.traits})
-
-    def _transport_path(self, item: Item) -> Path | None:
-        return self.transport / f"{item.name}.safetensors" if self.transport else None
 
 
 def synth_stage(
@@ -58,37 +52,24 @@ def synth_stage(
     ] = 10,
     *,
     stage: StageSettings,
-    transport: Annotated[
-        bool,
-        typer.Option(
-            "--transport",
-            help="Keep the baked transport in transport/SUBJECT.safetensors.",
-            rich_help_panel=IMAGE,
-        ),
-    ] = False,
     batch: Annotated[BatchOptions, Without("name")],
 ) -> None:
     """Photograph synthetic people in a light stage: one light at a time, several cameras, one exposure.
 
     Writes a capture for `facerf prepare-dataset`: stage.json, and SUBJECT/CAMERA/LIGHT.exr in half floats,
-    scene-linear Rec.709. SUBJECT/truth/CAMERA.exr has the true matte, classes, surface and material.
+    scene-linear Rec.709.
     Person number n depends on --seed, n and the face model alone, so a larger --subjects adds people and
     changes none.
     """
-    if transport and stage.renderer != "bake":
-        raise UsageError("--transport: --renderer mitsuba bakes no transport; give --renderer bake")
     from facerf_cli.synth.bank.heads import cached_face_model
-    from facerf_cli.synth.path_tracer import load_mitsuba
     from facerf_cli.synth.stage import close_capture, open_capture
 
     settings = settings_of(context)
     stage = replace(stage, seed=settings.seed)
     cached_face_model(stage.face_model)  # raises for an invalid model before anything is written
-    if stage.renderer == "mitsuba":
-        load_mitsuba()
     folders = [batch.output / f"{index:04d}" for index in range(subjects)]
     items = [Item(folder, folder, folder.name) for folder in folders]
-    photograph = Photograph(stage, batch.output / "transport" if transport else None)
+    photograph = Photograph(stage)
     if not batch.dry_run:
         open_capture(batch.output, stage)
     code = run_items(photograph, items, batch, settings)

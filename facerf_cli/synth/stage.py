@@ -7,24 +7,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from facerf_cli._version import __version__
 from facerf_cli.capture.stage_json import STAGE_FILE, STAGE_FORMAT
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.topology import GRID
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.texts import read_json
 from facerf_cli.files.write import write_exr
-from facerf_cli.light.mesh_transport import MeshTransport
 from facerf_cli.light.sphere import rig_directions
 from facerf_cli.light.transport import BakeSettings
-from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.run.logs import COMPUTER_GRAPHICS_SOURCE_TYPE, Provenance
-from facerf_cli.synth import path_tracer, renderer
+from facerf_cli.synth import renderer
 from facerf_cli.synth.bank.heads import cached_face_model
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.renderer import lenses_in, over_lenses
@@ -32,9 +27,6 @@ from facerf_cli.synth.stage_settings import StageSettings
 from facerf_cli.synth.subjects import Subject
 from facerf_cli.synth.views import CAMERA_DISTANCE_M, StageCamera, stage_cameras, truth_of
 
-_TRANSPORT_SIDE = 128  # texels along a side of the transport that a capture may store
-TRUTH = "truth"  # folder of a subject with the true layers of each camera
-EVEN_LIGHT = 4.0  # sum of the weights of a rig's lights under a map of radiance 1
 _LEAST_FACING = -0.2  # cosine to a camera below which a vertex is not baked
 _BAKE = BakeSettings()
 
@@ -108,15 +100,10 @@ def close_capture(folder: Path, settings: StageSettings) -> None:
     write_document(folder / STAGE_FILE, describe_stage(settings) | {"subjects": subjects})
 
 
-def photograph_subject(
-    subject: Subject, settings: StageSettings
-) -> tuple[Iterator[Tensor], MeshTransport | None]:
-    """Render linear images [L, 3, H, W], one camera at a time; return them and the bake, if there is one."""
+def photograph_subject(subject: Subject, settings: StageSettings) -> Iterator[Tensor]:
+    """Render linear images [L, 3, H, W], one camera at a time."""
     directions, cameras = light_directions(settings), _cameras(settings)
     mesh, appearance = subject.mesh, subject.appearance
-    if settings.renderer == "mitsuba":
-        images = (path_tracer.photograph(mesh, appearance, directions, camera)[0] for camera in cameras)
-        return images, None
     wanted = _visible_vertices(mesh, cameras)
     transport = renderer.bake_person(mesh, directions, _BAKE, settings.seed, wanted)
     irradiance = renderer.scattered_irradiance(mesh, appearance, transport)
@@ -125,7 +112,7 @@ def photograph_subject(
         images, _ = renderer.photograph(mesh, appearance, transport, camera, irradiance=irradiance)
         return _with_lenses(images, subject, camera, directions)
 
-    return map(photo, cameras), transport
+    return map(photo, cameras)
 
 
 def _with_lenses(images: Tensor, subject: Subject, camera: StageCamera, directions: np.ndarray) -> Tensor:
@@ -147,26 +134,14 @@ def _visible_vertices(mesh: HeadMesh, cameras: tuple[StageCamera, ...]) -> np.nd
     return visible
 
 
-def write_subject(
-    folder: Path, subject: Subject, settings: StageSettings, transport_path: Path | None
-) -> None:
-    """Write `folder`/CAMERA/LIGHT.exr, truth/CAMERA.exr and subject.json atomically, and the bake to a path.
-
-    The colour of the truth is that of the person under an even white light of radiance 1.
-    """
+def write_subject(folder: Path, subject: Subject, settings: StageSettings) -> None:
+    """Write `folder`/CAMERA/LIGHT.exr and subject.json atomically."""
     model = cached_face_model(settings.face_model)
     metadata = Provenance(**model.stamp, source_type=COMPUTER_GRAPHICS_SOURCE_TYPE).attributes()
-    cameras, transport = photograph_subject(subject, settings)
     with atomic_path(folder) as unfinished:
-        for camera, images in enumerate(cameras):
-            even = images.sum(0).permute(1, 2, 0).numpy() * (EVEN_LIGHT / len(images))
-            view = _cameras(settings)[camera]
-            truth = truth_of(subject.mesh, subject.appearance, view)
-            write_exr(unfinished / TRUTH / f"C{camera}.exr", even, layers=truth.layers(), metadata=metadata)
+        for camera, images in enumerate(photograph_subject(subject, settings)):
             for light, image in enumerate(images.permute(0, 2, 3, 1).numpy()):
                 write_exr(unfinished / f"C{camera}" / f"L{light:03d}.exr", image, metadata=metadata)
-        if transport_path and transport:
-            _save_transport(transport_path, subject, transport, settings)
         record = {
             "traits": subject.traits,
             "head_to_world": subject.head_to_world.tolist(),
@@ -174,32 +149,3 @@ def write_subject(
             "more_landmarks_world": subject.more_landmarks_world,
         }
         write_document(unfinished / "subject.json", record)
-
-
-def _save_transport(path: Path, subject: Subject, transport: MeshTransport, settings: StageSettings) -> None:
-    """Write the bake resampled to UV space, head frame, in the form of `bake_heads.bake_head`."""
-    skin = np.flatnonzero(subject.mesh.is_part("skin"))
-    texels = bake_attributes(subject.face_vertices, GRID, _TRANSPORT_SIDE).permute(1, 2, 0).reshape(-1, 3)
-    rotation = subject.head_to_world.numpy()
-    distances, near = cKDTree(subject.mesh.vertices[skin]).query(texels.numpy() @ rotation.T, 3)
-    weights = 1 / (distances + 1e-5)
-    weights /= weights.sum(-1, keepdims=True)
-    cosines = np.clip(transport.directions @ subject.mesh.normals.T, 0, None)
-    direct = (transport.visibility * cosines)[:, transport.sites].T
-    bounce = transport.gathered(direct)[transport.site_of].T * transport.baked
-
-    def in_uv(baked: np.ndarray) -> Tensor:
-        field = np.einsum("lnk,nk->ln", baked[:, skin[near]], weights)
-        shape = (len(field), _TRANSPORT_SIDE, _TRANSPORT_SIDE)
-        values = (np.clip(field, 0, 1) * 255).round().astype(np.uint8)
-        return torch.from_numpy(np.ascontiguousarray(values.reshape(shape)))
-
-    tensors = {
-        "vertices": subject.face_vertices.contiguous(),
-        "directions": torch.from_numpy(transport.directions @ rotation).float(),
-        "visibility": in_uv(transport.visibility),
-        "bounce": in_uv(np.sqrt(bounce)),
-    }
-    with atomic_path(path) as temporary:
-        # One entry only: safetensors writes several in random order.
-        save_file(tensors, temporary, metadata={"face_model": cached_face_model(settings.face_model).credit})

@@ -5,7 +5,6 @@ from typing import Literal
 
 from facerf_cli.option import option
 
-Renderer = Literal["bake", "mitsuba"]
 Frame = Literal["head", "bust"]
 _STAGE, _IMAGE = "People and stage", "Image"
 
@@ -17,8 +16,6 @@ class StageSettings:
     Attributes:
         size_px: Write square images of this side.
         face_model: Draw people from this face model: builtin, or a .npz of `face-model import`.
-        renderer: Render with light transport baked once a person (bake), or by path tracing, slow and
-            accurate (mitsuba).
         lights: Use so many lights, uniform on the sphere.
         cameras: Use so many cameras, the first of eight: from the front, then ever more from the sides.
         frame: Show the head down to the collar, or a bust down to the chest.
@@ -28,7 +25,6 @@ class StageSettings:
         256, metavar="PX", panel=_IMAGE, flags=("--size",), least=64, most=1024, everyday=True
     )
     face_model: str = option("builtin", metavar="NAME|PATH", panel=_STAGE)
-    renderer: Renderer = option("bake", panel=_IMAGE)
     lights: int = option(150, metavar="N", panel=_STAGE, least=4, most=1000)
     cameras: int = option(8, metavar="N", panel=_STAGE, least=1, most=8, everyday=True)
     seed: int = 0

@@ -227,20 +227,6 @@ class Truth:
         """Share [H, W] of each pixel that shows the person."""
         return np.asarray(1 - self.classes[..., class_index("background")])
 
-    def layers(self) -> dict[str, np.ndarray]:
-        """The layers by the names that they have in an EXR file."""
-        classes = {f"class.{name}": self.classes[..., index] for index, name in enumerate(CLASSES)}
-        return {
-            "person.A": self.alpha,
-            **classes,
-            "albedo": self.albedo,
-            "normal": self.normals,
-            "position": self.positions_m,
-            "depth.Z": -self.positions_m[..., 2],
-            "specular.Y": self.specular,
-            "roughness.Y": self.roughness,
-        }
-
 
 def truth_of(mesh: HeadMesh, appearance: Appearance, camera: StageCamera) -> Truth:
     """Compute the layers of the image that a camera takes of a person."""

@@ -16,7 +16,6 @@ from facerf_cli.run.machine import memory_bytes
 MISSING = "MISSING"
 # Extras of the package (pyproject.toml) for users, and the use of each.
 EXTRAS = {
-    "synth": "`--renderer mitsuba`",
     "face-models": "Basel's models in `face-model import`",
     "tensorboard": "the curves of `train`",
     "ray": "`--ray`, on clusters",

@@ -153,7 +153,6 @@ WRONG: dict[str, dict[str, str]] = {
     },
     "view": {"a.jpg b.jpg -o me.html": "is one file", "index": "rename the photo"},
     "envmap": {"--kind moon": "moon", "--size 33": "--size", "--count 0": "--count"},
-    "synth-stage": {"--renderer mitsuba --transport": "--transport"},
     "prepare-dataset stage": {
         "--split 300/10/40": "the capture has 2",
         "--split half": "--split",

@@ -1,12 +1,12 @@
 """The truth of an image: matte, classes, surface and material of known shapes; places of irises and ears."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import torch
 
 from facerf_cli.face.morphable import load_face_model
-from facerf_cli.portrait.parse import CLASSES, class_index
+from facerf_cli.portrait.parse import class_index
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import HeadMesh
 from facerf_cli.synth.head.shell import shell_head
@@ -45,16 +45,15 @@ def test_layers_of_all_classes_are_those_of_geometry_in_camera_space() -> None:
     np.testing.assert_allclose(np.linalg.norm(centre, axis=-1)[inside], RADIUS_M, atol=3e-4)
     cosines = (truth.normals * centre).sum(-1)[inside] / RADIUS_M
     assert cosines.min() > 0.99
-    depth = truth.layers()["depth.Z"][inside]
+    depth = -truth.positions_m[..., 2][inside]
     assert abs(depth.min() - (FAR_M - RADIUS_M)) < 3e-4
     turned = truth_of(halves(), painted(), camera(yaw_deg=90.0))
     # The head's left half in the image, skin, turns to the camera when the head turns to the right.
     assert turned.classes[middle, middle, class_index("skin")] > 0.99
     np.testing.assert_allclose(turned.normals[middle, middle], [0, 0, 1], atol=0.03)
     assert turned.positions_m[middle, middle, 2] > -FAR_M + 0.9 * RADIUS_M
-    layers = truth_of(halves(), painted(), camera()).layers()
-    assert {f"class.{name}" for name in CLASSES} < set(layers) and "person.A" in layers
-    assert all(np.isfinite(layer).all() for layer in layers.values())
+    truth = truth_of(halves(), painted(), camera())
+    assert all(np.isfinite(getattr(truth, field.name)).all() for field in fields(truth))
     cameras = stage_cameras(64)
     places = torch.stack([-c.head_to_camera.T.float() @ c.translation_m.float() for c in cameras])
     assert len(cameras) == 8 and (places[:, 2] > 0).all()

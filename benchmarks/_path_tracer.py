@@ -2,7 +2,7 @@
 
 The scene has geometry, normals, textures, relief, directional lights, diffuse bounces and the two specular
 lobes. It has no subsurface scattering, hair is shaded like any other surface, and all shadows are hard.
-Requires the extra: pip install 'facerf[synth]'.
+Requires mitsuba: pip install 'facerf[dev]'.
 """
 
 import math
@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from facerf_cli.errors import UsageError
 from facerf_cli.synth.appearance.materials import Appearance
 from facerf_cli.synth.head.mesh import PARTS, HeadMesh
 from facerf_cli.synth.random_fields import CANVAS_SPAN
@@ -60,13 +59,9 @@ def photograph(
 
 
 def load_mitsuba() -> types.ModuleType:
-    """Import mitsuba and set its variant; raise UsageError if it is not installed."""
-    try:
-        import mitsuba
-    except ImportError as error:
-        raise UsageError(
-            f"renderer mitsuba: not installed ({error}); run pip install 'facerf[synth]'"
-        ) from error
+    """Import mitsuba and set its variant."""
+    import mitsuba
+
     if mitsuba.variant() != "scalar_rgb":
         mitsuba.set_variant("scalar_rgb")
     return mitsuba
