@@ -176,6 +176,11 @@ def _faults(
     capture: Capture, image: Path, raw: np.ndarray, corners_px: np.ndarray, fit: ColourFit
 ) -> Iterator[str]:
     """Faults of patches that are too small or clipped to measure, and of colours that are not a chart's."""
+    if not (mean := fit.delta_e_after.mean()) <= LARGEST_DELTA_E:
+        yield (
+            f"the patches' colours differ from a ColorChecker Classic's by a mean CIE delta E 2000 "
+            f"of {mean:.0f}; check the corners and the colour space '{capture.colour_space}'"
+        )
     inside = patches(raw, corners_px)
     if (fewest := min(map(len, inside))) < _LEAST_PX:
         yield (
@@ -186,11 +191,6 @@ def _faults(
     header = read_header(image) if clipped else None
     if header and not header.is_floating:  # floating-point values may exceed 1
         yield f"{clipped} of the chart's patches are clipped at white; expose it less"
-    if not (mean := fit.delta_e_after.mean()) <= LARGEST_DELTA_E:
-        yield (
-            f"the patches' colours differ from a ColorChecker Classic's by a mean CIE delta E 2000 "
-            f"of {mean:.0f}; check the corners and the colour space '{capture.colour_space}'"
-        )
     (white, grey), (wanted, wanted_grey) = (
         colours[GREYS][:2].max(-1)
         for colours in (_normalise(capture, sample(raw, corners_px)), published_colours())
