@@ -31,7 +31,6 @@ from facerf_cli.network import checkpoint
 from facerf_cli.network.checkpoint import new_network, save_checkpoint, save_networks, use_form
 from facerf_cli.network.features import LightNetwork
 from facerf_cli.portrait.find import Face, face_at
-from facerf_cli.relighting import photo_light
 from facerf_cli.relighting.models import Models
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import load_models_once
@@ -240,7 +239,7 @@ def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch
         asked.append(given["estimator"])
         return SimpleNamespace(light=None)
 
-    monkeypatch.setattr(photo_light, "estimate_light", estimate)
-    monkeypatch.setattr(photo_light, "reflectance_of", lambda *given: None)
+    monkeypatch.setattr(people, "estimate_light", estimate)
+    monkeypatch.setattr(people, "reflectance_of", lambda *given: None)
     method.explained(None)  # type: ignore[arg-type]
     assert asked == [method.estimator]
