@@ -47,7 +47,7 @@ def test_relighting_mixes_no_devices() -> None:
     given = {kind: fake_device.moved(copy.deepcopy(getattr(models.networks, kind))) for kind in KINDS}
     networks = Networks(models.networks.files, fake_device.DEVICE, given)
     graphs = mediapipe_networks(torch.device("cpu"))  # of stored operators, which take their device's
-    networks._loaded["people"] = PeopleNetworks(given["parsing"], *graphs)
+    networks.people = PeopleNetworks(given["parsing"], *graphs)
     photo, light = facerf.read_image(ASTRONAUT), facerf.Light.single(60, 30)
     expected = facerf.fit(models, photo).relight(light)
     with fake_device.in_use() as calls:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from facerf_cli.errors import UsageError
-from facerf_cli.option import flag
 
 RESULTS_VERSION = 27  # raised where the same recipe gives other pixels
 SHIPPED = Path(__file__).parents[1] / "assets"
@@ -76,10 +75,10 @@ def _content(files: Iterable[Path], digest_of: DigestOf) -> str:
 
 
 def require_same(before: Recipe, now: Recipe, said: str, advice: str) -> None:
-    """Raise UsageError, `SAID: other options: --size; ADVICE`, where two recipes differ."""
+    """Raise UsageError, `SAID: other crop, seed; ADVICE`, where two recipes differ."""
     names = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
     if names:
-        raise UsageError(f"{said}: other options: {', '.join(map(flag, names))}; {advice}")
+        raise UsageError(f"{said}: other {', '.join(names).replace('_', ' ')}; {advice}")
 
 
 def text_of_state(path: Path) -> str:

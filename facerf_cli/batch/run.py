@@ -329,7 +329,8 @@ def _make(job: Job, plan: Plan, journal: Journal, options: BatchOptions, setting
     def done(result: ItemResult) -> int:
         """Note and print the result of an item; return 1 for a failure."""
         row = _row(job.verb, result, options.output)
-        journal.add(result.item, row, result.made, plan.outputs[result.item], plan.keys)
+        outputs = job.outputs_of(result.item) if result.made else ()  # may depend on what was made
+        journal.add(result.item, row, result.made, outputs, plan.keys)
         return _print_result(result, options)
 
     failures = sum(map(done, plan.refused))

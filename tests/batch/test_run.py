@@ -532,7 +532,7 @@ def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) 
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
     refused(
-        UsageError, "run: other options: --lights, --matte; advice", require_same, one, other, "run", "advice"
+        UsageError, "run: other lights, matte; advice", require_same, one, other, "run", "advice"
     )
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
     (tmp_path / "mattes").mkdir()

@@ -34,12 +34,12 @@ def test_jobs_have_a_share_each_and_items_give_theirs_back(monkeypatch: Patch) -
     assert Settings(memory_bytes=7).job_bytes(4) == 7
     seen = []
     item = Item(Path("a"), Path("a"), "a")
-    _run_one(lambda item: seen.append(memory.limit_bytes()), False, 12345, item)  # type: ignore[arg-type]
+    _run_one(lambda item: seen.append(memory.limit_bytes()), None, 12345, item)  # type: ignore[arg-type]
     assert seen == [12345]
     given: list[str] = []
     monkeypatch.setattr(memory, "give_back", lambda: given.append("back"))
     for process in (lambda item: Outcome([]), lambda item: 1 / 0):
-        _run_one(process, False, 1 << 30, Item(Path("a"), Path("a"), "a"))
+        _run_one(process, None, 1 << 30, Item(Path("a"), Path("a"), "a"))
     assert given == ["back", "back"]
     assert global_options_first(["relight", "a.jpg", "--memory", "2"]) == [
         "--memory",

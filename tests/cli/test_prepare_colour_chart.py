@@ -99,7 +99,7 @@ def test_jobs_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, cap
     for line in ([], [*chart[:2], "--chart-corners", corners]):
         assert prepare(wrong, corrected, *SPLIT, *line) == 2
         assert (
-            "or --colour-chart of the capture; give --overwrite" in capsys.readouterr().err
+            "other stage values; give --overwrite" in capsys.readouterr().err
             and tree(corrected) == before
         )
 

@@ -270,7 +270,7 @@ def test_other_options_do_not_mix_and_a_dry_run_writes_nothing(
 ) -> None:
     line = ["prepare-dataset", str(given[0]), "-o", str(prepared.folder), "--crop", "128"]
     assert main(line) == 2
-    assert "was prepared otherwise: other options: --crop; give --overwrite always" in capsys.readouterr().err
+    assert "was prepared otherwise: other crop; give --overwrite always" in capsys.readouterr().err
     assert prepare(given[0], tmp_path / "out", "--dry-run") == 0
     assert "olat/0001/C2.exr" in capsys.readouterr().out and not (tmp_path / "out").exists()
 

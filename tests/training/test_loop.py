@@ -220,7 +220,7 @@ def test_more_steps_go_on_from_a_finished_run(tmp_path: Path) -> None:
 def test_a_run_is_not_written_over_nor_resumed_otherwise(tmp_path: Path) -> None:
     train(toy_objective(), tmp_path, replace(TINY, steps=1))
     refused(UsageError, "holds a run already; give --resume", train, toy_objective(), tmp_path, TINY)
-    with pytest.raises(UsageError, match="the run began otherwise: other options: --batch; resume it"):
+    with pytest.raises(UsageError, match="the run began otherwise: other batch; resume it"):
         train(toy_objective(), tmp_path, replace(TINY, batch=4), resume=True)
     (tmp_path / "state.pt").write_bytes((tmp_path / "state.pt").read_bytes()[:2000])
     refused(InputError, "state.pt: cannot be resumed", train, toy_objective(), tmp_path, TINY, resume=True)

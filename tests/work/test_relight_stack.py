@@ -27,10 +27,9 @@ def lit(radiance: float) -> Relit:
 
 
 def test_the_person_alone_has_its_colours_exposure_and_layers_that_add_up() -> None:
-    image = StackImages(header(), Path(), header().seen).image(lit(0.6))
-    assert image.alpha is not None and image.alpha.mean() == 0.5
-    np.testing.assert_allclose(image.pixels[:, :2], 0.6, rtol=1e-6)
     composer = StackImages(header(), Path(), header().seen)
+    assert composer.matte.mean() == 0.5
+    np.testing.assert_allclose(composer.image(lit(0.6))[:, :2], 0.6, rtol=1e-6)
     one, other, both = (composer.light_layer(lit(radiance)) for radiance in (0.2, 0.4, 0.6))
     np.testing.assert_allclose(one + other, both, rtol=1e-5)
     assert composer.exposure_ev(lit(0.4), "auto") == -1.0 and composer.exposure_ev(lit(0.4), "face") == 1.0
