@@ -208,13 +208,12 @@ class Journal:
         rows = [row]
         if made:
             each = keys if len(keys) > 1 else [*keys] * len(outputs)
-            recipes = dict(zip(outputs, each, strict=True))
+            recipes = dict(zip(map(self._name, outputs), each, strict=True))
             rows += [one for one in (made.read, *made.outputs) if one]
             for one in made.outputs:
-                path = Path(one["file"])
-                name = self._name(path)
+                name = self._name(Path(one["file"]))
                 made_as = {"output": name, "verb": self._verb, "item": item.name, "sha256": one["sha256"]}
-                key = _key(recipes.get(path, ""), made.read.get("sha256", "none"))
+                key = _key(recipes.get(name, ""), made.read.get("sha256", "none"))
                 rows.append(made_as | {"key": key})
         for one in rows:
             self._take(one)

@@ -219,6 +219,14 @@ def test_other_options_make_all_again(two: Path, tmp_path: Path, capsys: Said) -
     assert "2 to make again: options changed" in capsys.readouterr().err
 
 
+def test_results_of_a_relative_folder_are_recognised(two: Path, monkeypatch: Patch, capsys: Said) -> None:
+    monkeypatch.chdir(two.parent)
+    run([Path("photos")], Path("out"))
+    capsys.readouterr()
+    assert run([Path("photos")], Path("out")) == 0 and made(capsys) == []
+    assert run([two], two.parent / "out") == 0 and made(capsys) == []
+
+
 @pytest.mark.parametrize(("overwrite", "expected"), [("never", ""), ("changed", "a"), ("always", "ab")])
 def test_overwrite(two: Path, tmp_path: Path, capsys: Said, overwrite: str, expected: str) -> None:
     run([two], tmp_path / "out")
@@ -531,9 +539,7 @@ def test_recipes_hold_the_content_of_files_folders_and_patterns(tmp_path: Path) 
     assert recipe_of(Outer(Inner(tmp_path / "two", jobs=8), "150"), file_sha256) == one
     (tmp_path / "two").write_bytes(b"2")
     other = recipe_of(Outer(Inner(tmp_path / "two"), str(tmp_path / "one")), file_sha256)
-    refused(
-        UsageError, "run: other lights, matte; advice", require_same, one, other, "run", "advice"
-    )
+    refused(UsageError, "run: other lights, matte; advice", require_same, one, other, "run", "advice")
     assert len(one["checkpoint"]) > 32  # the networks that facerf ships
     (tmp_path / "mattes").mkdir()
     (tmp_path / "mattes" / "a.png").write_bytes(b"1")
