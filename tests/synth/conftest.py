@@ -49,7 +49,7 @@ def transport_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bank of one person, whom two squares of a photo show; all processes of a run have the same."""
 
     def fill(folder: Path) -> None:
-        for name, tensors in transport_of("builtin", 1, 5, SMALL).items():
+        for name, tensors in transport_of("builtin", 1, 10, SMALL).items():
             save_file(tensors, folder / f"{name}.safetensors")
         look_at_photos(backgrounds(), SHIPPED_NETWORKS, 0, list(folder.glob("photo_*")))
 
