@@ -3,7 +3,6 @@
 `pytest tests/test_kills.py --kills 100` sends SIGKILL at more moments than the default.
 """
 
-import json
 import os
 import random
 import resource
@@ -21,7 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from facerf_cli.batch.run import REPORT_NAME
+from tests.folders import rows
 
 pytestmark = pytest.mark.slow
 
@@ -55,9 +54,8 @@ def ended(process: "subprocess.Popen[str]") -> int:
 
 
 def outputs_of(folder: Path) -> dict[str, tuple[int, str]]:
-    """Size in bytes and digest of the visible files of an output folder, by name, without the report."""
-    files = [path for path in folder.glob("[!.]*") if path.name != REPORT_NAME] if folder.exists() else []
-    contents = {path.name: path.read_bytes() for path in files}
+    """Size in bytes and digest of the visible files of an output folder, by name."""
+    contents = {path.name: path.read_bytes() for path in folder.glob("[!.]*")}
     return {name: (len(content), sha256(content).hexdigest()) for name, content in contents.items()}
 
 
@@ -65,9 +63,9 @@ def assert_whole(folder: Path, undisturbed: Undisturbed) -> None:
     """No output is missing, half-written or different; no temporary file is left; one row per photo."""
     assert outputs_of(folder) == undisturbed.outputs
     assert not [*folder.rglob(".*part-*"), *folder.rglob(".facerf-lock*")]
-    rows = [json.loads(line) for line in (folder / REPORT_NAME).read_text().splitlines()]
-    assert sorted(row["item"] for row in rows) == sorted(path.stem for path in undisturbed.inputs.iterdir())
-    assert not [row for row in rows if row["status"] == "failed"]
+    ends = rows(folder)
+    assert sorted(ends) == sorted(path.stem for path in undisturbed.inputs.iterdir())
+    assert not [row for row in ends.values() if row["status"] == "failed"]
 
 
 def assert_finishes(folder: Path, undisturbed: Undisturbed) -> None:

@@ -185,7 +185,7 @@ def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pyt
         raise AssertionError("made again")
 
     for name in ("FaceAlone", "PersonInPhoto"):
-        monkeypatch.setattr(f"facerf_cli.person.{name}", made_again)
+        monkeypatch.setattr(f"facerf_cli.relighting.fitted.{name}", made_again)
     monkeypatch.setattr("facerf_cli.person.reflectance_of", made_again)
     assert np.isfinite(one.relight(facerf.Light.single(20, 0))).all()
     with pytest.raises(AssertionError, match="made again"):
