@@ -130,8 +130,8 @@ class Journal:
         if overwrite == "never":
             return {path: "" for path in outputs if not is_occupied(path)}
         stale = {}
-        for number, path in enumerate(outputs):
-            reason = self.why(item, path, keys[number if len(keys) > 1 else 0])
+        for path, key in _with_keys(outputs, keys):
+            reason = self.why(item, path, key)
             if reason is None:
                 continue
             if refusal := self.refusal(path):
@@ -207,14 +207,12 @@ class Journal:
         """
         rows = [row]
         if made:
-            each = keys if len(keys) > 1 else [*keys] * len(outputs)
-            recipes = dict(zip(map(self._name, outputs), each, strict=True))
+            recipes = {self._name(path): key for path, key in _with_keys(outputs, keys)}
             rows += [one for one in (made.read, *made.outputs) if one]
             for one in made.outputs:
                 name = self._name(Path(one["file"]))
-                made_as = {"output": name, "verb": self._verb, "item": item.name, "sha256": one["sha256"]}
                 key = _key(recipes.get(name, ""), made.read.get("sha256", "none"))
-                rows.append(made_as | {"key": key})
+                rows.append(self._output_row(name, one, key) | {"item": item.name})
         for one in rows:
             self._take(one)
         self._append(rows)
@@ -222,14 +220,16 @@ class Journal:
     def add_file(self, item: Item, output: Path, key: str) -> None:
         """Add the one output of a run that has no items, with the digest of its recipe."""
         read, written = file_row(item.input_path), file_row(output)
-        row = {"output": self._name(output), "verb": self._verb, "item": item.name}
-        row |= {"sha256": written["sha256"], "key": _key(key, read["sha256"])}
-        self._append([read, written, row])
+        row = self._output_row(self._name(output), written, _key(key, read["sha256"]))
+        self._append([read, written, row | {"item": item.name}])
 
     def own(self, path: Path) -> None:
         """Note a file that belongs to no item, such as the list of all pages, as written by facerf."""
-        row = {"output": self._name(path), "verb": self._verb, "key": ""}
-        self._append([row | {"sha256": file_row(path)["sha256"]}])
+        self._append([self._output_row(self._name(path), file_row(path), "")])
+
+    def _output_row(self, name: str, written: Row, key: str) -> Row:
+        """The row of a finished output, from the row of its file."""
+        return {"output": name, "verb": self._verb, "sha256": written["sha256"], "key": key}
 
     def _append(self, rows: Iterable[Row]) -> None:
         with suppress(*self._lost):
@@ -386,6 +386,11 @@ def _in_cache(file: Path) -> Path:
 
     name = hashlib.sha256(os.fsencode(os.path.abspath(file))).hexdigest()[:16]
     return cache_folder() / "written" / f"{name}.jsonl"
+
+
+def _with_keys(outputs: Sequence[Path], keys: Sequence[str]) -> Iterator[tuple[Path, str]]:
+    """Pair outputs with their keys; one key may serve all."""
+    return zip(outputs, keys if len(keys) > 1 else [*keys] * len(outputs), strict=True)
 
 
 def _key(recipe: str, input_sha256: str) -> str:
