@@ -36,11 +36,10 @@ from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.relighting.face_alone import FaceAlone, FaceInPhoto
-from facerf_cli.relighting.heads import fit_photo
+from facerf_cli.relighting.fitting import fit_photo, reflectance_of
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, load_models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.photo_light import Estimator, estimate_light
-from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.training.losses import load_features
 

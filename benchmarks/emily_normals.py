@@ -16,9 +16,10 @@ import numpy as np
 from _common import SHARED, arguments, print_header, print_row, required
 from PIL import Image
 
-from facerf_cli.api import Light, Models, fit, load_models
+from facerf_cli import Light, fit, load_models
 from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import linear_to_srgb
+from facerf_cli.relighting.models import Models
 
 VIEWS = range(1, 8)
 LIGHTS = ((-60, 20), (60, 20), (-30, 45), (30, 45), (0, 70), (0, -20))  # azimuth and elevation, degrees

@@ -44,10 +44,9 @@ from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.heads import head_of
+from facerf_cli.relighting.fitting import head_of, reflectance_of
 from facerf_cli.relighting.models import Models, load_models
-from facerf_cli.relighting.portrait_field import SteadyFrame
-from facerf_cli.relighting.reflectance import reflectance_of
+from facerf_cli.relighting.portrait_field import SmoothedFrame
 from facerf_cli.relighting.shot import SteadyShot
 from facerf_cli.relighting.tracking import FaceTracker
 
@@ -79,7 +78,7 @@ def steady_shot(models: Models, frames: list[np.ndarray]) -> SteadyShot:
     return SteadyShot(models, frames.__getitem__, sightings, models.sides())
 
 
-def relit(models: Models, frame: np.ndarray, head: Head, steady: SteadyFrame | None = None) -> np.ndarray:
+def relit(models: Models, frame: np.ndarray, head: Head, steady: SmoothedFrame | None = None) -> np.ndarray:
     """Relight a frame by the target's light."""
     reflectance = reflectance_of(models, head, "portrait", photo=frame, steady=steady)
     light = RigLight(rig_directions(LIGHTS), TARGET)

@@ -20,10 +20,9 @@ from facerf_cli.image.colour import ExposureRule, luminance
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.network.inputs import MEAN_RADIANCE
-from facerf_cli.person import fit
+from facerf_cli.person import Target, fit
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import class_index
-from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.synth.appearance.materials import draw_appearance
 from facerf_cli.synth.bank.portrait_samples import StoredView, load_view
@@ -92,7 +91,7 @@ def measured(
     gain = GAIN / float(natural[0].sum(0).mean())
     photo = (gain * source + wall).permute(1, 2, 0).clamp(0, 1).numpy()
     person = fit(models, photo, white=None, face=find_faces(models.networks.people, photo, "the photo")[0])
-    composition = person.composed(Target(background="none"))
+    composition = person.prepare(Target(background="none"))
     shown = {}
     lit = composition.relit(Light(rig, torch.cat([lamp, natural[1:]])))
     for light, relit in zip(("lamp", "daylight"), lit, strict=True):

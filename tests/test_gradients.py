@@ -163,12 +163,12 @@ def test_images_in_the_photo_have_no_gradients_and_say_so(
         "texture": (person.with_texture(torch.from_numpy(person.texture).requires_grad_()), plain),
     }
     for one, lit in each.values():
-        refused(UsageError, "do not go through images in the photo; give alone=True", one.relight, lit)
+        refused(UsageError, "gradients: ... pass alone=True", one.relight, lit)
         with torch.no_grad():
             assert not torch.as_tensor(one.relight(lit)).requires_grad
     for network in (models.networks.reflectance, models.networks.portrait):
         weight = next(network.parameters()).requires_grad_(True)
-        refused(UsageError, "do not go through images in the photo", person.relight, plain)
+        refused(UsageError, "gradients: ... pass alone=True", person.relight, plain)
         weight.requires_grad_(False)
     assert isinstance(person.relight(facerf.Light(directions, weights)), Tensor)
 

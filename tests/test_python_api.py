@@ -96,7 +96,7 @@ def test_it_gives_what_the_command_line_gives(page: dict[str, Any], tmp_path: Pa
 
 def test_a_group_is_of_one_photo(person: facerf.Person) -> None:
     other = replace(person, photo=person.photo[:, ::-1])
-    for people, said in (([], "give one or more"), ([person, other], "of several photos")):
+    for people, said in (([], "pass at least one"), ([person, other], "different photos")):
         refused(ValueError, said, facerf.Group, people)
     assert "box_px" in repr(astronaut.face()) and len(repr(astronaut.face())) < 200
 
@@ -185,7 +185,7 @@ def test_a_light_costs_what_a_light_costs(page: dict[str, Any], monkeypatch: pyt
         raise AssertionError("made again")
 
     for name in ("FaceAlone", "PersonInPhoto"):
-        monkeypatch.setattr(f"facerf_cli.relighting.fitted.{name}", made_again)
+        monkeypatch.setattr(f"facerf_cli.person.{name}", made_again)
     monkeypatch.setattr("facerf_cli.person.reflectance_of", made_again)
     assert np.isfinite(one.relight(facerf.Light.single(20, 0))).all()
     with pytest.raises(AssertionError, match="made again"):
@@ -224,8 +224,8 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
     refused(ValueError, "not a list of some of normal", person.relight, KEY, layers=["depht"])
     refused(ValueError, "not one of portrait, field", facerf.fit, models, photo, reflectance="foo")
     refused(ValueError, "matte has shape", facerf.fit, models, photo, matte=np.ones((3, 3)))
-    refused(UsageError, "albedo: is of the portrait", lambda: person.albedo)
-    refused(UsageError, "device abacus: ... give cpu", facerf.load_models, device="abacus")
+    refused(UsageError, "albedo: ... fit with reflectance='portrait'", lambda: person.albedo)
+    refused(UsageError, "device abacus: ... use cpu", facerf.load_models, device="abacus")
     refused(ValueError, "length 1", person.olat, np.ones((2, 3)))
 
 
@@ -261,7 +261,7 @@ def test_choices_that_do_not_go_together() -> None:
         {"network_alone": True, "reflectance": "prt"},
         {"geometry": "network", "landmarks_px": np.zeros((68, 2))},
     ):
-        refused(FacerfError, "leave", facerf.fit, astronaut.models(), astronaut.photo(), **choice)
+        refused(FacerfError, "remove", facerf.fit, astronaut.models(), astronaut.photo(), **choice)
 
 
 def test_importing_it_loads_nothing_heavy() -> None:

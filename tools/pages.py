@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from posixpath import join, normpath, relpath
 
+from facerf_cli import API
 from facerf_cli.main import VERBS
 
 ROOT = Path(__file__).parents[1]
@@ -24,7 +25,10 @@ MADE = {
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#]+)")
 _MARKER = re.compile(r"(?:-|\d+\.) +")
 _CODE_OR_SPECIAL = re.compile(r"`[^`]*`|[*_<]")
-_API = "# Python API\n\n[Python](python.md) shows how it is used.\n\n::: facerf_cli.api\n"
+_API = "# Python API\n\n[Python](python.md) shows how it is used.\n\n" + "\n".join(
+    f"::: facerf_cli.{module}.{name}\n    options: {{show_root_heading: true}}\n"
+    for name, module in API.items()
+)
 _REPOSITORY = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Repository"]
 
 

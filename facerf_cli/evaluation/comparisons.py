@@ -35,10 +35,10 @@ from facerf_cli.image.colour import luminance
 from facerf_cli.light.envmap import rig_to_latlong
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, direction_to_azel
+from facerf_cli.person import Target
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.face_alone import FaceAlone
-from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.relightable import Relit
 

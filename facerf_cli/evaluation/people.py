@@ -30,14 +30,13 @@ from facerf_cli.image.skin import skin_albedo
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.files import checkpoint_file
+from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face, NoFaceError, find_faces
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture
-from facerf_cli.relighting.fitted import FittedPerson, Target
-from facerf_cli.relighting.heads import head_of
+from facerf_cli.relighting.fitting import head_of, reflectance_of
 from facerf_cli.relighting.models import Models, Sides, load_models
 from facerf_cli.relighting.photo_light import DEFAULT_ESTIMATOR, Estimator, estimate_light
-from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.estimate_light import feature_network
 from facerf_cli.work.photo_options import LightOptions, PhotoOptions, networks_of
@@ -73,14 +72,14 @@ class Method:
         self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit | None = None
     ) -> np.ndarray:
         """The face alone [S, S, 3] under one light, in the pose and the crop of a fit, else in its own."""
-        return FittedPerson(self.models, None, head, reflectance).image(light, Target(fit, "face"))
+        return Person(self.models, None, head, reflectance).image(light, Target(fit, "face"))
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Light, target: Target
     ) -> Iterator[np.ndarray]:
         """Yield an image under each weighted sum of lights; in the photo, if it is given."""
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
-        composition = FittedPerson(self.models, photo, head, reflectance).composed(target)
+        composition = Person(self.models, photo, head, reflectance).prepare(target)
         for relit in composition.relit(lights):
             yield composition.image(relit)
 

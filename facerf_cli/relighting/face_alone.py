@@ -1,4 +1,4 @@
-"""A face by its relit texture: alone, in the pose of its photo or another, or in its photo.
+"""Render only the face from its relit texture: over black in any pose, or blended into its photo.
 
 See the paper, 'Relighting'.
 """
@@ -30,14 +30,14 @@ _FACE_ALPHA = "face.A"
 
 
 class FaceAlone(Relightable):
-    """A head in a pose, before nothing: in its photo's frame, or without one in its crop's.
+    """Only the face, in any pose, over black, in the frame of its photo or of its crop.
 
     Args:
-        model: The face model of the fit.
-        head: The head in its photo, which the reflectance is of.
-        reflectance: Textures of the face under lights; None where textures are given.
-        fit: The head's pose and shape as shown; None: as in the photo.
-        photo_px: Height and width of the photo.
+        model: Face model of the fit.
+        head: Head in its photo.
+        reflectance: Renders textures of the face under lights; None if textures are passed instead.
+        fit: Pose and shape of the rendered head; None: as in the photo.
+        photo_px: Height and width of the photo; None: the frame is the crop.
     """
 
     def __init__(
@@ -52,27 +52,23 @@ class FaceAlone(Relightable):
         crop = (fit or head.fit).crop
         if photo_px is None:
             crop = Crop(0.0, 0.0, float(crop.size_px), crop.size_px)
-        self.vertices_m = (fit or head.fit).vertices_camera(model)  # [V, 3] as shown, camera space
+        self.vertices_m = (fit or head.fit).vertices_camera(model)  # [V, 3], camera space
         camera = photo_camera(crop, *(photo_px or (crop.size_px, crop.size_px)))
         self.view = view_face(self.vertices_m, camera, crop.side_px)
 
     @property
     def size_px(self) -> tuple[int, int]:
-        """Height and width of the frame."""
         return self.view.size_px
 
     @property
     def matte(self) -> np.ndarray:
-        """Share [H, W] of the face, with a soft border."""
         return self.view.full(self.view.mask)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of one texture."""
         return self.head.face.texture.nbytes
 
     def relit(self, lights: Light) -> Iterator[Relit]:
-        """Relight the face by each sum of lights (paper, 'Relighting')."""
         assert self.reflectance is not None
         turn = None if self.fit is None else self.head.fit.turn_to(self.fit.rotation)
         side, near = self.head.face.texture.shape[-1], lights.near_points(self.vertices_m.mean(0))
@@ -84,38 +80,37 @@ class FaceAlone(Relightable):
             yield Relit(texture, own=own)
 
     def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
-        """What gives rows of the image, not multiplied by the mask, of lights over black, and of layers."""
         require_face_layers(request.layers)
         return partial(self._render, request)
 
     def _render(self, request: RenderRequest, rows: slice) -> dict[str, np.ndarray]:
+        """Render rows. "rgb" is not multiplied by the mask, lights over black are."""
         view, window = self.view, Window(rows, slice(0, self.view.size_px[1]))
         part = window.common(view.window)
-        inside, found = part.inside(view.window), {}
+        inside, layers = part.inside(view.window), {}
         if request.image is not None:
-            found["rgb"] = window.framed(view.render(request.image.texture, inside).detach().numpy(), part)
+            layers["rgb"] = window.framed(view.render(request.image.texture, inside).detach().numpy(), part)
         for name in request.layers:
-            found |= face_layer(view, name, window)
+            layers |= face_layer(view, name, window)
         for name, light in request.lights.items():
-            shown = view.render(light.texture, inside) * view.mask[inside][..., None]
-            found[name] = window.framed(shown.detach().numpy(), part)
-        return found
+            masked = view.render(light.texture, inside) * view.mask[inside][..., None]
+            layers[name] = window.framed(masked.detach().numpy(), part)
+        return layers
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        """The exposure in EV, by a rule, of the relit texture over that of the photo."""
         own = torch.zeros(3) if relit.own is None else relit.own.detach()
         source = self.head.face.texture
         textures = relit.texture + own[:, None, None] * source, source
         lit, plate = (texture.permute(1, 2, 0).numpy() for texture in textures)
-        seen = self.head.face.visible.numpy()
-        return chosen_exposure_ev(rule, lit, plate, seen, seen)
+        visible = self.head.face.visible.numpy()
+        return chosen_exposure_ev(rule, lit, plate, visible, visible)
 
 
 class FaceInPhoto:
-    """A face in its photo [H, W, 3], with the photo's detail, blended in by its mask.
+    """A face with the photo's detail, blended into its photo [H, W, 3] by the mask of the face.
 
-    So a person is relit whose reflectance is the face's alone: the paper's field, and the models that it is
-    compared with. `matte` [H, W] is the person's share.
+    Used if the reflectance covers only the face: the paper's field and the comparison models. `matte` [H, W]
+    is the person's alpha.
     """
 
     def __init__(self, face: FaceAlone, photo: np.ndarray, matte: np.ndarray) -> None:
@@ -125,21 +120,21 @@ class FaceInPhoto:
         self.matte = matte * face.matte
         self._detail = FaceDetail(face.head.face, face.view)
 
-    def share(self, rows: slice) -> np.ndarray:
-        """Share [h, W] of the face in rows of the photo."""
+    def alpha_rows(self, rows: slice) -> np.ndarray:
+        """Return the alpha [h, W] of the face in rows of the photo."""
         return self.matte[rows]
 
-    def ready(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Sequence[str]]:
-        """Compute all that does not depend on rows; raises UsageError for layers of whole people."""
+    def precompute(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Sequence[str]]:
+        """Compute everything that does not depend on rows; raises UsageError for layers of a whole person."""
         require_face_layers(layers)
-        return self._detail.ready(relit.texture), layers
+        return self._detail.precompute(relit.texture), layers
 
     def render(
         self, window: Window, own: np.ndarray, lights: Sequence[tuple[Tensor, Sequence[str]]]
     ) -> Iterator[dict[str, np.ndarray]]:
-        """Yield rows of the photo, whose person has its `own` colours [h, W, 3], under each light.
+        """Yield "rgb" [h, W, 3] and layers in a window of the photo under each precomputed light.
 
-        "rgb" [h, W, 3] is the face; others are the light's layers.
+        `own` [h, W, 3] are the person's colours in the photo.
         """
         part = window.common(self.view.window)
         lit = self._detail.over(part, own[part.inside(window)])
@@ -151,14 +146,16 @@ class FaceInPhoto:
 
 
 def require_face_layers(names: Sequence[str]) -> None:
-    """Raise UsageError for layers of whole people."""
+    """Raise UsageError for layers that only a whole person has."""
     for name in names:
         if name not in FACE_LAYERS:
-            raise UsageError(f"--aov {name}: is of whole people; give --reflectance portrait and a photo")
+            raise UsageError(
+                f"--aov {name}: requires the whole person; use --reflectance portrait and a photo"
+            )
 
 
 def face_layer(view: FaceView, name: str, window: Window) -> dict[str, np.ndarray]:
-    """A window [h, w, C] of one of `FACE_LAYERS` in the photo's frame, by its name in a file."""
+    """Return one of `FACE_LAYERS` [h, w, C] in a window of the photo, by its name in a file."""
     part = window.common(view.window)
     inside = part.inside(view.window)
     if name == "face":

@@ -1,4 +1,4 @@
-"""The neural reflectance field of one face: its texture under any light, far or near, and any sum."""
+"""Neural reflectance field of a face: its texture under far and near lights and their weighted sums."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -23,53 +23,59 @@ from facerf_cli.raster.texture import bake_attributes
 from facerf_cli.relighting import White
 from facerf_cli.relighting.detail import NOISE, contrast, lost_detail
 from facerf_cli.relighting.models import Models
-from facerf_cli.relighting.white import Balance, without_colour_of_shade
+from facerf_cli.relighting.white import WhiteBalance, without_colour_of_shade
 from facerf_cli.run.memory import limit_bytes
 from facerf_cli.run.threads import count, in_threads
 
-_LIGHTS_ON_CPU = 4  # in one batch: more leave the processor's cache and are slower
-_LIGHT_SIDE = 128  # texels on which light is estimated
-_AROUND = 32  # lights that shine as even light does
+_LIGHTS_ON_CPU = 4  # per batch: more leave the processor's cache and are slower
+_LIGHT_SIDE = 128  # texels of the texture on which light is estimated
+_UNIFORM_LIGHTS = 32  # lights that approximate uniform light
 _DETAIL_PX, _VISIBLE = 4.0, 0.3  # standard deviation of the blur of detail, in texels; least visibility
-SEEN_WELL = 0.9  # share of a small texel from which on its colour is the photo's
+SEEN_WELL = 0.9  # visibility above which a small texel shows the photo's colour
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """The field of a face, by the network alone or corrected by a photo's quotient; a `Reflectance`.
+    """Reflectance field of a face, predicted by the network and optionally corrected by the photo.
 
-    With `even_shade` the network sees the face `without_colour_of_shade`, as the quotient's field does. A
-    `balance` holds the gain of its white; `detail` [3, T, T] is the factor of `with_detail`.
+    Attributes:
+        models: Provides the Reflectance Network.
+        face: Texture of the face in the photo.
+        quotient: Ratio image that makes the photo's original light reproduce the photo.
+        bf16: Whether the network runs in bfloat16.
+        remove_shade_colour: Whether the network sees the face `without_colour_of_shade`; set with `quotient`.
+        balance: White balance of the face.
+        detail: Factor [3, T, T] that restores detail (`with_detail`).
     """
 
     models: Models
     face: FaceTexture
     quotient: Quotient | None = None
     bf16: bool = False
-    even_shade: bool = False
-    balance: Balance | None = None
+    remove_shade_colour: bool = False
+    balance: WhiteBalance | None = None
     detail: Tensor | None = None
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
-        """Textures [M, 3, T, T] under M sums, weights [M, L, 3], of lights [L, 3]; see `Reflectance`."""
+        """Return textures [M, 3, T, T] under M sums, [M, L, 3], of lights [L, 3]; see `Reflectance`."""
         used = shining(weights)
         used[0] |= not used.any()
         return weighted_sum(self.olats(directions[used], turn), weights[:, used])
 
     def olats(self, lights: Tensor, turn: Tensor | None = None) -> Iterator[Tensor]:
-        """Yield OLAT textures for unit camera-space lights [L, 3], in batches [l, 3, T, T].
+        """Yield batches [l, 3, T, T] of textures under one light at a time, from unit directions [L, 3].
 
         `turn` [3, 3] rotates the head from its pose in the photo to the target's: N_t = turn N_s (paper,
-        'Network Architecture'). The encoder runs once a field, the decoder once a light.
+        'Network Architecture'). The encoder runs once per field, the decoder once per light.
         """
         network, face, device = self._network, self.face, self.models.device
         encoded = self._encode() if self.has_gradients else self._encoded
         normals = face.normals if turn is None else torch.einsum("dc,cij->dij", turn, face.normals)
         normals, grey = normals[None].to(device), is_grey(face.texture)
 
-        def decoded(some: Tensor) -> Tensor:
+        def decoded(batch: Tensor) -> Tensor:
             with mixed_precision(device, self.bf16):
-                olats = network.decode(encoded, normals, some[None].to(device))[0]
+                olats = network.decode(encoded, normals, batch[None].to(device))[0]
             olats = olats.float().cpu()
             olats = olats.mean(1, keepdim=True).expand_as(olats) if grey else olats
             olats = self.quotient.corrected(olats) if self.quotient else olats
@@ -78,47 +84,46 @@ class Field:
 
         yield from in_threads(decoded, torch.split(lights, self._batch(len(lights))))
 
-    def small_under_even_light(self) -> Tensor:
-        """The face's small texture [3, t, t] under even white light."""
-        rig = rig_directions(_AROUND)
-        return replace(self, face=shrunk(self.face)).relit(rig, torch.full((1, _AROUND, 3), 1 / _AROUND))[0]
+    def small_under_uniform_light(self) -> Tensor:
+        """Return the face's small texture [3, t, t] under uniform white light."""
+        rig, share = rig_directions(_UNIFORM_LIGHTS), 1 / _UNIFORM_LIGHTS
+        return replace(self, face=shrunk(self.face)).relit(rig, torch.full((1, _UNIFORM_LIGHTS, 3), share))[0]
 
-    def with_detail(self, even: Tensor) -> "Field":
+    def with_detail(self, uniform: Tensor) -> "Field":
         """Return the field with the detail of the texture that the network loses (`detail.py`).
 
-        `even` [3, t, t] is the small face under even white light. How much of the contrast of its own texture
-        it keeps is the same at all scales, so that it is measured there.
+        The network keeps the same fraction of a texture's contrast at all scales, so the fraction is measured
+        on `uniform` [3, t, t], the small face under uniform white light.
         """
-        small, sigma = shrunk(self.face), _DETAIL_PX * even.shape[-1] / self.face.texture.shape[-1]
+        small, sigma = shrunk(self.face), _DETAIL_PX * uniform.shape[-1] / self.face.texture.shape[-1]
         sure = (small.visible > SEEN_WELL).float()
-        shown, kept = (
-            contrast(image, sure, sigma, NOISE * float(image.mean())) for image in (small.texture, even)
+        photo, kept = (
+            contrast(image, sure, sigma, NOISE * float(image.mean())) for image in (small.texture, uniform)
         )
         texture = self.face.texture.detach()
         weight = (self.face.visible * region_mask("skin", texture.shape[-1]) > _VISIBLE).float()
         finer = contrast(texture, weight, _DETAIL_PX, NOISE * float(texture.mean()))
-        grey, colour = ((1 - _slope(*pair)) * one for one, *pair in zip(finer, shown, kept, strict=True))
+        grey, colour = ((1 - _slope(*pair)) * one for one, *pair in zip(finer, photo, kept, strict=True))
         return replace(self, detail=lost_detail(grey, colour, weight, _DETAIL_PX))
 
     @property
     def has_gradients(self) -> bool:
-        """If the encoded face has gradients, which serve one `backward` alone."""
+        """Whether the encoded face has gradients; its graph then serves only one `backward`."""
         network: Any = self._network
-        taken = (self.face.texture, *network.parameters())
-        return torch.is_grad_enabled() and any(values.requires_grad for values in taken)
+        inputs = (self.face.texture, *network.parameters())
+        return torch.is_grad_enabled() and any(values.requires_grad for values in inputs)
 
     @cached_property
     def _encoded(self) -> Any:
         return self._encode()
 
     def _encode(self) -> Any:
-        """The face as the network's encoder sees it."""
         face, device = self.face, self.models.device
-        visible, shown = face.visible[None, None], face.texture
-        if self.even_shade:
-            skin = face.visible * region_mask("skin", shown.shape[-1])
-            shown = shown * without_colour_of_shade(shown, skin)
-        texture = without_cast(shown[None], visible, self.models.source_colours)
+        visible, texture = face.visible[None, None], face.texture
+        if self.remove_shade_colour:
+            skin = face.visible * region_mask("skin", texture.shape[-1])
+            texture = texture * without_colour_of_shade(texture, skin)
+        texture = without_cast(texture[None], visible, self.models.source_colours)
         with mixed_precision(device, self.bf16):
             return self._network.encode(*(x.to(device) for x in (texture, face.normals[None], visible)))
 
@@ -127,7 +132,6 @@ class Field:
         return self.models.networks.reflectance
 
     def _batch(self, lights: int) -> int:
-        """Lights that are decoded at once."""
         most = _LIGHTS_ON_CPU if self.models.device.type == "cpu" else lights
         texels = self.face.texture.shape[-1] ** 2
         bytes_per_light = self._network.bytes_per_light(texels) * count()
@@ -140,15 +144,15 @@ def _slope(x: Tensor, y: Tensor) -> float:
 
 
 def shining(weights: Tensor) -> Tensor:
-    """The lights [L] that matter to sums of them, weights [M, L, 3]: for gradients all, else those not 0."""
+    """Return a mask [L] of the lights with a weight in [M, L, 3]; all of them if gradients are wanted."""
     return (weights.abs().sum((0, 2)) > 0) | weights.requires_grad
 
 
 def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
-    """The photo's side of the evidence for its light, without lights; InputError if too little is visible.
+    """Return the photo's part of the evidence for its light, still without lights.
 
-    The mask is the interior of the face where the photo shows it well. Eyes are left out unless `keep_eyes`,
-    since the field of open eyes is not learnt (paper, 'Results').
+    The mask is the interior of the face where it is clearly visible. Eyes are left out unless `keep_eyes`,
+    since the field of open eyes is not learnt (paper, 'Results'). Raises InputError if too little is visible.
     """
     small = shrunk(face)
     mask = (small.visible > SEEN_WELL) & (interior_texture(_LIGHT_SIDE)[0] > 0.5)
@@ -160,68 +164,74 @@ def photo_evidence(face: FaceTexture, keep_eyes: bool = False) -> LightEvidence:
 
 
 def shrunk(face: FaceTexture) -> FaceTexture:
-    """The texture at the side at which light is estimated."""
+    """Return the texture at the size at which light is estimated."""
     side = (_LIGHT_SIDE, _LIGHT_SIDE)
     fields = torch.cat([face.texture, face.visible[None], face.normals])[None]
     small = F.interpolate(fields, side, mode="area")[0]
     return FaceTexture(small[:3], small[3], F.normalize(small[4:], dim=0))
 
 
-def balance_of(white: White, shown: Iterable[tuple[FaceTexture, Tensor]]) -> Balance:
-    """The balance of a face by its photos: each a texture, and the small face under even white light."""
-    faces, even = zip(*((shrunk(face), relit) for face, relit in shown), strict=True)
+def balance_of(white: White, pairs: Iterable[tuple[FaceTexture, Tensor]]) -> WhiteBalance:
+    """Return the white balance of a face from its textures, each with the small face under uniform light."""
+    faces, uniform = zip(*((shrunk(face), relit) for face, relit in pairs), strict=True)
     skin = torch.stack([face.visible > SEEN_WELL for face in faces]) * region_mask("skin", _LIGHT_SIDE)
     photos = torch.stack([face.texture for face in faces], 1)
-    return Balance.of(white, torch.stack(even, 1), photos, skin)
+    return WhiteBalance.of(white, torch.stack(uniform, 1), photos, skin)
 
 
 def weighted_sum(batches: Iterable[Tensor], weights: Tensor) -> Tensor:
-    """Sum OLATs [L, 3, ...], given in batches, by rgb weights [M, L, 3]: [M, 3, ...] (paper, 'Relighting').
+    """Sum batches of OLATs [L, 3, ...] by rgb weights [M, L, 3] to [M, 3, ...] (paper, 'Relighting').
 
-    Textures are summed before they are rendered, since a render costs more; the batches are never all held.
+    Textures are summed before they are rendered, because rendering costs more. Only one batch is in memory.
     """
     total, done = torch.zeros(()), 0
     for olats in batches:
-        some = weights[:, done : done + len(olats)]
-        flat = torch.einsum("mlc,lcn->mcn", some, olats.flatten(2))
+        part = weights[:, done : done + len(olats)]
+        flat = torch.einsum("mlc,lcn->mcn", part, olats.flatten(2))
         total = total + flat.view(*flat.shape[:2], *olats.shape[2:])
         done += len(olats)
     return total
 
 
 _APART_DEG, _MOST_STEPS = 10.0, 3  # of the grid, and steps from its middle; wider patches have wider steps
-_POINT_DEG = 0.5  # half a patch's width up to which a light is far
-_SIDE = 64  # texels of the maps by which far lights are mixed: they are smooth
-_AT_ONCE = 8  # far lights
+_POINT_DEG = 0.5  # half width of a patch below which a light counts as far
+_SIDE = 64  # texels of the maps that mix far lights; they are smooth
+_AT_ONCE = 8  # far lights per batch
 
 
 def near_texture(
     reflectance: Reflectance, points: PointLights, vertices_m: Tensor, side: int, turn: Tensor | None = None
 ) -> Tensor:
-    """The texture [3, side, side] of a face, vertices [V, 3] in camera space, under a near light of rgb 1.
+    """Return the texture [3, side, side] of a face under a near light of rgb 1.
 
-    Seen from the face, a near light covers a patch of directions: each texel sees its points elsewhere. A
-    grid of far lights spans the patch, and each texel mixes them bilinearly, by where it sees the light and
-    how near. Between the grid's directions that is an approximation; a light far away is a far one exactly.
+    Seen from the face, a near light covers a patch of directions, because each texel sees its points
+    elsewhere. A grid of far lights spans the patch, and each texel mixes them bilinearly by the direction and
+    distance at which it sees the light. Between the grid's directions this is an approximation; a distant
+    light is exactly one far light.
 
-    `turn` is that of `Reflectance.relit`; the vertices are turned already.
+    Args:
+        reflectance: Renders the face under far lights.
+        points: The near light.
+        vertices_m: Vertices [V, 3] of the face in camera space, already rotated by `turn`.
+        side: Texels of the texture.
+        turn: Rotation of the head, as in `Reflectance.relit`.
     """
     positions_m = bake_attributes(vertices_m, math.isqrt(len(vertices_m)), _SIDE)
-    directions, shares = far_lights_of(points, positions_m)
+    directions, weights = far_lights_of(points, positions_m)
     total = torch.zeros(3, side, side)
-    for some, maps in zip(torch.split(directions, _AT_ONCE), torch.split(shares, _AT_ONCE), strict=True):
-        each = torch.eye(len(some))[..., None].expand(-1, -1, 3)
-        textures = reflectance.relit(some, each, turn)
+    for lights, maps in zip(torch.split(directions, _AT_ONCE), torch.split(weights, _AT_ONCE), strict=True):
+        each = torch.eye(len(lights))[..., None].expand(-1, -1, 3)
+        textures = reflectance.relit(lights, each, turn)
         wide = F.interpolate(maps[:, None], size=(side, side), mode="bilinear", align_corners=False)
         total = total + (wide * textures).sum(0)
     return total
 
 
 def far_lights_of(points: PointLights, positions_m: Tensor) -> tuple[Tensor, Tensor]:
-    """Directions [K, 3] of far lights that span a near one, and the share [K, T, T] of each at positions.
+    """Return far lights that replace a near one: directions [K, 3] and weights [K, T, T] at each texel.
 
-    positions [3, T, T] are in camera space. The grid is one of angles about the direction to the light's
-    middle (azimuthal equidistant), so that it can span more than a half-space.
+    Positions [3, T, T] are in camera space. The grid is regular in the angles around the direction to the
+    light's middle (azimuthal equidistant), so it can span more than a half-space.
     """
     toward, irradiance = points.arriving(positions_m)  # [P, T, T, 3], [P, T, T]
     axis = -points.toward
@@ -233,22 +243,22 @@ def far_lights_of(points: PointLights, positions_m: Tensor) -> tuple[Tensor, Ten
     steps = 0 if extent_deg < _POINT_DEG else min(math.ceil(extent_deg / _APART_DEG), _MOST_STEPS)
     apart_deg = max(_APART_DEG, extent_deg / max(steps, 1))
     cells = (flat_deg / apart_deg).clamp(-steps, steps)
-    across, along = (_hats(cells[..., number], steps) for number in (0, 1))
-    shares = torch.einsum("pij,puij,pvij->uvij", irradiance, across, along)
+    across, along = (_linear_interp_weights(cells[..., number], steps) for number in (0, 1))
+    weights = torch.einsum("pij,puij,pvij->uvij", irradiance, across, along)
     offsets = torch.arange(-steps, steps + 1) * math.radians(apart_deg)
     directions = _directions(offsets, axis, sides)
-    used = shares.amax((2, 3)) > 0
-    return directions[used], shares[used]
+    used = weights.amax((2, 3)) > 0
+    return directions[used], weights[used]
 
 
-def _hats(places: Tensor, steps: int) -> Tensor:
-    """Linear shares [P, 2 steps + 1, T, T] of places [P, T, T] in -steps..steps among whole numbers."""
+def _linear_interp_weights(coordinates: Tensor, steps: int) -> Tensor:
+    """Return weights [P, 2 steps + 1, T, T] of coordinates [P, T, T] in -steps..steps among the integers."""
     nodes = torch.arange(-steps, steps + 1)[:, None, None]
-    return (1 - (places[:, None] - nodes).abs()).clamp_min(0)
+    return (1 - (coordinates[:, None] - nodes).abs()).clamp_min(0)
 
 
 def _directions(offsets: Tensor, axis: Tensor, sides: tuple[Tensor, Tensor]) -> Tensor:
-    """Unit directions [n, n, 3] at angles [n] from an axis toward each of two sides."""
+    """Return unit directions [n, n, 3] at angles [n] from an axis toward each of two sides."""
     u, v = torch.meshgrid(offsets, offsets, indexing="ij")
     angle = torch.hypot(u, v)[..., None]
     slope = torch.sinc(angle / math.pi)  # sin(angle) / angle
@@ -256,7 +266,7 @@ def _directions(offsets: Tensor, axis: Tensor, sides: tuple[Tensor, Tensor]) -> 
 
 
 def _sides(axis: Tensor) -> tuple[Tensor, Tensor]:
-    """Two unit vectors that are orthogonal to an axis [3] and to each other."""
+    """Return two unit vectors that are orthogonal to an axis [3] and to each other."""
     helper = torch.eye(3)[int(axis.abs().argmin())]
     first = F.normalize(torch.linalg.cross(axis, helper), dim=0)
     return first, torch.linalg.cross(axis, first)

@@ -1,6 +1,6 @@
-"""The face model and every trained network, on its device, from the shipped file or the user's."""
+"""The face model and the trained networks, loaded on first use onto their device."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from facerf_cli.errors import InputError
+from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -17,8 +17,7 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.checkpoint import load_networks, use_form
 from facerf_cli.network.diffuse_sh import DiffuseNetwork
 from facerf_cli.network.features import LightNetwork
-from facerf_cli.network.files import SHIPPED, read_metadata, serving_files
-from facerf_cli.network.geometry import GeometryNetwork
+from facerf_cli.network.files import SHIPPED, checkpoint_file, read_metadata, serving_files
 from facerf_cli.network.inputs import SourceColours
 from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.portrait import PortraitNetwork
@@ -26,28 +25,28 @@ from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.network.stored_graph import ASSET, PeopleNetworks, mediapipe_networks
 from facerf_cli.portrait.parse import CLASSES, LANDMARKS
 
-TEXTURE_SIDE, LARGEST_TEXTURE = 256, 2048  # texels: by default, and at most
+TEXTURE_SIDE, LARGEST_TEXTURE = 256, 2048  # texels: default and maximum
+CROP_PER_TEXTURE = 2  # crop side over texture side, so that unwrapping averages pixels
 _CPU = torch.device("cpu")
-CROP_PER_TEXTURE = 2  # side of the crop over that of the texture, so that unwrapping averages pixels
 
 
 @dataclass(frozen=True)
 class Sides:
-    """Sides of a texture and of the crop that it is unwrapped from."""
+    """Side of the face texture in texels, and of the crop that it is unwrapped from."""
 
     texture: int
     crop_px: int
 
 
 class Networks:
-    """The trained networks by name, each loaded when it is first read, and kept on the device.
+    """The trained networks by name. Each is loaded on first access and kept on the device.
 
-    Reading one raises InputError for a file that is damaged or of another version.
+    Accessing a network raises InputError if its file is damaged or from another version.
 
     Args:
-        files: File of each network, by its name.
-        device: Where they compute.
-        given: Networks in place of those of files.
+        files: File of each network.
+        device: Device that the networks run on.
+        given: Networks that replace those in files.
     """
 
     reflectance: ReflectanceNetwork
@@ -56,7 +55,7 @@ class Networks:
     light_features: LightNetwork  # S_f
     parsing: ParsingNetwork
     portrait: PortraitNetwork
-    people: PeopleNetworks  # that find people and cut them out
+    people: PeopleNetworks  # find people and segment them
 
     def __init__(
         self,
@@ -68,96 +67,87 @@ class Networks:
         vars(self).update(self._given)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Send the files to another process, which loads each network once, or the given networks."""
+        """Pickle only the files, which another process loads once; networks without a file as they are."""
         if self._given:
             return Networks, (self.files, self.device, self._given)
         return _networks_once, (tuple(self.files.items()), self.device)
 
     def __getattr__(self, name: str) -> Any:
-        """Load a network that has not been read before."""
         if name == "people":
             self.people = PeopleNetworks(self.parsing, *mediapipe_networks(self.device))
         elif name in SHIPPED:
-            path = self.files[name]
-            network: Any = load_networks(path, LAYOUT_VERSION, (name,))[0][name]
-            if name in _CHECKS:
-                _CHECKS[name](path, network)
+            network: Any = load_networks(self.files[name], LAYOUT_VERSION, (name,))[0][name]
+            _check(self.files[name], name, network)
             setattr(self, name, network.to(self.device).eval().requires_grad_(False))
         else:
             raise AttributeError(name)
         return vars(self)[name]
 
     def load(self, names: Iterable[str]) -> None:
-        """Load networks by name."""
         for name in names:
             getattr(self, name)
 
     def with_networks(self, **networks: nn.Module) -> "Networks":
-        """Return the same networks with others in place of some."""
+        """Return a copy in which some networks are replaced."""
         loaded = {name: network for name, network in vars(self).items() if name in SHIPPED}
         return Networks(self.files, self.device, {**loaded, **networks})
 
     def sha256(self, name: str) -> str:
-        """SHA-256 of the file that serves a network."""
         return described_file(self.files[name])["sha256"]
 
     def served(self) -> dict[str, dict[str, str]]:
-        """File and SHA-256 of each network that was needed so far, for reports."""
+        """Return file and SHA-256 of each network that was loaded so far, for reports."""
         files = {name: self.files[name] for name in SHIPPED if name in vars(self)}
         if "people" in vars(self):
             files["mediapipe"] = ASSET
         return {name: described_file(path) for name, path in files.items()}
 
 
-def _check_parsing(path: Path, network: ParsingNetwork) -> None:
-    """Raise InputError for a Parsing Network of other classes or landmarks."""
-    if (network.settings.classes, network.settings.landmarks) != (len(CLASSES), LANDMARKS):
-        raise InputError(f"{path}: holds no Parsing Network of this version; train one, --stage parsing")
+def _check(path: Path, name: str, network: Any) -> None:
+    """Raise InputError for a network whose sizes do not match this version's classes or face model."""
+    if name == "parsing" and (network.settings.classes, network.settings.landmarks) != (
+        len(CLASSES),
+        LANDMARKS,
+    ):
+        raise InputError(f"{path}: not a Parsing Network of this version; train one with --stage parsing")
+    if name == "geometry":
+        model, settings = load_face_model(BUILTIN), network.settings
+        if settings.identity > len(model.identity) or settings.expression > len(model.expression):
+            raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
 
 
-def _check_geometry(path: Path, network: GeometryNetwork) -> None:
-    """Raise InputError where a Geometry Network regresses more coefficients than the built-in model has."""
-    model, settings = load_face_model(BUILTIN), network.settings
-    if settings.identity > len(model.identity) or settings.expression > len(model.expression):
-        raise InputError(f"{path}: its Geometry Network fits another built-in face model; train it again")
-
-
-_CHECKS: dict[str, Callable[[Path, Any], None]] = {"parsing": _check_parsing, "geometry": _check_geometry}
-
-
-@cache  # loaded once a process
+@cache  # networks are loaded once per process
 def _networks_once(files: tuple[tuple[str, Path], ...], device: torch.device) -> Networks:
     return Networks(dict(files), device)
 
 
-SHIPPED_NETWORKS = Networks()  # on the CPU; a verb's own are in its Models
+SHIPPED_NETWORKS = Networks()  # on the CPU; the networks of a command are in its Models
 
 
 @dataclass(frozen=True)
 class Models:
-    """The face model, on the CPU as all geometry is, and the trained networks on their device."""
+    """The face model, on the CPU like all geometry, and the trained networks on their device."""
 
     face: MorphableModel
     networks: Networks
-    trained_sides: Sides = Sides(TEXTURE_SIDE, CROP_PER_TEXTURE * TEXTURE_SIDE)  # or the default ones
+    trained_sides: Sides = Sides(TEXTURE_SIDE, CROP_PER_TEXTURE * TEXTURE_SIDE)
     default_geometry: Geometry = "landmarks"  # "network" if both networks were trained together
-    source_colours: SourceColours | None = None  # of the network's training; None: no cast is removed
+    source_colours: SourceColours | None = None  # of the training data; None: colour casts are not removed
 
     @property
     def device(self) -> torch.device:
-        """The device of the networks."""
         return self.networks.device
 
     def checkpoint_name(self, network: str = "reflectance") -> str:
-        """Name of the file that serves a network."""
+        """Return the name of a network's file without suffix."""
         return self.networks.files[network].stem
 
     def with_networks(self, **networks: nn.Module) -> "Models":
-        """Return the same models with other networks in place of some."""
+        """Return a copy in which some networks are replaced."""
         return replace(self, networks=self.networks.with_networks(**networks))
 
     def sides(self, texture_side: int | None = None) -> Sides:
-        """The sides that the networks were trained on; or a texture's, with a crop in the same proportion."""
+        """Return the sides used in training, or a custom texture side with a crop in the same proportion."""
         trained = self.trained_sides
         if texture_side is None:
             return trained
@@ -165,18 +155,32 @@ class Models:
 
 
 def load_models(
-    checkpoints: Sequence[Path] = (),
+    checkpoint: str | Path | Sequence[str | Path] | None = None,
     face_model: str | Path = BUILTIN,
-    device: torch.device = _CPU,
+    device: str | torch.device = "cpu",
     form: str | None = None,
 ) -> Models:
-    """Load a face model (its name or file); the networks of checkpoints, else the shipped ones, follow.
+    """Load a face model and networks. A network is read from its file when it is first used.
 
-    A network is loaded when it is first needed. Its form may be package.module:Class of code that is
-    installed. Raises InputError for what is no checkpoint.
+    Args:
+        checkpoint: A checkpoint or the folder of a training run, or a list of them. Each provides the
+            networks that its last training trained; all others are the shipped ones.
+        face_model: "builtin", or the file of an imported face model.
+        device: "cpu", "cuda", "cuda:1", "mps" or a `torch.device`.
+        form: package.module:Class, the installed class of a custom Reflectance Network.
+
+    Raises:
+        InputError: A file is not a checkpoint.
+        UsageError: torch does not find the device.
     """
+    if isinstance(device, str):
+        try:
+            device = torch.empty(0, device=device).device
+        except (RuntimeError, AssertionError):
+            raise UsageError(f"device {device}: not found by torch; use cpu, cuda or mps") from None
     use_form(form)
-    files = serving_files(checkpoints, user="facerf")
+    checkpoints = [checkpoint] if isinstance(checkpoint, (str, Path)) else checkpoint or ()
+    files = serving_files([checkpoint_file(Path(path)) for path in checkpoints], user="facerf")
     path = files["reflectance"]
     metadata = read_metadata(path)
     side = _side(path, metadata, "texture_side", TEXTURE_SIDE)
@@ -205,9 +209,9 @@ def _source_colours(path: Path, metadata: dict[str, Any]) -> SourceColours | Non
         raise InputError(f"{path}: invalid source_colours in its metadata; train it again") from None
 
 
-@cache  # of many MB
+@cache  # hashing a checkpoint takes longer than rendering an image
 def described_file(path: Path) -> dict[str, str]:
-    """Path and SHA-256 of a checkpoint, for reports; of a shipped one the name alone."""
+    """Return path and SHA-256 of a checkpoint, for reports; for a shipped one only its name."""
     return {
         "file": path.name if path in (*SHIPPED.values(), ASSET) else str(path),
         "sha256": file_sha256(path),

@@ -1,9 +1,9 @@
-"""The light of a photo: over a rig (paper, 'Light Estimation'), and as its own field explains it.
+"""Estimate the light of a photo: over a rig (paper, 'Light Estimation'), and for a field's ratio image.
 
-A flash on the camera lights a face much as a few lamps around it do, and a free fit to a coarse rig takes
-these, since the field is not exact: then the field is corrected for shadows that the photo does not have. So
-the light by whose quotient a field is corrected to its photo is one lamp, which may be anywhere, and light
-from around, which is as even as the photo allows (`source_light`).
+A flash on the camera lights a face much like a few lights around it, and a free fit to a coarse rig prefers
+these, because the field is not exact. The field would then be corrected for shadows that the photo does not
+have. So the light that defines a field's ratio image is one key light from any direction plus ambient light
+that is as uniform as the photo allows (`source_light`).
 """
 
 import math
@@ -35,126 +35,126 @@ from facerf_cli.relighting.field import SEEN_WELL, Field, balance_of, photo_evid
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.white import without_baked_in
 
-_AROUND = 32  # lights of the rig from around
-_RINGS_DEG = (14.0, 6.0)  # of the search for the lamp, each around the best place so far
-_RING = 6  # places on a ring
-_ONE_LAMP = 0.8  # share of the lamp in a photo's light from which it may be the light
-_AS_WELL = 1.1  # times the error of the rig's lights: one lamp then explains the photo as well
+_AMBIENT_LIGHTS = 32  # lights of the rig for ambient light
+_RINGS_DEG = (14.0, 6.0)  # rings of the search for the key light, each around the best direction so far
+_RING = 6  # directions per ring
+_ONE_KEY = 0.8  # fraction of the key light in a photo's light above which it may be the only light
+_AS_WELL = 1.1  # error over that of the rig's lights up to which one key light explains the photo as well
 _TINY = 1e-12  # avoids divisions by 0
 
 
 @dataclass(frozen=True, eq=False)
 class SourceLight:
-    """The estimated light of a photo, the lamp first, and the field's quotient under it.
+    """Estimated light of a photo, key light first, and the field's ratio image under it.
 
-    `even` [3, t, t] is the small face under even white light.
+    `uniform` [3, t, t] is the small face under uniform white light.
     """
 
     light: RigLight
     quotient: Quotient
-    even: Tensor
+    uniform: Tensor
 
 
 @torch.no_grad()
 def source_light(models: Models, face: FaceTexture, held: RigLight | None = None) -> SourceLight:
-    """Estimate the light of a photo, on small textures, and the quotient that corrects the field to it.
+    """Estimate the light of a photo on small textures, and the ratio image that corrects the field to it.
 
-    A light that is `held` over the frames of a shot, by `light_of_frames`, is not estimated again.
+    If a light is `held` over the frames of a shot (`light_of_frames`), it is not estimated.
     """
     frame = _Frame.of(models, face)
     light = _estimated([frame]) if held is None else held
     small = frame.field.face
-    lamp, even = frame.under(light.directions[:1]), frame.around.mean(0)
-    explained = weighted_sum([lamp, frame.around], light.weights[None])[0]
+    key, ambient = frame.under(light.directions[:1]), frame.ambient.mean(0)
+    explained = weighted_sum([key, frame.ambient], light.weights[None])[0]
     skin = small.visible * region_mask("skin", small.texture.shape[-1])
-    key = lamp[0].mean(0) / even.mean(0).clamp_min(_TINY)
-    plain = without_baked_in(even, small.texture, skin, key, share_of_lamp(light))
+    shading = key[0].mean(0) / ambient.mean(0).clamp_min(_TINY)
+    plain = without_baked_in(ambient, small.texture, skin, shading, key_light_fraction(light))
     quotient = Quotient.of(small.texture, explained, small.visible, plain)
-    return SourceLight(light, quotient, quotient.corrected(frame.around).mean(0))
+    return SourceLight(light, quotient, quotient.corrected(frame.ambient).mean(0))
 
 
 @torch.no_grad()
 def light_of_frames(models: Models, faces: Sequence[FaceTexture]) -> RigLight:
-    """Estimate one light, on small textures, from several frames of a shot together."""
+    """Estimate one light from several frames of a shot together, on small textures."""
     return _estimated([_Frame.of(models, face) for face in faces])
 
 
 def over_rig(light: RigLight, rig: Tensor) -> Tensor:
-    """Weights [L, 3] of a rig's lights that shine as a light of `light_of_frames` does.
+    """Return weights [L, 3] of a rig that reproduce a light of `light_of_frames`.
 
-    The lamp is shared by the three lights around it, and the light from around keeps its sum.
+    The key light is split among the three lights around it. The sum of the ambient light is preserved.
     """
     weights = torch.zeros(len(rig), 3)
-    index, share = lights_around(light.directions[:1], rig)
-    weights.index_add_(0, index[0], share[0][:, None].float() * light.weights[:1])
-    index, share = lights_around(rig, light.directions[1:])
-    even = (share[..., None].float() * light.weights[1:][index]).sum(1)
-    return weights + even * (light.weights[1:].sum(0) / even.sum(0).clamp_min(_TINY))
+    index, part = lights_around(light.directions[:1], rig)
+    weights.index_add_(0, index[0], part[0][:, None].float() * light.weights[:1])
+    index, part = lights_around(rig, light.directions[1:])
+    ambient = (part[..., None].float() * light.weights[1:][index]).sum(1)
+    return weights + ambient * (light.weights[1:].sum(0) / ambient.sum(0).clamp_min(_TINY))
 
 
-def share_of_lamp(light: RigLight) -> float:
-    """The lamp's share of all the light that `light_of_frames` found, 0 to 1."""
+def key_light_fraction(light: RigLight) -> float:
+    """Return the fraction of a light of `light_of_frames` that is its key light, 0 to 1."""
     return float(light.weights[0].sum() / light.weights.sum().clamp_min(_TINY))
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """The network's field of a small texture, and its OLATs [L, 3, t, t] under the rig from around."""
+    """The network's field of a small texture, and its OLATs [L, 3, t, t] under the rig for ambient light."""
 
     field: Field
-    around: Tensor
+    ambient: Tensor
 
     @staticmethod
     def of(models: Models, face: FaceTexture) -> "_Frame":
-        field = Field(models, shrunk(face), even_shade=True)
-        return _Frame(field, torch.cat(list(field.olats(rig_directions(_AROUND)))))
+        field = Field(models, shrunk(face), remove_shade_colour=True)
+        return _Frame(field, torch.cat(list(field.olats(rig_directions(_AMBIENT_LIGHTS)))))
 
     def under(self, directions: Tensor) -> Tensor:
-        """OLATs [l, 3, t, t] under lights [l, 3]."""
+        """Return OLATs [l, 3, t, t] under lights [l, 3]."""
         return torch.cat(list(self.field.olats(directions)))
 
-    def seen(self, images: Tensor) -> Tensor:
-        """Texels [..., N] of images [..., t, t] that the photo shows well."""
+    def well_observed_texels(self, images: Tensor) -> Tensor:
+        """Return the texels [..., N] of images [..., t, t] that are clearly visible in the photo."""
         return images[..., self.field.face.visible > SEEN_WELL]
 
 
 def _estimated(frames: Sequence[_Frame]) -> RigLight:
-    lamp = _lamp(frames)
-    pairs = [(torch.cat([one.under(lamp), one.around]), one) for one in frames]
-    olats = torch.cat([one.seen(olats) for olats, one in pairs], -1)
-    return RigLight(
-        torch.cat([lamp, rig_directions(_AROUND)]), estimate_lamps(olats, _photo(frames), len(lamp))
+    key = _key_direction(frames)
+    olats = torch.cat(
+        [one.well_observed_texels(torch.cat([one.under(key), one.ambient])) for one in frames], -1
     )
+    weights = estimate_lamps(olats, _photo(frames), len(key))
+    return RigLight(torch.cat([key, rig_directions(_AMBIENT_LIGHTS)]), weights)
 
 
-def _lamp(frames: Sequence[_Frame]) -> Tensor:
-    """Direction [1, 3] of the lamp that explains the frames best, together with even light from around."""
+def _key_direction(frames: Sequence[_Frame]) -> Tensor:
+    """Return the direction [1, 3] of the key light that explains the frames best, with ambient light."""
     photo = _photo(frames).mean(0)
-    around = torch.cat([one.seen(one.around.mean((0, 1))) for one in frames], -1)
+    ambient = torch.cat([one.well_observed_texels(one.ambient.mean((0, 1))) for one in frames], -1)
 
     def errors(olats: Sequence[Tensor]) -> list[float]:
-        """Errors of lamps, given their OLATs [l, 3, t, t] of each frame."""
-        lamps = torch.cat([one.seen(of_one.mean(1)) for of_one, one in zip(olats, frames, strict=True)], -1)
-        return [lamp_error(lamp, around, photo) for lamp in lamps]
+        """Return the error of each key light from its OLATs [l, 3, t, t] in each frame."""
+        pairs = zip(olats, frames, strict=True)
+        texels = torch.cat([one.well_observed_texels(of_one.mean(1)) for of_one, one in pairs], -1)
+        return [lamp_error(key, ambient, photo) for key in texels]
 
-    if not len(photo):  # nothing is visible enough
-        return rig_directions(_AROUND)[:1]
-    places, found = rig_directions(_AROUND), errors([one.around for one in frames])
+    if not len(photo):  # too little is visible
+        return rig_directions(_AMBIENT_LIGHTS)[:1]
+    directions, each = rig_directions(_AMBIENT_LIGHTS), errors([one.ambient for one in frames])
     for ring_deg in _RINGS_DEG:
-        best = places[found.index(min(found))]
+        best = directions[each.index(min(each))]
         ring = _ring(best, ring_deg)
-        found = [min(found), *errors([one.under(ring) for one in frames])]
-        places = torch.cat([best[None], ring])
-    return places[found.index(min(found))][None]
+        each = [min(each), *errors([one.under(ring) for one in frames])]
+        directions = torch.cat([best[None], ring])
+    return directions[each.index(min(each))][None]
 
 
 def _photo(frames: Sequence[_Frame]) -> Tensor:
-    """Texels [3, N] that the photos of frames show well."""
-    return torch.cat([one.seen(one.field.face.texture) for one in frames], -1)
+    return torch.cat([one.well_observed_texels(one.field.face.texture) for one in frames], -1)
 
 
 def _ring(axis: Tensor, degrees: float) -> Tensor:
-    """Directions [_RING, 3] at an angle from a direction [3]."""
+    """Return directions [_RING, 3] at an angle from a direction [3]."""
     across = F.normalize(torch.linalg.cross(axis, torch.eye(3)[axis.abs().argmin()]), dim=0)
     other = torch.linalg.cross(axis, across)
     turns = torch.arange(_RING)[:, None] * (2 * math.pi / _RING)
@@ -164,10 +164,11 @@ def _ring(axis: Tensor, degrees: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Settings of estimating the light of a photo over a rig.
+    """Settings for estimating a photo's light over a rig.
 
-    Without `non_negative` by the paper's least squares, whose weights may be negative. `features` (V_f or
-    S_f) refines the weights (paper, 'Light Estimation').
+    Attributes:
+        non_negative: Whether weights must not be negative; the paper's least squares allow negative weights.
+        features: Network (V_f or S_f) that refines the weights (paper, 'Light Estimation').
     """
 
     non_negative: bool = True
@@ -179,10 +180,15 @@ DEFAULT_ESTIMATOR = Estimator()
 
 @dataclass(frozen=True, eq=False)
 class LightEstimate:
-    """The light of a photo, the evidence for it, and the texture [3, t, t] of the face under it.
+    """Estimated light of a photo.
 
-    If features refined the weights, `refined` holds the refinement, and `least_squares` [L, 3] are those
-    before. `key_share` is the share of the key light, where that was asked.
+    Attributes:
+        light: The light.
+        evidence: What it was estimated from.
+        explained: Texture [3, t, t] of the face under the light.
+        refined: The refinement by features, if any.
+        least_squares: Weights [L, 3] before that refinement.
+        key_share: Fraction of the key light, if it was estimated.
     """
 
     light: RigLight
@@ -205,18 +211,20 @@ def estimate_light(
 ) -> LightEstimate:
     """Estimate the light of a head's photo over a rig (paper, 'Light Estimation', Eq. leastsq).
 
-    Args:
-        models: The networks and the face model.
-        head: The head in its photo.
-        kind: The field, or a baseline of the paper, which estimates its own light.
-        rig: Unit directions [L, 3], camera space; by default 150.
-        estimator: How the least squares are solved and refined.
-        keep_eyes: Eyes take part, which the paper leaves out.
-        more: Heads of other frames of a shot, which take part.
-        white: The light is that over the photo's or over skin's own colours (`white.py`).
+    If one key light plus ambient light (`light_of_frames`) explains the photo as well, that is the result.
 
-    Where one lamp and light from around explain the photo as well, they are its light (`light_of_frames`).
-    Raises InputError where too little of the face is visible.
+    Args:
+        models: Networks and face model.
+        head: Head in its photo.
+        kind: The field, or a comparison model, which estimates its own light.
+        rig: Unit directions [L, 3] in camera space; 150 by default.
+        estimator: How the least squares are solved and refined.
+        keep_eyes: Whether to use the eyes, which the paper leaves out.
+        more: Heads in other frames of a shot, used together.
+        white: White balance of the skin that the light falls on (`white.py`).
+
+    Raises:
+        InputError: Too little of the face is visible.
     """
     evidence = photo_evidence(head.face, keep_eyes)
     if kind != "field":
@@ -227,34 +235,34 @@ def estimate_light(
     rig = rig_directions() if rig is None else rig
     heads = [(head, evidence), *((one, photo_evidence(one.face, keep_eyes)) for one in more)]
     frames = [
-        replace(seen, directions=rig, olats=torch.cat(list(Field(models, shrunk(one.face)).olats(rig))))
-        for one, seen in heads
+        replace(photo, directions=rig, olats=torch.cat(list(Field(models, shrunk(one.face)).olats(rig))))
+        for one, photo in heads
     ]
     evidence, features = frames[0], estimator.features
     whole = joined(frames)
-    weights, share = whole.least_squares(estimator.non_negative), None
+    weights, key_share = whole.least_squares(estimator.non_negative), None
     if estimator.non_negative:
         own = light_of_frames(models, [one.face for one, _ in heads])
-        share, one_lamp = share_of_lamp(own), over_rig(own, rig)
-        left = [whole.residual(whole.relit(either)) for either in (weights, one_lamp)]
-        if share > _ONE_LAMP and left[1] < _AS_WELL * left[0]:
-            weights = one_lamp
+        key_share, one_key = key_light_fraction(own), over_rig(own, rig)
+        errors = [whole.residual(whole.relit(either)) for either in (weights, one_key)]
+        if key_share > _ONE_KEY and errors[1] < _AS_WELL * errors[0]:
+            weights = one_key
 
     def balanced(weights: Tensor) -> RigLight:
-        """The light of weights [L, 3] over a face of the white that is wanted."""
+        """Return the light of weights [L, 3] that falls on white-balanced skin."""
         if white is None:
             return RigLight(rig, weights)
         quotient = Quotient.of(evidence.photo, evidence.relit(weights), shrunk(head.face).visible)
-        even = quotient.corrected(evidence.olats).mean(0)
-        return RigLight(rig, weights / balance_of(white, [(head.face, even)]).gain)
+        uniform = quotient.corrected(evidence.olats).mean(0)
+        return RigLight(rig, weights / balance_of(white, [(head.face, uniform)]).gain)
 
     if features is None:
-        return LightEstimate(balanced(weights), evidence, evidence.relit(weights), key_share=share)
+        return LightEstimate(balanced(weights), evidence, evidence.relit(weights), key_share=key_share)
 
     def layers(x: Tensor) -> list[Tensor]:
         return features.layers((x / exposure).to(models.device))
 
     exposure = exposure_of(evidence.photo[None], evidence.mask[None, None].float())  # as in their training
     refined = refine_light(evidence, weights, layers, estimator.non_negative)
-    shown = evidence.relit(refined.weights)
-    return LightEstimate(balanced(refined.weights), evidence, shown, refined, weights, share)
+    relit = evidence.relit(refined.weights)
+    return LightEstimate(balanced(refined.weights), evidence, relit, refined, weights, key_share)

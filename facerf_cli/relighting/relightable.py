@@ -1,7 +1,8 @@
-"""The interface of all that can be relit: people in a photo, a face alone, an OLAT stack.
+"""Interface of everything that can be relit: people in a photo, only a face, an OLAT stack.
 
-It is relit at the resolution of its maps, once for all sums of lights, and rendered at that of its
-frame, some rows at a time. Both are linear in light: layers of single lights add up.
+A subject is relit at the resolution of its maps, for all sums of lights at once, and rendered at the
+resolution of its frame in strips of rows. Both steps are linear in the light, so layers of single lights add
+up.
 """
 
 from abc import ABC, abstractmethod
@@ -16,47 +17,47 @@ from torch import Tensor
 from facerf_cli.image.colour import ExposureRule
 from facerf_cli.image.strips import Empty, Rows, in_strips, new_array
 from facerf_cli.relighting.cast_shadows import CastShadow
-from facerf_cli.relighting.portrait_field import PortraitLight
+from facerf_cli.relighting.portrait_field import PersonShading
 from facerf_cli.run.memory import batches
 
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """A person under one sum of lights, at the resolution of its maps; linear radiance.
+    """A subject under one sum of lights, at the resolution of its maps, in linear radiance.
 
     Attributes:
-        texture: The face [3, T, T].
-        views: Of a `PersonInPhoto` its light in each square.
-        mirrored: Of a `PersonInPhoto` what its eyes mirror [N, 3, s, s].
-        mouth: Of a `PersonInPhoto` the face [3, T, T] in what falls into its mouth.
-        own: Share [3] of the photo's own light, which joins the sum.
-        keys: Of a `PersonInPhoto` key lights alone, and the shadow that each casts.
+        texture: Texture of the face [3, T, T].
+        own: Weight [3] of the photo's original light in the sum.
+        views: `PersonInPhoto`: its shading in each square.
+        eye_reflections: `PersonInPhoto`: what its irises reflect [N, 3, s, s].
+        mouth: `PersonInPhoto`: the face [3, T, T] under the light that enters the mouth.
+        keys: `PersonInPhoto`: each key light on its own, and the shadow it casts.
     """
 
     texture: Tensor
-    views: tuple[PortraitLight, ...] = ()
-    mirrored: Tensor | None = None
+    views: tuple[PersonShading, ...] = ()
+    eye_reflections: Tensor | None = None
     mouth: Tensor | None = None
     own: Tensor | None = None
     keys: "tuple[tuple[Relit, CastShadow], ...]" = ()
 
     @property
     def tensors(self) -> list[Tensor]:
-        """Texture and light of the views, in which images are linear."""
+        """Texture and shading; images are linear in them."""
         return [self.texture, *(maps for view in self.views for maps in view.tensors)]
 
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """Images and layers to render of a subject.
+    """What to render of a subject.
 
     Attributes:
-        image: The sum of lights of the image "rgb" [H, W, 3]; None leaves the image out.
-        lights: Sums of lights of layers [H, W, 3] over black, by name.
-        layers: Names of further layers, under the image's light.
+        image: Sum of lights for the image "rgb" [H, W, 3]; None: no image.
+        lights: Sums of lights for layers [H, W, 3] over black, by name.
+        layers: Names of other layers, under the image's light.
         ev: Exposure in EV at which the photo's background keeps its look.
         background: Image [H, W, 3] behind the subject; None: the photo, or nothing.
-        wrap: Light [H, W, 3] of the background that is added to the image, and is its layer "wrap".
+        wrap: Light [H, W, 3] of the background, added to the image and returned as layer "wrap".
     """
 
     image: Any = None
@@ -66,18 +67,11 @@ class RenderRequest:
     background: Rows | None = None
     wrap: Rows | None = None
 
-    def wrapped(self, found: dict[str, np.ndarray], rows: slice) -> dict[str, np.ndarray]:
-        """Arrays of some rows, with the background's light over the edge."""
-        if self.wrap is not None and self.image is not None:
-            found["wrap"] = self.wrap[rows]
-            found["rgb"] = found["rgb"] + found["wrap"]
-        return found
-
 
 class Relightable(ABC):
     """A subject that can be relit in a frame."""
 
-    keeps_photo = False  # True where the photo's own background stays behind it
+    keeps_photo = False  # True if the photo's own background stays behind the subject
 
     @property
     @abstractmethod
@@ -87,11 +81,11 @@ class Relightable(ABC):
     @property
     @abstractmethod
     def matte(self) -> np.ndarray:
-        """Share [H, W] of the frame that is relit."""
+        """Alpha [H, W] of the part that is relit."""
 
     @property
     def person_matte(self) -> np.ndarray | None:
-        """The matte of a photo's person, which images hold as a layer; None of a face alone."""
+        """The matte that images contain as a layer; None for only a face."""
         return None
 
     @property
@@ -101,51 +95,51 @@ class Relightable(ABC):
 
     @abstractmethod
     def relit(self, lights: Any) -> Iterator[Any]:
-        """Relight the subject by M sums of lights at once; one prediction serves all."""
+        """Yield the subject under each of M sums of lights, from a single prediction."""
 
     @abstractmethod
     def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
-        """What gives rows [h, W, ...] of all that is asked; what does not depend on rows is computed first.
+        """Compute everything that does not depend on rows; return a function that renders rows [h, W, ...].
 
         Raises UsageError for layers that this subject lacks.
         """
 
     @abstractmethod
     def exposure_ev(self, relit: Any, rule: ExposureRule) -> float:
-        """The exposure in EV of the subject under one sum of lights, by a rule."""
+        """Return the exposure in EV that a rule chooses for the subject under one sum of lights."""
 
     def relit_images(self, lights_of: Callable[[slice], Any], sums: Sequence[int]) -> Iterator[list[Any]]:
-        """Relight the subject for images that need some `sums` of lights each; yield a list for each image.
+        """Yield the relit subject for each image, as a list with one entry per sum of lights.
 
-        As many images at a time as fit the memory share one prediction. `lights_of` gives the lights of a
-        range of all sums.
+        As many images as fit the memory share one prediction.
+
+        Args:
+            lights_of: Returns the lights for a range of all sums.
+            sums: Number of sums of lights for each image.
         """
         first = 0
         for part in self.parts(sums):
             last = first + sum(sums[part])
-            found = self.relit(lights_of(slice(first, last)))
-            yield from ([*islice(found, count)] for count in sums[part])
+            relit = self.relit(lights_of(slice(first, last)))
+            yield from ([*islice(relit, count)] for count in sums[part])
             first = last
 
     def parts(self, sums: Sequence[int]) -> list[slice]:
-        """As many images at a time as fit the memory, of images that need some `sums` of lights each."""
+        """Return ranges of images that fit the memory together; `sums` as in `relit_images`."""
         return batches(len(sums), max(sums, default=1) * self.nbytes)
 
     def rendered(self, request: RenderRequest, empty: Empty = new_array) -> dict[str, np.ndarray]:
-        """All rows of what is asked; `empty` makes the array of a layer, by its name and shape.
-
-        Raises UsageError for layers that this subject lacks.
-        """
+        """Render the whole frame, strip by strip, into arrays that `empty` allocates by name and shape."""
         return in_strips(self.renderer(request), *self.size_px, empty)
 
     def image(self, relit: Any) -> np.ndarray:
-        """The image [H, W, 3] under one sum of lights, not multiplied by alpha."""
+        """Render the image [H, W, 3] under one sum of lights, not premultiplied."""
         return self.rendered(RenderRequest(relit))["rgb"]
 
     def alpha(self, background: Rows | None = None) -> np.ndarray | None:
-        """The matte where nothing is behind the subject, else None."""
+        """Return the matte if nothing is behind the subject, else None."""
         return self.matte if background is None and not self.keeps_photo else None
 
     def light_layer(self, relit: Any) -> np.ndarray:
-        """The subject [H, W, 3] under one of several lights, over black."""
+        """Render the subject [H, W, 3] under one sum of lights over black."""
         return self.rendered(RenderRequest(lights={"": relit}))[""]

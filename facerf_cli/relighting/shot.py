@@ -1,8 +1,8 @@
-"""One person through the frames of a shot: one identity and one light, and maps that are smoothed over time.
+"""One person through the frames of a shot: one identity, one light, and temporally smoothed maps.
 
 Maps are smoothed by a bilateral filter along time (Tomasi and Manduchi, *Bilateral filtering for gray and
-color images*, 1998): a pixel takes part in the mean as far as the image there looks as it does in the frame
-itself.
+color images*, 1998): a neighbouring frame contributes to a pixel to the extent that its image looks the same
+there.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,29 +36,29 @@ from facerf_cli.relighting import White
 from facerf_cli.relighting.field import balance_of
 from facerf_cli.relighting.models import Models, Sides
 from facerf_cli.relighting.photo_light import light_of_frames, source_light
-from facerf_cli.relighting.portrait_field import SteadyFrame, maps_of
+from facerf_cli.relighting.portrait_field import SmoothedFrame, maps_of
 from facerf_cli.relighting.tracking import Sighting, path_of
-from facerf_cli.relighting.white import Balance
+from facerf_cli.relighting.white import WhiteBalance
 
 MAPS_REACH = 2  # frames on each side of a map's window
 _ALIKE = 0.03  # difference of images, in 0..1, at which a neighbour's weight falls to 0.6
-_BLUR_PX = 3  # side of the square over which images are compared, against their noise
+_BLUR_PX = 3  # side of the square over which images are compared, because of their noise
 _TINY = 1e-9
 
 
 def steadied(maps: Sequence[Tensor], images: Sequence[Tensor], middle: int) -> Tensor:
-    """Mean over time of maps [C, h, w] of neighbouring frames, for the frame `middle` of them.
+    """Return the mean over time of maps [C, h, w] of neighbouring frames, for the frame `middle` of them.
 
-    images [3, h, w] in 0..1, display-encoded, say where the frames look alike.
+    Display-encoded images [3, h, w] in 0..1 tell where the frames look alike.
     """
     own = _blurred(images[middle])
-    total, weight = torch.zeros_like(maps[middle]), torch.zeros_like(own[:1])
+    total, weights = torch.zeros_like(maps[middle]), torch.zeros_like(own[:1])
     for index, (one, image) in enumerate(zip(maps, images, strict=True)):
         apart = (_blurred(image) - own).square().mean(0, keepdim=True)
         near = 1 - abs(index - middle) / (MAPS_REACH + 1)
-        share = near * torch.exp(-apart / (2 * _ALIKE**2))
-        total, weight = total + share * one, weight + share
-    return total / weight.clamp_min(_TINY)
+        weight = near * torch.exp(-apart / (2 * _ALIKE**2))
+        total, weights = total + weight * one, weights + weight
+    return total / weights.clamp_min(_TINY)
 
 
 def _blurred(image: Tensor) -> Tensor:
@@ -69,7 +69,7 @@ _KEYS = 12  # frames whose identities are averaged
 
 
 def spread_over(frames: Sequence[int], count: int) -> list[int]:
-    """At most `count` of some frames, evenly spread, the first and the last among them."""
+    """Return at most `count` of some frames, evenly spread, including the first and the last."""
     at = np.linspace(0, len(frames) - 1, min(count, len(frames))).round().astype(int)
     return [frames[index] for index in dict.fromkeys(at.tolist())]
 
@@ -77,7 +77,7 @@ def spread_over(frames: Sequence[int], count: int) -> list[int]:
 def identity_of(
     model: MorphableModel, landmarks_px: Sequence[np.ndarray], shape: tuple[int, int], crop_px: int
 ) -> Tensor:
-    """The identity [Ki] of one person from landmarks [68, 2] of several frames of shape [H, W]."""
+    """Fit the identity [Ki] of one person to landmarks [68, 2] in several frames of shape [H, W]."""
     keys = [landmarks_px[index] for index in spread_over(range(len(landmarks_px)), _KEYS)]
     crops = [from_landmarks(px, crop_px) for px in keys]
     inside = [crop.to_crop(px) for crop, px in zip(crops, keys, strict=True)]
@@ -88,7 +88,7 @@ def identity_of(
 
 
 class OnePerson:
-    """One identity alpha [Ki], whose pose and expression are fitted to frames of a size (height, width)."""
+    """A person of known identity alpha [Ki] in frames of a size (height, width)."""
 
     def __init__(self, model: MorphableModel, alpha: Tensor, size_px: tuple[int, int], crop_px: int) -> None:
         self._alpha, self._size_px, self._crop_px = alpha, size_px, crop_px
@@ -97,20 +97,20 @@ class OnePerson:
         self._model = replace(model, name="one person", mean=mean, identity=model.identity[:0])
 
     def fit(self, landmarks_px: np.ndarray) -> FaceFit:
-        """Fit pose and expression to landmarks [68, 2] of a frame."""
+        """Fit pose and expression to landmarks [68, 2] in a frame."""
         crop = from_landmarks(landmarks_px, self._crop_px)
         inside = crop.to_crop(landmarks_px)
         fit = fit_landmarks(self._model, inside, crop, trust=trust_inside(inside, crop, *self._size_px))
         return replace(fit, model=self._name, alpha=self._alpha)
 
 
-KEY_FRAMES = 5  # from which the light is estimated
+KEY_FRAMES = 5  # frames that the light is estimated from
 _UNIT = ("normals", "strands")  # maps of unit vectors
 
 
 @dataclass(eq=False)
-class _Observation:
-    """Classes [C, h, w] that a frame shows alone, its small image, and the rest once it is asked for."""
+class _FrameObservation:
+    """Classes [C, h, w] predicted for one frame, its small image, and results that are computed on demand."""
 
     classes: Tensor
     small: Tensor
@@ -120,18 +120,19 @@ class _Observation:
 
 
 class SteadyShot:
-    """A person through the frames of a shot, each steadied by those around it.
+    """A person through the frames of a shot, each frame smoothed with its neighbours.
 
-    What frames see is kept for those around the last one that was asked for: in order each is looked at once.
-    What holds for the whole shot is found when it is first needed, and kept.
+    Observations are kept only for frames near the last requested one; if frames are requested in order,
+    networks run once per frame. Results for the whole shot are computed on first use and kept.
 
     Args:
-        models: The face model and the networks.
-        frames: Gives frames by number, scene-linear [H, W, 3], all of one size.
-        sightings: The face in each of them.
-        sides: Those of texture and crop.
-        mattes: Gives the person's [H, W] by number, if given; black in frames without the person.
-        white: Whose colours skin has under even white light; None: those of the networks.
+        models: Face model and networks.
+        frames: Returns a frame by number, scene-linear [H, W, 3]; all have one size.
+        sightings: The face in each frame.
+        sides: Sides of texture and crop.
+        mattes: Returns the user's alpha [H, W] of the person by number; black if a frame does not show the
+            person.
+        white: White balance of the skin; None keeps the networks' colours.
     """
 
     def __init__(
@@ -146,64 +147,59 @@ class SteadyShot:
         self._models, self._frames, self._mattes = models, frames, mattes
         self._sides, self._white = sides, white
         self._path = path_of(sightings)  # [N, 68, 2], NaN where the face is lost
-        self._sighted = [frame for frame, seen in enumerate(sightings) if seen]
-        self._shown = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
-        self._near: dict[int, _Observation] = {}
+        self._sighted = [frame for frame, sighting in enumerate(sightings) if sighting]
+        self._tracked = frozenset(np.flatnonzero(np.isfinite(self._path).all((1, 2))).tolist())
+        self._near: dict[int, _FrameObservation] = {}
 
-    def window(self, frame: int, portrait: bool = True) -> SteadyFrame:
-        """A frame as those around it steady it; `portrait` says whether the portrait field is wanted."""
+    def window(self, frame: int, portrait: bool = True) -> SmoothedFrame:
+        """Return a frame smoothed with its neighbours; `portrait` includes what the portrait field needs."""
         light, balance = self.light, self._balance  # from other frames, before those around this one
         self._keep_near(frame)
-        views = self._steady_views(frame) if portrait and self._shows(frame) else ()
+        views = self._smoothed_views(frame) if portrait and self._shows_person(frame) else ()
         head = self._key_heads.get(frame) or self._head(frame)
-        return SteadyFrame(head, light, self._segmentation(frame), views, balance)
+        return SmoothedFrame(head, light, self._segmentation(frame), views, balance)
 
     def segmentation(self, frame: int) -> Segmentation:
-        """The person of a frame, from the classes of those around it."""
+        """Segment the person in a frame, from the classes of its neighbours."""
         self._keep_near(frame)
         return self._segmentation(frame)
 
     def landmarks_px(self, frame: int) -> np.ndarray:
-        """Smoothed landmarks [68, 2] of a frame; raises InputError where the face is lost."""
-        if frame not in self._shown:
-            raise InputError(f"frame {frame}: the face is not seen in more frames than can be filled in")
-        found: np.ndarray = self._path[frame]
-        return found
+        """Return the smoothed landmarks [68, 2] in a frame; raises InputError if the face is lost."""
+        if frame not in self._tracked:
+            raise InputError(f"frame {frame}: the face is not visible for more frames than can be bridged")
+        return np.asarray(self._path[frame])
 
     @cached_property
     def key_frames(self) -> list[int]:
-        """Frames that stand for the shot, evenly spread over those in which the face was sighted.
-
-        Those whose given matte is black are left out.
-        """
+        """Representative frames, evenly spread over those with a sighting, and a matte that is not black."""
         if not self._sighted:
             raise InputError("no frame shows a face")
         keys = spread_over(self._sighted, KEY_FRAMES)
-        return [frame for frame in keys if self._shows(frame)] or keys
+        return [frame for frame in keys if self._shows_person(frame)] or keys
 
     @property
     def middle(self) -> int:
-        """The key frame of the middle."""
+        """The middle key frame."""
         return self.key_frames[len(self.key_frames) // 2]
 
     @property
     def other_heads(self) -> list[Head]:
-        """The heads of the other key frames."""
+        """Heads in the other key frames."""
         return [head for frame, head in self._key_heads.items() if frame != self.middle]
 
     @cached_property
     def light(self) -> RigLight:
-        """The light of the shot, from key frames together."""
+        """Light of the shot, estimated from all key frames together."""
         return light_of_frames(self._models, [head.face for head in self._key_heads.values()])
 
     @cached_property
-    def _balance(self) -> Balance | None:
-        """The balance of the shot, from key frames together."""
+    def _balance(self) -> WhiteBalance | None:
         if self._white is None:
             return None
         faces = [head.face for head in self._key_heads.values()]
-        evens = [source_light(self._models, one, self.light).even for one in faces]
-        return balance_of(self._white, list(zip(faces, evens, strict=True)))
+        uniform = [source_light(self._models, one, self.light).uniform for one in faces]
+        return balance_of(self._white, list(zip(faces, uniform, strict=True)))
 
     @cached_property
     def _key_heads(self) -> dict[int, Head]:
@@ -216,13 +212,13 @@ class SteadyShot:
     @cached_property
     def _person(self) -> OnePerson:
         size_px, crop_px = self._frames(self._sighted[0]).shape[:2], self._sides.crop_px
-        places = [self._path[frame] for frame in self._sighted]
-        alpha = identity_of(self._models.face, places, size_px, crop_px)
+        landmarks_px = [self._path[frame] for frame in self._sighted]
+        alpha = identity_of(self._models.face, landmarks_px, size_px, crop_px)
         return OnePerson(self._models.face, alpha, size_px, crop_px)
 
     @cached_property
     def _wide(self) -> tuple[float, float, float] | None:
-        """Place and side of the wider square in the middle of the shot, in sides of the head's square."""
+        """Offset and side of the wider square in the middle of the shot, in sides of the head's square."""
         fit = self._fit(self.middle)
         head = portrait_square(fit.crop.to_photo(fit.landmarks_px.numpy()))
         wide = wider_square(head, self._segmentation(self.middle).matte)
@@ -231,26 +227,25 @@ class SteadyShot:
         offsets = wide.x0_px - head.x0_px, wide.y0_px - head.y0_px
         return offsets[0] / head.side_px, offsets[1] / head.side_px, wide.side_px / head.side_px
 
-    def _shows(self, frame: int) -> bool:
+    def _shows_person(self, frame: int) -> bool:
         return self._mattes is None or bool(self._mattes(frame).any())
 
     def _around(self, frame: int) -> list[int]:
-        """The frame and its neighbours that show the face, without those beyond a frame where it is lost."""
-        found = [frame]
+        """Return the frame and its neighbours, up to the nearest frames in which the face is lost."""
+        frames = [frame]
         for step in (-1, 1):
             at = frame + step
-            while abs(at - frame) <= MAPS_REACH and 0 <= at < len(self._path) and at in self._shown:
-                found.append(at)
+            while abs(at - frame) <= MAPS_REACH and 0 <= at < len(self._path) and at in self._tracked:
+                frames.append(at)
                 at += step
-        return sorted(found)
+        return sorted(frames)
 
     def _keep_near(self, frame: int) -> None:
-        """Let go what only frames far from this one need; its neighbours need their own neighbours."""
+        """Release observations far from a frame; its neighbours need their own neighbours."""
         reach = 2 * MAPS_REACH
-        self._near = {one: seen for one, seen in self._near.items() if abs(one - frame) <= reach}
+        self._near = {at: observed for at, observed in self._near.items() if abs(at - frame) <= reach}
 
-    def _seen(self, frame: int) -> _Observation:
-        """Look at a frame alone, once."""
+    def _observed(self, frame: int) -> _FrameObservation:
         if frame not in self._near:
             people, landmarks_px = self._models.networks.people, self.landmarks_px(frame)
             image = to_display(self._frames(frame))
@@ -259,31 +254,30 @@ class SteadyShot:
                 classes = parsed(people.parsing, image, landmarks_px, small)
             else:
                 classes = seen_classes(people, image, landmarks_px, small)
-            self._near[frame] = _Observation(classes, small)
+            self._near[frame] = _FrameObservation(classes, small)
         return self._near[frame]
 
     def _segmentation(self, frame: int) -> Segmentation:
-        seen = self._seen(frame)
-        if seen.segmentation is None:
+        observed = self._observed(frame)
+        if observed.segmentation is None:
             around = self._around(frame)
-            near = [self._seen(one) for one in around]
+            near = [self._observed(one) for one in around]
             mean = steadied([one.classes for one in near], [one.small for one in near], around.index(frame))
             mean = mean / mean.sum(0).clamp_min(1e-6)
             if self._mattes is not None:
-                seen.segmentation = within_matte(mean, self._mattes(frame))
+                observed.segmentation = within_matte(mean, self._mattes(frame))
             else:
                 image = to_display(self._frames(frame))
-                seen.segmentation = segmentation_of(mean, image, self.landmarks_px(frame))
-        return seen.segmentation
+                observed.segmentation = segmentation_of(mean, image, self.landmarks_px(frame))
+        return observed.segmentation
 
     def _fit(self, frame: int) -> FaceFit:
-        seen = self._seen(frame)
-        if seen.fit is None:
-            seen.fit = self._person.fit(self.landmarks_px(frame))
-        return seen.fit
+        observed = self._observed(frame)
+        if observed.fit is None:
+            observed.fit = self._person.fit(self.landmarks_px(frame))
+        return observed.fit
 
     def _head(self, frame: int) -> Head:
-        """The head of a frame, without what covers its skin."""
         model, fit, photo = self._models.face, self._fit(frame), self._frames(frame)
         cropped = fit.crop.apply(photo)
         head = Head(cropped, fit, unwrap_face(model, fit, cropped, self._sides.texture, photo.shape))
@@ -291,13 +285,13 @@ class SteadyShot:
         classes = self._segmentation(frame).classes
         try:
             return head.without(model, uncovered_in(classes, (height, width), fit.crop))
-        except InputError:  # all of it is covered: in this frame something passes before it
+        except InputError:  # in this frame something covers the whole face
             return head
 
     def _views(self, frame: int) -> list[tuple[SeenPerson, PortraitMaps]]:
-        """The person around the head and, if it needs it, in a wider square that follows the head."""
-        seen = self._seen(frame)
-        if seen.views is None:
+        """Return the person around the head and, if the shot needs it, in a wider square around that."""
+        observed = self._observed(frame)
+        if observed.views is None:
             networks, photo = self._models.networks, self._frames(frame)
             fit, segmentation = self._fit(frame), self._segmentation(frame)
             person = look_at_person(networks.people, self._models.face, photo, fit, segmentation=segmentation)
@@ -306,19 +300,19 @@ class SteadyShot:
                 head = person.square
                 x, y, side = (part * head.side_px for part in self._wide)
                 people.append(person.within(Crop(head.x0_px + x, head.y0_px + y, side, head.size_px), photo))
-            seen.views = [(one, maps_of(networks.portrait, one)) for one in people]
-        return seen.views
+            observed.views = [(one, maps_of(networks.portrait, one)) for one in people]
+        return observed.views
 
-    def _steady_views(self, frame: int) -> tuple[tuple[SeenPerson, PortraitMaps], ...]:
-        """The person of a frame, and maps averaged with its neighbours', since squares follow the head."""
-        around = [one for one in self._around(frame) if self._shows(one)]
+    def _smoothed_views(self, frame: int) -> tuple[tuple[SeenPerson, PortraitMaps], ...]:
+        """Return the person in a frame, and maps averaged with its neighbours'; squares follow the head."""
+        around = [one for one in self._around(frame) if self._shows_person(one)]
         views = zip(*(self._views(one) for one in around), strict=True)
         middle = around.index(frame)
-        return tuple((near[middle][0], _steadied_maps(near, middle)) for near in views)
+        return tuple((near[middle][0], _smoothed_maps(near, middle)) for near in views)
 
 
-def _steadied_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int) -> PortraitMaps:
-    """Maps of the middle one of some frames, averaged with the others'."""
+def _smoothed_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int) -> PortraitMaps:
+    """Average the maps of the middle frame with those of its neighbours."""
     images = [_encoded(person) for person, _ in near]
     halves = [F.avg_pool2d(image[None], 2)[0] for image in images]
     means: dict[str, Tensor] = {}
@@ -328,15 +322,15 @@ def _steadied_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int)
         layers = [getattr(maps, name)[0] for _, maps in near]
         if name == "gain":
             layers = [layer.log() for layer in layers]
-        found = steadied(layers, images if layers[0].shape[-1] == images[0].shape[-1] else halves, middle)
+        mean = steadied(layers, images if layers[0].shape[-1] == images[0].shape[-1] else halves, middle)
         if name in _UNIT:
-            found = F.normalize(found, dim=0)
-        means[name] = (found.exp() if name == "gain" else found)[None]
+            mean = F.normalize(mean, dim=0)
+        means[name] = (mean.exp() if name == "gain" else mean)[None]
     person = near[middle][0]
     albedo = person.exposed[None] * means["gain"] + means["bias"]
     return PortraitMaps(albedo=albedo, **means)
 
 
 def _encoded(person: SeenPerson) -> Tensor:
-    """The person's image [3, S, S] for comparison, display-encoded in 0..1; the skin is about middle grey."""
+    """Return the person's display-encoded image [3, S, S] in 0..1, with skin at about middle grey."""
     return (person.exposed / 2).clamp(0, 1).pow(1 / 2.2)

@@ -1,8 +1,8 @@
 """Cuts of a video, one face tracked through the frames of a shot, and its smoothed path.
 
-A curve is smoothed by a local quadratic (Savitzky and Golay, *Smoothing and differentiation of data by
-simplified least squares procedures*, 1964), with weights, so that frames that are missing or unsure count for
-nothing or little. It has no delay, and keeps a movement that is a parabola over the window.
+Curves are smoothed by a local quadratic (Savitzky and Golay, *Smoothing and differentiation of data by
+simplified least squares procedures*, 1964) with weights, so that missing or uncertain frames have little or
+no influence. The filter has no delay and preserves a movement that is a parabola over the window.
 """
 
 from collections import deque
@@ -18,14 +18,14 @@ from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.find import Face, choose_face, detect_faces, face_near
 
 _ROWS, _COLUMNS = 12, 16  # of a thumbnail
-_LEAST = 0.05  # change at a cut, display values in 0..1
-_TIMES = 3.0  # of the largest change around it
+_LEAST = 0.05  # least change at a cut, display values in 0..1
+_TIMES = 3.0  # change at a cut over the largest change around it
 _AROUND = 3  # frames on each side
 
 
 def with_cuts(images: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, bool]]:
     """Yield the frames of a video, sRGB uint8 [H, W, 3], in order, and True where a new shot begins."""
-    changes: list[float] = []  # of each frame but the first from the one before it
+    changes: list[float] = []  # from each frame to the next
     ahead: deque[np.ndarray] = deque()
     before: np.ndarray | None = None
     for number, image in enumerate(chain(images, [None] * _AROUND), -_AROUND):
@@ -42,41 +42,44 @@ def with_cuts(images: Iterable[np.ndarray]) -> Iterator[tuple[np.ndarray, bool]]
 
 
 def is_cut(change: float, around: Sequence[float]) -> bool:
-    """Tell if a change is that of a cut, among the changes of the frames around it."""
+    """Return True if a change is a cut, given the changes of the frames around it."""
     return change > max(_LEAST, _TIMES * max(around, default=0.0))
 
 
 def thumbnail(image_srgb: np.ndarray) -> np.ndarray:
-    """Means [_ROWS, _COLUMNS, 3] in 0..1 of parts of an image, uint8 [H, W, 3]."""
+    """Return the means [_ROWS, _COLUMNS, 3] in 0..1 of the blocks of an image, uint8 [H, W, 3]."""
     pixels = torch.from_numpy(image_srgb).permute(2, 0, 1)[None].float() / 255
     return F.adaptive_avg_pool2d(pixels, (_ROWS, _COLUMNS))[0].permute(1, 2, 0).numpy()
 
 
-LONGEST_GAP = 12  # frames without the face that are bridged: half a second at 24 frames a second
+LONGEST_GAP = 12  # frames without the face that are bridged: half a second at 24 frames per second
 _FURTHEST = 1.5  # extents of its landmarks that a face may move while it is lost
 _SIZES = (0.6, 1.7)  # range of the change of its size meanwhile
 
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A face in one frame: landmarks [68, 2] in pixels, and its median expected error, in their extent."""
+    """A face in one frame.
+
+    `landmarks_px` is [68, 2]; `error` is their median expected error, in extents of the landmarks.
+    """
 
     landmarks_px: np.ndarray
     error: float
 
 
 class FaceTracker:
-    """Finds one face in frame after frame; `which` chooses it: largest, or an index from the left."""
+    """Track one face from frame to frame; `which` selects it: largest, or an index from the left."""
 
     def __init__(self, people: PeopleNetworks, which: str) -> None:
         self._people, self._which = people, which
         self._last: np.ndarray | None = None
 
     def track(self, image_srgb: np.ndarray) -> Sighting | None:
-        """Find the face in the next frame, sRGB uint8 [H, W, 3]; None where it is not seen.
+        """Find the face in the next frame, sRGB uint8 [H, W, 3]; return None if it is not visible.
 
-        Near the place of the frame before, else in the whole frame: the one nearest to that place, of about
-        its size.
+        The face is searched near its last position, then in the whole frame. There, the nearest face of about
+        the same size is used.
         """
         last = self._last
         face = None if last is None else face_near(self._people, image_srgb, last)
@@ -98,7 +101,7 @@ class FaceTracker:
 
 
 def _may_be(face: Face, last: np.ndarray) -> bool:
-    """Tell if a face can be the one that was at landmarks [68, 2]."""
+    """Return True if this may be the face that was last seen at landmarks [68, 2]."""
     before, now = _extent_px(last), _extent_px(face.landmarks_px)
     low, high = _SIZES
     return low < now / before < high and _apart_px(face.landmarks_px, last) < _FURTHEST * before
@@ -113,35 +116,34 @@ def _extent_px(landmarks_px: np.ndarray) -> float:
 
 
 REACH = 5  # frames on each side of a curve's window
-_FULL = 4  # frames with weight from which on a window has a quadratic; with fewer it is a line or a mean
+_FULL = 4  # frames with weight that a quadratic needs; fewer are fitted by a line or a mean
 _BRIDGE_WEIGHT = 0.05  # of a frame in a gap
 
 
 def path_of(sightings: Sequence[Sighting | None]) -> np.ndarray:
-    """Smoothed landmarks [N, 68, 2] of a shot; NaN where the face is lost, but for gaps that are bridged."""
+    """Return smoothed landmarks [N, 68, 2] of a shot, NaN where the face is lost; short gaps are bridged."""
     path = np.full((len(sightings), 68, 2), np.nan)
     weights = np.zeros(len(sightings))
-    for frame, seen in enumerate(sightings):
-        if seen is not None:
-            path[frame], weights[frame] = seen.landmarks_px, 1.0
+    for frame, sighting in enumerate(sightings):
+        if sighting is not None:
+            path[frame], weights[frame] = sighting.landmarks_px, 1.0
     for first, last in gaps(sightings):
         if is_bridged(first, last, len(sightings)):
-            share = (np.arange(first, last + 1) - first + 1)[:, None, None] / (last - first + 2)
-            path[first : last + 1] = path[first - 1] + share * (path[last + 1] - path[first - 1])
+            progress = (np.arange(first, last + 1) - first + 1)[:, None, None] / (last - first + 2)
+            path[first : last + 1] = path[first - 1] + progress * (path[last + 1] - path[first - 1])
             weights[first : last + 1] = _BRIDGE_WEIGHT
-    kept = weights > 0
-    found = smoothed(np.where(kept[:, None, None], path, 0), weights)
-    return np.where(kept[:, None, None], found, np.nan)
+    kept = (weights > 0)[:, None, None]
+    return np.where(kept, smoothed(np.where(kept, path, 0), weights), np.nan)
 
 
 def gaps(sightings: Sequence[Sighting | None]) -> Iterator[tuple[int, int]]:
-    """First and last frames of each run of frames without the face."""
-    seen = [-1, *(frame for frame, one in enumerate(sightings) if one is not None), len(sightings)]
-    return ((before + 1, after - 1) for before, after in pairwise(seen) if after > before + 1)
+    """Yield the first and last frame of each run of frames without the face."""
+    sighted = [-1, *(frame for frame, one in enumerate(sightings) if one is not None), len(sightings)]
+    return ((before + 1, after - 1) for before, after in pairwise(sighted) if after > before + 1)
 
 
 def is_bridged(first: int, last: int, count: int) -> bool:
-    """Tell if a gap in `count` frames is filled in from the frames around it."""
+    """Return True if a gap in a shot of `count` frames is filled in from the frames around it."""
     return first > 0 and last + 1 < count and last - first < LONGEST_GAP
 
 
@@ -164,7 +166,7 @@ def smoothed(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _local(at: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The value [C] at 0 of the polynomial that fits values [M, C] at times [M] best."""
+    """Return the value [C] at time 0 of the polynomial that best fits values [M, C] at times [M]."""
     order = 2 if len(at) >= _FULL else min(1, len(at) - 1)
     columns = np.vander(at, order + 1, increasing=True) * np.sqrt(weight)[:, None]
     return np.asarray(np.linalg.lstsq(columns, values * np.sqrt(weight)[:, None], rcond=None)[0][0])

@@ -1,22 +1,23 @@
-"""The photo's light in a person's colours: white balance, the colour of shade, shade and glare in the albedo.
+"""White balance, the colour of shade, and shading and highlights left in the albedo.
 
-The colour of a photo's light and that of its skin are known as a product alone, and networks take too much of
-it for the light's: under white light skin turns ashen. But a camera has balanced white already. So under even
-white light skin gets the chromaticity that the photo shows (`photo`). Of a photo that is far from white, as
-by sodium light, the estimated colour is taken out (`scene`), but never further than to a colour that skin
-has. The gains that do this are the same for all lights. Hair and cloth, of whose colour networks leave more,
-have gains of their own, by the same light (`Balance`).
+A photo shows only the product of light colour and skin colour, and networks attribute too much of it to the
+light: under white light, skin turns ashen. But a camera has already balanced white. So under uniform white
+light skin gets the chromaticity of the photo (`photo`). In a photo that is far from white, such as one taken
+under sodium light, the estimated colour is removed (`scene`), but only until skin has a colour that skin can
+have. The gains are the same for all lights. Hair and cloth have their own gains, for the same light, because
+networks keep more of their colour (`WhiteBalance`).
 
-Where the key of a photo does not reach, skin is seen in other light: blue sky, a purple wall. Networks take
-some of that colour for the skin's own, and under a new key it shows as a stain. So they see a photo whose
-shaded skin has the colour of its lit skin (`without_colour_of_shade`). Brightness and detail stay; the
-correction of each field knows the photo as it is, and gives it back in its own light.
+Where a photo's key light does not reach, skin is lit by other light: blue sky, a purple wall. Networks
+attribute some of that colour to the skin, and under a new key light it shows as a stain. Therefore networks
+see a photo in which shaded skin has the colour of lit skin (`without_colour_of_shade`). Brightness and detail
+stay. The ratio image of each field uses the unmodified photo, so the original light still reproduces it.
 
-Networks also leave shade and glare in the albedo of skin. Where the photo's key does not reach skin, or skin
-glares in it, the photo tells little of its albedo. What is finer there than a pixel of the maps stays, what
-is coarser becomes that of the skin around, in colour, too (`without_baked_in`). Glare is brighter and whiter
-than the skin around (the dichromatic model: Shafer, *Using color to separate reflection components*, 1985),
-so that of grey photos is not known.
+Networks also leave shading and specular highlights in the albedo of skin. Where the photo's key light does
+not reach skin, or skin has a highlight, the photo says little about the albedo. There, detail finer than a
+pixel of the maps is kept, and the low frequencies, including colour, are replaced by those of the surrounding
+skin (`without_baked_in`). Highlights are brighter and whiter than the skin around them (the dichromatic
+model: Shafer, *Using color to separate reflection components*, 1985), so they cannot be detected in grey
+photos.
 """
 
 from dataclasses import dataclass
@@ -32,74 +33,80 @@ from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.raster.texture import blurred, blurred_within, smoothstep
 from facerf_cli.relighting import White
 
-SURE = 0.9  # share of a class
-_BLACK = 0.15  # of the median brightness of a class: what is darker has no colour of its own
-_BY_KEY = 0.6  # quantile of it: what is darker may have the colour of another light than the scene's key
-_LEAST = 500  # pixels or texels that have a colour
-_BALANCED, _FAR = 0.3, 0.8  # difference of log chromaticities of a photo's skin from all colours of skin
+SURE = 0.9  # coverage of a class above which a pixel counts
+_BLACK = 0.15  # fraction of the class's median brightness below which chromaticity is ignored
+_BY_KEY = 0.6  # quantile of brightness; darker pixels may be lit by another light than the scene's key light
+_LEAST = 500  # least number of pixels or texels with a chromaticity
+_BALANCED, _FAR = 0.3, 0.8  # distance of the photo's skin from all colours of skin, in log chromaticity
 BARE = [class_index(name) for name in ("skin", "ears", "neck", "hand")]
 _GROUPS = [BARE, *([number] for number in range(1, len(CLASSES)) if number not in BARE)]
-_SHADE_REACH = 0.03  # blur of colours, in sides: what is narrower, as freckles are, is the skin's own
-_SHADE = (0.3, 0.8)  # brightness over that of lit skin, below which all is shade, and from which on none
-_MOST_SHADE = 4.0  # change of a channel
-_DARK = 0.01  # of the brightness of lit skin: what is darker has no colour of its own
+_SHADE_REACH = 0.03  # blur of colours as a fraction of the image side; finer detail, like freckles, is skin's
+_SHADE = (0.3, 0.8)  # brightness relative to lit skin: below the first all is shade, above the second none
+_MOST_SHADE = 4.0  # limit of a channel's change
+_DARK = 0.01  # fraction of the brightness of lit skin below which chromaticity is ignored
 _TINY = 1e-6
-_FINE, _NEAR, _AROUND = 1 / 224, 1 / 28, 1 / 10  # standard deviations of blurs, in sides
-_SKIN = (0.6, 0.9)  # share of skin from which on a pixel counts, and counts whole
-_BRIGHT = 0.9  # quantile of the key on skin
-_HARD = (0.5, 0.8)  # share of the key, up to which light is soft, and from which on it is hard
-_LIT = (0.2, 0.6)  # key over that, up to which skin lies in shade, and from which on it does not
-_WHITER = (0.02, 0.1)  # share of added white from which on skin glares, and surely does
-_BRIGHTER = (0.0, 0.2)  # log of its brightness over that around, likewise
-_LEAST_PLAIN = 0.01  # share of plain skin around, below which nothing is known of it
-_MOST_BAKED = 1.5  # log of a factor
+_FINE, _NEAR, _AROUND = 1 / 224, 1 / 28, 1 / 10  # standard deviations of blurs, fractions of the image side
+_SKIN = (0.6, 0.9)  # coverage of skin at which a pixel begins to count, and counts fully
+_BRIGHT = 0.9  # quantile of the key light on skin
+_HARD = (0.5, 0.8)  # fraction of the key light: light is soft below the first, hard above the second
+_LIT = (0.2, 0.6)  # key light over that quantile: skin is shaded below the first, lit above the second
+_WHITER = (0.02, 0.1)  # fraction of added white at which a highlight begins, and is certain
+_BRIGHTER = (0.0, 0.2)  # log brightness over the surroundings at which it begins, and is certain
+_LEAST_PLAIN = 0.01  # fraction of plain skin around below which its albedo is unknown
+_MOST_BAKED = 1.5  # limit of a factor's logarithm
 
 
 @dataclass(frozen=True, eq=False)
-class Balance:
-    """The gain [3] of a face, and the log chromaticity [2] of the light that is taken out of the photo.
+class WhiteBalance:
+    """White balance of a person.
 
-    `even` is the brightness of even light, from all around, under which skin is as bright as in the photo.
-    `off_white` is how far the photo's skin is from all colours of skin, in log chromaticity; in most photos
-    about 0. `white` says whose colours are kept.
+    Attributes:
+        gain: Gain [3] of the face.
+        light: Log chromaticity [2] of the light that is removed from the photo.
+        uniform_scale: Intensity of uniform light that reproduces the skin's brightness in the photo.
+        off_white: Distance of the photo's skin from all colours of skin, in log chromaticity; about 0 in most
+            photos.
+        white: Which colours are kept.
     """
 
     gain: Tensor
     light: Tensor
-    even: float
+    uniform_scale: float
     off_white: float = 0.0
     white: White = "photo"
 
     @staticmethod
-    def of(white: White, relit: Tensor, photo: Tensor, skin: Tensor) -> "Balance":
-        """The balance of a face relit [3, ...] by even white light, by its photo [3, ...], scene-linear.
+    def of(white: White, relit: Tensor, photo: Tensor, skin: Tensor) -> "WhiteBalance":
+        """Return the white balance of a face from its photo [3, ...], scene-linear.
 
-        That light has the radiance 1 / 4: a surface that nothing shades receives that much of it.
-        `skin` [...] is the share of skin. Grey photos, and those where little skin has a colour, keep theirs.
+        `relit` [3, ...] is the face under uniform white light of radiance 1 / 4: the radiance that a surface
+        without any occluder receives. `skin` [...] is the coverage of skin. Grey photos, and those where
+        little skin has a chromaticity, are not changed.
         """
         chromas = _chromas(relit, photo, skin, white)
         seen, lit = (float(luminance((one * skin).flatten(1).sum(1).numpy())) for one in (photo, relit))
-        even = seen / max(4 * lit, 1e-6)
+        uniform_scale = seen / max(4 * lit, 1e-6)
         if chromas is None:
-            return Balance(torch.ones(3), torch.zeros(2), even, white=white)
-        found, shown = chromas
-        nearest = _nearest_skin(shown)
-        off_white = float((shown - nearest).norm())
-        wanted = shown
+            return WhiteBalance(torch.ones(3), torch.zeros(2), uniform_scale, white=white)
+        of_relit, of_photo = chromas
+        nearest = _nearest_skin(of_photo)
+        off_white = float((of_photo - nearest).norm())
+        wanted = of_photo
         if white == "scene":
-            share = smoothstep(torch.tensor((off_white - _BALANCED) / (_FAR - _BALANCED)))
-            wanted = torch.lerp(nearest, _nearest_skin(found), share)
-        return Balance(_gain(found, wanted), shown - wanted, even, off_white, white)
+            weight = smoothstep(torch.tensor((off_white - _BALANCED) / (_FAR - _BALANCED)))
+            wanted = torch.lerp(nearest, _nearest_skin(of_relit), weight)
+        return WhiteBalance(_gain(of_relit, wanted), of_photo - wanted, uniform_scale, off_white, white)
 
     @property
-    def is_far(self) -> bool:
-        """True where the photo's light is certainly coloured."""
+    def is_strongly_coloured(self) -> bool:
+        """Whether the photo's light certainly has a colour."""
         return self.off_white > (_BALANCED + _FAR) / 2
 
     def gains(self, relit: Tensor, photo: Tensor, classes: Tensor) -> Tensor:
-        """Gains [3, ...] of a person relit [3, ...] by even white light; the photo is [3, ...].
+        """Return gains [3, ...] of a whole person.
 
-        classes [C, ...] are shares.
+        `relit` [3, ...] is the person under uniform white light, the photo is [3, ...], and `classes` [C,
+        ...] is the coverage of each class.
         """
         gains = torch.ones(len(CLASSES), 3)
         for group in _GROUPS:
@@ -110,9 +117,9 @@ class Balance:
         return 1 + torch.einsum("k...,kc->c...", classes[1:] / person, gains[1:] - 1)
 
 
-def _chromas(relit: Tensor, photo: Tensor, share: Tensor, white: White) -> tuple[Tensor, Tensor] | None:
-    """Median chromaticities [2] of what is surely of a class and has a colour: relit, and in the photo."""
-    sure = share > SURE
+def _chromas(relit: Tensor, photo: Tensor, coverage: Tensor, white: White) -> tuple[Tensor, Tensor] | None:
+    """Return the median log chromaticities [2] of a class, relit and in the photo; None if it has none."""
+    sure = coverage > SURE
     sure &= ~clipped(photo, sure).any(0)
     brightness = photo.mean(0)
     sure &= brightness > _BLACK * brightness[sure].median()
@@ -124,19 +131,19 @@ def _chromas(relit: Tensor, photo: Tensor, share: Tensor, white: White) -> tuple
 
 
 def _chroma(colours: Tensor) -> Tensor:
-    """Median log red / green and log blue / green [2] of colours [3, N]."""
+    """Return median log red / green and log blue / green [2] of colours [3, N]."""
     red, green, blue = colours.clamp_min(1e-6).log()
     return torch.stack([(red - green).median(), (blue - green).median()])
 
 
-def _gain(found: Tensor, wanted: Tensor) -> Tensor:
-    """The gain [3] from a chromaticity [2] to another, which keeps luminance."""
+def _gain(start: Tensor, wanted: Tensor) -> Tensor:
+    """Return the gain [3] from one log chromaticity [2] to another that keeps luminance."""
 
     def colour(chroma: Tensor) -> Tensor:
         rgb = torch.stack([chroma[0], chroma.new_zeros(()), chroma[1]]).exp()
         return rgb / float(luminance(rgb.numpy()))
 
-    return colour(wanted) / colour(found)
+    return colour(wanted) / colour(start)
 
 
 def _nearest_skin(chroma: Tensor) -> Tensor:
@@ -146,9 +153,9 @@ def _nearest_skin(chroma: Tensor) -> Tensor:
 
 
 def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
-    """Factors [3, S, S] for a scene-linear image [3, S, S], where shaded skin gets the colour of lit skin.
+    """Return factors [3, S, S] that give shaded skin in an image [3, S, S] the colour of lit skin.
 
-    `skin` [S, S] is the share of skin; without any the factors are 1.
+    The image is scene-linear. `skin` [S, S] is the coverage of skin; without any skin the factors are 1.
     """
     image, skin = image.detach(), skin.detach()
     near, reach = 0.3 * _SHADE_REACH * image.shape[-1], _SHADE_REACH * image.shape[-1]
@@ -156,8 +163,8 @@ def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
     lit = (image * skin * brightness).sum((1, 2)) / (skin * brightness).sum().clamp_min(_TINY)
     level = blurred_within(brightness[None], skin, near)[0] / lit.mean().clamp_min(_TINY)
     shade = ((_SHADE[1] - level) / (_SHADE[1] - _SHADE[0])).clamp(0, 1)
-    even = image / (brightness + _DARK * lit.mean()).clamp_min(_TINY)  # each pixel counts alike
-    colour = blurred_within(even, shade * skin, reach)
+    chroma = image / (brightness + _DARK * lit.mean()).clamp_min(_TINY)  # all pixels have equal weight
+    colour = blurred_within(chroma, shade * skin, reach)
     typical = (lit / lit.mean().clamp_min(_TINY))[:, None, None]
     change = typical * colour.mean(0) / colour.clamp_min(_TINY)
     amount = blurred_within(shade[None], skin, near)[0] * (2 * skin).clamp(max=1)
@@ -165,23 +172,27 @@ def without_colour_of_shade(image: Tensor, skin: Tensor) -> Tensor:
 
 
 def even_shade_of(image: Tensor, classes: Tensor) -> Tensor:
-    """Factors of bare skin, by classes [C, S, S], for an image that the Portrait Network is to see."""
+    """Return the factors for bare skin, by classes [C, S, S], in an image for the Portrait Network."""
     return without_colour_of_shade(image, classes[BARE].sum(0))
 
 
-def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor, share: float) -> Tensor:
-    """Factors [3, S, S] of an albedo [3, S, S], where skin then has neither shade nor glare of the photo.
+def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor, key_fraction: float) -> Tensor:
+    """Return factors [3, S, S] that remove the photo's shading and highlights from the albedo of skin.
 
-    The photo [3, S, S] is scene-linear, `skin` [S, S] the share of bare skin; `key` [S, S] is what the
-    photo's key light does to a white surface there, `share` what it is of the photo's light: in soft light
-    albedo has neither.
+    Args:
+        albedo: [3, S, S].
+        photo: Scene-linear [3, S, S].
+        skin: Coverage [S, S] of bare skin.
+        key: Radiance [S, S] of a white surface under the photo's key light.
+        key_fraction: Fraction of the photo's light that is the key light. In soft light the factors are 1.
     """
     sure, skin = skin > _SKIN[1], _ramp(skin, _SKIN)
     if not sure.any():
         return torch.ones_like(albedo)
     side = photo.shape[-1]
     shade = 1 - _ramp(key / torch.quantile(key[sure], _BRIGHT).clamp_min(_TINY), _LIT)
-    baked = _ramp(torch.tensor(share), _HARD) * torch.maximum(shade, _glare(photo, skin * (1 - shade)))
+    highlights = _highlights(photo, skin * (1 - shade))
+    baked = _ramp(torch.tensor(key_fraction), _HARD) * torch.maximum(shade, highlights)
     logs = albedo.clamp_min(1e-4).log()
     coarse = blurred_within(logs, skin, _FINE * side)
     plain = (skin * (1 - baked)) ** 4
@@ -191,8 +202,8 @@ def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor, s
     return (skin * baked * (around - coarse)).clamp(-_MOST_BAKED, _MOST_BAKED).exp()
 
 
-def _glare(photo: Tensor, skin: Tensor) -> Tensor:
-    """The certainty [S, S] that skin glares: colours are those around, and white besides."""
+def _highlights(photo: Tensor, skin: Tensor) -> Tensor:
+    """Return the certainty [S, S] that skin has a highlight: the surrounding colour plus white."""
     if is_grey(photo):
         return torch.zeros_like(skin)
     near, around = (blurred_within(photo, skin, blur * photo.shape[-1]) for blur in (_FINE, _NEAR))
@@ -200,11 +211,11 @@ def _glare(photo: Tensor, skin: Tensor) -> Tensor:
     of_white, of_colour, mixed = ((x * y).sum(0) for x, y in ((near, white), (near, colour), (colour, white)))
     square = (colour * colour).sum(0)
     added = (of_white * square - of_colour * mixed) / (square / 3 - mixed**2).clamp_min(1e-4)
-    share = added / near.sum(0).clamp_min(_TINY)
+    whiter = added / near.sum(0).clamp_min(_TINY)
     brighter = (near.sum(0).clamp_min(_TINY) / around.sum(0).clamp_min(_TINY)).log()
-    return _ramp(share, _WHITER) * _ramp(brighter, _BRIGHTER)
+    return _ramp(whiter, _WHITER) * _ramp(brighter, _BRIGHTER)
 
 
 def _ramp(values: Tensor, ends: tuple[float, float]) -> Tensor:
-    """0 up to the first end, 1 from the second on."""
+    """Return a smooth step from 0 at the first end to 1 at the second."""
     return smoothstep((values - ends[0]) / (ends[1] - ends[0]))

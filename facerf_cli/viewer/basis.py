@@ -24,10 +24,10 @@ from facerf_cli.image.colour import (
 from facerf_cli.image.strips import fitted, resized
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import rig_directions
+from facerf_cli.person import Person
 from facerf_cli.portrait.parse import class_index
-from facerf_cli.relighting.fitted import FittedPerson
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
-from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView
+from facerf_cli.relighting.portrait_field import PersonShading, PortraitField, PortraitView
 from facerf_cli.relighting.relightable import Relit
 
 RATIO_PX = 320  # the longer side of a ratio
@@ -147,7 +147,7 @@ def _linear(encoded: np.ndarray, white: float) -> np.ndarray:
     return np.asarray(srgb_to_linear(encoded.astype(np.float32) / 255) * np.float32(white))
 
 
-def basis_of_photo(person: FittedPerson, people: PeopleInPhoto) -> Basis:
+def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
     """The basis of a person, the only one of `people`, under the lights over which `relight` integrates maps.
 
     The images of single lights and of their mean, the last, are rendered small; the mean is rendered as large
@@ -157,28 +157,28 @@ def basis_of_photo(person: FittedPerson, people: PeopleInPhoto) -> Basis:
     assert photo is not None and isinstance(field, PortraitField)
     small_photo, small_head = shrunk_photo(photo, person.head, RATIO_PX)
     small_field = _shrunk(field, photo, small_photo.shape[1], small_photo.shape[0])
-    small = PeopleInPhoto([FittedPerson(person.models, small_photo, small_head, small_field).in_photo()])
+    small = PeopleInPhoto([Person(person.models, small_photo, small_head, small_field).in_photo()])
     rig, view = rig_directions(), field.views[0]
     images: list[np.ndarray] = []
     coarse: list[np.ndarray] = []
 
     def add(relit: Relit) -> None:
         images.append(small.light_layer([relit]).astype(np.float16))
-        (part,) = view.relit(relit.views[0])
+        (part,) = view.render(relit.views[0])
         coarse.append(part.permute(1, 2, 0).numpy().astype(np.float16))
 
     total: list[Tensor] = []
     for some in torch.split(rig, _LIGHTS_AT_ONCE):
         for (relit,) in people.relit(Light.each(some)):
             add(relit)
-            assert relit.mirrored is not None and relit.mouth is not None
-            maps = [*relit.tensors, relit.mirrored, relit.mouth]
+            assert relit.eye_reflections is not None and relit.mouth is not None
+            maps = [*relit.tensors, relit.eye_reflections, relit.mouth]
             total = [one + of_all for one, of_all in zip(maps, total, strict=True)] if total else maps
     texture, *maps, mirrored, mouth = (one / len(rig) for one in total)
     count = len(maps) // len(field.views)
-    views = tuple(PortraitLight(*maps[at : at + count]) for at in range(0, len(maps), count))
-    mean = Relit(texture, views=views, mirrored=mirrored, mouth=mouth)
-    add(replace(mean, mirrored=torch.zeros_like(mirrored)))  # eyes, which do not mirror a room
+    views = tuple(PersonShading(*maps[at : at + count]) for at in range(0, len(maps), count))
+    mean = Relit(texture, views=views, eye_reflections=mirrored, mouth=mouth)
+    add(replace(mean, eye_reflections=torch.zeros_like(mirrored)))  # eyes, which do not mirror a room
     shown = people.light_layer([mean])
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
     samples = LightSamples.of(np.stack(coarse), 1 - classes[0], classes[class_index("skin")], source)

@@ -30,9 +30,9 @@ from facerf_cli.portrait.find import Face, face_with
 from facerf_cli.portrait.person import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
-from facerf_cli.relighting.heads import head_of
+from facerf_cli.relighting.fitting import head_of
 from facerf_cli.relighting.models import Models, load_models
-from facerf_cli.relighting.portrait_field import SteadyFrame
+from facerf_cli.relighting.portrait_field import SmoothedFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
@@ -94,7 +94,7 @@ class FittedFace(PhotoFace):
     """A face with its head; `steady` is of a frame of a shot, `matte` [H, W] is the person's if given."""
 
     head: Head = field(kw_only=True)
-    steady: SteadyFrame | None = None
+    steady: SmoothedFrame | None = None
     matte: np.ndarray | None = None
 
     @property

@@ -22,11 +22,10 @@ from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
 from facerf_cli.light.light import Light
 from facerf_cli.light.studio_points import rig_by_text
-from facerf_cli.person import fit
+from facerf_cli.person import Target, fit, olat_images
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.field import Field
-from facerf_cli.relighting.fitted import Target, olat_images
-from facerf_cli.relighting.reflectance import reflectance_of
+from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.threads import one_ahead
 from facerf_cli.work.photos import (
@@ -89,7 +88,7 @@ def _of_person(
     choices: dict[str, Any] = {"network_alone": work.network_alone, "white": work.white}
     with naming(item.input_path):
         person = fit(models, photo, matte=matte, head=head, normals=normals, **choices)
-    subject = person.composed(Target(alpha=alpha, background="none"))
+    subject = person.prepare(Target(alpha=alpha, background="none"))
 
     def olats() -> Iterator[Tensor]:
         for images in olat_images(subject, directions):

@@ -24,9 +24,8 @@ from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
 from facerf_cli.light.envmap import Backdrop
 from facerf_cli.light.light import Light
 from facerf_cli.light.studio_points import intensity_of
-from facerf_cli.person import Person, fit
+from facerf_cli.person import Person, Target, fit
 from facerf_cli.raster.camera import Camera, rays_of_rows
-from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
 from facerf_cli.run.logs import LOGGER_NAME, json_line, step
@@ -221,7 +220,7 @@ def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
         metadata=_metadata(item, plan),
         people=people,
         faces=tuple(face.number for face, _ in fitted),
-        evens=tuple(person.even_brightness for _, person in fitted),
+        evens=tuple(person.uniform_intensity for _, person in fitted),
         alpha=alpha if keeps_photo else None,
         behind=_backdrop(options.background, options.background_blur, camera),
         plate=plate_metadata(read.image.metadata),
@@ -237,13 +236,13 @@ def _scene_of_face(item: Item, plan: RelightPlan, read: _Read, face: PhotoFace) 
     with naming(item.input_path):
         require_face(person.models.face, posed or fitted.fit, read.image.pixels.shape[:2])
     return Scene(
-        subject=person.composed(Target(posed, "face")),
+        subject=person.prepare(Target(posed, "face")),
         setups=plan.setups,
         lights_of=_over_rig(plan),
         metadata=_metadata(item, plan),
         people=[fitted],
         faces=(fitted.number,),
-        evens=(person.even_brightness,),
+        evens=(person.uniform_intensity,),
         tag=fitted.tag,
         plate=plate_metadata(read.image.metadata),
     )
@@ -271,7 +270,7 @@ def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace
     if known:
         return known, person
     found = fitted_face(face, person.head, read.matte)
-    if person.balance is not None and person.balance.is_far and options.white == "photo":
+    if person.balance is not None and person.balance.is_strongly_coloured and options.white == "photo":
         log.info("%s: its light has a strong colour (--white scene takes it out)", face.name)
     found.see(person.segmentation)
     return found, person

@@ -98,7 +98,7 @@ def of_photo(
     person = fit(models, photo, matte=matte, white=white, head=head, normals=normals)
     people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
-    return basis, Plate(photo, people.matte, photo - people.own_layer(), person.even_brightness)
+    return basis, Plate(photo, people.matte, photo - people.own_layer(), person.uniform_intensity)
 
 
 def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:

@@ -13,9 +13,9 @@ from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb, luminance
 from facerf_cli.light.entries import EVEN, OWN, LitImage, lit_images
 from facerf_cli.light.light import Light
-from facerf_cli.relighting.fitted import Target
+from facerf_cli.person import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
-from facerf_cli.relighting.white import Balance
+from facerf_cli.relighting.white import WhiteBalance
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
 from facerf_cli.work.lights import as_in_photo, lights_over_rig, with_room
 from tests import astronaut
@@ -159,6 +159,6 @@ def test_skin_is_as_bright_as_in_the_photo_at_0_ev_and_own_adds_to_it(given: Pat
 
 def test_python_has_it_of_a_person() -> None:
     fitted, field = astronaut.person(), astronaut.person().reflectance.field
-    field = replace(field, balance=Balance(torch.ones(3), torch.zeros(2), 2.5))
+    field = replace(field, balance=WhiteBalance(torch.ones(3), torch.zeros(2), 2.5))
     person = facerf.Person(fitted.models, fitted.photo, fitted.head, replace(fitted.reflectance, field=field))
     assert person.even.weights == pytest.approx(2.5 * facerf.Light.around().weights)

@@ -22,9 +22,8 @@ from facerf_cli.image.colour import srgb_to_linear
 from facerf_cli.image.strips import resized
 from facerf_cli.main import main
 from facerf_cli.portrait.parse import CLASSES
-from facerf_cli.relighting.heads import fit_photo
+from facerf_cli.relighting.fitting import fit_photo, reflectance_of
 from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import fit_faces, load_models_once, person_matte, read_matte, read_photo
 from tests.exr_layers import exr_layers

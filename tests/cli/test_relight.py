@@ -18,8 +18,7 @@ from facerf_cli.main import main
 from facerf_cli.option import attributes_of
 from facerf_cli.relighting.face_alone import FACE_LAYERS, FaceAlone
 from facerf_cli.relighting.field import Field
-from facerf_cli.relighting.people_in_photo import PeopleInPhoto
-from facerf_cli.relighting.person_in_photo import PERSON_LAYERS
+from facerf_cli.relighting.people_in_photo import PERSON_LAYERS, PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable
 from facerf_cli.synth.sky.skies import kind_of
 from facerf_cli.work.relight_options import RelightOptions, parse_aov

@@ -18,10 +18,9 @@ from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.files.olat_stack import read_olats
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
-from facerf_cli.person import Person
+from facerf_cli.person import Person, Target
 from facerf_cli.portrait.find import Face
 from facerf_cli.raster.camera import Camera, project
-from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Networks, Sides
 
 LIGHTS = torch.eye(3)

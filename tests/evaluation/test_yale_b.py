@@ -30,9 +30,8 @@ from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import Face
-from facerf_cli.relighting.heads import fit_photo, head_of
+from facerf_cli.relighting.fitting import fit_photo, head_of, reflectance_of
 from facerf_cli.relighting.models import Sides, load_models
-from facerf_cli.relighting.reflectance import reflectance_of
 from tests.capture.yale_fixture import FLASHES, write_pgm, write_yale_b
 from tests.conftest import SHARED
 from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone

@@ -18,8 +18,8 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.main import main
 from facerf_cli.person import Person, fit
 from facerf_cli.portrait.person import unit_normals
-from facerf_cli.relighting.enlarged import Enlarged
 from facerf_cli.relighting.portrait_field import PortraitField
+from facerf_cli.relighting.upsampled import UpsampledView
 from facerf_cli.work.photos import read_normals
 from tests import astronaut
 from tests.exr_layers import exr_layers
@@ -57,7 +57,7 @@ def field_of(person: Person) -> PortraitField:
 
 def shown(person: Person, bumpy: np.ndarray) -> np.ndarray:
     """Pixels that the layers have, with normals that are given."""
-    return np.asarray((person.share > 0.5) & bumpy.any(-1))
+    return np.asarray((person.matte_array > 0.5) & bumpy.any(-1))
 
 
 def test_the_layer_has_the_given_normals_in_our_axes_and_the_networks_where_none_are(
@@ -65,7 +65,7 @@ def test_the_layer_has_the_given_normals_in_our_axes_and_the_networks_where_none
 ) -> None:
     inside, own = shown(person, bumpy), astronaut.person().normals
     np.testing.assert_allclose(person.normals[inside], bumpy[inside], atol=1e-5)
-    rest = (person.share > 0.5) & ~bumpy.any(-1)
+    rest = (person.matte_array > 0.5) & ~bumpy.any(-1)
     rest[:-56] = False  # where the maps' pixels see both
     assert rest.sum() > 5000 and ((person.normals * own).sum(-1)[rest] > 0.999).mean() > 0.99
 
@@ -78,9 +78,9 @@ def test_slopes_are_the_change_of_the_shading_with_the_normals(person: Person) -
         torch.tensor([3, -5, 8]) * 1e-4,
     )
     moved = view.maps._replace(normals=view.maps.normals + step.view(1, 3, 1, 1))
-    before, after = (one.lit(lights, weights)[0] for one in (view, replace(view, maps=moved)))
-    assert before.slopes is not None
-    expected = torch.einsum("ckij,k->cij", before.slopes.unflatten(0, (3, 3)), step)
+    before, after = (one.shade(lights, weights)[0] for one in (view, replace(view, maps=moved)))
+    assert before.normal_gradient is not None
+    expected = torch.einsum("ckij,k->cij", before.normal_gradient.unflatten(0, (3, 3)), step)
     away = (after.shading - before.shading - expected).abs()
     assert (away < 1e-6).float().mean() > 0.98 and expected.abs().median() > 1e-4
 
@@ -109,8 +109,8 @@ def test_bumps_change_nothing_in_the_photos_own_light(person: Person) -> None:
         Window(slice(100, 140), slice(200, 260)),
     )
     shown, plain = (
-        enlarged.over(window, photo[window])(enlarged.ready(view.own, ("normal",)))
-        for enlarged in map(Enlarged, (view, without))
+        enlarged.over(window, photo[window])(enlarged.precompute(view.own, ("normal",)))
+        for enlarged in map(UpsampledView, (view, without))
     )
     assert np.abs(shown["normal"] - plain["normal"]).max() > 0.2
     np.testing.assert_allclose(shown["change"], 1, atol=1e-5)
@@ -120,7 +120,7 @@ def test_what_are_not_the_normals_of_the_face_is_refused(bumpy: np.ndarray) -> N
     with pytest.raises(InputError, match=r"not those of the face \(mean cosine 0\.\d+\)"):
         fitted(bumpy[..., ::-1].copy())  # as OpenCV writes RGB
     refused(InputError, "40 x 30 pixels, the photo 512 x 512; give its own", fitted, bumpy[:30, :40])
-    refused(UsageError, "normals: are for the portrait field", fitted, bumpy, reflectance="field")
+    refused(UsageError, "normals: ... remove", fitted, bumpy, reflectance="field")
 
 
 def test_files_of_each_kind_hold_the_same(bumpy: np.ndarray, tmp_path: Path) -> None:

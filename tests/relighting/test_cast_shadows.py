@@ -12,9 +12,9 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light, stacked
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import KeyLight, far_samples
+from facerf_cli.person import Target
 from facerf_cli.portrait.proxy import OFF_M, Proxy, ProxyMaps
 from facerf_cli.relighting.cast_shadows import CastShadow, change, visibility
-from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from tests import astronaut
 
@@ -108,7 +108,7 @@ def test_key_lights_are_singled_out() -> None:
 
 @pytest.fixture(scope="module")
 def people() -> PeopleInPhoto:
-    found = astronaut.person().composed(Target(background="none"))
+    found = astronaut.person().prepare(Target(background="none"))
     assert isinstance(found, PeopleInPhoto)
     return found
 

@@ -110,7 +110,7 @@ def compose(
 def detailed(face: FaceTexture, screen: FaceView, photo: np.ndarray, texture: Tensor) -> np.ndarray:
     """The pixels of a photo of a whole screen under a relit texture."""
     detail = FaceDetail(face, screen)
-    return detail.over(screen.window, photo)(detail.ready(texture))
+    return detail.over(screen.window, photo)(detail.precompute(texture))
 
 
 def psnr_db(result: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:

@@ -63,7 +63,7 @@ def eyes(photo: np.ndarray) -> Eyes:
 def lit(photo: np.ndarray, relit: np.ndarray, mirrored: Tensor, rows: slice = slice(0, SIDE)) -> np.ndarray:
     """Some rows of a relit image with mirror images in the eyes."""
     seen = eyes(photo)
-    return seen.lit(relit[rows].copy(), seen.ready(mirrored), Window(rows, slice(0, SIDE)))
+    return seen.lit(relit[rows].copy(), seen.precompute(mirrored), Window(rows, slice(0, SIDE)))
 
 
 def test_the_photos_catchlight_gives_way_and_a_lid_keeps_its_light() -> None:
@@ -170,7 +170,7 @@ def test_light_arrives_from_near_and_far() -> None:
 
 def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_is() -> None:
     lights = torch.stack([azel_to_direction(azimuth, 10.0) for azimuth in (-75.0, 0.0, 75.0)])
-    seen = astronaut.field().views[0].mirrored(Light.each(lights), torch.zeros(3)).amax((2, 3, 4))
+    seen = astronaut.field().views[0].eye_reflections(Light.each(lights), torch.zeros(3)).amax((2, 3, 4))
     alone = mirrored_in_cornea(lights, Light.each(lights).weights, torch.ones(3)).amax((1, 2, 3))
     left, right = (seen / alone[:, None]).T  # as the photo shows them
     assert left[1] > 0.8 and right[1] > 0.8
@@ -179,7 +179,7 @@ def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_
     near = StudioLight(at_m=(0.0, 0.1, 0.3), rgb=(1.0, 1.0, 1.0))
     lights = Light(torch.zeros(0, 3), torch.zeros(1, 0, 3), near=(near,), near_weights=torch.ones(1, 1, 3))
     at, view = 2 * (torch.arange(64) + 0.5) / 64 - 1, astronaut.field().views[0]
-    images = view.mirrored(lights, view.person.maps.positions_m.mean((1, 2)))[0, :, 0]
+    images = view.eye_reflections(lights, view.person.maps.positions_m.mean((1, 2)))[0, :, 0]
     left, right = (float(image.sum(0) @ at / image.sum()) for image in images)
     assert left > 0.05 and right < -0.05  # toward the nose
 
@@ -187,7 +187,7 @@ def test_the_nose_keeps_a_light_from_an_eye_and_each_sees_a_near_light_where_it_
 def test_lips_keep_light_from_above_and_aside_from_the_teeth(monkeypatch: pytest.MonkeyPatch) -> None:
     """In front of the face they keep nothing. Layers add up."""
     person, photo = astronaut.person(), astronaut.photo()
-    people = person.composed()
+    people = person.prepare()
     inner = person.head.fit.crop.to_photo(person.head.landmarks_px)[60:68]
     teeth = polygon2mask(photo.shape[:2], inner[:, ::-1]) & (luminance(photo) > 0.3)
     lights = torch.stack([azel_to_direction(*light) for light in ((0.0, 0.0), (0.0, 55.0), (-70.0, 0.0))])

@@ -17,7 +17,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetworkSettings
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import crop_camera, pose_to_rotation, project
-from facerf_cli.relighting.heads import fit_photo, regress_photo
+from facerf_cli.relighting.fitting import fit_photo, regress_photo
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models, Sides, load_models
 from tests.refusals import refused
 

@@ -15,13 +15,12 @@ from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.light.studio_points import PointLights, far_samples
-from facerf_cli.person import Person
+from facerf_cli.person import Person, Target
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.relighting.field import far_lights_of, near_texture
-from facerf_cli.relighting.fitted import Target
+from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import Relightable
 from tests import astronaut
 
@@ -35,7 +34,7 @@ class Shown:
 
     def __init__(self) -> None:
         self.field: PortraitField = astronaut.field()
-        self.people = astronaut.person().composed(TARGET)
+        self.people = astronaut.person().prepare(TARGET)
         self.matte = self.field.person.segmentation.matte
 
     def image(self, *lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> np.ndarray:
@@ -52,7 +51,7 @@ class Shown:
         lights = near(light)
         assert isinstance(self.people, PeopleInPhoto)
         around = lights.near_points(self.people.people[0].vertices_m.mean(0))
-        return self.field.views[0].lit(lights.directions, lights.weights, around).reached[0, 0]
+        return self.field.views[0].shade(lights.directions, lights.weights, around).visibility[0, 0]
 
 
 def near(*lights: StudioLight, rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Light:
@@ -115,11 +114,11 @@ def test_every_pixel_of_a_matt_person_follows_cosine_and_distance(person: Shown)
     matt = replace(view, correction=None, maps=maps._replace(trust=0 * maps.trust + 50, **dark))
     light = StudioLight(at_m=(0.1, 0.2, 0.3))
     ((points, rgb),) = near(light).near_points(person.people.people[0].vertices_m.mean(0))
-    lit = matt.lit(*DARK, [(points, rgb)])
+    lit = matt.shade(*DARK, [(points, rgb)])
     offsets = points.places_m[0, :, None, None] - view.person.maps.positions_m
     cosine = (offsets / offsets.norm(dim=0) * maps.normals[0]).sum(0).clamp_min(0)
     wanted = cosine * points.strength / offsets.square().sum(0)
-    reached = lit.reached[0, 0] > 0.999
+    reached = lit.visibility[0, 0] > 0.999
     assert reached.float().mean() > 0.3 and wanted[reached].std() > 0.3
     torch.testing.assert_close(lit.shading[0, 0][reached], wanted[reached], rtol=2e-3, atol=1e-4)
 
@@ -133,7 +132,9 @@ def test_large_lights_cast_soft_shadows(person: Shown, is_near: bool) -> None:
         if is_near:
             return person.reached_by(StudioLight(at_m=(x, y, z), size_m=size))
         directions, shares = far_samples(StudioLight(azel_deg=(60.0, 40.0), size_deg=60 * size))
-        return person.field.views[0].lit(directions, shares[None, :, None].expand(-1, -1, 3)).reached[0, 0]
+        return (
+            person.field.views[0].shade(directions, shares[None, :, None].expand(-1, -1, 3)).visibility[0, 0]
+        )
 
     skin = person.field.person.classes[1] > 0.9
     found = [reached(size) for size in (0.0, 0.4, 0.8)]
@@ -148,7 +149,7 @@ def test_other_models_have_near_lights_too(person: Shown, kind: str) -> None:
     """Their textures add up, and so does what surrounds the face where it follows the field."""
     models, photo, head = astronaut.models(), astronaut.photo(), astronaut.head()
     reflectance = reflectance_of(models, head, kind)  # type: ignore[arg-type]
-    people = Person(models, photo, head, reflectance).composed(TARGET)
+    people = Person(models, photo, head, reflectance).prepare(TARGET)
 
     def image(*lights: StudioLight) -> np.ndarray:
         return over_black(people, near(*lights))

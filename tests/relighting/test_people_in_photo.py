@@ -59,10 +59,10 @@ class Plain:
         matte[:, self.columns] = self.strength
         return matte
 
-    def share(self, rows: slice) -> np.ndarray:
+    def alpha_rows(self, rows: slice) -> np.ndarray:
         return self.matte[rows]
 
-    def ready(self, relit: float, layers: Any) -> Any:
+    def precompute(self, relit: float, layers: Any) -> Any:
         return relit, layers
 
     def render(self, window: Window, own: np.ndarray, lights: list[Any]) -> Iterator[dict[str, np.ndarray]]:

@@ -12,7 +12,7 @@ from facerf_cli.face.view import photo_camera
 from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.portrait.proxy import Proxy
 from facerf_cli.raster.camera import PIXEL_CENTRE, project
-from facerf_cli.relighting.person_in_photo import Surface
+from facerf_cli.relighting.people_in_photo import Surface
 
 SIZE = 200, 300  # of the photo
 SMALL = 50, 75  # of the classes

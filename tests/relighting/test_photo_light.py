@@ -11,7 +11,7 @@ from facerf_cli.face.landmarks import to_display
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk
-from facerf_cli.relighting.heads import fit_photo
+from facerf_cli.relighting.fitting import fit_photo
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import estimate_light, light_of_frames, over_rig, source_light
 from tests import astronaut

@@ -19,18 +19,17 @@ from facerf_cli.image.strips import Window, strips
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.portrait import PortraitInputs
-from facerf_cli.person import Person, fit
+from facerf_cli.person import Person, Target, fit
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.person import SEEN_PX, wider_square
-from facerf_cli.relighting.enlarged import Enlarged
-from facerf_cli.relighting.fitted import Target
+from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.photo_light import source_light
-from facerf_cli.relighting.portrait_field import PortraitField, PortraitLight, PortraitView, maps_of
-from facerf_cli.relighting.reflectance import reflectance_of
+from facerf_cli.relighting.portrait_field import PersonShading, PortraitField, PortraitView, maps_of
 from facerf_cli.relighting.relightable import RenderRequest
+from facerf_cli.relighting.upsampled import UpsampledView
 from tests import astronaut
 
 NAMES = ("albedo", "specular", "normal", "position", "depth", "shadow")
@@ -187,7 +186,7 @@ def test_left_and_right_are_treated_alike_and_without_light_all_is_black(field: 
     light, everywhere = azel_to_direction(50, 20)[None, None], torch.ones(1, 1, *seen.gain.shape[-2:])
     one, two = (maps.olats(light, everywhere) for maps in (seen, in_mirror.mirrored()))
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3)  # rounding, through some 40 layers
-    lit = field.lit(lamp(0).directions, torch.zeros(2, 1, 3))
+    lit = field.shade(lamp(0).directions, torch.zeros(2, 1, 3))
     for view, one in zip(field.views, lit, strict=True):
         assert one.shading.shape == (2, *view.person.image.shape)
         assert max(float(maps.abs().max()) for maps in one.tensors) == 0
@@ -221,7 +220,7 @@ def test_a_lamp_lights_its_side_and_one_behind_leaves_the_face_dark(
 def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: Person) -> None:
     """The field of a face knows no hair beside it: it would light a temple through the hair."""
     directions = torch.cat([lamp(azimuth, 20).directions for azimuth in (30, 140, 175)])
-    people = person.composed(Target(background="none"))
+    people = person.prepare(Target(background="none"))
     weights = torch.cat([torch.eye(3), torch.ones(1, 3)])[..., None].expand(-1, -1, 3)
     relit = list(people.relit(Light(directions, weights)))
     ahead, behind = relit[0][0].texture, relit[2][0].texture
@@ -234,7 +233,7 @@ def test_light_from_behind_is_none_of_the_face_fields_and_adds_up(person: Person
 def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     photo: np.ndarray, person: Person, field: PortraitField
 ) -> None:
-    people = person.composed()
+    people = person.prepare()
     relit = next(people.relit(one_sum(lamp(40, 30))))
     names = (*NAMES, "classes", "face", "uv")
     layers = people.rendered(RenderRequest(relit, layers=names))
@@ -242,7 +241,7 @@ def test_a_light_of_the_photo_and_its_layers_are_finite_and_not_negative(
     for name, layer in layers.items():
         assert layer.shape[:2] == photo.shape[:2] and np.isfinite(layer).all()
         assert name in ("normal", "position") or layer.min() >= 0
-    face_alone = replace(person, photo=None).composed()
+    face_alone = replace(person, photo=None).prepare()
     with pytest.raises(UsageError, match="--aov albedo"):
         face_alone.rendered(RenderRequest(relit[0], layers=("albedo",)))
 
@@ -253,7 +252,7 @@ def test_layers_of_colour_are_cut_by_the_matte_as_those_of_lights_are(
     """No hard edge where a little of a neighbour is in a pixel; where the photo has no alpha is nothing."""
     alpha = np.ones(photo.shape[:2], np.float32)
     alpha[:, : photo.shape[1] // 2] = 0
-    people = person.composed(Target(alpha=alpha))
+    people = person.prepare(Target(alpha=alpha))
     request = RenderRequest(next(people.relit(one_sum(lamp(40, 30)))), layers=NAMES)
     cut, matte = people.rendered(request), people.matte
     assert ((matte > 0.02) & (matte < 0.9)).sum() > 100
@@ -277,7 +276,7 @@ def test_no_pixel_depends_on_the_strip_that_it_is_in(
     lights = RigLight(torch.cat([key.directions, behind.directions]), torch.ones(2, 3))
 
     def shown() -> list[np.ndarray]:
-        people = person.composed()
+        people = person.prepare()
         relit = next(people.relit(one_sum(lights)))
         return list(people.rendered(RenderRequest(relit, layers=names)).values())
 
@@ -296,7 +295,7 @@ def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(fie
     head, wide = field.views
     assert wide.person.square.side_px > head.person.square.side_px
     matte = head.person.segmentation.matte
-    part, weight = Enlarged(head).weight(Window(*(slice(0, length) for length in matte.shape)))
+    part, weight = UpsampledView(head).weight(Window(*(slice(0, length) for length in matte.shape)))
     assert weight.max() == 1 and weight[matte[part] > 0.5].min() == 0
     assert np.abs(np.diff(weight, axis=1)).max() < 0.05 and weight[:, [0, -1]].max() < 0.05
     head, matte = Crop(40, 30, 60, SEEN_PX), np.zeros((300, 200), np.float32)
@@ -314,12 +313,12 @@ def test_wider_squares_hold_the_person_and_go_on_where_that_of_the_head_ends(fie
 def test_the_photos_detail_is_in_light_from_the_front_and_from_behind(field: PortraitField) -> None:
     """Shading of 1: both lights show the same image, which in hair has the photo's contrast."""
     view, photo = field.views[0], astronaut.photo()
-    enlarged, window = Enlarged(view), Window(slice(0, len(photo)), slice(0, photo.shape[1]))
+    enlarged, window = UpsampledView(view), Window(slice(0, len(photo)), slice(0, photo.shape[1]))
     ones = torch.ones(3, *view.person.image.shape[1:])
-    lit = PortraitLight(ones, 0 * ones, ones, torch.cat([ones, 0 * ones]))
+    lit = PersonShading(ones, 0 * ones, ones, torch.cat([ones, 0 * ones]))
     where_they_are = SimpleNamespace(at=lambda window: (torch.zeros(2, *window.shape), torch.tensor(1.0)))
-    shown = enlarged.over(window, photo, cast(Any, where_they_are))(enlarged.ready(lit, behind=True))
-    front, behind = shown["rgb"], shown["behind"]
+    shown = enlarged.over(window, photo, cast(Any, where_they_are))(enlarged.precompute(lit, rear=True))
+    front, behind = shown["rgb"], shown["rear"]
     np.testing.assert_allclose(behind, front, rtol=1e-5)
     classes = F.grid_sample(view.person.classes[None], enlarged._grid(window)[None], align_corners=False)
     hair = classes[0, class_index("hair")].numpy() > 0.8

@@ -12,16 +12,14 @@ from facerf_cli.face.topology import region_mask
 from facerf_cli.light.estimate import estimate_signed_weights
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.network.inputs import MEAN_RADIANCE, colour_cast
-from facerf_cli.person import Person
+from facerf_cli.person import Person, Target
 from facerf_cli.portrait.person import look_at_person
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
-from facerf_cli.relighting.fitted import Target
-from facerf_cli.relighting.heads import fit_photo
+from facerf_cli.relighting.fitting import fit_photo, reflectance_of
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import Estimator, estimate_light
-from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run import memory
 from facerf_cli.work.plan import require_face
 from tests import astronaut
@@ -108,7 +106,7 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     images = [person.image(light, target) for target in targets]
     for image, target in zip(images, targets, strict=True):
         assert image.shape == (256, 256, 3)
-        assert (image[person.composed(target).matte == 0] == 0).mean() > 0.5
+        assert (image[person.prepare(target).matte == 0] == 0).mean() > 0.5
     # the point nearest to the camera
     noses = [
         FaceAlone(models.face, head, fit=target.fit).view.surface(slice(0, 256))[..., 5] for target in targets

@@ -13,10 +13,10 @@ from facerf_cli.image.skin import skin_albedo
 from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.relighting import White
 from facerf_cli.relighting.field import Field, shrunk
+from facerf_cli.relighting.fitting import reflectance_of
 from facerf_cli.relighting.photo_light import estimate_light
 from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.relighting.reflectance import reflectance_of
-from facerf_cli.relighting.white import SURE, Balance, without_baked_in, without_colour_of_shade
+from facerf_cli.relighting.white import SURE, WhiteBalance, without_baked_in, without_colour_of_shade
 from tests import astronaut
 
 SIZE = (24, 30)
@@ -30,10 +30,10 @@ def of_colour(colour: Tensor) -> Tensor:
     return colour[:, None, None] * torch.linspace(0.4, 1, SIZE[1]).expand(1, *SIZE)
 
 
-def balance(white: White, light: Tensor, **given: Tensor) -> Balance:
+def balance(white: White, light: Tensor, **given: Tensor) -> WhiteBalance:
     """The balance of pale skin in a light, which is relit with a cast."""
     found = {"relit": of_colour(PALE * CAST), "photo": of_colour(PALE * light), "skin": torch.ones(SIZE)}
-    return Balance.of(white, **(found | given))
+    return WhiteBalance.of(white, **(found | given))
 
 
 def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white() -> None:
@@ -42,7 +42,7 @@ def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white(
     torch.testing.assert_close(white / white[1], PALE * WARM / (PALE * WARM)[1], rtol=1e-4, atol=0)
     assert luminance(white.numpy()) == pytest.approx(float(luminance((PALE * CAST).numpy())), rel=1e-4)
     found = balance("scene", ORANGE)
-    assert found.is_far and balance("photo", ORANGE).is_far
+    assert found.is_strongly_coloured and balance("photo", ORANGE).is_strongly_coloured
     white = PALE * CAST * found.gain  # the cast skin is none, so its nearest one is taken
     chroma = (white / white[1])[::2].log()
     skins = torch.rand(1, 2, 300, 300, generator=torch.Generator().manual_seed(0)).square()
@@ -53,7 +53,7 @@ def test_skin_gets_the_photos_chromaticity_at_its_luminance_also_far_from_white(
         found.light, (ORANGE * PALE / white / ORANGE[1] * white[1] / PALE[1])[::2].log()
     )
     found = balance("scene", torch.ones(3))
-    assert not found.is_far and found.light.abs().max() < 0.02
+    assert not found.is_strongly_coloured and found.light.abs().max() < 0.02
     torch.testing.assert_close(found.gain, balance("photo", torch.ones(3)).gain, rtol=0.02, atol=0)
     assert error("photo") < 0.03 < 0.3 < error("scene")
 
@@ -72,7 +72,11 @@ def test_few_grey_clipped_or_black_pixels_of_skin_change_nothing() -> None:
     few.flatten()[:499] = 1
     grey = of_colour(torch.full((3,), 0.5))
     for found in (balance("photo", WARM, skin=few), balance("photo", WARM, photo=grey)):
-        assert found.gain.tolist() == [1, 1, 1] and found.light.tolist() == [0, 0] and not found.is_far
+        assert (
+            found.gain.tolist() == [1, 1, 1]
+            and found.light.tolist() == [0, 0]
+            and not found.is_strongly_coloured
+        )
     few.flatten()[499] = 1
     assert balance("photo", WARM, skin=few).gain.tolist() != [1, 1, 1]
     clean = of_colour(PALE * WARM)
@@ -116,7 +120,7 @@ def error(white: White | None) -> float:
     head = in_orange()
     field = reflectance_of(astronaut.models(), head, "field", white=white)
     assert isinstance(field, Field)
-    small, even = shrunk(head.face), field.small_under_even_light()
+    small, even = shrunk(head.face), field.small_under_uniform_light()
     skin = (small.visible * region_mask("skin", small.texture.shape[-1])) > SURE
     both = (image[:, skin].clamp_min(1e-4).log() for image in (small.texture, even))
     photo, found = (torch.stack([red - green, blue - green]).median(1).values for red, green, blue in both)

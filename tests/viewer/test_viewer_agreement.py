@@ -33,11 +33,10 @@ from facerf_cli.light.studio_points import far_samples
 from facerf_cli.main import main
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import find_faces
-from facerf_cli.relighting.heads import head_of
+from facerf_cli.relighting.fitting import head_of, reflectance_of
 from facerf_cli.relighting.models import load_models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PortraitField
-from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.viewer.page import packed, page
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room

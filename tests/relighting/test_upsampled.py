@@ -14,8 +14,8 @@ from facerf_cli.image.strips import Window
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.raster.texture import blurred
-from facerf_cli.relighting.enlarged import EdgeFill, Enlarged, Rims, colours_of, places, trust_in
-from facerf_cli.relighting.portrait_field import PortraitLight, from_behind
+from facerf_cli.relighting.portrait_field import PersonShading, rear_fraction
+from facerf_cli.relighting.upsampled import EdgeFill, Rims, UpsampledView, colours_of, edge_confidence, places
 from tests import astronaut
 
 SIDE, SCALE = 48, 5  # pixels of the maps, and of the photo along each of them
@@ -51,7 +51,7 @@ def test_two_sides_of_an_edge_keep_their_own_values() -> None:
     """Maps of 1 and 3, blurred by a pixel as those of a network are: at the photo's pixels they are sharp."""
     colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
     maps = blurred(mixed(skin(SIDE, SCALE), 1, 3)[None], 1.0)
-    trust = trust_in(colours, ONES, 0 * ONES)
+    trust = edge_confidence(colours, ONES, 0 * ONES)
     photo = mixed(skin(SIDE * SCALE, 1), DARK, BRIGHT)[:HEIGHT, :WIDTH, None].expand(-1, -1, 3)
     read = places(colours, trust, grid(), photo, 1.0)
     found, bled = (
@@ -69,7 +69,7 @@ def test_maps_of_any_layout_stay_as_they_are() -> None:
     colours = colours_of(mixed(skin(SIDE, SCALE), DARK, BRIGHT)).expand(3, -1, -1)
     by_pixel = torch.rand(SIDE, SIDE, 2, generator=torch.Generator().manual_seed(0))
     before = by_pixel.clone()
-    trust = trust_in(colours, ONES, 0 * ONES)
+    trust = edge_confidence(colours, ONES, 0 * ONES)
     found = EdgeFill.of(colours, trust, ONES, trust).filled(by_pixel.permute(2, 0, 1))
     assert torch.equal(by_pixel, before) and (found.permute(1, 2, 0) != before).any()
 
@@ -77,7 +77,7 @@ def test_maps_of_any_layout_stay_as_they_are() -> None:
 def test_a_block_of_light_on_plain_cloth_fades_and_none_of_it_crosses_an_edge() -> None:
     share = skin(SIDE, SCALE)
     colours = colours_of(mixed(share, DARK, BRIGHT)).expand(3, -1, -1)
-    trust = trust_in(colours, ONES, 0 * ONES)
+    trust = edge_confidence(colours, ONES, 0 * ONES)
     away = distance(SIDE, SCALE) / SCALE
     jumps = torch.where(away > 6, 3.0, 1.0)[None]  # within the bright half
     found = EdgeFill.of(colours, trust, ONES, 0 * ONES).filled(jumps)[0]
@@ -95,7 +95,7 @@ def test_where_there_is_no_edge_nothing_changes() -> None:
     maps = torch.rand(2, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
     photo = torch.full((HEIGHT, WIDTH, 3), 0.2)
     for colours, solid, loose in ((shades, 1, 0), (edges, 0, 0), (edges, 1, 1)):
-        trust = trust_in(colours, solid * ONES, loose * ONES)
+        trust = edge_confidence(colours, solid * ONES, loose * ONES)
         assert torch.equal(EdgeFill.of(colours, trust, ONES, trust).filled(maps), maps)
         assert torch.equal(places(colours, trust, grid(), photo, 1.0), grid())
 
@@ -124,12 +124,12 @@ def test_no_light_of_a_hand_is_on_the_cloth_behind_it(glossy: bool) -> None:
     lit = blurred(mixed(share, 0.5, 2).expand(3, -1, -1), 1.0)
     lit[..., :20] *= 2
     parts = (0 * lit, lit) if glossy else (lit, 0 * lit)
-    light = PortraitLight(*parts, reached=lit, behind=torch.zeros(6, size, size))
+    light = PersonShading(*parts, visibility=lit, rear=torch.zeros(6, size, size))
     both = skin(side_px + 20, 1)[:side_px], distance(side_px + 20, 1)[:side_px].numpy()
     photo = mixed(both[0], DARK, BRIGHT)[..., None].expand(-1, -1, 3).numpy().copy()
-    enlarged = Enlarged(replace(view, person=person, maps=maps))
+    enlarged = UpsampledView(replace(view, person=person, maps=maps))
     shown = enlarged.over(Window(slice(0, side_px), slice(0, side_px + 20)), photo)
-    relit = luminance(shown(enlarged.ready(light))["rgb"])
+    relit = luminance(shown(enlarged.precompute(light))["rgb"])
     cloth, far = (both[1] < -BESIDE) & (both[1] > -FAR), (both[1] < -FAR) & (both[1] > -3 * FAR)
     assert np.abs(np.diff(relit, axis=1))[:, 30:50].max() < 0.15 * relit[far].mean()
     assert np.abs(relit[cloth] / relit[far].mean() - 1).max() < (0.2 if glossy else 0.15)
@@ -190,4 +190,4 @@ def test_rims_lie_along_the_outline_of_a_photo_of_any_size() -> None:
 
 @pytest.mark.parametrize(("azimuth_deg", "share"), [(0, 0), (90, 0), (110, 0), (160, 1)])
 def test_a_light_ahead_or_aside_makes_no_rim(azimuth_deg: float, share: float) -> None:
-    assert float(from_behind(azel_to_direction(azimuth_deg, 0))) == pytest.approx(share)
+    assert float(rear_fraction(azel_to_direction(azimuth_deg, 0))) == pytest.approx(share)
