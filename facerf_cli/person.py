@@ -63,12 +63,7 @@ Background = Literal["photo", "none"] | Array | tuple[float, float, float]
 _LIGHTS_AT_ONCE, _PIXELS_AT_ONCE = 8, 1 << 23  # upper limits for a batch of OLAT images
 
 
-def find_faces(
-    models: Models,
-    photo: Array,
-    which: str = "all",
-    name: str = "photo",
-) -> list[Face]:
+def find_faces(models: Models, photo: Array, which: str = "all", name: str = "photo") -> list[Face]:
     """Find the faces in a photo, sorted from left to right.
 
     Args:
@@ -217,10 +212,8 @@ class Person:
     tensors: bool = False
 
     def __repr__(self) -> str:
-        if self.photo is None:
-            return f"<facerf.Person, only the face, {self.kind}>"
-        height, width = self.photo.shape[:2]
-        return f"<facerf.Person in {width} x {height} pixels, {self.kind}>"
+        size = "" if self.photo is None else " in {1} x {0} pixels".format(*self.photo.shape)
+        return f"<facerf.Person{size}, {self.kind}>"
 
     def relight(
         self,
@@ -471,7 +464,6 @@ class Person:
     def _images_of_face(
         self, lights: Sequence[Light], pose: Pose | None, layers: Sequence[str]
     ) -> Iterator[dict[str, Any]]:
-        """Yield the image [H, W, 4] and the layers of only the face under each light, with gradients."""
         face = self.face_alone(None if pose is None else replace(self.head.fit, rotation=_rotation(pose)))
         view = face.view
         for (relit,) in face.relit_images(lambda part: stacked(lights[part]), [1] * len(lights)):
@@ -489,10 +481,7 @@ class Person:
         images: Iterator[dict[str, Any]],
         layers: Sequence[str],
     ) -> Any:
-        """Return images, or dicts with layers: one for a light, a list for a list of lights.
-
-        `inputs` are what gradients may reach besides the lights.
-        """
+        """Return the result for a light, or a list for a list; `inputs` are what else gradients may reach."""
         inputs = [*inputs, *(array for one in lights for array in (one.directions, one.weights, one.own_rgb))]
         with _grad_for_tensors(*inputs):
             each = [

@@ -78,13 +78,8 @@ def visibility(
 ) -> Tensor:
     """Trace the visibility [N] of a light from the N `traced` pixels [s, s] of a proxy's maps.
 
-    Args:
-        proxy: The mesh.
-        maps: Its normals and positions [3, s, s].
-        traced: Mask of the pixels.
-        coarse: Visibility [s, s] that is used where a fold of the proxy is in the way.
-        ends: Unit directions [n, 3] to samples of the light, camera space, or positions in metres.
-        near: Whether `ends` are positions.
+    `coarse` [s, s] is used where a fold of the proxy is in the way. `ends` [n, 3] are unit directions to
+    samples of the light or, if it is `near`, positions in metres, in camera space.
     """
     normals, points = (field.numpy()[:, traced].T for field in (maps.normals, maps.positions_m))
     origins = (points + OFF_M * normals).astype(np.float32)

@@ -105,12 +105,8 @@ def without_catchlights(
 ) -> np.ndarray:
     """Return the pixels [h, w, 3] of an iris without its catchlights.
 
-    Args:
-        pixels: The photo.
-        away: Distance [h, w] from the centre of the iris, in radii.
-        coverage: Fraction [h, w] of each pixel that the iris covers.
-        radius_px: Radius of the iris.
-        blur: Standard deviation of the photo's blur in pixels.
+    `away` [h, w] is the distance from the centre of the iris in radii, `coverage` [h, w] the fraction of each
+    pixel that the iris covers, and `blur` the standard deviation of the photo's blur in pixels.
     """
     light, visible = luminance(pixels), coverage > 0.5
     rings = np.arange(int(min(_RINGS, radius_px)))

@@ -30,14 +30,10 @@ _FACE_ALPHA = "face.A"
 
 
 class FaceAlone(Relightable):
-    """Only the face, in any pose, over black, in the frame of its photo or of its crop.
+    """Only the face over black, in the frame of its photo, or of its crop if there is no `photo_px`.
 
-    Args:
-        model: Face model of the fit.
-        head: Head in its photo.
-        reflectance: Renders textures of the face under lights; None if textures are passed instead.
-        fit: Pose and shape of the rendered head; None: as in the photo.
-        photo_px: Height and width of the photo; None: the frame is the crop.
+    `fit` is the pose and shape of the rendered head; by default they are the photo's. `reflectance` renders
+    the texture under lights; None if textures are passed instead.
     """
 
     def __init__(
@@ -125,7 +121,7 @@ class FaceInPhoto:
         return self.matte[rows]
 
     def precompute(self, relit: Relit, layers: Sequence[str] = ()) -> tuple[Tensor, Sequence[str]]:
-        """Compute everything that does not depend on rows; raises UsageError for layers of a whole person."""
+        """Compute everything that does not depend on rows."""
         require_face_layers(layers)
         return self._detail.precompute(relit.texture), layers
 
@@ -146,7 +142,6 @@ class FaceInPhoto:
 
 
 def require_face_layers(names: Sequence[str]) -> None:
-    """Raise UsageError for layers that only a whole person has."""
     for name in names:
         if name not in FACE_LAYERS:
             raise UsageError(

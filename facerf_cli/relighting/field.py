@@ -36,25 +36,15 @@ SEEN_WELL = 0.9  # visibility above which a small texel shows the photo's colour
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """Reflectance field of a face, predicted by the network and optionally corrected by the photo.
-
-    Attributes:
-        models: Provides the Reflectance Network.
-        face: Texture of the face in the photo.
-        quotient: Ratio image that makes the photo's original light reproduce the photo.
-        bf16: Whether the network runs in bfloat16.
-        remove_shade_colour: Whether the network sees the face `without_colour_of_shade`; set with `quotient`.
-        balance: White balance of the face.
-        detail: Factor [3, T, T] that restores detail (`with_detail`).
-    """
+    """Reflectance field of a face, predicted by the network and optionally corrected by the photo."""
 
     models: Models
     face: FaceTexture
-    quotient: Quotient | None = None
+    quotient: Quotient | None = None  # ratio image: the photo's original light reproduces the photo
     bf16: bool = False
-    remove_shade_colour: bool = False
+    remove_shade_colour: bool = False  # whether the network sees the face `without_colour_of_shade`
     balance: WhiteBalance | None = None
-    detail: Tensor | None = None
+    detail: Tensor | None = None  # factor [3, T, T] that restores detail (`with_detail`)
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return textures [M, 3, T, T] under M sums, [M, L, 3], of lights [L, 3]; see `Reflectance`."""
@@ -209,12 +199,7 @@ def near_texture(
     distance at which it sees the light. Between the grid's directions this is an approximation; a distant
     light is exactly one far light.
 
-    Args:
-        reflectance: Renders the face under far lights.
-        points: The near light.
-        vertices_m: Vertices [V, 3] of the face in camera space, already rotated by `turn`.
-        side: Texels of the texture.
-        turn: Rotation of the head, as in `Reflectance.relit`.
+    `vertices_m` [V, 3] are in camera space, already rotated by `turn`, the rotation for `Reflectance.relit`.
     """
     positions_m = bake_attributes(vertices_m, math.isqrt(len(vertices_m)), _SIDE)
     directions, weights = far_lights_of(points, positions_m)

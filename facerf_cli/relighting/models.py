@@ -41,12 +41,8 @@ class Sides:
 class Networks:
     """The trained networks by name. Each is loaded on first access and kept on the device.
 
-    Accessing a network raises InputError if its file is damaged or from another version.
-
-    Args:
-        files: File of each network.
-        device: Device that the networks run on.
-        given: Networks that replace those in files.
+    `given` networks replace those in files. Accessing a network raises InputError if its file is damaged or
+    from another version.
     """
 
     reflectance: ReflectanceNetwork
@@ -104,7 +100,6 @@ class Networks:
 
 
 def _check(path: Path, name: str, network: Any) -> None:
-    """Raise InputError for a network whose sizes do not match this version's classes or face model."""
     if name == "parsing" and (network.settings.classes, network.settings.landmarks) != (
         len(CLASSES),
         LANDMARKS,

@@ -22,7 +22,7 @@ from facerf_cli.errors import UsageError
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.view import photo_camera, rows_of_camera, view_face
-from facerf_cli.image.colour import ExposureRule
+from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Window, enlarged, in_strips
 from facerf_cli.light.light import Light
 from facerf_cli.portrait.matte import PersonColours
@@ -79,7 +79,7 @@ class Surface:
         return self.depth_m(rows) * rays_of_rows(self._camera, self._size_px, rows).numpy()
 
     def _depth_of_proxy(self, camera: Camera) -> Tensor:
-        """Return the depth [h, w] of the proxy's outer side; infinite where it is not visible."""
+        """Return the depth [h, w] of the proxy's outer side; infinite elsewhere."""
         return rasterize(self._proxy.vertices, self._outside, camera).depth_m
 
     def _continued(self, classes: Tensor) -> Tensor:
@@ -135,10 +135,7 @@ class PersonInPhoto:
         return np.minimum(self.matte[rows], self._field.person.segmentation.matte[rows])
 
     def relit(self, lights: Light) -> Iterator[Relit]:
-        """Yield the person under each sum of lights (paper, 'Relighting'), from a single prediction.
-
-        The face field ignores light from behind.
-        """
+        """Yield the person under each sum of lights; the face field ignores light from behind."""
         field, owns = self._field, lights.owns
         lights, keys = lights.with_keys_alone()
         directions, weights = lights.directions, lights.weights
@@ -185,7 +182,7 @@ class PersonInPhoto:
         return Rims(person.segmentation.matte, person.square.side_px / person.sides)
 
     def precompute(self, relit: Relit, layers: Sequence[str] = ()) -> PersonLight:
-        """Compute everything that does not depend on rows; raises UsageError for an unknown layer."""
+        """Compute everything that does not depend on rows."""
         assert relit.eye_reflections is not None
         for name in layers:
             if name not in (*PERSON_LAYERS, *FACE_LAYERS):
@@ -231,10 +228,7 @@ class PersonInPhoto:
     def _shadows(
         self, light: PersonLight, among: Window
     ) -> Iterator[tuple[PersonLight | None, Window, np.ndarray]]:
-        """Yield each key light on its own, and the part of a window that its shadow changes, by [h, w, 1].
-
-        Shadows are computed in the narrower view.
-        """
+        """Yield each key light on its own, and the part of a window that its shadow changes, by [h, w, 1]."""
         view = self._views[0]
         part, weight = view.weight(among)
         for key, shadow in light.keys if weight.any() else ():
@@ -305,8 +299,11 @@ class PersonInPhoto:
         return {name: values}
 
     def exposure_ev(self, relit: Relit, rule: ExposureRule) -> float:
-        own = torch.zeros(3) if relit.own is None else relit.own.detach()
-        return self._views[0].exposure_ev(relit.views[0], own, rule)
+        view, own = self._field.views[0], torch.zeros(3) if relit.own is None else relit.own.detach()
+        image, skin = view.person.image, view.person.classes[class_index("skin")].numpy()
+        (radiance,) = view.render(relit.views[0])
+        lit, plate = (x.permute(1, 2, 0).numpy() for x in (radiance + own[:, None, None] * image, image))
+        return chosen_exposure_ev(rule, lit, plate, skin, view.person.own_pixels.numpy())
 
     @cached_property
     def _surface(self) -> Surface:
@@ -364,7 +361,6 @@ class PeopleInPhoto(Relightable):
         return zip(*(person.relit(own) for person, own in zip(self.people, each, strict=True)), strict=True)
 
     def exposure_ev(self, relit: Sequence[Relit], rule: ExposureRule) -> float:
-        """Return the exposure in EV that a rule chooses for the nearest person."""
         return self.people[0].exposure_ev(relit[0], rule)
 
     def renderer(self, request: RenderRequest) -> Callable[[slice], dict[str, np.ndarray]]:
@@ -412,10 +408,7 @@ class PeopleInPhoto(Relightable):
         return layers
 
     def _present(self, rows: slice) -> tuple[list[int], _Alphas]:
-        """Return number and alpha [h, W, 1] of the people in rows; in a crowd these are few.
-
-        The nearest person is always included, with all of its matte.
-        """
+        """Return number and alpha [h, W, 1] of the nearest person, and of the few others in rows."""
         numbers, alphas = [0], [self.people[0].matte[rows][..., None]]
         for number, person in enumerate(self.people[1:], 1):
             if (alpha := person.alpha_rows(rows)).any():

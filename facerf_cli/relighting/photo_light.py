@@ -164,15 +164,10 @@ def _ring(axis: Tensor, degrees: float) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """Settings for estimating a photo's light over a rig.
+    """Settings for estimating a photo's light over a rig."""
 
-    Attributes:
-        non_negative: Whether weights must not be negative; the paper's least squares allow negative weights.
-        features: Network (V_f or S_f) that refines the weights (paper, 'Light Estimation').
-    """
-
-    non_negative: bool = True
-    features: FeatureNetwork | None = None
+    non_negative: bool = True  # the paper's least squares allow negative weights
+    features: FeatureNetwork | None = None  # V_f or S_f refine the weights (paper, 'Light Estimation')
 
 
 DEFAULT_ESTIMATOR = Estimator()
@@ -180,23 +175,14 @@ DEFAULT_ESTIMATOR = Estimator()
 
 @dataclass(frozen=True, eq=False)
 class LightEstimate:
-    """Estimated light of a photo.
-
-    Attributes:
-        light: The light.
-        evidence: What it was estimated from.
-        explained: Texture [3, t, t] of the face under the light.
-        refined: The refinement by features, if any.
-        least_squares: Weights [L, 3] before that refinement.
-        key_share: Fraction of the key light, if it was estimated.
-    """
+    """Estimated light of a photo, and the evidence that it was estimated from."""
 
     light: RigLight
     evidence: LightEvidence
-    explained: Tensor
-    refined: RefinedLight | None = None
-    least_squares: Tensor | None = None
-    key_share: float | None = None
+    explained: Tensor  # texture [3, t, t] of the face under the light
+    refined: RefinedLight | None = None  # the refinement by features, if any
+    least_squares: Tensor | None = None  # weights [L, 3] before that refinement
+    key_share: float | None = None  # fraction of the key light, if it was estimated
 
 
 def estimate_light(

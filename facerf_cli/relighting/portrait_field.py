@@ -54,13 +54,11 @@ _DARK = 0.1  # fraction of a person's mean below which chromaticity is ignored
 class PersonShading:
     """Shading of a person under M sums of lights, in the crop square; each map is [M, 3, S, S].
 
-    Attributes:
-        shading: Multiplies the albedo. Includes the photo's ratio image.
-        specular: Is added to the product. Includes the photo's ratio image.
-        visibility: Fraction of the light that is not shadowed.
-        rear: Shading and specular [M, 6, S, S] of light from behind, which is drawn as a rim.
-        normal_gradient: Derivative [M, 9, S, S] of r, g, b of the shading with respect to x, y, z of the
-            normal; only if the user supplied normals, which are finer than the maps.
+    Radiance is albedo times `shading` plus `specular`; both include the photo's ratio image. `visibility` is
+    the fraction of the light that is not shadowed. `rear` [M, 6, S, S] are shading and specular of light from
+    behind, which is drawn as a rim. `normal_gradient` [M, 9, S, S] is the derivative of r, g, b of the
+    shading with respect to x, y, z of the normal; only if the user supplied normals, which are finer than the
+    maps.
     """
 
     shading: Tensor
@@ -70,7 +68,6 @@ class PersonShading:
     normal_gradient: Tensor | None = None
 
     def __getitem__(self, number: int) -> "PersonShading":
-        """Return one of the sums, with maps [3, S, S]."""
         return PersonShading(*(maps[number] for maps in self.tensors))
 
     @property
@@ -88,21 +85,15 @@ class PersonShading:
 
 @dataclass(frozen=True, eq=False)
 class SmoothedFrame:
-    """A person in one frame of a shot, smoothed over neighbouring frames.
+    """A person in one frame of a shot, smoothed over neighbouring frames."""
 
-    Attributes:
-        head: Head without skin that is covered.
-        light: Light of the whole shot.
-        segmentation: Classes and matte.
-        portrait: For the portrait field: the person in each view, and the maps.
-        balance: White balance of the whole shot.
-    """
-
-    head: Head
-    light: RigLight
+    head: Head  # without skin that is covered
+    light: RigLight  # of the whole shot
     segmentation: Segmentation
-    portrait: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()
-    balance: WhiteBalance | None = None
+    portrait: tuple[
+        tuple[SeenPerson, PortraitMaps], ...
+    ] = ()  # for the portrait field: each view and its maps
+    balance: WhiteBalance | None = None  # of the whole shot
 
 
 class _LightBatch(NamedTuple):
@@ -119,25 +110,16 @@ class _LightBatch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PortraitView:
-    """Light transport of a person in one square of the photo.
-
-    Attributes:
-        person: The person in the square.
-        maps: Maps of the network for one person; the albedo is in the units of the network's input.
-        exposure: Radiance of the photo over the maps' radiance in the photo's light, [3, 1, 1].
-        correction: Ratio image.
-        own: Shading in the photo's light, if the user supplied normals.
-    """
+    """Light transport of a person in one square of the photo."""
 
     person: SeenPerson
-    maps: PortraitMaps
-    exposure: Tensor
-    correction: Correction | None = None
-    own: PersonShading | None = None
+    maps: PortraitMaps  # batch of 1; the albedo is in the units of the network's input
+    exposure: Tensor  # radiance of the photo over the maps' radiance in the photo's light, [3, 1, 1]
+    correction: Correction | None = None  # ratio image
+    own: PersonShading | None = None  # shading in the photo's light, if the user supplied normals
 
     @staticmethod
     def of(person: SeenPerson, maps: PortraitMaps, source: SourceLight | None) -> "PortraitView":
-        """Return the view of a person, corrected by the photo's estimated light, if there is one."""
         view = PortraitView(person, maps, torch.full((3, 1, 1), person.exposure))._with_detail()
         if source is None:
             return view
@@ -207,7 +189,6 @@ class PortraitView:
         return shading[0], specular[0], irradiance[0]
 
     def _far(self, directions: Tensor, weights: Tensor) -> Iterator[_LightBatch]:
-        """Yield batches of far lights [L, 3] with rgb weights [M, L, 3], without lights of weight 0."""
         used = shining(weights)
         if used.any():
             for lights, part in zip(
@@ -220,7 +201,6 @@ class PortraitView:
                 yield _LightBatch(*maps, unshadowed, part, rear_fraction(lights), lights[..., None, None])
 
     def _near(self, points: PointLights, weights: Tensor) -> Iterator[_LightBatch]:
-        """Yield batches of the points of a near light with rgb weights [M, 3]."""
         toward, irradiance = points.arriving(self.person.maps.positions_m)
         rear = rear_fraction(-points.toward)
         for first in range(0, len(toward), _LIGHTS_AT_ONCE):
@@ -287,24 +267,18 @@ class PortraitView:
         return torch.stack(images, 1) if images else torch.zeros(len(lights.weights), 0, 3, 1, 1)
 
     def render(self, shading: PersonShading) -> Tensor:
-        """Return the radiance [M, 3, S, S] of the person in the square, at the resolution of the maps."""
+        """Return the radiance [M, 3, S, S] of the person, at the resolution of the maps."""
         merged = shading.with_rear_merged
         return (self.maps.albedo * merged.shading + merged.specular) * self.exposure
 
 
 @dataclass(frozen=True, eq=False)
 class PortraitField:
-    """Light transport of a person; as a `Reflectance` it renders textures of the face.
+    """Light transport of a person; as a `Reflectance` it renders textures of the face."""
 
-    Attributes:
-        views: Head and shoulders, and the whole person if that square shows more.
-        field: The face field.
-        texels: Coordinates [T, T, 2] of the face's texels in the first view's square, for grid_sample.
-    """
-
-    views: tuple[PortraitView, ...]
+    views: tuple[PortraitView, ...]  # head and shoulders, and the whole person if that square shows more
     field: Field
-    texels: Tensor
+    texels: Tensor  # coordinates [T, T, 2] of the face's texels in the first view, for grid_sample
 
     @staticmethod
     @torch.no_grad()
@@ -315,23 +289,19 @@ class PortraitField:
         source: SourceLight | None,
         squares: Sequence[tuple[SeenPerson, PortraitMaps]],
     ) -> "PortraitField":
-        """Return the field of a person from the maps of each square and the photo's light, if estimated.
-
-        The whole person uses the white balance of the face field.
-        """
+        """Return the field from maps of each square; all of it uses the face field's white balance."""
         views = tuple(PortraitView.of(*one, source).with_white_balance(field.balance) for one in squares)
         return PortraitField(views, field, _texels_in_square(model, head, squares[0][0]))
-
-    @property
-    def person(self) -> SeenPerson:
-        """The person in the square around head and shoulders."""
-        return self.views[0].person
 
     def shade(
         self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()
     ) -> list[PersonShading]:
         """Shade the person in each view; see `PortraitView.shade`."""
         return [view.shade(directions, weights, near) for view in self.views]
+
+    @property
+    def person(self) -> SeenPerson:
+        return self.views[0].person
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
         """Return textures [M, 3, T, T] of the face; if the head is turned, from the face field only."""

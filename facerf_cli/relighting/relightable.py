@@ -23,23 +23,14 @@ from facerf_cli.run.memory import batches
 
 @dataclass(frozen=True, eq=False)
 class Relit:
-    """A subject under one sum of lights, at the resolution of its maps, in linear radiance.
+    """Maps of a subject under one sum of lights, in linear radiance; only whole people have all of them."""
 
-    Attributes:
-        texture: Texture of the face [3, T, T].
-        own: Weight [3] of the photo's original light in the sum.
-        views: `PersonInPhoto`: its shading in each square.
-        eye_reflections: `PersonInPhoto`: what its irises reflect [N, 3, s, s].
-        mouth: `PersonInPhoto`: the face [3, T, T] under the light that enters the mouth.
-        keys: `PersonInPhoto`: each key light on its own, and the shadow it casts.
-    """
-
-    texture: Tensor
-    views: tuple[PersonShading, ...] = ()
-    eye_reflections: Tensor | None = None
-    mouth: Tensor | None = None
-    own: Tensor | None = None
-    keys: "tuple[tuple[Relit, CastShadow], ...]" = ()
+    texture: Tensor  # of the face [3, T, T]
+    views: tuple[PersonShading, ...] = ()  # the person in each square
+    eye_reflections: Tensor | None = None  # what the irises reflect [N, 3, s, s]
+    mouth: Tensor | None = None  # the face [3, T, T] under the light that enters the mouth
+    own: Tensor | None = None  # weight [3] of the photo's original light in the sum
+    keys: "tuple[tuple[Relit, CastShadow], ...]" = ()  # each key light on its own, and the shadow it casts
 
     @property
     def tensors(self) -> list[Tensor]:
@@ -49,23 +40,14 @@ class Relit:
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """What to render of a subject.
+    """What to render of a subject."""
 
-    Attributes:
-        image: Sum of lights for the image "rgb" [H, W, 3]; None: no image.
-        lights: Sums of lights for layers [H, W, 3] over black, by name.
-        layers: Names of other layers, under the image's light.
-        ev: Exposure in EV at which the photo's background keeps its look.
-        background: Image [H, W, 3] behind the subject; None: the photo, or nothing.
-        wrap: Light [H, W, 3] of the background, added to the image and returned as layer "wrap".
-    """
-
-    image: Any = None
-    lights: Mapping[str, Any] = field(default_factory=dict)
-    layers: Sequence[str] = ()
-    ev: float = 0.0
-    background: Rows | None = None
-    wrap: Rows | None = None
+    image: Any = None  # sum of lights for the image "rgb" [H, W, 3]; None: no image
+    lights: Mapping[str, Any] = field(default_factory=dict)  # for layers [H, W, 3] over black, by name
+    layers: Sequence[str] = ()  # names of other layers, under the image's light
+    ev: float = 0.0  # exposure at which the photo's background keeps its look
+    background: Rows | None = None  # image [H, W, 3] behind the subject; None: the photo, or nothing
+    wrap: Rows | None = None  # light [H, W, 3] of the background, added to the image; layer "wrap"
 
 
 class Relightable(ABC):
@@ -111,11 +93,8 @@ class Relightable(ABC):
     def relit_images(self, lights_of: Callable[[slice], Any], sums: Sequence[int]) -> Iterator[list[Any]]:
         """Yield the relit subject for each image, as a list with one entry per sum of lights.
 
-        As many images as fit the memory share one prediction.
-
-        Args:
-            lights_of: Returns the lights for a range of all sums.
-            sums: Number of sums of lights for each image.
+        `sums` is the number of sums for each image; `lights_of` returns the lights of a range of all sums. As
+        many images as fit the memory share one prediction.
         """
         first = 0
         for part in self.parts(sums):

@@ -122,17 +122,11 @@ class _FrameObservation:
 class SteadyShot:
     """A person through the frames of a shot, each frame smoothed with its neighbours.
 
-    Observations are kept only for frames near the last requested one; if frames are requested in order,
-    networks run once per frame. Results for the whole shot are computed on first use and kept.
+    Observations are kept only for frames near the last requested one, so networks run once per frame if frames
+    are requested in order. Results for the whole shot are computed on first use and kept.
 
-    Args:
-        models: Face model and networks.
-        frames: Returns a frame by number, scene-linear [H, W, 3]; all have one size.
-        sightings: The face in each frame.
-        sides: Sides of texture and crop.
-        mattes: Returns the user's alpha [H, W] of the person by number; black if a frame does not show the
-            person.
-        white: White balance of the skin; None keeps the networks' colours.
+    `frames` returns a frame by number, scene-linear [H, W, 3] of one size. `mattes` returns the user's alpha
+    [H, W] of the person, which is black if a frame does not show the person.
     """
 
     def __init__(
@@ -159,11 +153,6 @@ class SteadyShot:
         head = self._key_heads.get(frame) or self._head(frame)
         return SmoothedFrame(head, light, self._segmentation(frame), views, balance)
 
-    def segmentation(self, frame: int) -> Segmentation:
-        """Segment the person in a frame, from the classes of its neighbours."""
-        self._keep_near(frame)
-        return self._segmentation(frame)
-
     def landmarks_px(self, frame: int) -> np.ndarray:
         """Return the smoothed landmarks [68, 2] in a frame; raises InputError if the face is lost."""
         if frame not in self._tracked:
@@ -180,12 +169,11 @@ class SteadyShot:
 
     @property
     def middle(self) -> int:
-        """The middle key frame."""
         return self.key_frames[len(self.key_frames) // 2]
 
     @property
     def other_heads(self) -> list[Head]:
-        """Heads in the other key frames."""
+        """Heads in all key frames but the middle one."""
         return [head for frame, head in self._key_heads.items() if frame != self.middle]
 
     @cached_property
@@ -312,7 +300,6 @@ class SteadyShot:
 
 
 def _smoothed_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int) -> PortraitMaps:
-    """Average the maps of the middle frame with those of its neighbours."""
     images = [_encoded(person) for person, _ in near]
     halves = [F.avg_pool2d(image[None], 2)[0] for image in images]
     means: dict[str, Tensor] = {}

@@ -59,13 +59,10 @@ _SIZES = (0.6, 1.7)  # range of the change of its size meanwhile
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A face in one frame.
+    """A face in one frame."""
 
-    `landmarks_px` is [68, 2]; `error` is their median expected error, in extents of the landmarks.
-    """
-
-    landmarks_px: np.ndarray
-    error: float
+    landmarks_px: np.ndarray  # [68, 2]
+    error: float  # median expected error of the landmarks, in their extents
 
 
 class FaceTracker:

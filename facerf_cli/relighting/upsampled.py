@@ -31,7 +31,6 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.sparse import csr_array
 from torch import Tensor
 
-from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Window, enlarged, fitted
 from facerf_cli.portrait.matte import shrunk
 from facerf_cli.portrait.parse import class_index
@@ -73,13 +72,9 @@ class EdgeFill(NamedTuple):
 
     @staticmethod
     def of(colours: Tensor, trust: Tensor, own: Tensor, kept: Tensor) -> "EdgeFill":
-        """Fill the pixels that keep less than all of their values, by colour and trust.
+        """Find replacements for pixels of colours [3, S, S] that keep a part, `kept` [S, S], of their value.
 
-        Args:
-            colours: Colours [3, S, S] of the maps.
-            trust: Trust [S, S] in the maps.
-            own: Mask [S, S] of the person, whose pixels are used.
-            kept: Weight [S, S] of a pixel's own value.
+        They take values of the person's pixels, `own` [S, S], by colour and by trust [S, S].
         """
         side, flat = own.shape[-1], colours.flatten(1)
         wide, trusted = (F.pad(part, (_REACH_PX,) * 4).flatten(-2) for part in (colours, trust * own))
@@ -133,12 +128,8 @@ def edge_confidence(colours: Tensor, solid: Tensor, loose: Tensor) -> Tensor:
 def places(colours: Tensor, trust: Tensor, grid: Tensor, radiance: Tensor, unit: float) -> Tensor:
     """Return the coordinates [h, w, 2] in -1..1 at which pixels of the photo read the maps.
 
-    Args:
-        colours: Colours [3, S, S] of the maps.
-        trust: Trust [S, S] in the maps.
-        grid: The pixels' own coordinates [h, w, 2].
-        radiance: Radiance [h, w, 3] of the pixels.
-        unit: Radiance of 1 in the units of the Portrait Network.
+    `colours` [3, S, S] and `trust` [S, S] are of the maps, `grid` [h, w, 2] and `radiance` [h, w, 3] of the
+    pixels. `unit` is the radiance of 1 in the units of the Portrait Network.
     """
     side, near = colours.shape[-1], (trust < _FAR).float()[None, None]
     near_edge = F.grid_sample(near, grid[None], "nearest", "border", align_corners=False).flatten()
@@ -265,11 +256,10 @@ class UpsampledView:
     def over(
         self, window: Window, pixels: np.ndarray, rims: Rims | None = None
     ) -> Callable[[Maps], dict[str, np.ndarray]]:
-        """Return a function that renders a window of the photo, whose pixels are [h, w, 3].
+        """Return a function that renders a window of the photo, with pixels [h, w, 3], from precomputed maps.
 
-        It takes the maps of a light from `precompute`. It returns "rgb" [h, w, 3], the radiance under light
-        from the front; "rear", the radiance under light from behind, drawn as `rims`; "change", the factor of
-        both by user-supplied normals; and layers.
+        It returns "rgb" [h, w, 3], the radiance under light from the front; "rear", the radiance under light
+        from behind, drawn as `rims`; "change", the factor of both by user-supplied normals; and layers.
         """
         grid, albedo, detail = self._unlit(window, pixels)
         finer = self._finer(window, grid)
@@ -292,7 +282,7 @@ class UpsampledView:
                 values[name] = _read(maps[name], grid)
             if "normal" in maps and finer is not None:
                 values["normal"] = values["normal"] + finer
-            return {name: _by_pixel(one) for name, one in values.items()}
+            return {name: one.permute(1, 2, 0).numpy() for name, one in values.items()}
 
         return lit
 
@@ -319,15 +309,6 @@ class UpsampledView:
         """Return the factor [h, w] of a light's image by the shadow that it casts."""
         grid = self._grid(window)
         return np.asarray(change(CastShadow(*(_read(maps, grid) for maps in shadow))).numpy())
-
-    def exposure_ev(self, light: PersonShading, own: Tensor, rule: ExposureRule) -> float:
-        """Return the exposure in EV that a rule chooses under a light [3, S, S] plus the photo's own [3]."""
-        view = self._view
-        (relit,) = view.render(light)
-        relit = relit + own[:, None, None] * view.person.image
-        skin = view.person.classes[class_index("skin")].numpy()
-        image = view.person.image.permute(1, 2, 0).numpy()
-        return chosen_exposure_ev(rule, _by_pixel(relit), image, skin, self.own.numpy())
 
     def _smooth(self, light: Tensor) -> Tensor:
         """Return shading and specular [6, S, S], continued over the background; specular is blurred."""
@@ -362,7 +343,3 @@ def _change(maps: Maps, grid: Tensor, finer: Tensor) -> Tensor:
 def _read(maps: Tensor, grid: Tensor) -> Tensor:
     """Return maps [C, h, w] at coordinates [h, w, 2]; the border repeats outside of the square."""
     return F.grid_sample(maps[None], grid[None], padding_mode="border", align_corners=False)[0]
-
-
-def _by_pixel(values: Tensor) -> np.ndarray:
-    return values.permute(1, 2, 0).numpy()

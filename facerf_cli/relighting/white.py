@@ -58,21 +58,12 @@ _MOST_BAKED = 1.5  # limit of a factor's logarithm
 
 @dataclass(frozen=True, eq=False)
 class WhiteBalance:
-    """White balance of a person.
+    """White balance of a person."""
 
-    Attributes:
-        gain: Gain [3] of the face.
-        light: Log chromaticity [2] of the light that is removed from the photo.
-        uniform_scale: Intensity of uniform light that reproduces the skin's brightness in the photo.
-        off_white: Distance of the photo's skin from all colours of skin, in log chromaticity; about 0 in most
-            photos.
-        white: Which colours are kept.
-    """
-
-    gain: Tensor
-    light: Tensor
-    uniform_scale: float
-    off_white: float = 0.0
+    gain: Tensor  # [3] of the face
+    light: Tensor  # log chromaticity [2] of the light that is removed from the photo
+    uniform_scale: float  # intensity of uniform light that reproduces the skin's brightness in the photo
+    off_white: float = 0.0  # log chromaticity between the photo's skin and the nearest skin; mostly about 0
     white: White = "photo"
 
     @staticmethod
@@ -177,14 +168,11 @@ def even_shade_of(image: Tensor, classes: Tensor) -> Tensor:
 
 
 def without_baked_in(albedo: Tensor, photo: Tensor, skin: Tensor, key: Tensor, key_fraction: float) -> Tensor:
-    """Return factors [3, S, S] that remove the photo's shading and highlights from the albedo of skin.
+    """Return factors [3, S, S] that remove the photo's shading and highlights from an albedo [3, S, S].
 
-    Args:
-        albedo: [3, S, S].
-        photo: Scene-linear [3, S, S].
-        skin: Coverage [S, S] of bare skin.
-        key: Radiance [S, S] of a white surface under the photo's key light.
-        key_fraction: Fraction of the photo's light that is the key light. In soft light the factors are 1.
+    The photo [3, S, S] is scene-linear. `skin` [S, S] is the coverage of bare skin, `key` [S, S] the radiance
+    of a white surface under the photo's key light, and `key_fraction` that light's fraction of all light. In
+    soft light the factors are 1.
     """
     sure, skin = skin > _SKIN[1], _ramp(skin, _SKIN)
     if not sure.any():
