@@ -122,8 +122,8 @@ class _FrameObservation:
 class SteadyShot:
     """A person through the frames of a shot, each frame smoothed with its neighbours.
 
-    Observations are kept only for frames near the last requested one, so networks run once per frame if frames
-    are requested in order. Results for the whole shot are computed on first use and kept.
+    Observations are kept only for frames near the last requested one, so networks run once per frame if
+    frames are requested in order. Results for the whole shot are computed on first use and kept.
 
     `frames` returns a frame by number, scene-linear [H, W, 3] of one size. `mattes` returns the user's alpha
     [H, W] of the person, which is black if a frame does not show the person.
