@@ -1,21 +1,27 @@
-"""Several people in one image, by people with known answers."""
+"""People in a photo: composites of people with known answers, and the depth of a person."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import torch
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import InputError
+from facerf_cli.face.crop import Crop
+from facerf_cli.face.view import photo_camera
 from facerf_cli.files.read import LinearImage
 from facerf_cli.image.strips import Window
 from facerf_cli.portrait.find import Face, choose_face
-from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.portrait.parse import CLASSES, class_index
+from facerf_cli.portrait.proxy import Proxy
+from facerf_cli.raster.camera import PIXEL_CENTRE, project
+from facerf_cli.relighting.people_in_photo import PeopleInPhoto, Surface
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run import memory
 from facerf_cli.run.memory import batches
@@ -181,3 +187,45 @@ def test_a_person_is_drawn_in_its_own_rows_alone() -> None:
     assert drawn == [2, 3]
     for name in ("rgb", "key"):
         assert rows[0][name][0, 1] == pytest.approx(0.2) and rows[2][name][0, 1] == pytest.approx(0.5)
+
+
+PHOTO_PX = 200, 300  # of the photo
+CLASSES_PX = 50, 75  # of the classes
+CROP = Crop(100.0, 50.0, 100.0, 64)
+HEAD_M, BODY_M = 1.0, 1.2
+ROWS = slice(0, PHOTO_PX[0])
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    """A near card, the head, above a far one, whose upper end it hides; hair and cloth go on at the right."""
+    near, far = card(HEAD_M, -0.05, 0.02), card(BODY_M, -0.12, -0.01)
+    triangles = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    proxy = Proxy.of(torch.cat([near, far]), torch.cat([triangles, triangles + 4]))
+    label = torch.zeros(CLASSES_PX, dtype=torch.long)
+    label[:30, 20:70], label[30:, 20:70] = class_index("hair"), class_index("garment")
+    classes = torch.nn.functional.one_hot(label, len(CLASSES)).permute(2, 0, 1).float()
+    person = SimpleNamespace(
+        proxy=proxy, fit=SimpleNamespace(crop=CROP), segmentation=SimpleNamespace(classes=classes)
+    )
+    return Surface(cast(Any, person), PHOTO_PX)
+
+
+def card(depth_m: float, low: float, high: float) -> torch.Tensor:
+    """Corners [4, 3] of a card before the camera, between two heights at the depth of 1 m."""
+    corners = [[-0.05, low, -1], [0.05, low, -1], [0.05, high, -1], [-0.05, high, -1]]
+    return torch.tensor(corners) * depth_m
+
+
+def test_depth_and_positions_lie_on_the_surfaces_row_by_row(surface: Surface) -> None:
+    """Neither where one hides the other nor beyond them: hair goes on with the head, cloth with the body."""
+    depth_m = surface.depth_m(ROWS)[..., 0]
+    near, far = (np.abs(depth_m - known) < 1e-3 for known in (HEAD_M, BODY_M))
+    assert (near | far)[:, 80:280].all()
+    row_of_edge = round(photo_camera(CROP, *PHOTO_PX).cy_px + 0.05 * photo_camera(CROP, *PHOTO_PX).focal_px)
+    assert near[:row_of_edge, 140:160].all() and far[row_of_edge:, 140:160].all()  # the cards
+    assert near[:112, 200:280].all() and far[128:, 200:280].all()  # beyond them, by classes
+    places_px = project(torch.from_numpy(surface.position_m(ROWS)), photo_camera(CROP, *PHOTO_PX))
+    x, y = np.meshgrid(*(np.arange(length) + PIXEL_CENTRE for length in PHOTO_PX[::-1]))
+    np.testing.assert_allclose(places_px, np.stack([x, y], -1), atol=1e-3)
+    np.testing.assert_allclose(surface.depth_m(slice(64, 96)), surface.depth_m(ROWS)[64:96], atol=1e-6)
