@@ -165,20 +165,11 @@ class PhotoCamera(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Pose and surroundings of a rendered person.
+    """Pose and surroundings of a rendered person; in another pose, only the face is rendered."""
 
-    Attributes:
-        fit: Pose and shape of the rendered head; None: as in the photo.
-        composite: "photo" renders the person in the photo, "face" only the face.
-        matte: Alpha [H, W] in 0..1 of the part that is relit; None: all of the person.
-        alpha: Alpha [H, W] of the photo itself, which multiplies the matte.
-        background: The photo, nothing, or an image that is passed with each render.
-    """
-
-    fit: FaceFit | None = None
-    composite: Literal["photo", "face"] = "photo"
-    matte: np.ndarray | None = None
-    alpha: np.ndarray | None = None
+    fit: FaceFit | None = None  # pose and shape of the head; None: as in the photo
+    matte: np.ndarray | None = None  # alpha [H, W] in 0..1 of the part that is relit; None: all of the person
+    alpha: np.ndarray | None = None  # alpha [H, W] of the photo itself, which multiplies the matte
     background: Behind = "photo"
 
 
@@ -192,24 +183,15 @@ class Person:
     Everything that does not depend on the light is computed once and kept. Attributes and results are numpy
     arrays. They are tensors on the models' device if the photo, or an array passed to the method, is a
     tensor.
-
-    Attributes:
-        models: Networks and face model.
-        photo: Scene-linear [H, W, 3]; None: there is only the face, in the frame of its crop.
-        head: Fitted face model and the texture of the face.
-        reflectance: Renders the person under any lights.
-        user_matte: The person's alpha [H, W], if the user supplied one.
-        kind: Kind of the reflectance.
-        tensors: True if the photo was passed as a tensor.
     """
 
     models: Models
-    photo: np.ndarray | None
-    head: Head
-    reflectance: Reflectance
-    user_matte: np.ndarray | None = None
+    photo: np.ndarray | None  # scene-linear [H, W, 3]; None: there is only the face, in the frame of its crop
+    head: Head  # fitted face model and the texture of the face
+    reflectance: Reflectance  # renders the person under any lights
+    user_matte: np.ndarray | None = None  # alpha [H, W] of the person, if the user supplied one
     kind: RelightKind = "portrait"
-    tensors: bool = False
+    tensors: bool = False  # whether the photo was passed as a tensor
 
     def __repr__(self) -> str:
         size = "" if self.photo is None else " in {1} x {0} pixels".format(*self.photo.shape)
@@ -233,8 +215,7 @@ class Person:
                 is scaled to cover the frame; or a colour (r, g, b).
             layers: Names of layers, as for `facerf relight --aov`. The result is then a dict of "image" and
                 the layers [H, W] or [H, W, C].
-            room: Fraction of the lights' sum that a white room reflects as ambient fill, 0 to 1. Maps get
-                none.
+            room: Fraction, 0 to 1, of all lights but maps that a white room reflects as ambient fill.
             alone: Render only the face, in the pose of the photo, as [H, W, 4].
 
         Gradients flow to the lights, the pose and the texture if only the face is rendered (docs/python.md).
@@ -437,7 +418,7 @@ class Person:
 
     def prepare(self, target: Target = AS_IN_PHOTO) -> Relightable:
         """Return the person in a pose and over a background, ready to be relit by any number of lights."""
-        if self.photo is None or target.composite == "face":
+        if self.photo is None or target.fit is not None:
             return self.face_alone(target.fit)
         return PeopleInPhoto([self.in_photo(target)], target.background)
 

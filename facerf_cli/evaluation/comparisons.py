@@ -67,7 +67,7 @@ def compare_olats(faces: Sequence[Portrait], bench: Bench) -> Iterator[Compariso
     predictions, views = {}, []
     for method in methods:
         view = target.pose_of(face.by(method.models), method.models)
-        predictions[method.name] = next(method.images(None, view.head, lights, Target(view.fit, "face")))
+        predictions[method.name] = next(method.images(None, view.head, lights, Target(view.fit)))
         views.append(view)
     first = views[0]
     predictions[LAMBERT] = _lambert(methods[0].models, light, first)
@@ -287,7 +287,7 @@ def rendered(case: Case, source: np.ndarray | None, bench: Bench) -> dict[str, n
         if case.facts["pose"] != SAME:
             place = torch.tensor([float(case.facts[name]) for name in _PLACE])
             fit = replace(head.fit, rotation=pose_to_rotation(*turn_deg), translation_m=place, crop=frame)
-            target = Target(fit, "face")
+            target = Target(fit)
         images[method.name] = next(method.images(source, head, lights, target))
     return images
 

@@ -72,7 +72,7 @@ class Method:
         self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit | None = None
     ) -> np.ndarray:
         """The face alone [S, S, 3] under one light, in the pose and the crop of a fit, else in its own."""
-        return Person(self.models, None, head, reflectance).image(light, Target(fit, "face"))
+        return Person(self.models, None, head, reflectance).image(light, Target(fit))
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Light, target: Target

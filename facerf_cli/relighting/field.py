@@ -231,7 +231,10 @@ def far_lights_of(points: PointLights, positions_m: Tensor) -> tuple[Tensor, Ten
     across, along = (_linear_interp_weights(cells[..., number], steps) for number in (0, 1))
     weights = torch.einsum("pij,puij,pvij->uvij", irradiance, across, along)
     offsets = torch.arange(-steps, steps + 1) * math.radians(apart_deg)
-    directions = _directions(offsets, axis, sides)
+    u, v = torch.meshgrid(offsets, offsets, indexing="ij")
+    radius = torch.hypot(u, v)[..., None]
+    slope = torch.sinc(radius / math.pi)  # sin(radius) / radius
+    directions = radius.cos() * axis + slope * (u[..., None] * sides[0] + v[..., None] * sides[1])
     used = weights.amax((2, 3)) > 0
     return directions[used], weights[used]
 
@@ -240,14 +243,6 @@ def _linear_interp_weights(coordinates: Tensor, steps: int) -> Tensor:
     """Return weights [P, 2 steps + 1, T, T] of coordinates [P, T, T] in -steps..steps among the integers."""
     nodes = torch.arange(-steps, steps + 1)[:, None, None]
     return (1 - (coordinates[:, None] - nodes).abs()).clamp_min(0)
-
-
-def _directions(offsets: Tensor, axis: Tensor, sides: tuple[Tensor, Tensor]) -> Tensor:
-    """Return unit directions [n, n, 3] at angles [n] from an axis toward each of two sides."""
-    u, v = torch.meshgrid(offsets, offsets, indexing="ij")
-    angle = torch.hypot(u, v)[..., None]
-    slope = torch.sinc(angle / math.pi)  # sin(angle) / angle
-    return angle.cos() * axis + slope * (u[..., None] * sides[0] + v[..., None] * sides[1])
 
 
 def _sides(axis: Tensor) -> tuple[Tensor, Tensor]:

@@ -208,7 +208,9 @@ class PersonInPhoto:
 
         `own` [h, W, 3] are the person's colours in the photo. "rgb" is 0 where there is no person.
         """
-        among = Window(window.rows, used_columns(self.matte[window.rows]))
+        used = np.flatnonzero(self.matte[window.rows].any(0))
+        columns = slice(int(used[0]), int(used[-1]) + 1) if len(used) else slice(0, 1)
+        among = Window(window.rows, columns)
         rims = self._rims if any("rear" in maps for light in lights for maps in light.views) else None
         by_maps = self._by_maps(among, own[:, among.columns], rims)
         for light in lights:
@@ -251,7 +253,9 @@ class PersonInPhoto:
         part = among.common(self.view.window)
         at = part.inside(among)
         if on_face := all(part.shape):
-            face, face_weight = self._detail.over(part, own[at]), self._face_weight(part)[..., None]
+            bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
+            face_weight = (self.view.mask[part.inside(self.view.window)].numpy() * bare)[..., None]
+            face = self._detail.over(part, own[at])
 
         def lit(light: PersonLight) -> dict[str, np.ndarray]:
             values: dict[str, np.ndarray] = {}
@@ -270,11 +274,6 @@ class PersonInPhoto:
             return values | {"rgb": person + values["rear"] if "rear" in values else person}
 
         return lit
-
-    def _face_weight(self, part: Window) -> np.ndarray:
-        """Return the weight [h, w] of the face field in a part of its window."""
-        bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
-        return np.asarray(self.view.mask[part.inside(self.view.window)].numpy() * bare)
 
     def _layer(self, name: str, window: Window, of_views: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return a layer [h, W, C] of rows, by the names that it has in a file.
@@ -318,12 +317,6 @@ class PersonInPhoto:
             if part == among and weight.min() == 1:  # hides wider views
                 return parts
         return [*parts, (len(self._views) - 1, among, np.ones(0))]
-
-
-def used_columns(values: np.ndarray) -> slice:
-    """Return the range of columns in which values [h, W] are not all 0; at least one column."""
-    at = np.flatnonzero(values.any(0))
-    return slice(int(at[0]), int(at[-1]) + 1) if len(at) else slice(0, 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -371,18 +371,14 @@ def _with_own_colours(maps: PortraitMaps, inputs: PortraitInputs) -> PortraitMap
     own = (inputs.image * maps.gain).clamp_min(0)
     own_grey, light = (image.mean(1, keepdim=True) for image in (own, inputs.image))
     person = 1 - inputs.classes[:, :1]
-    dark = (
-        _DARK
-        * (light * person).mean((2, 3), keepdim=True)
-        / person.mean((2, 3), keepdim=True).clamp_min(1e-6)
-    )
+    lit, covered = (image.mean((2, 3), keepdim=True) for image in (light * person, person))
+    dark = _DARK * lit / covered.clamp_min(1e-6)
     of_classes = torch.einsum("bkij,bcij->bkc", inputs.classes, own)
     of_classes[:, BARE] = of_classes[:, BARE].sum(1, keepdim=True)
     of_classes = of_classes / of_classes.mean(2, keepdim=True).clamp_min(1e-9)
     typical = torch.einsum("bkij,bkc->bcij", inputs.classes, of_classes)
-    colour = torch.lerp(
-        typical, own / own_grey.clamp_min(1e-9), light**2 / (light**2 + dark**2).clamp_min(1e-12)
-    )
+    sure = light**2 / (light**2 + dark**2).clamp_min(1e-12)
+    colour = torch.lerp(typical, own / own_grey.clamp_min(1e-9), sure)
     amount = maps.bias.mean(1, keepdim=True)
     cloth = inputs.classes[:, [class_index(name) for name in _CLOTH]].sum(1, keepdim=True)
     bias = colour * torch.lerp(amount, torch.minimum(amount, own_grey), cloth)

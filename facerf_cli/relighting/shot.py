@@ -93,15 +93,14 @@ class OnePerson:
     def __init__(self, model: MorphableModel, alpha: Tensor, size_px: tuple[int, int], crop_px: int) -> None:
         self._alpha, self._size_px, self._crop_px = alpha, size_px, crop_px
         mean = model.vertices(alpha[None], torch.zeros(1, len(model.expression)))[0]
-        self._name = model.name
-        self._model = replace(model, name="one person", mean=mean, identity=model.identity[:0])
+        self._model = replace(model, mean=mean, identity=model.identity[:0])
 
     def fit(self, landmarks_px: np.ndarray) -> FaceFit:
         """Fit pose and expression to landmarks [68, 2] in a frame."""
         crop = from_landmarks(landmarks_px, self._crop_px)
         inside = crop.to_crop(landmarks_px)
         fit = fit_landmarks(self._model, inside, crop, trust=trust_inside(inside, crop, *self._size_px))
-        return replace(fit, model=self._name, alpha=self._alpha)
+        return replace(fit, alpha=self._alpha)
 
 
 KEY_FRAMES = 5  # frames that the light is estimated from
@@ -300,7 +299,7 @@ class SteadyShot:
 
 
 def _smoothed_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int) -> PortraitMaps:
-    images = [_encoded(person) for person, _ in near]
+    images = [(person.exposed / 2).clamp(0, 1).pow(1 / 2.2) for person, _ in near]
     halves = [F.avg_pool2d(image[None], 2)[0] for image in images]
     means: dict[str, Tensor] = {}
     for name in PortraitMaps._fields:
@@ -316,8 +315,3 @@ def _smoothed_maps(near: Sequence[tuple[SeenPerson, PortraitMaps]], middle: int)
     person = near[middle][0]
     albedo = person.exposed[None] * means["gain"] + means["bias"]
     return PortraitMaps(albedo=albedo, **means)
-
-
-def _encoded(person: SeenPerson) -> Tensor:
-    """Return the person's display-encoded image [3, S, S] in 0..1, with skin at about middle grey."""
-    return (person.exposed / 2).clamp(0, 1).pow(1 / 2.2)

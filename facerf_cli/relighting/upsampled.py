@@ -261,8 +261,15 @@ class UpsampledView:
         It returns "rgb" [h, w, 3], the radiance under light from the front; "rear", the radiance under light
         from behind, drawn as `rims`; "change", the factor of both by user-supplied normals; and layers.
         """
-        grid, albedo, detail = self._unlit(window, pixels)
-        finer = self._finer(window, grid)
+        grid = places(self._colours, self._trust, self._grid(window), torch.from_numpy(pixels), self._unit)
+        albedo, source, skin = torch.split(_read(self._fixed_maps, grid), [3, 3, 1])
+        source, skin = (maps.permute(1, 2, 0) for maps in (source, skin))
+        detail = finer_detail(torch.from_numpy(pixels / self._unit), source, skin, self._typical_skin)
+        detail = detail.permute(2, 0, 1)
+        albedo, finer = albedo * detail, None
+        if self._normals is not None and self._view.person.normals is not None:
+            supplied = torch.from_numpy(self._view.person.normals[window]).permute(2, 0, 1)
+            finer = (supplied - _read(self._normals, grid)) * supplied.any(0)  # 0 where none are supplied
         own = None if finer is None or self._own_light is None else _change(self._own_light, grid, finer)
         if rims is not None:
             offsets_px, brightness = rims.at(window)
@@ -285,25 +292,6 @@ class UpsampledView:
             return {name: one.permute(1, 2, 0).numpy() for name, one in values.items()}
 
         return lit
-
-    def _unlit(self, window: Window, pixels: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what no light changes: coordinates [h, w, 2] in the maps, albedo and detail [3, h, w].
-
-        The albedo contains the detail, which also is the factor of specular.
-        """
-        grid = places(self._colours, self._trust, self._grid(window), torch.from_numpy(pixels), self._unit)
-        albedo, source, skin = torch.split(_read(self._fixed_maps, grid), [3, 3, 1])
-        source, skin = (maps.permute(1, 2, 0) for maps in (source, skin))
-        detail = finer_detail(torch.from_numpy(pixels / self._unit), source, skin, self._typical_skin)
-        detail = detail.permute(2, 0, 1)
-        return grid, albedo * detail, detail
-
-    def _finer(self, window: Window, grid: Tensor) -> Tensor | None:
-        """Return user-supplied normals minus the maps' [3, h, w]; 0 where the user supplied none."""
-        if self._normals is None or self._view.person.normals is None:
-            return None
-        supplied = torch.from_numpy(self._view.person.normals[window]).permute(2, 0, 1)
-        return (supplied - _read(self._normals, grid)) * supplied.any(0)
 
     def shadow_factor(self, shadow: CastShadow, window: Window) -> np.ndarray:
         """Return the factor [h, w] of a light's image by the shadow that it casts."""

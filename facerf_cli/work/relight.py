@@ -236,7 +236,7 @@ def _scene_of_face(item: Item, plan: RelightPlan, read: _Read, face: PhotoFace) 
     with naming(item.input_path):
         require_face(person.models.face, posed or fitted.fit, read.image.pixels.shape[:2])
     return Scene(
-        subject=person.prepare(Target(posed, "face")),
+        subject=person.face_alone(posed),
         setups=plan.setups,
         lights_of=_over_rig(plan),
         metadata=_metadata(item, plan),

@@ -101,7 +101,7 @@ def test_a_turned_head_is_shown_alone_in_its_pose(models: Models, head: Head) ->
     light = RigLight(azel_to_direction(0.0, 0.0)[None], torch.ones(1, 3))
     turned = replace(head.fit, rotation=pose_to_rotation(30, 0, 0))
     straight = replace(head.fit, rotation=pose_to_rotation(0, 0, 0))
-    targets = [Target(fit, "face") for fit in (straight, turned)]
+    targets = [Target(fit) for fit in (straight, turned)]
     person = Person(models, None, head, reflectance_of(models, head))
     images = [person.image(light, target) for target in targets]
     for image, target in zip(images, targets, strict=True):
