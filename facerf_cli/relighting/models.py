@@ -41,7 +41,7 @@ class Sides:
 class Networks:
     """The trained networks by name. Each is loaded on first access and kept on the device.
 
-    `given` networks replace those in files. Accessing a network raises InputError if its file is damaged or
+    `custom` networks replace those in files. Accessing a network raises InputError if its file is damaged or
     from another version.
     """
 
@@ -57,15 +57,15 @@ class Networks:
         self,
         files: Mapping[str, Path] = SHIPPED,
         device: torch.device = _CPU,
-        given: Mapping[str, nn.Module] | None = None,
+        custom: Mapping[str, nn.Module] | None = None,
     ) -> None:
-        self.files, self.device, self._given = dict(files), device, dict(given or {})
-        vars(self).update(self._given)
+        self.files, self.device, self._custom = dict(files), device, dict(custom or {})
+        vars(self).update(self._custom)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle only the files, which another process loads once; networks without a file as they are."""
-        if self._given:
-            return Networks, (self.files, self.device, self._given)
+        if self._custom:
+            return Networks, (self.files, self.device, self._custom)
         return _networks_once, (tuple(self.files.items()), self.device)
 
     def __getattr__(self, name: str) -> Any:
