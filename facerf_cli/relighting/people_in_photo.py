@@ -253,9 +253,7 @@ class PersonInPhoto:
         part = among.common(self.view.window)
         at = part.inside(among)
         if on_face := all(part.shape):
-            bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
-            face_weight = (self.view.mask[part.inside(self.view.window)].numpy() * bare)[..., None]
-            face = self._detail.over(part, own[at])
+            face, face_weight = self._detail.over(part, own[at]), self._face_weight(part)[..., None]
 
         def lit(light: PersonLight) -> dict[str, np.ndarray]:
             values: dict[str, np.ndarray] = {}
@@ -274,6 +272,11 @@ class PersonInPhoto:
             return values | {"rgb": person + values["rear"] if "rear" in values else person}
 
         return lit
+
+    def _face_weight(self, part: Window) -> np.ndarray:
+        """Return the weight [h, w] of the face field in a part of its window."""
+        bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
+        return np.asarray(self.view.mask[part.inside(self.view.window)].numpy() * bare)
 
     def _layer(self, name: str, window: Window, of_views: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return a layer [h, W, C] of rows, by the names that it has in a file.

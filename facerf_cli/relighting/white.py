@@ -75,10 +75,8 @@ class WhiteBalance:
         little skin has a chromaticity, are not changed.
         """
         chromas = _chromas(relit, photo, skin, white)
-        photographed, lit = (
-            float(luminance((one * skin).flatten(1).sum(1).numpy())) for one in (photo, relit)
-        )
-        uniform_scale = photographed / max(4 * lit, 1e-6)
+        sums = [float(luminance((one * skin).flatten(1).sum(1).numpy())) for one in (photo, relit)]
+        uniform_scale = sums[0] / max(4 * sums[1], 1e-6)
         if chromas is None:
             return WhiteBalance(torch.ones(3), torch.zeros(2), uniform_scale, white=white)
         of_relit, of_photo = chromas

@@ -90,7 +90,7 @@ def test_under_its_own_light_the_photo_comes_back_and_no_face_is_seen_through_wh
     height, width = shown.size_px
     half = np.tile(np.arange(width) < width // 2, (height, 1))
     shown._covered = (~half)[None].astype(np.float32)
-    share = shown._face_share(shown.view.window)
+    share = shown._face_weight(shown.view.window)
     np.testing.assert_array_equal(share, shown.view.mask.numpy() * half[shown.view.window])
 
 
