@@ -90,9 +90,7 @@ class SmoothedFrame:
     head: Head  # without skin that is covered
     light: RigLight  # of the whole shot
     segmentation: Segmentation
-    portrait: tuple[
-        tuple[SeenPerson, PortraitMaps], ...
-    ] = ()  # for the portrait field: each view and its maps
+    portrait: tuple[tuple[SeenPerson, PortraitMaps], ...] = ()  # each view and its maps
     balance: WhiteBalance | None = None  # of the whole shot
 
 
@@ -255,14 +253,10 @@ class PortraitView:
         images = []
         for number in range(len(self.person.eyes.irises_px)):
             shadows, places = self.person.around_iris(number)
-            maps = PortraitMaps(
-                *(
-                    F.grid_sample(part, places[None], "bilinear", "border", align_corners=False)
-                    for part in self.maps
-                )
-            )
+            grid = places[None]
+            parts = [F.grid_sample(x, grid, padding_mode="border", align_corners=False) for x in self.maps]
             toward, weights = lights.arriving(torch.from_numpy(shadows.origins.mean(0)), centre_m)
-            *_, irradiance = maps.shaded(toward[None], shadows.along(toward)[None])
+            *_, irradiance = PortraitMaps(*parts).shaded(toward[None], shadows.along(toward)[None])
             images.append(mirrored_in_cornea(toward, weights, irradiance[0].mean((1, 2))))
         return torch.stack(images, 1) if images else torch.zeros(len(lights.weights), 0, 3, 1, 1)
 
