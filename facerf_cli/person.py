@@ -296,7 +296,7 @@ class Person:
 
     @cached_property
     def light(self) -> Light:
-        """The photo's light, estimated over a rig of 150 lights."""
+        """Light of the photo, estimated over a rig of 150 lights."""
         return self.estimate_light()
 
     @property
@@ -327,7 +327,7 @@ class Person:
 
     @property
     def landmarks(self) -> Array:
-        """The 68 landmarks [68, 2] in pixels of the photo, with pixel centres at index + 0.5."""
+        """Landmarks [68, 2] in pixels of the photo, with pixel centres at index + 0.5."""
         return self._to_caller_type(self.head.fit.crop.to_photo(self.head.landmarks_px))
 
     @property
@@ -340,7 +340,7 @@ class Person:
 
     @property
     def mesh(self) -> "trimesh.Trimesh":
-        """The fitted, textured face in the head's frame, in metres: `.vertices` [V, 3], `.export(path)`."""
+        """Fitted, textured face in the head's frame, in metres: `.vertices` [V, 3], `.export(path)`."""
         import trimesh  # takes as long as all other imports of a relight together
         from PIL import Image
 
@@ -537,7 +537,7 @@ class Group:
 
     @cached_property
     def prepared(self) -> PeopleInPhoto:
-        """The people in their photo, ready to be relit by any number of lights."""
+        """People in their photo, ready to be relit by any number of lights."""
         nearest_first = sorted(self.people, key=lambda person: -person.head.fit.crop.side_px)
         with torch.no_grad():
             return PeopleInPhoto([person.in_photo() for person in nearest_first])

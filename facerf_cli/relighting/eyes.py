@@ -162,7 +162,7 @@ def mirrored_in_cornea(directions: Tensor, weights: Tensor, visible: Tensor) -> 
 
 @dataclass(frozen=True, eq=False)
 class _Iris:
-    """A window of the photo that contains an iris."""
+    """Window of the photo that contains an iris."""
 
     number: int  # among the person's irises
     window: Window
@@ -174,7 +174,7 @@ class _Iris:
 
 
 class Eyes:
-    """The irises of a person, as far as they are visible between the lids in a photo [H, W, 3]."""
+    """Irises of a person, as far as they are visible between the lids in a photo [H, W, 3]."""
 
     def __init__(self, photo: Rows, eyes: SeenEyes, size_px: tuple[int, ...]) -> None:
         every = (_iris(photo, eyes, number, size_px) for number in range(len(eyes.irises_px)))

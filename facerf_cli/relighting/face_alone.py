@@ -103,7 +103,7 @@ class FaceAlone(Relightable):
 
 
 class FaceInPhoto:
-    """A face with the photo's detail, blended into its photo [H, W, 3] by the mask of the face.
+    """Face with the photo's detail, blended into its photo [H, W, 3] by the mask of the face.
 
     Used if the reflectance covers only the face: the paper's field and the comparison models. `matte` [H, W]
     is the person's alpha.

@@ -1,4 +1,4 @@
-"""The face model and the trained networks, loaded on first use onto their device."""
+"""Face model and trained networks, loaded on first use onto their device."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +39,7 @@ class Sides:
 
 
 class Networks:
-    """The trained networks by name. Each is loaded on first access and kept on the device.
+    """Trained networks by name. Each is loaded on first access and kept on the device.
 
     `custom` networks replace those in files. Accessing a network raises InputError if its file is damaged or
     from another version.
@@ -84,7 +84,7 @@ class Networks:
             getattr(self, name)
 
     def with_networks(self, **networks: nn.Module) -> "Networks":
-        """Return a copy in which some networks are replaced."""
+        """Return a copy with some networks replaced."""
         loaded = {name: network for name, network in vars(self).items() if name in SHIPPED}
         return Networks(self.files, self.device, {**loaded, **networks})
 
@@ -121,7 +121,7 @@ SHIPPED_NETWORKS = Networks()  # on the CPU; the networks of a command are in it
 
 @dataclass(frozen=True)
 class Models:
-    """The face model, on the CPU like all geometry, and the trained networks on their device."""
+    """Face model, on the CPU like all geometry, and trained networks on their device."""
 
     face: MorphableModel
     networks: Networks
@@ -138,7 +138,7 @@ class Models:
         return self.networks.files[network].stem
 
     def with_networks(self, **networks: nn.Module) -> "Models":
-        """Return a copy in which some networks are replaced."""
+        """Return a copy with some networks replaced."""
         return replace(self, networks=self.networks.with_networks(**networks))
 
     def sides(self, texture_side: int | None = None) -> Sides:

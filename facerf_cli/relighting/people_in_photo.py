@@ -101,7 +101,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class PersonLight:
-    """A person under one sum of lights, with everything computed that does not depend on rows."""
+    """Person under one sum of lights, with everything computed that does not depend on rows."""
 
     views: list[Maps]
     face: Tensor
@@ -111,7 +111,7 @@ class PersonLight:
 
 
 class PersonInPhoto:
-    """A person in its photo [H, W, 3]; `matte` [H, W] is the alpha of the part that is relit."""
+    """Person in its photo [H, W, 3]; `matte` [H, W] is the alpha of the part that is relit."""
 
     def __init__(
         self, model: MorphableModel, photo: np.ndarray, head: Head, field: PortraitField, matte: np.ndarray

@@ -77,7 +77,7 @@ class PersonShading:
 
     @property
     def with_rear_merged(self) -> "PersonShading":
-        """A copy with the rear light added to shading and specular."""
+        """Copy with the rear light added to shading and specular."""
         shading, specular = torch.chunk(self.rear, 2, -3)
         nothing = torch.zeros_like(self.rear)
         return PersonShading(self.shading + shading, self.specular + specular, self.visibility, nothing)
@@ -85,7 +85,7 @@ class PersonShading:
 
 @dataclass(frozen=True, eq=False)
 class SmoothedFrame:
-    """A person in one frame of a shot, smoothed over neighbouring frames."""
+    """Person in one frame of a shot, smoothed over neighbouring frames."""
 
     head: Head  # without skin that is covered
     light: RigLight  # of the whole shot

@@ -51,7 +51,7 @@ class RenderRequest:
 
 
 class Relightable(ABC):
-    """A subject that can be relit in a frame."""
+    """Subject that can be relit in a frame."""
 
     keeps_photo = False  # True if the photo's own background stays behind the subject
 
@@ -67,7 +67,7 @@ class Relightable(ABC):
 
     @property
     def person_matte(self) -> np.ndarray | None:
-        """The matte that images contain as a layer; None for only a face."""
+        """Matte that images contain as a layer; None for only a face."""
         return None
 
     @property

@@ -1,4 +1,4 @@
-"""One person through the frames of a shot: one identity, one light, and temporally smoothed maps.
+"""Follow one person through the frames of a shot: one identity, one light, and temporally smoothed maps.
 
 Maps are smoothed by a bilateral filter along time (Tomasi and Manduchi, *Bilateral filtering for gray and
 color images*, 1998): a neighbouring frame contributes to a pixel to the extent that its image looks the same
@@ -88,7 +88,7 @@ def identity_of(
 
 
 class OnePerson:
-    """A person of known identity alpha [Ki] in frames of a size (height, width)."""
+    """Person of known identity alpha [Ki] in frames of a size (height, width)."""
 
     def __init__(self, model: MorphableModel, alpha: Tensor, size_px: tuple[int, int], crop_px: int) -> None:
         self._alpha, self._size_px, self._crop_px = alpha, size_px, crop_px
@@ -119,7 +119,7 @@ class _FrameObservation:
 
 
 class SteadyShot:
-    """A person through the frames of a shot, each frame smoothed with its neighbours.
+    """Person through the frames of a shot, each frame smoothed with its neighbours.
 
     Observations are kept only for frames near the last requested one, so networks run once per frame if
     frames are requested in order. Results for the whole shot are computed on first use and kept.

@@ -59,7 +59,7 @@ _SIZES = (0.6, 1.7)  # range of the change of its size meanwhile
 
 @dataclass(frozen=True, eq=False)
 class Sighting:
-    """A face in one frame."""
+    """Face in one frame."""
 
     landmarks_px: np.ndarray  # [68, 2]
     error: float  # median expected error of the landmarks, in their extents

@@ -199,7 +199,7 @@ class Rims:
 
 
 class UpsampledView:
-    """The person of a view under sums of lights, at the resolution of the photo [H, W, 3]."""
+    """Person of a view under sums of lights, at the resolution of the photo [H, W, 3]."""
 
     def __init__(self, view: PortraitView) -> None:
         self._view = view
