@@ -496,22 +496,22 @@ class Person:
             return self._to_caller_type(people.rendered(RenderRequest(relit, layers=[name]))[name])
 
 
-@dataclass(frozen=True, eq=False)
 class Group:
     """People in one photo, who are relit together.
 
-    Attributes:
+    Args:
         people: Results of `fit`, all for the same photo.
     """
 
-    people: Sequence[Person]
-
-    def __post_init__(self) -> None:
-        photos = [person.photo for person in self.people if person.photo is not None]
-        if not photos or len(photos) < len(self.people):
+    def __init__(self, people: Sequence[Person]) -> None:
+        photos = [person.photo for person in people if person.photo is not None]
+        if not photos or len(photos) < len(people):
             raise ValueError("people: pass at least one person, each fitted in a photo")
         if any(photo is not photos[0] and not np.array_equal(photo, photos[0]) for photo in photos):
             raise ValueError("people: come from different photos; pass people of one photo")
+        self.people, nearest_first = people, sorted(people, key=lambda person: -person.head.fit.crop.side_px)
+        with torch.no_grad():
+            self.prepared = PeopleInPhoto([person.in_photo() for person in nearest_first])
 
     def relight(
         self,
@@ -534,13 +534,6 @@ class Group:
     def matte(self) -> Array:
         """Alpha [H, W] of all people."""
         return self.people[0]._to_caller_type(self.prepared.matte)
-
-    @cached_property
-    def prepared(self) -> PeopleInPhoto:
-        """People in their photo, ready to be relit by any number of lights."""
-        nearest_first = sorted(self.people, key=lambda person: -person.head.fit.crop.side_px)
-        with torch.no_grad():
-            return PeopleInPhoto([person.in_photo() for person in nearest_first])
 
     def _images(
         self, lights: Sequence[Light], background: Background, layers: Sequence[str]
