@@ -205,10 +205,16 @@ class PortraitView:
             batch = slice(first, first + _LIGHTS_AT_ONCE)
             unshadowed = irradiance[batch]
             visible = self.person.shadows.toward(points.places_m[batch])
-            maps = (unshadowed * one for one in self._single_lights(toward[batch], visible))
-            part = weights[:, None].expand(-1, len(unshadowed), -1)
-            along = toward[batch].permute(0, 3, 1, 2)
-            yield _LightBatch(*maps, unshadowed, part, rear.expand(len(unshadowed)), along)
+            shading, specular, visibility = self._single_lights(toward[batch], visible)
+            yield _LightBatch(
+                shading=unshadowed * shading,
+                specular=unshadowed * specular,
+                irradiance=unshadowed * visibility,
+                unshadowed=unshadowed,
+                weights=weights[:, None].expand(-1, len(unshadowed), -1),
+                rear=rear.expand(len(unshadowed)),
+                toward=toward[batch].permute(0, 3, 1, 2),
+            )
 
     def shade(
         self, directions: Tensor, weights: Tensor, near: Sequence[tuple[PointLights, Tensor]] = ()

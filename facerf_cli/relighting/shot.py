@@ -152,6 +152,11 @@ class SteadyShot:
         head = self._key_heads.get(frame) or self._head(frame)
         return SmoothedFrame(head, light, self._segmentation(frame), views, balance)
 
+    def segmentation(self, frame: int) -> Segmentation:
+        """Segment the person in a frame, from the classes of its neighbours."""
+        self._keep_near(frame)
+        return self._segmentation(frame)
+
     def landmarks_px(self, frame: int) -> np.ndarray:
         """Return the smoothed landmarks [68, 2] in a frame; raises InputError if the face is lost."""
         if frame not in self._tracked:

@@ -112,8 +112,7 @@ def seen(count: int) -> list[Sighting | None]:
 
 def first_class(view: SteadyShot, frame: int) -> float:
     """Return the mean number of the frames that a frame's classes are averaged over."""
-    view._keep_near(frame)
-    return float(view._segmentation(frame).classes[0].mean()) * 1000
+    return float(view.segmentation(frame).classes[0].mean()) * 1000
 
 
 def test_each_frame_is_looked_at_once_and_little_is_kept(monkeypatch: Patch) -> None:
@@ -121,7 +120,7 @@ def test_each_frame_is_looked_at_once_and_little_is_kept(monkeypatch: Patch) -> 
     view, most = view_of(watched, seen(FRAMES)), 0
     gc.freeze()  # what was there before is not looked through each time
     for frame in range(FRAMES):
-        first_class(view, frame)
+        view.segmentation(frame)
         gc.collect()
         most = max(most, sum(held() is not None for held in watched.held))
     gc.unfreeze()
@@ -134,7 +133,7 @@ def test_a_frame_is_the_mean_of_both_sides_and_of_none_beyond_a_lost_face(monkey
     assert first_class(view, 10) == pytest.approx(10, abs=1e-3)
     assert first_class(view, 19) < 19 - 0.3  # frames after it are lost
     assert first_class(view, 20 + LONGEST_GAP + 1) > 20 + LONGEST_GAP + 1.3
-    refused(InputError, "frame 25:", view.landmarks_px, 25)
+    refused(InputError, "frame 25:", view.segmentation, 25)
 
 
 def test_key_frames_are_those_that_show_the_face(monkeypatch: Patch) -> None:
