@@ -177,14 +177,14 @@ class PortraitView:
         return self._with_albedo(balance.gains(uniform, person.image, person.classes))
 
     def _single_lights(self, lights: Tensor, visible: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return shading, specular and irradiance [l, S, S] of single lights, given their visibility.
+        """Return shading, specular and visibility [l, S, S] of single lights, given the proxy's visibility.
 
         Lights of rgb 1 are directions [l, 3], or [l, S, S, 3] per pixel.
         """
         size = self.person.image.shape[1:]
         wide = F.interpolate(visible[None], size=size, mode="bilinear", align_corners=False)
-        shading, specular, irradiance = self.maps.shaded(lights[None], wide)
-        return shading[0], specular[0], irradiance[0]
+        shading, specular, visibility = self.maps.shaded(lights[None], wide)
+        return shading[0], specular[0], visibility[0]
 
     def _far(self, directions: Tensor, weights: Tensor) -> Iterator[_LightBatch]:
         used = shining(weights)
@@ -262,8 +262,8 @@ class PortraitView:
             grid = places[None]
             parts = [F.grid_sample(x, grid, padding_mode="border", align_corners=False) for x in self.maps]
             toward, weights = lights.arriving(torch.from_numpy(shadows.origins.mean(0)), centre_m)
-            *_, irradiance = PortraitMaps(*parts).shaded(toward[None], shadows.along(toward)[None])
-            images.append(mirrored_in_cornea(toward, weights, irradiance[0].mean((1, 2))))
+            *_, visibility = PortraitMaps(*parts).shaded(toward[None], shadows.along(toward)[None])
+            images.append(mirrored_in_cornea(toward, weights, visibility[0].mean((1, 2))))
         return torch.stack(images, 1) if images else torch.zeros(len(lights.weights), 0, 3, 1, 1)
 
     def render(self, shading: PersonShading) -> Tensor:
