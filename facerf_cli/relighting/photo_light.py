@@ -21,9 +21,9 @@ from facerf_cli.light.envmap import lights_around
 from facerf_cli.light.estimate import (
     LightEvidence,
     RefinedLight,
-    estimate_lamps,
+    estimate_key_light,
     joined,
-    lamp_error,
+    key_light_error,
     refine_light,
 )
 from facerf_cli.light.sphere import RigLight, rig_directions
@@ -122,9 +122,7 @@ def _estimated(frames: Sequence[_Frame]) -> RigLight:
     lamp = _lamp(frames)
     pairs = [(torch.cat([one.under(lamp), one.around]), one) for one in frames]
     olats = torch.cat([one.seen(olats) for olats, one in pairs], -1)
-    return RigLight(
-        torch.cat([lamp, rig_directions(_AROUND)]), estimate_lamps(olats, _photo(frames), len(lamp))
-    )
+    return RigLight(torch.cat([lamp, rig_directions(_AROUND)]), estimate_key_light(olats, _photo(frames)))
 
 
 def _lamp(frames: Sequence[_Frame]) -> Tensor:
@@ -135,7 +133,7 @@ def _lamp(frames: Sequence[_Frame]) -> Tensor:
     def errors(olats: Sequence[Tensor]) -> list[float]:
         """Errors of lamps, given their OLATs [l, 3, t, t] of each frame."""
         lamps = torch.cat([one.seen(of_one.mean(1)) for of_one, one in zip(olats, frames, strict=True)], -1)
-        return [lamp_error(lamp, around, photo) for lamp in lamps]
+        return [key_light_error(lamp, around, photo) for lamp in lamps]
 
     if not len(photo):  # nothing is visible enough
         return rig_directions(_AROUND)[:1]
