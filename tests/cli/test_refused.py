@@ -85,7 +85,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--matte-from rembg:u2net": "No such option: --matte-from ... pass --person",
         "--ocio who.csv": "Error reading OCIO config",
         "--ocio missing.ocio": "--ocio missing.ocio: no such file; give",
-        "--lights 0": "give 1 to 4096",
+        "--lights 0": "use 1 to 4096",
         "--texture-size 100": "give a multiple of 256",
         "--envmap-sampling best": "'best' is not one of 'cell'",
         "--background-blur nan": "--background-blur",
@@ -119,7 +119,7 @@ WRONG: dict[str, dict[str, str]] = {
         "-o a.jpg": "-o a.jpg: is ",
     },
     "predict-olat a.jpg": {
-        "--lights 0": "give 1 to 4096",
+        "--lights 0": "use 1 to 4096",
         "--lights few": "no such file; pass a number",
         "--lights 1,nan": "numbers separated by commas",
         "--pose 10,20": "--pose",

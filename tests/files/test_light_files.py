@@ -49,7 +49,7 @@ def test_a_light_comes_back_from_plain_json(tmp_path: Path) -> None:
 
 BAD: dict[str, dict[str, Any]] = {
     "format is ... facerf-light-1": {"format": "other"},
-    "directions is missing": {"directions": None},
+    "no 'directions'; add it": {"directions": None},
     "2 directions but 1 weights": {"weights": [[1, 1, 1]]},
     "directions that are unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
     "weights is ... rows of 3": {"weights": [[1, 1, 1], [1, 1]]},

@@ -171,7 +171,7 @@ def test_broken_pixels_are_counted() -> None:
     envmap = torch.zeros(4, 8, 3)
     check_envmap(envmap)
     envmap[1, 2, 0], envmap[3, 3] = torch.nan, torch.inf
-    refused(InputError, "2 pixels", check_envmap, envmap)
+    refused(InputError, "2 NaN", check_envmap, envmap)
 
 
 def _sun(rotations_deg: list[float], lights: int, sampling: Sampling) -> torch.Tensor:

@@ -96,7 +96,7 @@ def test_a_rotation_carries_each_direction_with_it() -> None:
 
 
 def test_what_is_no_order_is_said() -> None:
-    refused(InputError, "from 0 to 20", sh_basis, unit_vectors(1), 21)
+    refused(InputError, "use 0 to 20", sh_basis, unit_vectors(1), 21)
     refused(InputError, "8 spherical-harmonic", order_of, torch.zeros(8, 3))
     assert order_of(torch.zeros(16, 3)) == 3
 

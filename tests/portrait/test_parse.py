@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.portrait.parse import LANDMARKS, MIRROR, MORE_LANDMARKS, Square, mirrored_landmarks, uncovered
+from facerf_cli.portrait.parse import LANDMARKS, MIRROR, MORE_LANDMARKS, Square, uncovered
 from tests.portrait.seen import places, seen_of
 
 
@@ -42,7 +42,7 @@ def test_positive_turns_borders_and_large_photos() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (512, 512, 3)).astype(np.uint8)
     cut = Square(256.0, 256.0, 512.0).cut(noise, 16).numpy()
     assert cut.std() < 0.02 and abs(cut.mean() - 0.5) < 0.01
-    mirror = np.array(mirrored_landmarks())
+    mirror = MIRROR[68:] - 68
     assert (mirror[mirror] == np.arange(len(mirror))).all()
     names = dict(zip(MORE_LANDMARKS, (MORE_LANDMARKS[k] for k in mirror), strict=True))
     assert names["left ear lobe"] == "right ear lobe" and names["right iris"] == "left iris"

@@ -12,8 +12,8 @@ from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.image.strips import in_strips
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait import segment as module
+from facerf_cli.portrait.matte import HeadPlace
 from facerf_cli.portrait.parse import CLASSES, LANDMARKS, MORE_LANDMARKS, Square, SquareView, class_index
-from facerf_cli.portrait.people import HeadPlace
 from facerf_cli.portrait.segment import Segmentation, segment, with_cloth, with_ears
 from tests.portrait.seen import places, seen_of, white_people
 

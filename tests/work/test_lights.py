@@ -110,7 +110,7 @@ def test_wrong_lamps(text: str) -> None:
 
 def test_a_rig_out_of_range_and_a_light_given_twice(tmp_path: Path) -> None:
     (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
-    refused(UsageError, "rig.txt: ... give -90", parse_lights, str(tmp_path / "rig.txt"))
+    refused(UsageError, "rig.txt: ... use -90", parse_lights, str(tmp_path / "rig.txt"))
     refused(UsageError, "once", collect_setups, LightSources(light=["1,2", "1.0,2"]), Path("out"))
 
 
