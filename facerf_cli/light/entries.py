@@ -300,7 +300,8 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     places: list[tuple[str | None, str | None]] = []
     for key, value in _pairs(text):
         if key is None or key not in ("name", *KEYS, *_REMOVED):
-            if not _is_place(value):
+            is_known = value in (*WORDS, *preset_names()) or value.endswith(".toml")
+            if not is_known and "," not in value:
                 part = value if key is None else f"{key}={value}"
                 known = f"AZ,EL, a rig file (.toml) or one of {', '.join((*preset_names(), *WORDS))}"
                 known += f"; keys: {', '.join(KEYS)}"
@@ -321,7 +322,11 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
         (word if name is None and (word := place or settings.get("from")) in (OWN, EVEN) else name, place)
         for name, place in places
     ]
-    lights = [_light(settings, name, place) for name, place in places]
+    lights = []
+    for name, place in places:
+        is_rig = place is not None and (place in preset_names() or place.endswith(".toml"))
+        fields = settings if place is None or is_rig else {"from": place, **settings}
+        lights.append(light_by_keys(fields, "--light", name, _rig(place) if place and is_rig else None))
     if len({bool(light.names) for light in lights}) > 1:
         raise UsageError(f"{where} only some lights have names; name all of them (key=40,20) or none")
     if any(name is not None for name, _ in places):
@@ -329,14 +334,6 @@ def _entry(text: str) -> tuple[list[LitImage], str | None]:
     if settings:
         return lights, "light_" + re.sub(r"[^A-Za-z0-9.+-]+", "_", text).strip("_")
     return lights, lights[0].name if lights[0].names else "light_" + "+".join(light.name for light in lights)
-
-
-def _light(settings: Mapping[str, str], name: str | None, place: str | None) -> LitImage:
-    if place is None:
-        return light_by_keys(settings, "--light", name)
-    if place in preset_names() or place.endswith(".toml"):
-        return light_by_keys(settings, "--light", name, _rig(place))
-    return light_by_keys({"from": place, **settings}, "--light", name)
 
 
 def _pairs(text: str) -> list[tuple[str | None, str]]:
@@ -347,10 +344,6 @@ def _pairs(text: str) -> list[tuple[str | None, str]]:
     if any("=" in value for *_, value in parts):
         raise UsageError(f"--light {text!r}: separate keys by semicolons; use 'from=60,10;stops=1'")
     return [(key.strip(), value.strip()) if equals else (None, key.strip()) for key, equals, value in parts]
-
-
-def _is_place(value: str) -> bool:
-    return "," in value or value in WORDS or value in preset_names() or value.endswith(".toml")
 
 
 def preset_names() -> tuple[str, ...]:

@@ -77,7 +77,12 @@ def rotated_weights(
 ) -> Tensor:
     """Compute `envmap_weights` for several rotations: [R, L, 3]."""
     if sampling == "paper":
-        return torch.stack([_pixel_weights(envmap, directions, rotation) for rotation in rotations_deg])
+        envmap, uv = torch.as_tensor(envmap), direction_to_uv(directions.double())
+        height, width = envmap.shape[:2]
+        row = (uv[:, 1] * height).long().clamp(0, height - 1)
+        columns = [((uv[:, 0] + degrees / 360) * width).floor().long() % width for degrees in rotations_deg]
+        pixels = torch.stack([envmap[row, column] for column in columns])
+        return (pixels.double() * (4 / len(directions))).float()
     height = cell_rows(len(directions))
     if sampling == "smooth":
         texels = latlong_directions(height, 2 * height, torch.float64).reshape(-1, 3)
@@ -156,15 +161,6 @@ def _row_edges(height: int) -> Tensor:
     return (math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)).sin()
 
 
-def _pixel_weights(envmap: Tensor, directions: Tensor, rotate_deg: float) -> Tensor:
-    envmap = torch.as_tensor(envmap)
-    height, width = envmap.shape[:2]
-    uv = direction_to_uv(directions.double())
-    column = ((uv[:, 0] + rotate_deg / 360) * width).floor().long() % width
-    row = (uv[:, 1] * height).long().clamp(0, height - 1)
-    return (envmap[row, column].double() * (4 / len(directions))).float()
-
-
 def ball(
     envmap: Tensor, side_px: int, kind: Literal["mirror", "diffuse"] = "mirror", rotate_deg: float = 0.0
 ) -> Tensor:
@@ -183,7 +179,11 @@ def ball(
         reflected = 2 * normals[inside][:, 2:] * normals[inside] - toward_camera
         radiance[inside] = look_up(mean_radiance(envmap, 2 * side_px, rotate_deg), reflected)
     else:
-        radiance[inside] = look_up(_irradiance(envmap, rotate_deg) / math.pi, normals[inside])
+        facing = latlong_directions(_IRRADIANCE_ROWS, 2 * _IRRADIANCE_ROWS)
+        sources = latlong_directions(_SOURCE_ROWS, 2 * _SOURCE_ROWS).reshape(-1, 3)
+        power = texel_integrals(envmap, _SOURCE_ROWS, 2 * _SOURCE_ROWS, rotate_deg).reshape(-1, 3).float()
+        irradiance = (facing @ sources.T).clamp(min=0) @ power
+        radiance[inside] = look_up(irradiance / math.pi, normals[inside])
     return F.avg_pool2d(radiance.permute(2, 0, 1), _BALL_SAMPLES).permute(1, 2, 0)
 
 
@@ -206,14 +206,6 @@ def resampled(envmap: Tensor, height: int, rotate_deg: float = 0.0) -> Tensor:
 def mean_radiance(envmap: Tensor, most_rows: int, rotate_deg: float) -> Tensor:
     """Rotate a map and, against aliasing, average it to at most `most_rows` rows [h, 2 h, 3]."""
     return resampled(envmap, min(most_rows, len(envmap)), rotate_deg)
-
-
-def _irradiance(envmap: Tensor, rotate_deg: float) -> Tensor:
-    """Return irradiance as a small lat-long map [h, 2 h, 3] over the direction of the normal."""
-    normals = latlong_directions(_IRRADIANCE_ROWS, 2 * _IRRADIANCE_ROWS)
-    sources = latlong_directions(_SOURCE_ROWS, 2 * _SOURCE_ROWS).reshape(-1, 3)
-    power = texel_integrals(envmap, _SOURCE_ROWS, 2 * _SOURCE_ROWS, rotate_deg).reshape(-1, 3).float()
-    return (normals @ sources.T).clamp(min=0) @ power
 
 
 def rig_triangles(lights: np.ndarray) -> np.ndarray:

@@ -56,33 +56,24 @@ def light_of_picture(picture: Tensor, fov_deg: float = FOV_DEG) -> PictureLight:
         raise ValueError(f"the angle of view is {fov_deg:g} degrees; use 1 to 170")
     height, width = picture.shape[:2]
     half_width = math.tan(math.radians(fov_deg / 2))
-    tangents = torch.tensor([[half_width, half_width * height / width]])
+    tangents = torch.tensor([half_width, half_width * height / width])
     pixels = picture.permute(2, 0, 1)[None].float().clamp_min(0)
     directions = latlong_directions(_MAP_ROWS, 2 * _MAP_ROWS)
-    guess, log_error = network()(
-        F.interpolate(pixels.clamp_max(1), (ROWS, COLUMNS), mode="area"), tangents, directions
-    )
-    known, inside = _reprojected(pixels, tangents[0], directions)
-    return PictureLight(torch.lerp(_less_coloured(guess[0]), known, inside), float(log_error.exp()))
+    network_input = F.interpolate(pixels.clamp_max(1), (ROWS, COLUMNS), mode="area")
+    (estimate,), log_error = network()(network_input, tangents[None], directions)
 
-
-def _less_coloured(envmap: Tensor) -> Tensor:
-    """Desaturate a map's mean colour, because part of an image's colour comes from the objects in it."""
-    solid_angles = latlong_solid_angles(*envmap.shape[:2])[..., None]
-    mean = (envmap * solid_angles).sum((0, 1))
+    # Part of an image's colour comes from the objects in it.
+    mean = (estimate * latlong_solid_angles(_MAP_ROWS, 2 * _MAP_ROWS)[..., None]).sum((0, 1))
     cast = mean / (mean @ mean.new_tensor(LUMINANCE))
-    return envmap * cast ** (_KEPT_COLOUR - 1)
+    estimate = estimate * cast ** (_KEPT_COLOUR - 1)
 
-
-def _reprojected(pixels: Tensor, tangents: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Sample an image [1, 3, h, w] in directions [H, W, 3]; also return its weight [H, W, 1], 0 outside."""
     x, y, z = directions.unbind(-1)
     at = torch.stack([x, -y], -1) / (-z[..., None]).clamp_min(1e-6) / tangents
     rows = max(1, round(float(tangents[1]) * _MAP_ROWS / math.pi * 2))
     small = F.interpolate(pixels, (rows, max(1, round(rows * float(tangents[0] / tangents[1])))), mode="area")
     known = F.grid_sample(small, at[None], padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
-    inside = ((1 - at.abs().amax(-1)) / _SEAM).clamp(0, 1) * (z < 0)
-    return known, inside[..., None]
+    weight = ((1 - at.abs().amax(-1)) / _SEAM).clamp(0, 1) * (z < 0)
+    return PictureLight(torch.lerp(estimate, known, weight[..., None]), float(log_error.exp()))
 
 
 class PictureLightNetwork(nn.Module):

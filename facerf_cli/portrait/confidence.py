@@ -112,13 +112,26 @@ def face_facts(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     """Measure a face in a scene-linear photo [H, W, 3]."""
     left, right = view.landmarks_px[list(OUTER_EYE_CORNERS)]
     extent_px = max(view.extent_px, 1e-6)
+    positions = unit_centres(_GRID).reshape(-1, 2)
+    positions = positions[in_hull(positions, view.square.to_share(view.landmarks_px[:68]))]
+    columns, rows = np.floor(view.square.to_photo(positions)).astype(int).T
+    height, width = photo.shape[:2]
+    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+    right_px, down_px = (positions * view.classes.shape[-1]).astype(int)[inside].T
+    pixels = photo[rows[inside], columns[inside]]
+    step = max(1, max(height, width) // 512)
+    white = _WHITE * float(photo[::step, ::step].max())
+    levels = to_display(pixels[None], display_ev(photo))[..., 1]
     return {
         "unclear": view.relative_error,
         "unsteady": view.unsteadiness,
         "small": extent_px,
         "blurred": view.sharpness,
         "turned": float(np.linalg.norm(right - left)) / extent_px,
-        **_facts_of_pixels(view, photo),
+        "covered": float(covering(view.classes)[down_px, right_px].mean()),
+        "cropped": 1 - float(inside.mean()),
+        "overexposed": float(((pixels >= white).sum(-1) >= 2).mean()),
+        "dark": float(len(np.unique(levels))),
     }
 
 
@@ -129,26 +142,6 @@ def in_hull(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     offset = np.einsum("ijk,jk->ij", across, corners)
     bounds = (across @ corners.T <= offset[..., None] + _ON_LINE).all(-1) & along.any(-1)
     return np.asarray((points @ across[bounds].T <= offset[bounds] + _ON_LINE).all(-1))
-
-
-def _facts_of_pixels(view: SquareView, photo: np.ndarray) -> dict[str, float]:
-    """Measure the pixels between the landmarks."""
-    positions = unit_centres(_GRID).reshape(-1, 2)
-    positions = positions[in_hull(positions, view.square.to_share(view.landmarks_px[:68]))]
-    columns, rows = np.floor(view.square.to_photo(positions)).astype(int).T
-    height, width = photo.shape[:2]
-    inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
-    right, down = (positions * view.classes.shape[-1]).astype(int).T
-    pixels = photo[rows[inside], columns[inside]]
-    step = max(1, max(height, width) // 512)
-    white = _WHITE * float(photo[::step, ::step].max())
-    levels = to_display(pixels[None], display_ev(photo))[..., 1]
-    return {
-        "covered": float(covering(view.classes)[down[inside], right[inside]].mean()),
-        "cropped": 1 - float(inside.mean()),
-        "overexposed": float(((pixels >= white).sum(-1) >= 2).mean()),
-        "dark": float(len(np.unique(levels))),
-    }
 
 
 def matte_facts(

@@ -59,7 +59,11 @@ class Correction:
         explained = torch.einsum("lc,lcij->cij", weights, olats)
         total = person.sum().clamp_min(1.0)
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
-        ratio = _ratio(photo, explained, floor)
+        ratio = (photo + floor) / (explained + floor).clamp_min(1e-9)
+        brightness = photo.mean(0, keepdim=True)
+        grey = (brightness + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
+        coloured = brightness**2 / (brightness**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
+        ratio = torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
         mean = float((explained.mean(0) * person).sum() / total)
         excess = blurred_within(ratio - 1, person, _BLUR_PX) * person
         plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
@@ -93,15 +97,6 @@ class Correction:
         allowed = brightness * (self.explained + self.floor)
         brighter = (grey + self.floor * brightness) / allowed.clamp_min(1e-9)
         return cosine.clamp(0, 1)[:, None, None] ** _SHARPNESS / brighter.clamp_min(1)
-
-
-def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
-    """Return Q [3, S, S], grey where the photo is so dark that its colour is noise."""
-    ratio = (photo + floor) / (explained + floor).clamp_min(1e-9)
-    brightness = photo.mean(0, keepdim=True)
-    grey = (brightness + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
-    coloured = brightness**2 / (brightness**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
-    return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:

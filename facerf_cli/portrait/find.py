@@ -8,7 +8,7 @@ face.
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -203,7 +203,10 @@ def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[S
                 score[likely],
                 strict=True,
             ):
-                boxes.append(_Box(_level(square, middle, float(size.max()), eyes), float(its_score)))
+                x_px, y_px = square.to_photo(middle)
+                side_px = _MESH_SIDES * float(size.max()) * square.side_px
+                level = Square(float(x_px), float(y_px), side_px, _turn_rad(square.to_photo(eyes)))
+                boxes.append(_Box(level, float(its_score)))
     return boxes
 
 
@@ -225,8 +228,7 @@ def mesh_in(network: StoredGraph, image_srgb: np.ndarray, square: Square) -> Fac
 
 def face_square(points_px: np.ndarray) -> Square:
     """Return the square, level with the eyes, in which to predict a mesh again from its points [478, 3]."""
-    left, right = points_px[list(_EYES), :2]
-    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    turn_rad = _turn_rad(points_px[list(_EYES), :2])
     level = Square(0.0, 0.0, 1.0, turn_rad)
     along = level.to_share(points_px[:468, :2])
     low, high = along.min(0), along.max(0)
@@ -234,12 +236,9 @@ def face_square(points_px: np.ndarray) -> Square:
     return Square(float(x_px), float(y_px), _MESH_SIDES * float((high - low).max()), turn_rad)
 
 
-def _level(square: Square, middle: np.ndarray, size: float, eyes: np.ndarray) -> Square:
-    """Return a face's square, level with its eyes [2, 2]; middle and eyes are in fractions of the input."""
-    left, right = square.to_photo(eyes)
-    x_px, y_px = square.to_photo(middle)
-    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    return Square(float(x_px), float(y_px), _MESH_SIDES * size * square.side_px, turn_rad)
+def _turn_rad(eyes_px: np.ndarray) -> float:
+    left, right = eyes_px
+    return -math.atan2(right[1] - left[1], right[0] - left[0])
 
 
 def distinct(proposed: list[_Proposed]) -> list[_Proposed]:
@@ -353,9 +352,16 @@ def detect_faces(people: PeopleNetworks, image_srgb: np.ndarray, everyone: bool 
     Rotated and small faces are searched only if no other is found, or for `everyone`.
     """
     check_display(image_srgb)
-    image_srgb = _brightened(image_srgb)
+    image_srgb, side_px = _brightened(image_srgb), float(max(image_srgb.shape[:2]))
+    attempts = [
+        first_squares(image_srgb),
+        [whole_photo(image_srgb, turn_rad) for turn_rad in _TURNS],
+        parts_of(image_srgb, side_px / 3),
+    ]
+    if side_px / 3 > _FINEST_PX:
+        attempts.append(parts_of(image_srgb, _FINEST_PX))
     meshes: list[FaceMesh] = []
-    for squares in _attempts(image_srgb):
+    for squares in attempts:
         meshes = distinct([*meshes, *find_meshes(people, image_srgb, squares)])
         if meshes and not everyone:
             break
@@ -404,16 +410,6 @@ def _brightened(image: np.ndarray) -> np.ndarray:
     return np.asarray((image * gain).clip(0, 255).astype(np.uint8))
 
 
-def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
-    """Yield the squares to search: the whole photo, then ever smaller parts of it."""
-    side_px = float(max(image.shape[:2]))
-    yield first_squares(image)
-    yield [whole_photo(image, turn_rad) for turn_rad in _TURNS]
-    yield parts_of(image, side_px / 3)
-    if side_px / 3 > _FINEST_PX:
-        yield parts_of(image, _FINEST_PX)
-
-
 def _face_of(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face | None:
     """Return the face of a mesh, or None if the Parsing Network finds no head there."""
     face, view = _looked_at(people, image, mesh.landmarks_px.astype(np.float64), mesh)
@@ -436,8 +432,7 @@ def _looked_at(
 
 
 def _around(face: np.ndarray) -> Square:
-    """Return the square that shows a face with landmarks [68, 2] large and upright."""
-    left, right = face[list(OUTER_EYE_CORNERS)]
-    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    upright = Square.around(face, _FACE_SIDES)
-    return replace(upright, side_px=max(upright.side_px, 1.0), turn_rad=turn_rad)
+    """Return the square in which a face with landmarks [68, 2] is large and upright."""
+    square = Square.around(face, _FACE_SIDES)
+    turn_rad = _turn_rad(face[list(OUTER_EYE_CORNERS)])
+    return replace(square, side_px=max(square.side_px, 1.0), turn_rad=turn_rad)

@@ -293,7 +293,15 @@ def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.n
     Fast guided filter (He et al., *Guided image filtering*, 2013; He and Sun, 2015): linear functions of the
     colour around each pixel are fitted at the small size and applied at the large one.
     """
-    maps = np.concatenate(local_lines(alpha[..., None], image, _REACH_PX, _SMOOTHNESS))
+    mean = partial(box_means, reach=_REACH_PX)
+    colour, value = mean(image), mean(alpha[..., None])
+    covariance, common = (
+        mean(image[..., :, None] * other[..., None, :]) - colour[..., :, None] * of_other[..., None, :]
+        for other, of_other in ((image, colour), (alpha[..., None], value))
+    )
+    slope = np.linalg.solve(covariance + _SMOOTHNESS * np.eye(3, dtype=np.float32), common)  # [h, w, 3, 1]
+    offset = value - (slope * colour[..., None]).sum(-2)
+    maps = np.concatenate([mean(slope)[..., 0], mean(offset)], -1).transpose(2, 0, 1)
     size = photo_srgb.shape[:2]
     lifted = np.empty(size, np.float32)
     for rows in strips(size):
@@ -301,24 +309,6 @@ def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.n
         colours = photo_srgb[rows].transpose(2, 0, 1) / np.float32(255)
         lifted[rows] = ((lines[:3] * colours).sum(0) + lines[3]).clip(0, 1)
     return lifted
-
-
-def local_lines(
-    values: np.ndarray, guide: np.ndarray, reach: int, smoothness: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fit values [h, w, K] as linear functions of nearby colours: slopes [3 K, h, w], offsets [K, h, w].
-
-    `reach` is in pixels. Where the variance of the colours is below `smoothness`, values are smoothed.
-    """
-    mean = partial(box_means, reach=reach)
-    colour, value = mean(guide), mean(values)
-    covariance, common = (
-        mean(guide[..., :, None] * other[..., None, :]) - colour[..., :, None] * of_other[..., None, :]
-        for other, of_other in ((guide, colour), (values, value))
-    )
-    slope = np.linalg.solve(covariance + smoothness * np.eye(3, dtype=np.float32), common)  # [h, w, 3, K]
-    offset = value - (slope * colour[..., None]).sum(-2)
-    return mean(slope).transpose(3, 2, 0, 1).reshape(-1, *value.shape[:2]), mean(offset).transpose(2, 0, 1)
 
 
 def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:

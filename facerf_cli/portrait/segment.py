@@ -274,16 +274,14 @@ def _nearness(view: SquareView, places_px: np.ndarray) -> np.ndarray:
     for line in (view.landmarks_px[ear] for ear in _EAR_LINES):
         low, high = line.min(0) - _EAR_REACH * width_px, line.max(0) + _EAR_REACH * width_px
         around = ((places_px > low) & (places_px < high)).all(-1)
-        apart = np.min([_distance(places_px[around], *pair) for pair in pairwise(line)], 0)
-        near[around] = np.maximum(near[around], np.exp(-0.5 * (apart / width_px) ** 2))
+        distances_px = []
+        for start, end in pairwise(line):
+            along, offset = end - start, places_px[around] - start
+            fraction = ((offset @ along) / max(float(along @ along), 1e-9)).clip(0, 1)
+            distances_px.append(np.linalg.norm(offset - fraction[..., None] * along, axis=-1))
+        nearest_px = np.min(distances_px, 0)
+        near[around] = np.maximum(near[around], np.exp(-0.5 * (nearest_px / width_px) ** 2))
     return near
-
-
-def _distance(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the distance [N] of points [N, 2] from the segment between two points [2]."""
-    along = end - start
-    share = (((places - start) @ along) / max(float(along @ along), 1e-9)).clip(0, 1)
-    return np.asarray(np.linalg.norm(places - start - share[..., None] * along, axis=-1))
 
 
 def with_cloth(classes: Tensor, image: Tensor, head: HeadPlace) -> Tensor:

@@ -130,7 +130,10 @@ def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshe
     px = project(vertices, camera)
     in_front = (vertices[:, 2] < -NEAR_M) & px.isfinite().all(-1)
     corners_px = px[triangles]  # [F, 3, 2]
-    low, high = (_within(_first_centre(end), camera) for end in (corners_px.amin(1), corners_px.amax(1)))
+    ends = (_first_centre(end).unbind(-1) for end in (corners_px.amin(1), corners_px.amax(1)))
+    low, high = (
+        torch.stack([x.clamp(0, camera.width_px), y.clamp(0, camera.height_px)], -1) for x, y in ends
+    )
     a, b, c = corners_px.unbind(1)
     area2_px = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     covers = in_front[triangles].all(-1) & (high > low).all(-1) & (area2_px.abs() > _SLIVER_PX2)
@@ -140,12 +143,6 @@ def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshe
     inverse_depth = -1 / vertices[:, 2][triangles[keep]]
     first_px = keep * meshes // max(len(triangles), 1) * (camera.width_px * camera.height_px)
     return _Screen(keep, first_px, corners_px[keep], inverse_depth, first[:, 1], size[:, 1], size.prod(-1))
-
-
-def _within(px: Tensor, camera: Camera) -> Tensor:
-    """Clamp positions [..., 2] to the image."""
-    x, y = px.unbind(-1)
-    return torch.stack([x.clamp(0, camera.width_px), y.clamp(0, camera.height_px)], -1)
 
 
 def _first_centre(position_px: Tensor) -> Tensor:
