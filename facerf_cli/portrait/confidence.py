@@ -113,7 +113,7 @@ def face_facts(view: SquareView, photo: np.ndarray) -> dict[str, float]:
     left, right = view.landmarks_px[list(OUTER_EYE_CORNERS)]
     extent_px = max(view.extent_px, 1e-6)
     positions = unit_centres(_GRID).reshape(-1, 2)
-    positions = positions[in_hull(positions, view.square.to_share(view.landmarks_px[:68]))]
+    positions = positions[in_hull(positions, view.square.to_unit_square(view.landmarks_px[:68]))]
     columns, rows = np.floor(view.square.to_photo(positions)).astype(int).T
     height, width = photo.shape[:2]
     inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
@@ -186,7 +186,7 @@ def check_seen(view: SquareView) -> None:
     """Raise InputError if the landmarks of a view clearly lie where no face is visible."""
     classes = view.classes.numpy()
     side = classes.shape[-1]
-    x, y = (view.square.to_share(view.landmarks_px[17:68]) * side).astype(int).clip(0, side - 1).T
+    x, y = (view.square.to_unit_square(view.landmarks_px[17:68]) * side).astype(int).clip(0, side - 1).T
     if classes[[0, class_index("garment")]][:, y, x].sum(0).mean() > _ELSEWHERE:
         raise InputError(f"landmarks: they lie on background or clothes, not on a face; {_ADVICE}")
 
@@ -209,7 +209,7 @@ def given_matte_facts(view: SquareView, matte: np.ndarray) -> dict[str, float]:
     columns, rows = positions_px[inside].astype(int).T
     person = 1 - view.classes[0].numpy()[inside]
     face = (1 - covering(view.classes).numpy())[inside]
-    face = face * in_hull(positions[inside], view.square.to_share(view.landmarks_px[:68]))
+    face = face * in_hull(positions[inside], view.square.to_unit_square(view.landmarks_px[:68]))
     if face.sum() < 1:
         return {}  # no face is visible that the matte could exclude
     alpha = matte[rows, columns]

@@ -230,7 +230,7 @@ def face_square(points_px: np.ndarray) -> Square:
     """Return the square, level with the eyes, in which to predict a mesh again from its points [478, 3]."""
     turn_rad = _turn_rad(points_px[list(_EYES), :2])
     level = Square(0.0, 0.0, 1.0, turn_rad)
-    along = level.to_share(points_px[:468, :2])
+    along = level.to_unit_square(points_px[:468, :2])
     low, high = along.min(0), along.max(0)
     x_px, y_px = level.to_photo((low + high) / 2)
     return Square(float(x_px), float(y_px), _MESH_SIDES * float((high - low).max()), turn_rad)

@@ -112,10 +112,10 @@ def person_among(
     """
     if not _squares_around(head, image.shape):
         return parsed, parsed
-    anybody, body = person_share(people.person, image, head), body_share(people.body, image, head)
+    anybody, body = person_coverage(people.person, image, head), body_coverage(people.body, image, head)
     share = np.maximum(anybody, body * (1 - _below_eyes(body, head)) * _near(body, head))  # hats
     if others:
-        persons, bodies = zip(*(_shares_of(other, people, image) for other in others), strict=True)
+        persons, bodies = zip(*(_coverage_of(other, people, image) for other in others), strict=True)
         heads = [head, *(HeadPlace.of(other.landmarks_px) for other in others)]
         anybody = np.maximum.reduce([anybody, *persons])
         share = share * part_of_first([body, *bodies], heads, np.maximum(share, anybody), image)
@@ -124,11 +124,13 @@ def person_among(
     return np.asarray(share - lowered), anybody
 
 
-def _shares_of(other: OtherHead, people: PeopleNetworks, image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _coverage_of(
+    other: OtherHead, people: PeopleNetworks, image: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the coverage [h, w] of people and of another head's body; computed once per image."""
     if not other.seen or not np.array_equal(other.seen[0], image):
         head = HeadPlace.of(other.landmarks_px)
-        person, body = person_share(people.person, image, head), body_share(people.body, image, head)
+        person, body = person_coverage(people.person, image, head), body_coverage(people.body, image, head)
         other.seen[:] = image, person, body
     return other.seen[1], other.seen[2]
 
@@ -146,10 +148,10 @@ def matte_of(share: np.ndarray, image_srgb: np.ndarray, landmarks_px: np.ndarray
     expected, unknown = outline(whole, scaled)
     alpha = solve_matte(image, expected, unknown)
     alpha = solved_before_plain_background(alpha, srgb_to_linear(image))
-    return alpha if size == (height, width) else lifted(alpha, image, image_srgb)
+    return alpha if size == (height, width) else enlarge_matte(alpha, image, image_srgb)
 
 
-def person_share(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np.ndarray:
+def person_coverage(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np.ndarray:
     """Return the coverage [h, w] of people in an image [h, w, 3] in 0..1, from views around a head.
 
     Squares that reach beyond the photo show a close-up from further away, as in the network's training.
@@ -170,7 +172,7 @@ def person_share(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np
     return np.asarray((total / weights).numpy())
 
 
-def body_share(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np.ndarray:
+def body_coverage(network: StoredGraph, image: np.ndarray, head: HeadPlace) -> np.ndarray:
     """Return the coverage [h, w] of a head's body in an image [h, w, 3] in 0..1; 0 if no body is found.
 
     The first square follows from the head, the second from the hips and the circle around the body that the
@@ -287,7 +289,7 @@ def _squares_around(head: HeadPlace, shape: tuple[int, ...]) -> list[Square]:
     return squares
 
 
-def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.ndarray:
+def enlarge_matte(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.ndarray:
     """Enlarge a matte [h, w] to a photo [H, W, 3] uint8; `image` [h, w, 3] in 0..1 is the small photo.
 
     Fast guided filter (He et al., *Guided image filtering*, 2013; He and Sun, 2015): linear functions of the
@@ -303,12 +305,12 @@ def lifted(alpha: np.ndarray, image: np.ndarray, photo_srgb: np.ndarray) -> np.n
     offset = value - (slope * colour[..., None]).sum(-2)
     maps = np.concatenate([mean(slope)[..., 0], mean(offset)], -1).transpose(2, 0, 1)
     size = photo_srgb.shape[:2]
-    lifted = np.empty(size, np.float32)
+    matte = np.empty(size, np.float32)
     for rows in strips(size):
         lines = enlarged(maps, size, rows)
         colours = photo_srgb[rows].transpose(2, 0, 1) / np.float32(255)
-        lifted[rows] = ((lines[:3] * colours).sum(0) + lines[3]).clip(0, 1)
-    return lifted
+        matte[rows] = ((lines[:3] * colours).sum(0) + lines[3]).clip(0, 1)
+    return matte
 
 
 def solid(matte: np.ndarray, loose: np.ndarray) -> np.ndarray:

@@ -92,7 +92,7 @@ class Square:
         """Convert positions [..., 2], in fractions of the side from the corner, to the photo's pixels."""
         return (np.asarray(share) - 0.5) @ self._matrix.T + (self.x_px, self.y_px)
 
-    def to_share(self, photo_px: np.ndarray) -> np.ndarray:
+    def to_unit_square(self, photo_px: np.ndarray) -> np.ndarray:
         """Convert the photo's pixels [..., 2] to fractions of the side from the corner."""
         return (np.asarray(photo_px) - (self.x_px, self.y_px)) @ np.linalg.inv(self._matrix).T + 0.5
 
@@ -229,7 +229,7 @@ def uncovered(view: SquareView, crop: Crop) -> np.ndarray:
 
     Outside of the network's view it is 1.
     """
-    return _uncovered_at(view.classes, view.square.to_share(_positions_px(crop)))
+    return _uncovered_at(view.classes, view.square.to_unit_square(_positions_px(crop)))
 
 
 def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.ndarray:
@@ -239,7 +239,7 @@ def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.nd
 
 def uncovered_by(matte: np.ndarray, crop: Crop) -> np.ndarray:
     """Compute `uncovered` from a matte [H, W] of the photo: other people and things cover the face."""
-    return share_bare(1 - crop.apply(matte[..., None])[..., 0])
+    return uncovered_fraction(1 - crop.apply(matte[..., None])[..., 0])
 
 
 def _positions_px(crop: Crop) -> np.ndarray:
@@ -252,7 +252,7 @@ def _uncovered_at(classes: Tensor, positions: np.ndarray) -> np.ndarray:
     """Sample at positions [S, S, 2], in fractions of the width and height of classes [C, h, w]."""
     grid = torch.from_numpy(2 * positions - 1).float()[None]
     sampled = F.grid_sample(covering(classes)[None, None], grid, align_corners=False)[0, 0]
-    return share_bare(sampled.numpy())
+    return uncovered_fraction(sampled.numpy())
 
 
 def covering(classes: Tensor) -> Tensor:
@@ -261,7 +261,7 @@ def covering(classes: Tensor) -> Tensor:
     return classes[~of_face].sum(0).float()
 
 
-def share_bare(covered: np.ndarray) -> np.ndarray:
+def uncovered_fraction(covered: np.ndarray) -> np.ndarray:
     """Return the visibility in 0..1 of a face covered by a fraction of other things."""
     low, high = _COVERED
     return (1 - (covered - low) / (high - low)).clip(0, 1)

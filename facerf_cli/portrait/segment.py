@@ -132,7 +132,7 @@ def segment(
     return replace(segmentation, facts=matte_facts(anybody, 1 - classes[0].numpy(), small_matte, head))
 
 
-def seen_classes(
+def predicted_classes(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
     """Return only the classes [C, h, w] of `segment`, which sum to 1; `small` is the `small_image`."""

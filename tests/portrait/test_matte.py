@@ -8,7 +8,7 @@ from facerf_cli.face.head import OtherHead
 from facerf_cli.portrait.matte import (
     HeadPlace,
     PersonColours,
-    lifted,
+    enlarge_matte,
     matte_of,
     outline,
     part_of_first,
@@ -40,14 +40,14 @@ def photo_of(matte: np.ndarray) -> np.ndarray:
 
 def test_a_small_matte_gets_the_photos_edge_and_no_pattern_where_it_is_sure() -> None:
     true, small = disc(4 * SIDE), disc(SIDE)
-    large = lifted(small, photo_of(small) / np.float32(255), photo_of(true))
+    large = enlarge_matte(small, photo_of(small) / np.float32(255), photo_of(true))
     assert large.shape == true.shape
     plain = np.repeat(np.repeat(small, 4, 0), 4, 1)
     assert np.abs(large - true).mean() < 0.1 * np.abs(plain - true).mean()
     pattern = np.random.default_rng(0).integers(0, 256, (SIDE, SIDE, 3)).astype(np.uint8)
     for value in (0.0, 1.0):
         sure = np.full((SIDE, SIDE), value, np.float32)
-        assert (lifted(sure, pattern / np.float32(255), pattern) == value).all()
+        assert (enlarge_matte(sure, pattern / np.float32(255), pattern) == value).all()
 
 
 def test_skin_hides_the_background_and_ends_at_its_outline_and_hair_may_not() -> None:
@@ -217,12 +217,12 @@ def test_each_head_of_a_crowd_is_looked_at_twice_however_many_there_are(monkeypa
     """Once for its own person, and once for all the others; in another image it is looked at again."""
     looks: list[HeadPlace] = []
 
-    def person_share(network: object, image: np.ndarray, head: HeadPlace) -> np.ndarray:
+    def person_coverage(network: object, image: np.ndarray, head: HeadPlace) -> np.ndarray:
         looks.append(head)
         return circle(head.x_px, head.y_px, head.height_px).astype(np.float32)
 
-    monkeypatch.setattr("facerf_cli.portrait.matte.person_share", person_share)
-    monkeypatch.setattr("facerf_cli.portrait.matte.body_share", person_share)
+    monkeypatch.setattr("facerf_cli.portrait.matte.person_coverage", person_coverage)
+    monkeypatch.setattr("facerf_cli.portrait.matte.body_coverage", person_coverage)
     image, parsed = np.zeros((240, 320, 3), np.float32), np.ones((240, 320), np.float32)
     landmarks_px = [FACE + np.array([x, y]) for x in (-100, 0, 100) for y in (0, 110)]
     crowd = [OtherHead(0.5 * points) for points in landmarks_px]

@@ -27,7 +27,7 @@ def test_a_square_shows_what_lies_there(turn_deg: float, side_px: float) -> None
     inside = ((places > 8) & (places < [292, 192])).all(-1)
     assert np.abs(cut[0] - (places[..., 0] - 0.5) / 299)[inside].max() < 0.02
     assert np.abs(cut[1] - (places[..., 1] - 0.5) / 199)[inside].max() < 0.02
-    assert np.abs(square.to_share(places) - np.stack(np.meshgrid(at, at), -1)).max() < 1e-9
+    assert np.abs(square.to_unit_square(places) - np.stack(np.meshgrid(at, at), -1)).max() < 1e-9
 
 
 def test_positive_turns_borders_and_large_photos() -> None:
