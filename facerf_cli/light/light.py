@@ -433,23 +433,16 @@ def unit_directions(values: Any) -> Tensor:
 
 
 def linear_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> Tensor:
-    """Return scene-linear pixels [H, W, 3] or [H, W] on the CPU; raises ValueError for an invalid array."""
-    check_kind(name, pixels, shape)
-    linear = as_tensor(pixels)
-    check_finite(name, linear.detach().numpy())
-    return linear
+    """Return scene-linear pixels [H, W, 3] or [H, W] on the CPU; raises as `uncopied_pixels` does."""
+    uncopied_pixels(name, pixels, shape)
+    return as_tensor(pixels)
 
 
-def uncopied_pixels(name: str, photo: Array) -> np.ndarray:
-    """Return a photo's pixels [H, W, 3] without copying them; raises ValueError for an invalid array."""
-    check_kind(name, photo)
-    pixels = np.asarray(photo.detach().cpu() if isinstance(photo, Tensor) else photo, np.float32)
-    check_finite(name, pixels)
-    return pixels
+def uncopied_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> np.ndarray:
+    """Return pixels [H, W, 3] or [H, W] without copying them.
 
-
-def check_kind(name: str, pixels: Any, shape: str = "[H, W, 3]") -> None:
-    """Raise TypeError or ValueError if the pixels are not an array [H, W, 3] or [H, W] of floats."""
+    Raises TypeError or ValueError if they are not an array of finite floats of that shape.
+    """
     if not isinstance(pixels, np.ndarray | Tensor):
         kind = type(pixels).__name__
         raise TypeError(f"{name} is {kind}, not an array {shape}; read a file with read_image")
@@ -457,12 +450,10 @@ def check_kind(name: str, pixels: Any, shape: str = "[H, W, 3]") -> None:
         raise ValueError(f"{name} has shape {list(pixels.shape)}, not {shape}")
     if not (pixels.is_floating_point() if isinstance(pixels, Tensor) else pixels.dtype.kind == "f"):
         raise ValueError(f"{name} has type {pixels.dtype}; use scene-linear floats, as read_image returns")
-
-
-def check_finite(name: str, values: np.ndarray) -> None:
-    """Raise ValueError for NaN or infinite pixels."""
-    if not np.isfinite(values).all():
+    array = np.asarray(pixels.detach().cpu() if isinstance(pixels, Tensor) else pixels, np.float32)
+    if not np.isfinite(array).all():
         raise ValueError(f"{name} contains values that are not finite")
+    return array
 
 
 def one_of(choices: Any, name: str, value: str) -> None:
@@ -473,11 +464,8 @@ def one_of(choices: Any, name: str, value: str) -> None:
 
 def as_tensor(values: Any) -> Tensor:
     """Return a float32 tensor on the CPU; gradients flow to a tensor."""
-    return (
-        (values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32)))
-        .float()
-        .cpu()
-    )
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32))
+    return tensor.float().cpu()
 
 
 def _joined(one: Array, two: Array) -> Array:
