@@ -23,7 +23,7 @@ from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.confidence import check_seen, lie_on_one
-from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
+from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, unit_centres, whole_photo
 from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.run.threads import in_threads
 
@@ -71,11 +71,8 @@ class _Detector:
 
     def anchors(self) -> np.ndarray:
         """Return the middles [N, 2] of the anchors, in fractions of the input's side."""
-        middles = []
-        for cells, each in self.scales:
-            at = (np.arange(cells) + 0.5) / cells
-            middles.append(np.repeat(np.stack(np.meshgrid(at, at), -1).reshape(-1, 2), each, 0))
-        return np.concatenate(middles)
+        grids = (np.repeat(unit_centres(cells).reshape(-1, 2), each, 0) for cells, each in self.scales)
+        return np.concatenate([*grids])
 
 
 _NEAR = _Detector(128, ((16, 2), (8, 6)), 0.5)
