@@ -208,9 +208,9 @@ def test_what_cannot_be_used_is_said(person: facerf.Person) -> None:
     refused(ValueError, "photo has shape ... 200, 300", facerf.fit, models, np.zeros((200, 300), np.float32))
     refused(ValueError, "uint8", facerf.fit, models, np.zeros((200, 300, 3), np.uint8))
     refused(ValueError, "not finite", facerf.fit, models, np.full((200, 300, 3), np.nan, np.float32))
-    refused(TypeError, "read a file by read_image", facerf.fit, models, str(PHOTO))
+    refused(TypeError, "read a file with read_image", facerf.fit, models, str(PHOTO))
     refused(InputError, "twice as wide as high", person.relight, np.ones((30, 40, 3), np.float32))
-    refused(ValueError, "room is 'none', not a share from 0 to 1", person.relight, KEY, room="none")
+    refused(ValueError, "room is 'none', not a fraction from 0 to 1", person.relight, KEY, room="none")
     refused(ValueError, "pose is", person.relight, KEY, pose=(math.nan, 0, 0))
     with pytest.raises(ValueError, match=r"not a list of some of normal, position, depth, uv, face$"):
         person.relight(KEY, layers=["albedo"])
@@ -246,14 +246,14 @@ def test_lights_that_are_none(person: facerf.Person, light: facerf.Light, said: 
     "shapes", [([12, 3], [12]), ([12, 3], [12, 1]), ([3, 3], [2, 3]), ([3], [3]), ([2, 2], [2, 2])]
 )
 def test_a_light_of_other_shapes_says_those_that_it_takes(shapes: tuple[list[int], list[int]]) -> None:
-    said = "shapes {} and {}; give [L, 3] and [L, 3]".format(*shapes)
+    said = "shapes {} and {}; use [L, 3] and [L, 3]".format(*shapes)
     with pytest.raises(ValueError, match=re.escape(said)):
         facerf.Light(*map(np.ones, shapes))
 
 
 @pytest.mark.parametrize("wrong", [(math.nan, 0), (0, 300), (0, 0, (1, -1, 1))])
 def test_a_single_light_that_is_none(wrong: Any) -> None:
-    refused(ValueError, "no light from", facerf.Light.single, *wrong)
+    refused(ValueError, "invalid light", facerf.Light.single, *wrong)
 
 
 def test_choices_that_do_not_go_together() -> None:

@@ -20,9 +20,8 @@ from facerf_cli.evaluation.measure import Case, Comparison
 from facerf_cli.evaluation.options import Chosen, YaleOptions
 from facerf_cli.evaluation.people import Bench
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.light import Light
+from facerf_cli.light.light import Light, far_samples
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import far_samples
 from facerf_cli.person import Target
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these

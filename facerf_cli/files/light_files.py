@@ -19,7 +19,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, read_document, write_document
 from facerf_cli.files.read import ENVMAP_LIMIT_PX, read_image
 from facerf_cli.light.envmap import check_envmap, rig_to_latlong
-from facerf_cli.light.sh import CONVENTION, positive_latlong
+from facerf_cli.light.sh import CONVENTION
 from facerf_cli.light.sphere import RigLight
 
 Format = Literal["facerf-light-1"]
@@ -36,11 +36,10 @@ _ADVICE = "give a .json that estimate-light wrote"
 
 @dataclass(frozen=True, eq=False)
 class LightRecord:
-    """The contents of a JSON light: directions and weights [L, 3] of a rig, or coefficients `sh`, or both.
+    """Contents of a JSON light: directions and weights [L, 3] of a rig, and optionally coefficients `sh`.
 
-    Coefficients [(order + 1)^2, 3] are those of `light.sh`. Without a rig, `directions` and `weights` have no
-    rows. `rig` describes the directions in words; `attributes` are the provenance
-    (`logs.Provenance.attributes`) and how the light was estimated.
+    Coefficients [(order + 1)^2, 3] are those of `light.sh`. `rig` describes the directions in words;
+    `attributes` are the provenance (`logs.Provenance.attributes`) and how the light was estimated.
     """
 
     directions: Tensor
@@ -53,9 +52,8 @@ class LightRecord:
 def write_light(path: Path, record: LightRecord) -> None:
     """Write a light as JSON atomically; a number that is not finite is a ValueError."""
     fields: dict[str, Any] = {"format": FORMAT, "axes": AXES, "units": UNITS}
-    if len(record.directions):
-        fields["rig"] = record.rig
-        fields |= {"directions": _numbers(record.directions), "weights": _numbers(record.weights)}
+    fields["rig"] = record.rig
+    fields |= {"directions": _numbers(record.directions), "weights": _numbers(record.weights)}
     if record.sh is not None:
         order = math.isqrt(len(record.sh)) - 1
         fields["sh"] = {"order": order, "convention": CONVENTION, "coefficients": _numbers(record.sh)}
@@ -90,24 +88,18 @@ class _HarmonicsEntry(Document):
 
 
 class _LightDocument(Document):
-    """The document; a light has directions and weights, or coefficients, or both."""
-
     format: Format
     rig: str = ""
-    directions: _Rows | None = None
-    weights: _Rows | None = None
+    directions: _Rows
+    weights: _Rows
     sh: _HarmonicsEntry | None = None
     provenance: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _is_light(self) -> "_LightDocument":
-        counts = [0 if rows is None else len(rows) for rows in (self.directions, self.weights)]
-        if counts[0] != counts[1]:
-            raise ValueError(f"{counts[0]} directions but {counts[1]} weights")
-        if not counts[0] and self.sh is None:
-            raise ValueError("both directions and sh are missing")
-        lengths = np.ones(1) if self.directions is None else np.linalg.norm(self.directions, axis=1)
-        if np.abs(lengths - 1).max() > _LENGTH_TOLERANCE:
+        if len(self.directions) != len(self.weights):
+            raise ValueError(f"{len(self.directions)} directions but {len(self.weights)} weights")
+        if np.abs(np.linalg.norm(self.directions, axis=1) - 1).max() > _LENGTH_TOLERANCE:
             raise ValueError("directions that are unit vectors are needed")
         if self.sh and self.sh.convention != CONVENTION:
             raise ValueError(f"sh has another convention; convert the coefficients to: {CONVENTION}")
@@ -121,11 +113,9 @@ def read_light(path: Path) -> LightRecord:
     if path.suffix.lower() != ".json":
         raise InputError(f"{path}: not a .json file; {_ADVICE}")
     light = read_document(path, _LightDocument, _ADVICE)
-    none = np.zeros((0, 3), np.float32)
-    directions = none if light.directions is None else light.directions
     return LightRecord(
-        torch.from_numpy(directions / np.linalg.norm(directions, axis=1, keepdims=True)),
-        torch.from_numpy(none if light.weights is None else light.weights),
+        torch.from_numpy(light.directions / np.linalg.norm(light.directions, axis=1, keepdims=True)),
+        torch.from_numpy(light.weights),
         light.rig,
         torch.from_numpy(light.sh.coefficients) if light.sh else None,
         {name: value for name, value in light.provenance.items() if _is_attribute(value)},
@@ -156,9 +146,6 @@ def read_map_file(path: Path | str) -> Tensor:
 
 @lru_cache(maxsize=2)  # converting a rig takes seconds, and relight reads the same light several times
 def _latlong(path: Path) -> Tensor:
-    """Convert a JSON light's rig, or its coefficients if it has no rig, to a map."""
+    """Convert a JSON light's rig to a map."""
     record = read_light(path)
-    if len(record.directions):
-        return rig_to_latlong(RigLight(record.directions, record.weights), _JSON_ROWS)
-    assert record.sh is not None
-    return positive_latlong(record.sh, _JSON_ROWS)
+    return rig_to_latlong(RigLight(record.directions, record.weights), _JSON_ROWS)

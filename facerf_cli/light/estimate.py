@@ -1,9 +1,9 @@
 """Estimate the light of a photo from a reflectance field (paper, 'Light Estimation').
 
-`LightEvidence` holds the textures under each single light of a rig and the texture of the photo.
+`LightEvidence` contains the textures under each single light of a rig and the texture of the photo.
 `LightEvidence.least_squares` solves Eq. (leastsq) of the paper for the weights of the lights; `refine_light`
 then minimises |V_f(explained texture) - V_f(photo's texture)|^2 over the weights by Adadelta (Zeiler,
-*ADADELTA: an adaptive learning rate method*, 2012), as the paper does. The caller gives the features.
+*ADADELTA: an adaptive learning rate method*, 2012), as the paper does. The caller passes the features.
 """
 
 import math
@@ -18,29 +18,29 @@ from facerf_cli.errors import InputError
 
 Features = Callable[[Tensor], Sequence[Tensor]]  # of linear textures [B, 3, T, T], black outside the mask
 
-_WHITE = 0.95  # of a photo that ends at 1: clipped texels, averaged with their neighbours, lie above this
-_LEAST_TEXELS = 200  # fewer do not determine where light comes from
+_WHITE = 0.95  # clipped texels of a photo that ends at 1, averaged with their neighbours, lie above this
+_LEAST_TEXELS = 200  # fewer do not determine the direction of light
 _BLACK = 1e-4  # mean of an unlit face: below one step of 8 bits
-# As shares of the photo's norm, against uneven light from around, and against lights of several colours.
+# Penalties of non-uniform ambient light and of lights of different colours, per norm of the photo.
 _EVEN, _ONE_COLOUR = 0.3, 0.3
-_REACHES = 0.1  # share of the largest mean radiance of the face under a light; below it, it is not solved for
-_CONDITION = 1e-2  # least singular value of signed least squares, as a share of the largest
-_OUTLIER = 3.0  # median errors from which on a texel's weight falls in inverse proportion to its error
+_REACHES = 0.1  # lights below this fraction of the largest mean radiance on the face are not solved for
+_CONDITION = 1e-2  # least singular value of signed least squares, relative to the largest
+_OUTLIER = 3.0  # median errors above which a texel's weight is inversely proportional to its error
 _ROUNDS, _ROUNDS_GREY = 3, 5  # of reweighting
-# Weights of smoothness and of shortness, as shares of the photo's norm: of the grey light that all channels
-# share, and of each channel's difference from it.
+# Penalties of roughness and of length, per norm of the photo: of the grey light that all channels share, and
+# of each channel's difference from it.
 _SMOOTH, _SHORT = 0.1, 0.01
 _SMOOTH_CHANNEL, _SHORT_CHANNEL = 1.0, 0.1
-_STANDS_OUT = 3.0  # mean weights by which a light differs from its neighbours if it is a lone bright light
-_NEIGHBOURHOOD = 1.5  # standard deviation of the neighbourhood of a light, in mean spacings of the lights
-_STEPS, _RATE = 150, 1.0  # of Adadelta, at most, and its learning rate, which is its own
-_PATIENCE, _SETTLED = 20, 0.002  # steps that end the search where they lower the loss by less than this share
-_TINY = 1e-12  # avoids divisions by 0
+_STANDS_OUT = 3.0  # difference of an isolated bright light from its neighbours, in mean weights
+_NEIGHBOURHOOD = 1.5  # standard deviation of a light's neighbourhood, in mean spacings of the lights
+_STEPS, _RATE = 150, 1.0  # maximum steps and learning rate of Adadelta
+_PATIENCE, _SETTLED = 20, 0.002  # the search ends when this many steps lower the loss by less than a fraction
+_TINY = 1e-12  # avoids division by 0
 
 
 @dataclass(frozen=True, eq=False)
 class LightEvidence:
-    """A face in UV space under each single light, and in its photo; all scene-linear.
+    """Evidence for a light: a face's textures under each single light and in its photo, scene-linear.
 
     directions [L, 3], unit, camera space; olats [L, 3, T, T]; photo [3, T, T]; mask [T, T] bool: the texels
     that are compared (the paper's M_t in UV space).
@@ -53,7 +53,7 @@ class LightEvidence:
 
     @property
     def clipped(self) -> Tensor:
-        """Texels [3, T, T] bool that are white in the photo, where the true radiance may be higher."""
+        """White texels [3, T, T] bool of the photo, whose true radiance may be higher."""
         return clipped(self.photo, self.mask)
 
     def require_a_face(self) -> None:
@@ -62,24 +62,24 @@ class LightEvidence:
         if texels < _LEAST_TEXELS:
             raise InputError(
                 f"too little of the face is visible to estimate its light ({texels} points of its texture; "
-                f"{_LEAST_TEXELS} are needed); give a photo or a matte that shows more of it"
+                f"{_LEAST_TEXELS} are needed); use a photo or a matte that shows more of it"
             )
         if float(self.photo[:, self.mask].mean()) < _BLACK:
-            raise InputError("the face is black in the photo: it shows no light; give a brighter photo")
+            raise InputError("the face is black in the photo, so its light is unknown; use a brighter photo")
 
     def relit(self, weights: Tensor) -> Tensor:
-        """The face under weights [L, 3]: [3, T, T]."""
+        """Return the face [3, T, T] under weights [L, 3]."""
         return torch.einsum("lc,lcij->cij", weights, self.olats)
 
     def residual(self, explained: Tensor) -> float:
-        """|explained [3, T, T] - photo| / |photo| in the mask; clipped texels count only if too dark."""
+        """Return |explained [3, T, T] - photo| / |photo| in the mask; clipped texels count if too dark."""
         photo, clipped = self.photo[:, self.mask], self.clipped[:, self.mask]
         error = explained[:, self.mask] - photo
         error = torch.where(clipped, error.clamp(max=0), error)
         return float(error.norm() / photo.norm().clamp_min(_TINY))
 
     def least_squares(self, non_negative: bool = True) -> Tensor:
-        """Weights [L, 3] over the mask by `estimate_smooth_weights`, or by `estimate_signed_weights`."""
+        """Solve for weights [L, 3] by `estimate_smooth_weights` or, if signed, `estimate_signed_weights`."""
         olats, photo = self.olats[..., self.mask], self.photo[:, self.mask]
         if not non_negative:
             return estimate_signed_weights(olats, photo)
@@ -87,16 +87,16 @@ class LightEvidence:
 
 
 def clipped(photo: Tensor, mask: Tensor) -> Tensor:
-    """Texels [3, ...] bool of a mask [...] that are white in a photo [3, ...].
+    """Return the texels [3, ...] bool of a mask [...] that are white in a photo [3, ...].
 
-    A photo with any value above 1 there is not clipped.
+    If any value in the mask is above 1, the photo is not clipped.
     """
     ends_at_white = bool(photo[:, mask].max() <= 1) if mask.any() else False
     return (photo >= _WHITE) & mask & ends_at_white
 
 
 def joined(frames: Sequence[LightEvidence]) -> LightEvidence:
-    """The evidence of several frames under the same lights, one below the other."""
+    """Stack the evidence of several frames under the same lights."""
     if len(frames) == 1:
         return frames[0]
     return LightEvidence(
@@ -107,51 +107,52 @@ def joined(frames: Sequence[LightEvidence]) -> LightEvidence:
     )
 
 
-def estimate_lamps(olats: Tensor, image: Tensor, lamps: int) -> Tensor:
-    """Solve Eq. (leastsq) for non-negative weights [L, C] of some lamps and light from around.
+def estimate_key_light(olats: Tensor, image: Tensor) -> Tensor:
+    """Solve Eq. (leastsq) for non-negative weights [L, C] of a key light and of ambient light.
 
-    Images [L, C, N], which are to sum to an image [C, N], are scene-linear. Iteratively reweighted least
-    squares: clipped, covered and misfitted elements lose weight. The lights after the first `lamps` are the
-    light from around; it is as even, and all lights are as much of one colour, as the image allows.
+    The first of the scene-linear images [L, C, N], whose weighted sum is to equal an image [C, N], is under
+    the key light, the others are under the lights of the ambient rig. Iteratively reweighted least squares
+    gives less weight to clipped, covered and misfitted elements. Ambient light is as uniform, and all light
+    as much of one colour, as the image allows.
     """
     count = len(olats)
-    uneven = np.zeros((count - lamps, count))
-    uneven[:, lamps:] = np.eye(count - lamps) - 1 / (count - lamps)
+    uneven = np.zeros((count - 1, count))
+    uneven[:, 1:] = np.eye(count - 1) - 1 / (count - 1)
     mean = _channels(olats.mean(1, keepdim=True), image.mean(0, keepdim=True))
     grey = _robust(mean, [1.0], _EVEN**2 * uneven.T @ uneven, np.zeros(count))
     weights = _near_grey(_channels(olats, image), grey, _ONE_COLOUR**2 * np.eye(count))
     return torch.from_numpy(weights).float()
 
 
-def lamp_error(lamp: Tensor, around: Tensor, image: Tensor) -> float:
-    """Root of the mean squared error of an image [N] as a sum of those of a lamp and of light from around."""
-    (channel,) = _channels(torch.stack([lamp, around])[:, None], image[None])
+def key_light_error(key: Tensor, uniform: Tensor, image: Tensor) -> float:
+    """Return the RMS error of an image [N] explained by a key light and uniform light, each an image [N]."""
+    (channel,) = _channels(torch.stack([key, uniform])[:, None], image[None])
     weights = _robust([channel], [1.0], np.zeros((2, 2)), np.zeros(2))
     return float(np.sqrt(np.square(channel.lights @ weights - channel.target).mean()))
 
 
 def estimate_signed_weights(olats: Tensor, image: Tensor) -> Tensor:
-    """Solve Eq. (leastsq) as the paper states it: signed weights [L, C], all elements weighted alike.
+    """Solve Eq. (leastsq) as the paper states it: signed weights [L, C], all elements weighted equally.
 
-    It is the solution of least norm among the combinations of lights that change the image noticeably:
-    singular values below `_CONDITION` of the largest are left out, for they are noise of the field (truncated
-    singular value decomposition; Hansen, *Rank-deficient and discrete ill-posed problems*, 1998).
+    The solution has the least norm among the combinations of lights that change the image noticeably.
+    Singular values below `_CONDITION` of the largest are dropped, because they are noise of the field
+    (truncated singular value decomposition; Hansen, *Rank-deficient and discrete ill-posed problems*, 1998).
     """
     channels = _channels(olats, image)
-    solved = [np.linalg.lstsq(one.lights, one.target, rcond=_CONDITION)[0] for one in channels]
+    solved = [np.linalg.lstsq(channel.lights, channel.target, rcond=_CONDITION)[0] for channel in channels]
     return torch.from_numpy(np.stack(solved, -1)).float()
 
 
 def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, clipped: Tensor) -> Tensor:
-    """Solve Eq. (leastsq) for a plausible light: non-negative, smooth where the face does not determine it.
+    """Solve Eq. (leastsq) for non-negative weights that are smooth where the face does not determine them.
 
-    The lights have directions [L, 3] and images [L, 3, N], which are to sum to an image [3, N]. A face
-    determines few of the hundreds of weights, and a solution for each channel alone has coloured specks. So
-    all channels first share one grey light, tinted, that is smooth except for lone bright lights; then each
-    channel differs from it by weights that are smooth over the sphere. Lights that hardly reach the face
-    (their mean radiance on it is below a tenth of the brightest light's) are not solved for:
-    their weights continue those around them. Covered and misfitted elements lose weight;
-    where `clipped` [3, N] bool, only too dark a result is an error.
+    The lights have directions [L, 3] and images [L, 3, N], whose weighted sum is to equal an image [3, N]. A
+    face determines few of the hundreds of weights, and separate solutions for the channels have coloured
+    specks. So all channels first share one grey light, tinted, that is smooth except for isolated bright
+    lights; then each channel differs from it by weights that are smooth over the sphere. Lights that hardly
+    reach the face (their mean radiance on it is below a tenth of the brightest light's) are interpolated from
+    their neighbours. Covered and misfitted elements lose weight; where `clipped` [3, N] bool, only too dark a
+    result is an error.
     """
     from_near = _difference_from_neighbours(directions.double().numpy())
     radiance = olats.double().mean((1, 2)).numpy()
@@ -164,9 +165,9 @@ def estimate_smooth_weights(directions: Tensor, olats: Tensor, image: Tensor, cl
 
 
 def _continuation(from_near: np.ndarray, reaches: np.ndarray) -> np.ndarray:
-    """Weights of all lights [L, S] from those of the lights that reach the face, [L] bool.
+    """Return the matrix [L, S] from the weights of the lights that reach the face, [L] bool, to all weights.
 
-    Each of the others is the mean of its neighbours (a discrete harmonic function), so it lies between the
+    Each other weight is the mean of its neighbours (a discrete harmonic function), so it lies between the
     weights around it and is never negative.
     """
     continued = np.zeros((len(reaches), int(reaches.sum())))
@@ -179,7 +180,7 @@ def _continuation(from_near: np.ndarray, reaches: np.ndarray) -> np.ndarray:
 
 
 class _Channel:
-    """One colour channel of the images under each light [N, L] and of the photo [N], with trust [N]."""
+    """Images [N, L] under each light and the photo [N] in one colour channel."""
 
     def __init__(self, lights: np.ndarray, target: np.ndarray, clipped: np.ndarray) -> None:
         self.lights, self.target, self._clipped = lights, target, clipped
@@ -187,20 +188,20 @@ class _Channel:
         self.power = float(target @ target)
 
     def normal_equations(self, gain: float) -> tuple[np.ndarray, np.ndarray]:
-        """The Gram matrix [L, L] and moments [L] of the weights that explain this channel, times `gain`."""
+        """Return the Gram matrix [L, L] and moments [L] for weights that are multiplied by `gain`."""
         trusted = gain * self.lights.T * self._trust
         return gain * trusted @ self.lights, trusted @ self.target
 
     def gain_of(self, weights: np.ndarray) -> float:
-        """The factor by which `weights` explain this channel best."""
+        """Return the factor that best fits `weights` to this channel."""
         explained = self.lights @ weights
         return float(
             (self._trust * self.target) @ explained / max((self._trust * explained) @ explained, _TINY)
         )
 
     def reweight(self, weights: np.ndarray) -> None:
-        """Set trust by the errors under the weights (Huber), 0 for clipped texels that are bright enough."""
-        if not len(self.target):  # nothing is visible enough
+        """Set trust from the errors under the weights (Huber), and 0 for clipped texels that are bright."""
+        if not len(self.target):
             return
         beyond = self.lights @ weights - self.target
         error = np.abs(np.where(self._clipped, np.minimum(beyond, 0), beyond))
@@ -212,15 +213,15 @@ class _Channel:
 def _channels(
     olats: Tensor, image: Tensor, clipped: Tensor | None = None, unknowns: np.ndarray | None = None
 ) -> list[_Channel]:
-    """The channels of images [L, C, N] and [C, N], none of which is clipped by default.
+    """Split images [L, C, N] and [C, N] into channels.
 
-    `unknowns` [L, S] gives the lights' weights from those that are solved for.
+    `unknowns` [L, S] maps the solved weights to those of all lights.
     """
     white = torch.zeros_like(image, dtype=torch.bool) if clipped is None else clipped
-    lights = [own.double().T.numpy() for own in olats.unbind(1)]
-    lights = lights if unknowns is None else [own @ unknowns for own in lights]
+    lights = [channel.double().T.numpy() for channel in olats.unbind(1)]
+    lights = lights if unknowns is None else [channel @ unknowns for channel in lights]
     targets = image.double().numpy()
-    return [_Channel(*one) for one in zip(lights, targets, white.numpy(), strict=True)]
+    return [_Channel(*channel) for channel in zip(lights, targets, white.numpy(), strict=True)]
 
 
 def _robust(
@@ -230,17 +231,17 @@ def _robust(
     wanted: np.ndarray,
     rounds: int = _ROUNDS,
 ) -> np.ndarray:
-    """Weights [L] >= 0 that explain each channel when multiplied by its gain, by reweighted least squares.
+    """Solve for weights [L] >= 0 that explain each channel when multiplied by its gain.
 
-    They are held near the `wanted` ones: `hold` [L, L] weighs squared differences, as shares of the channels'
-    power. Trust goes on from what it was before.
+    Reweighted least squares starts from the channels' present trust. `hold` [L, L] weighs squared differences
+    from the `wanted` weights, relative to the channels' power.
     """
     holding = sum(channel.power for channel in channels) * hold
     for _ in range(rounds):
         gram, moment = holding, holding @ wanted
         for channel, gain in zip(channels, gains, strict=True):
-            own_gram, own_moment = channel.normal_equations(gain)
-            gram, moment = gram + own_gram, moment + own_moment
+            of_channel = channel.normal_equations(gain)
+            gram, moment = gram + of_channel[0], moment + of_channel[1]
         weights = least_non_negative(gram, moment)
         for channel, gain in zip(channels, gains, strict=True):
             channel.reweight(gain * weights)
@@ -248,15 +249,16 @@ def _robust(
 
 
 def _near_grey(channels: Sequence[_Channel], grey: np.ndarray, hold: np.ndarray) -> np.ndarray:
-    """Weights [L, C] that explain each channel alone and are held near the grey light [L], times its gain."""
-    return np.stack([_robust([one], [1.0], hold, one.gain_of(grey) * grey) for one in channels], -1)
+    """Solve for weights [L, C] that explain each channel and stay near the grey light [L] times its gain."""
+    solved = [_robust([channel], [1.0], hold, channel.gain_of(grey) * grey) for channel in channels]
+    return np.stack(solved, -1)
 
 
 def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> np.ndarray:
-    """Estimate the light [S] that all channels share, each times a gain of its own.
+    """Estimate the light [S] that all channels share, each times its own gain.
 
-    The more a light stands out from its neighbours, the less smoothness is demanded of it (Cauchy weights);
-    otherwise a lone bright light would be spread over its neighbours.
+    The more a light differs from its neighbours, the less smoothness is demanded of it (Cauchy weights);
+    otherwise an isolated bright light would be spread over its neighbours.
     """
     lights = from_near.shape[1]
     grey, smooth = np.zeros(lights), np.ones(len(from_near))
@@ -271,13 +273,16 @@ def _grey_light(channels: list[_Channel], from_near: np.ndarray) -> np.ndarray:
 
 
 def least_non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
-    """argmin over x >= 0 of x' gram x - 2 moment' x, by the active sets of Lawson and Hanson's NNLS."""
+    """Return argmin over x >= 0 of x' gram x - 2 moment' x by Lawson and Hanson's active sets (NNLS).
+
+    scipy's `nnls` does not accept a Gram matrix, and scipy.optimize is slow to import.
+    """
     floor = 1e-9 * gram.trace() / len(gram) + _TINY  # a channel may be black throughout
     gram = gram + floor * np.eye(len(gram))
-    found, free = np.zeros(len(gram)), np.zeros(len(gram), bool)
+    weights, free = np.zeros(len(gram)), np.zeros(len(gram), bool)
     least = 1e-12 * np.abs(moment).max()
     for _ in range(3 * len(gram)):
-        gain = np.where(free, -np.inf, moment - gram @ found)
+        gain = np.where(free, -np.inf, moment - gram @ weights)
         if gain.max() <= least:
             break
         free[gain.argmax()] = True
@@ -287,15 +292,15 @@ def least_non_negative(gram: np.ndarray, moment: np.ndarray) -> np.ndarray:
             under = np.flatnonzero(free & (solved <= 0))
             if not len(under):
                 break
-            steps = found[under] / (found[under] - solved[under])
-            found += steps.min() * (solved - found)
+            steps = weights[under] / (weights[under] - solved[under])
+            weights += steps.min() * (solved - weights)
             free[under[steps == steps.min()]] = False
-        found = solved
-    return found
+        weights = solved
+    return weights
 
 
 def _difference_from_neighbours(directions: np.ndarray) -> np.ndarray:
-    """The matrix [L, L] from lights' weights to the difference of each from the mean of its neighbours."""
+    """Return the matrix [L, L] from weights to each light's difference from the mean of its neighbours."""
     spacing = math.sqrt(4 * math.pi / len(directions))
     near = np.exp((directions @ directions.T - 1) / (_NEIGHBOURHOOD * spacing) ** 2)
     np.fill_diagonal(near, 0)
@@ -304,7 +309,7 @@ def _difference_from_neighbours(directions: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class RefinedLight:
-    """Weights [L, 3], the losses of the start and of the result, and the number of steps."""
+    """Refined weights [L, 3], the losses before and after, and the number of steps."""
 
     weights: Tensor
     loss_before: float
@@ -321,16 +326,25 @@ def refine_light(
 ) -> RefinedLight:
     """Minimise the feature loss of a light by Adadelta; the result is never worse than the start.
 
-    Clipped texels have no error where they are bright enough.
+    Clipped texels that are bright enough have no error.
 
     Args:
         evidence: The photo's texture and its OLATs.
-        start: First weights [L, 3].
-        features: Of textures.
-        non_negative: Keep weights from 0 up, by projection.
+        start: Initial weights [L, 3].
+        features: Computes the features of textures.
+        non_negative: Clamp weights to 0 after each step.
     """
-    loss_of = _feature_loss(evidence, features)
-    unit = float(start.square().mean().sqrt()) or 1.0  # makes the size of a step the same for all photos
+    photo, clipped, mask = evidence.photo, evidence.clipped, evidence.mask
+    with torch.no_grad():
+        wanted = [layer.clone() for layer in features((photo * mask)[None])]
+
+    def loss_of(weights: Tensor) -> Tensor:
+        explained = evidence.relit(weights)
+        explained = torch.where(clipped, explained.minimum(photo), explained)
+        layers = features((explained * mask)[None])
+        return torch.stack([(a - b).square().mean() for a, b in zip(layers, wanted, strict=True)]).sum()
+
+    unit = float(start.square().mean().sqrt()) or 1.0  # makes the step size equal for all photos
     scaled = (start / unit).requires_grad_()
     optimizer = torch.optim.Adadelta([scaled], lr=_RATE)
     best, first, least, losses = start, 0.0, float("inf"), []
@@ -340,7 +354,8 @@ def refine_light(
         first = losses[0]
         if losses[-1] < least:
             best, least = scaled.detach() * unit, losses[-1]
-        if not first > 0 or _has_settled(losses):
+        has_settled = len(losses) > _PATIENCE and min(losses) > (1 - _SETTLED) * min(losses[:-_PATIENCE])
+        if not first > 0 or has_settled:
             break
         optimizer.zero_grad()
         (loss / first).backward()  # type: ignore[no-untyped-call]
@@ -348,24 +363,3 @@ def refine_light(
         if non_negative:
             scaled.data.clamp_(min=0)
     return RefinedLight(best.clone() if least < first else start, first, min(first, least), len(losses) - 1)
-
-
-def _feature_loss(evidence: LightEvidence, features: Features) -> Callable[[Tensor], Tensor]:
-    """The loss of weights: the squared difference of masked textures' features, a mean for each layer."""
-    photo, clipped, mask = evidence.photo, evidence.clipped, evidence.mask
-    with torch.no_grad():
-        wanted = [layer.clone() for layer in features((photo * mask)[None])]
-
-    def loss_of(weights: Tensor) -> Tensor:
-        explained = evidence.relit(weights)
-        explained = torch.where(clipped, explained.minimum(photo), explained)
-        found = features((explained * mask)[None])
-        return torch.stack([(a - b).square().mean() for a, b in zip(found, wanted, strict=True)]).sum()
-
-    return loss_of
-
-
-def _has_settled(losses: list[float]) -> bool:
-    if len(losses) <= _PATIENCE:
-        return False
-    return min(losses) > (1 - _SETTLED) * min(losses[:-_PATIENCE])

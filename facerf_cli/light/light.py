@@ -1,17 +1,22 @@
-"""Lights, as the Python API and all renderers take them, and arrays: numpy's or torch's."""
+"""Lights of the Python API and of all renderers: far, near and uniform lights, and their array checks.
 
+Renderers see a near light as points; `_grid` samples its square panel, and that of a soft far light.
+"""
+
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from facerf_cli.errors import UsageError
-from facerf_cli.image.colour import luminance
-from facerf_cli.light.entries import StudioLight
+from facerf_cli.image.colour import REC709_CHROMATICITIES, colour_science, luminance, rgb_to_xyz
+from facerf_cli.light.entries import StudioLight, parse_lights
 from facerf_cli.light.envmap import (
     NO_KEYS,
     check_envmap,
@@ -21,24 +26,29 @@ from facerf_cli.light.envmap import (
     without_keys,
 )
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
-from facerf_cli.light.studio_points import KeyLight, PointLights, far_samples, has_edges
 
 Array = np.ndarray | Tensor
 Rgb = tuple[float, float, float]
-_UNIT = 1e-3  # how far the length of a unit direction may be from 1
+WHITE_K = 6504.0  # correlated colour temperature of D65
+_UNIT = 1e-3  # tolerance of the length of a unit direction
+_APART_DEG, _MOST_A_SIDE = 6.0, 6  # spacing and number of samples along a panel's side, seen from the face
+_AROUND = 24  # samples of uniform light
+_NEAREST_M = 0.05  # distance below which irradiance stops growing
+_FULL_CONE = 0.8  # fraction of a spot's cone with full irradiance, which then falls to 0
+_WIDEST_DEG = 36.0  # angular side of a light from which its shadows have no hard edges
 
 
 @dataclass(frozen=True, eq=False)
 class Light:
-    """Lights that shine together: unit directions toward far ones [L, 3], camera space, rgb weights [L, 3].
+    """Far lights that shine together: unit directions [L, 3] toward them and rgb weights [L, 3].
 
-    A light of weight 1 gives a white Lambertian surface that faces it radiance 1. Lights add and scale:
-    `2 * key + sum(rims)`. Either array may be a tensor, to which gradients then flow. `own_rgb` [3], if not
-    None, is the share of the photo's own light. `keys` are ranges of the lights: each holds the samples of
-    one whose shadows have edges, as those of `Light.single` have. `near` lights, if any, have rgb weights
+    Directions are in camera space. A light of weight 1 gives a white Lambertian surface that faces it
+    radiance 1. Lights add and scale: `2 * key + sum(rims)`. If an array is a tensor, gradients flow to it.
+    `own_rgb` [3], if not None, is the factor of the photo's original light. `keys` are ranges of lights: each
+    range holds the samples of a light whose shadows have hard edges. `near` lights have rgb weights
     `near_weights` [J, 3] at the face's centre.
 
-    Renderers take M sums of the same lights in tensors (`stacked`): weights [M, L, 3], own_rgb [M, 3],
+    Renderers use M sums of the same lights as tensors (`stacked`): weights [M, L, 3], own_rgb [M, 3],
     near_weights [M, J, 3].
     """
 
@@ -51,51 +61,49 @@ class Light:
     __array_ufunc__ = None  # so that numpy leaves `array * light` to the light
 
     def __post_init__(self) -> None:
-        """Raise ValueError for arrays of other shapes."""
         directions, weights = list(np.shape(self.directions)), list(np.shape(self.weights))
         if directions[1:] != [3] or weights[-2:] != directions or len(weights) > 3:
-            shapes = f"shapes {directions} and {weights}; give [L, 3] and [L, 3] (r, g, b of each light)"
-            raise ValueError(f"directions and weights have {shapes}")
+            shapes = f"{directions} and {weights}; use [L, 3] and [L, 3] (r, g, b of each light)"
+            raise ValueError(f"directions and weights have shapes {shapes}")
 
     @staticmethod
     def single(azimuth_deg: float, elevation_deg: float, rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
-        """One light; azimuth > 0 is the image's right, elevation > 0 above.
+        """Return one light; azimuth > 0 is to the image's right, elevation > 0 is above.
 
-        Raises ValueError for an elevation beyond 90 degrees, a negative colour or what is no number.
+        Raises ValueError for an elevation beyond 90 degrees, a negative colour or a non-finite number.
         """
         if not (np.isfinite((azimuth_deg, *rgb)).all() and abs(elevation_deg) <= 90 and min(rgb) >= 0):
-            raise ValueError(f"no light from {azimuth_deg}, {elevation_deg} degrees of {rgb}")
+            raise ValueError(f"invalid light: azimuth {azimuth_deg}, elevation {elevation_deg}, rgb {rgb}")
         direction = azel_to_direction(azimuth_deg, elevation_deg)
         return Light(direction.numpy()[None], np.array([rgb], np.float32), keys=(slice(0, 1),))
 
     @staticmethod
     def around(rgb: Rgb = (1.0, 1.0, 1.0)) -> "Light":
-        """Even light from all around, which sends a white surface as much as a single light that it faces."""
-        directions, shares = far_samples(StudioLight())
-        return Light(directions.numpy(), shares[:, None].numpy() * np.array(rgb, np.float32))
+        """Return uniform light; it lights a white surface as much as a single light that it faces."""
+        directions, weights = far_samples(StudioLight())
+        return Light(directions.numpy(), weights[:, None].numpy() * np.array(rgb, np.float32))
 
     @staticmethod
     def own(rgb: Rgb | Array = (1.0, 1.0, 1.0)) -> "Light":
-        """The photo's own light, under which the person is as photographed; other lights add to it."""
+        """Return the photo's original light, which reproduces the photo; other lights add to it."""
         nothing = np.zeros((0, 3), np.float32)
         return Light(nothing, nothing, rgb if isinstance(rgb, Tensor) else np.array(rgb, np.float32))
 
     @staticmethod
     def each(directions: Tensor, keys: tuple[slice, ...] = ()) -> "Light":
-        """Each light [L, 3] alone, of rgb 1: L sums."""
+        """Return L sums, each with only one of the lights [L, 3], of rgb 1."""
         return Light(directions, torch.eye(len(directions))[..., None].expand(-1, -1, 3), keys=keys)
 
     @staticmethod
     def from_envmap(envmap: Array, rotate_deg: float = 0.0, lights: int = 150, keys: bool = True) -> "Light":
-        """A lat-long map [H, 2 H, 3] as a rig of lights; `rotate_deg` is added to every azimuth.
+        """Convert a lat-long map [H, 2 H, 3] to a rig of lights; `rotate_deg` is added to every azimuth.
 
-        With `keys` a sun of the map follows as a single light. Raises InputError for an array that is not
-        such a map.
+        With `keys`, a sun in the map becomes a separate single light. Raises InputError for another shape.
         """
         linear = linear_pixels("map", envmap)
         check_envmap(linear)
-        rest, found = without_keys(linear) if keys else (linear, NO_KEYS)
-        directions, suns = rig_directions(lights), turned(found, rotate_deg)
+        rest, key_lights = without_keys(linear) if keys else (linear, NO_KEYS)
+        directions, suns = rig_directions(lights), turned(key_lights, rotate_deg)
         weights = torch.cat([envmap_weights(rest, directions, rotate_deg), suns.weights])
         return Light(
             torch.cat([directions, suns.directions]).numpy(),
@@ -105,10 +113,10 @@ class Light:
 
     @staticmethod
     def from_picture(picture: Array, fov_deg: float = 60.0, lights: int = 150) -> "Light":
-        """The light in a picture [H, W, 3] behind the person, scene-linear: a guess, on the picture's scale.
+        """Estimate the light from a background [H, W, 3], scene-linear, in the background's units.
 
-        `fov_deg` is the angle of view across its width, 1 to 170 degrees. `light.picture.light_of_picture`
-        also gives the map and its expected error. Raises ValueError for another picture or angle.
+        `fov_deg` is the horizontal angle of view, 1 to 170 degrees. `light.picture.light_of_picture` also
+        returns the map and its expected error. Raises ValueError for another shape or angle.
         """
         from facerf_cli.light.picture import light_of_picture  # a network of its own
 
@@ -116,9 +124,9 @@ class Light:
         return Light.from_envmap(guess.envmap.numpy(), lights=lights)
 
     def to_envmap(self, height: int = 256) -> np.ndarray:
-        """A lat-long map [height, 2 height, 3] with these lights; UsageError for the photo's own."""
+        """Convert to a lat-long map [height, 2 height, 3]; raises UsageError for the photo's own light."""
         if self.own_rgb is not None:
-            raise UsageError("to_envmap: the photo's own light has no directions; take person.light")
+            raise UsageError("to_envmap: the photo's own light has no directions; use person.light")
         light = RigLight(*(values.detach() for values in self._tensors()))
         return rig_to_latlong(light, height).numpy()
 
@@ -136,10 +144,10 @@ class Light:
         )
 
     def __radd__(self, other: int) -> "Light":
-        return self if other == 0 else NotImplemented  # where `sum` begins
+        return self if other == 0 else NotImplemented  # the start value of `sum`
 
     def __mul__(self, factor: float | Rgb | Array) -> "Light":
-        """The same lights, so many times as bright: by a number, or by one for each colour."""
+        """Scale all lights by a number, or by one number per colour channel."""
 
         def scaled(values: Array | None) -> Any:
             if values is None:
@@ -153,7 +161,7 @@ class Light:
     __rmul__ = __mul__
 
     def _tensors(self) -> tuple[Tensor, Tensor]:
-        """Directions and weights as float32 tensors on the CPU; raises ValueError for what is no light."""
+        """Return directions and weights as float32 tensors on the CPU; raises ValueError for invalid ones."""
         directions, weights = unit_directions(self.directions), as_tensor(self.weights)
         if weights.ndim != 2:
             raise ValueError(f"weights have shape {list(weights.shape)}, not [L, 3]")
@@ -162,53 +170,54 @@ class Light:
         return directions, weights
 
     def some(self, sums: slice) -> "Light":
-        """Some of the sums, without the near lights that shine in none of them."""
+        """Select sums, with only the near lights that contribute to them."""
         own = None if self.own_rgb is None else self.own_rgb[sums]
+        selected = replace(self, weights=self.weights[sums], own_rgb=own)
         if self.near_weights is None:
-            return Light(self.directions, self.weights[sums], own, self.keys)
+            return selected
         near_weights = self.near_weights[sums]
         used = (near_weights != 0).any(0).any(1)
-        near = tuple(light for light, shines in zip(self.near, used, strict=True) if shines)
-        return Light(self.directions, self.weights[sums], own, self.keys, near, near_weights[:, used])
+        near = tuple(light for light, is_used in zip(self.near, used, strict=True) if is_used)
+        return replace(selected, near=near, near_weights=near_weights[:, used])
 
     @property
     def owns(self) -> Sequence[Tensor | None]:
-        """The share [3] of the photo's own light in each sum; None where it shines in none."""
+        """Rgb factor [3] of the photo's original light in each sum, or None."""
         return [None] * len(self.weights) if self.own_rgb is None else list(self.own_rgb)
 
-    def with_keys_alone(self) -> tuple["Light", list[KeyLight]]:
-        """These sums, then each key light alone that shines in one of them with others; and the keys.
+    def with_keys_alone(self) -> tuple["Light", list["KeyLight"]]:
+        """Append a sum for each key light that shines together with other lights; also return the keys.
 
-        Key lights are those of `keys`, and near ones that are not wide.
+        Key lights are those of `keys`, and near lights whose shadows have hard edges.
         """
         count = len(self.weights)
         near = torch.zeros(count, 0, 3) if self.near_weights is None else self.near_weights
         sums = [[far, near] for far, near in zip(self.weights, near, strict=True)]
-        narrow = [at for at, light in enumerate(self.near) if has_edges(light)]
+        narrow = [at for at, light in enumerate(self.near) if _wide_deg(light) <= _WIDEST_DEG]
         kinds = [(0, samples) for samples in self.keys] + [(1, slice(at, at + 1)) for at in narrow]
         keys: list[KeyLight] = []
         for number, (kind, samples) in product(range(count), kinds):
-            alone = [torch.zeros_like(weights) for weights in sums[number]]
-            alone[kind][samples] = sums[number][kind][samples]
-            if not alone[kind].any():
+            key = [torch.zeros_like(weights) for weights in sums[number]]
+            key[kind][samples] = sums[number][kind][samples]
+            if not key[kind].any():
                 continue
-            same = (at for at, one in enumerate(sums[:count]) if all(map(torch.equal, alone, one)))
+            same = (at for at, one in enumerate(sums[:count]) if all(map(torch.equal, key, one)))
             at = next(same, len(sums))
             keys.append(KeyLight(number, at, kind == 1, samples))
             if at == len(sums):
-                sums.append(alone)
+                sums.append(key)
         far, near = (torch.stack(weights) for weights in zip(*sums, strict=True))
         return Light(self.directions, far, near=self.near, near_weights=near if self.near else None), keys
 
-    def near_points(self, centre_m: Tensor) -> list[tuple[PointLights, Tensor]]:
-        """The near lights about a face's centre [3], camera space, each with its rgb weights [M, 3]."""
+    def near_points(self, centre_m: Tensor) -> list[tuple["PointLights", Tensor]]:
+        """Return the near lights around a face's centre [3], camera space, each with rgb weights [M, 3]."""
         weights = () if self.near_weights is None else self.near_weights.unbind(1)
         return [(PointLights.of(light, centre_m), rgb) for light, rgb in zip(self.near, weights, strict=True)]
 
     def arriving(self, place_m: Tensor, centre_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Unit directions [N, 3] and rgb weights [M, N, 3] of all light at a place [3] of a face.
+        """Return unit directions [N, 3] and rgb weights [M, N, 3] of all light at a position [3] on a face.
 
-        Near lights are about the face's centre [3].
+        Near lights are relative to the face's centre [3].
         """
         directions, weights = [self.directions], [self.weights]
         for points, rgb in self.near_points(centre_m):
@@ -218,10 +227,7 @@ class Light:
         return torch.cat(directions), torch.cat(weights, 1)
 
     def strengths(self) -> list[float]:
-        """Luminance of all light of each sum, from wherever it comes.
-
-        Of a light of rgb 1 it is 1, of a map of radiance 1 all around 4.
-        """
+        """Return each sum's luminance over all light: 1 for a light of rgb 1, 4 for a map of radiance 1."""
         total = self.weights.sum(1)
         if self.near_weights is not None:
             total = total + self.near_weights.sum(1)
@@ -230,23 +236,23 @@ class Light:
         return [float(value) for value in luminance(total.numpy())]
 
 
-def as_light(given: Any, room: float = 0.0) -> Light:
-    """A light, or a map's; of lights a white room may send the share `room` back.
+def as_light(light: Any, room: float = 0.0) -> Light:
+    """Convert a light or a map [H, 2 H, 3]; `room` adds uniform light of this fraction of a light's sum.
 
-    Raises TypeError for what is neither.
+    Raises TypeError for another type.
     """
     if not (isinstance(room, (int, float)) and 0 <= room <= 1):
-        raise ValueError(f"room is {room!r}, not a share from 0 to 1")
-    if isinstance(given, Light):
-        return given + Light.around() * (room * given.weights.sum(0)) if room else given
-    if isinstance(given, np.ndarray | Tensor) and given.ndim == 3:
-        return Light.from_envmap(given)
-    what = f"has shape {list(given.shape)}" if hasattr(given, "shape") else f"is {type(given).__name__}"
-    raise TypeError(f"light {what}, not a facerf.Light or a map [H, 2 H, 3]; read a file by read_image")
+        raise ValueError(f"room is {room!r}, not a fraction from 0 to 1")
+    if isinstance(light, Light):
+        return light + Light.around() * (room * light.weights.sum(0)) if room else light
+    if isinstance(light, np.ndarray | Tensor) and light.ndim == 3:
+        return Light.from_envmap(light)
+    kind = f"has shape {list(light.shape)}" if hasattr(light, "shape") else f"is {type(light).__name__}"
+    raise TypeError(f"light {kind}, not a facerf.Light or a map [H, 2 H, 3]; read a file with read_image")
 
 
 def stacked(lights: Sequence[Light]) -> Light:
-    """Lights of far directions as sums of one; directions that they share are one light."""
+    """Combine far lights into M sums over the same directions; equal directions become one light."""
     assert not any(light.near for light in lights)
     own, each = None, [light._tensors() for light in lights]
     if any(light.own_rgb is not None for light in lights):
@@ -268,20 +274,156 @@ def stacked(lights: Sequence[Light]) -> Light:
     return Light(directions, weights, own, tuple(slice(key, key + 1) for key in sorted(sharp)))
 
 
+class KeyLight(NamedTuple):
+    """A light whose shadows have hard edges, by the index of its sum and of the sum with only this light.
+
+    `samples` are its directions among the far lights, or its index among the near ones.
+    """
+
+    number: int
+    alone: int
+    is_near: bool
+    samples: slice
+
+
+@dataclass(frozen=True, eq=False)
+class PointLights:
+    """The sample points of one near light of rgb 1: positions [P, 3] in metres, camera space.
+
+    `toward` [3] is the unit vector from the light's middle to the face's centre; `strength` is each point's
+    irradiance times square metres. With `is_panel`, radiance falls with the cosine to `toward`, as for a
+    softbox.
+    """
+
+    places_m: Tensor
+    toward: Tensor
+    strength: float
+    is_panel: bool
+    half_cone_deg: float | None = None
+
+    @staticmethod
+    def of(light: StudioLight, centre_m: Tensor) -> "PointLights":
+        """Place a near light around a face's centre [3]; a surface there that faces it receives 1."""
+        assert light.at_m is not None
+        offset = torch.tensor(light.at_m)
+        distance_m = float(offset.norm())
+        away = offset / distance_m
+        wide_deg = _wide_deg(light)
+        places = centre_m + offset + light.size_m * _grid(away, wide_deg)
+        half = None if light.spot_deg is None else light.spot_deg / 2
+        unit = PointLights(places, -away, 1.0, light.size_m > 0, half)
+        directions, irradiance = unit.arriving(centre_m[:, None, None])
+        received = float((irradiance[:, 0, 0] * (directions[:, 0, 0] @ away)).sum())
+        return replace(unit, strength=1 / received)
+
+    def arriving(self, positions_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Return unit directions [P, H, W, 3] from positions [3, H, W] to the points; irradiance [P, H, W].
+
+        The irradiance is that of a surface that faces the point. It falls with the square of the distance.
+        """
+        offsets = self.places_m[:, None, None] - positions_m.permute(1, 2, 0)
+        distances_m = offsets.norm(dim=-1).clamp_min(1e-6)
+        directions = offsets / distances_m[..., None]
+        aligned = (-directions @ self.toward).clamp(-1, 1)
+        irradiance = self.strength / distances_m.clamp_min(_NEAREST_M).square()
+        if self.is_panel:
+            irradiance = irradiance * aligned.clamp_min(0)
+        if self.half_cone_deg is not None:
+            edge = (1 - torch.rad2deg(aligned.acos()) / self.half_cone_deg) / (1 - _FULL_CONE)
+            inside = edge.clamp(0, 1)
+            irradiance = irradiance * inside * inside * (3 - 2 * inside)
+        return directions, irradiance
+
+
+def far_samples(light: StudioLight) -> tuple[Tensor, Tensor]:
+    """Return a far light's sample directions [n, 3] and weights [n]; a surface that faces it receives 1."""
+    if light.azel_deg is None:
+        weight = 4 / _AROUND  # the mean of a clamped cosine over the sphere is 1 / 4
+        return rig_directions(_AROUND), torch.full((_AROUND,), weight)
+    middle = azel_to_direction(*light.azel_deg)
+    if light.size_deg == 0:  # equal to a single light to the last bit
+        return middle[None], torch.ones(1)
+    wide = 2 * math.tan(math.radians(light.size_deg / 2))
+    directions = F.normalize(middle + wide * _grid(middle, light.size_deg), dim=1)
+    return directions, torch.ones(len(directions)) / (directions @ middle).sum()
+
+
+def _wide_deg(light: StudioLight) -> float:
+    """Return the angle of a near light's side, seen from the face."""
+    assert light.at_m is not None
+    return math.degrees(2 * math.atan2(light.size_m / 2, math.hypot(*light.at_m)))
+
+
+def _grid(axis: Tensor, wide_deg: float) -> Tensor:
+    """Return offsets [n * n, 3] of cells of a unit square around an axis [3]; two sides are horizontal."""
+    if wide_deg == 0:
+        return torch.zeros(1, 3)
+    side = min(max(2, math.ceil(wide_deg / _APART_DEG)), _MOST_A_SIDE)
+    up = torch.tensor([0.0, 1.0, 0.0] if abs(float(axis[1])) < 0.99 else [0.0, 0.0, 1.0])
+    across = F.normalize(torch.linalg.cross(up, axis), dim=0)
+    along = torch.linalg.cross(axis, across)
+    cells = (torch.arange(side) + 0.5) / side - 0.5
+    v, u = torch.meshgrid(cells, cells, indexing="ij")
+    return (u[..., None] * across + v[..., None] * along).view(-1, 3)
+
+
+def is_narrow(directions: Tensor) -> bool:
+    """Return True if a light's samples [n, 3] are close enough that its shadows have hard edges."""
+    middle = F.normalize(directions.mean(0), dim=0)
+    return bool((directions @ middle).min() > math.cos(math.radians(_WIDEST_DEG / 2**0.5)))
+
+
+def is_of_rig(directions: Tensor, lights: int = _AROUND) -> Tensor:
+    """Return which directions [N, 3] belong to a rig; by default to the samples of uniform light."""
+    return (directions[:, None] == rig_directions(lights)).all(-1).any(-1)
+
+
+def intensity_of(light: StudioLight) -> Tensor:
+    """Return the light's colour times its strength [3], linear Rec.709."""
+    tint = torch.ones(3) if light.kelvin is None else torch.from_numpy(blackbody_rgb(light.kelvin)).float()
+    return torch.tensor(light.rgb) * tint * 2.0**light.stops
+
+
+def blackbody_rgb(kelvin: float) -> np.ndarray:
+    """Return linear Rec.709 [3] of a blackbody of 1667 to 25000 K with luminance 1; white at `WHITE_K`.
+
+    The Planckian locus is slightly greener than D65, so colours are divided by the colour at `WHITE_K`.
+    Colours outside Rec.709, such as candlelight, are clipped.
+    """
+    rgb = (_planckian_rgb(kelvin) / _planckian_rgb(WHITE_K)).clip(min=0)
+    balanced: np.ndarray = rgb / luminance(rgb)
+    return balanced
+
+
+def _planckian_rgb(kelvin: float) -> np.ndarray:
+    """Return linear Rec.709 [3] of the Planckian locus (Kang et al. 2002)."""
+    x, y = colour_science().temperature.CCT_to_xy_Kang2002(kelvin)
+    return np.linalg.solve(rgb_to_xyz(REC709_CHROMATICITIES), np.array([x / y, 1.0, (1 - x - y) / y]))
+
+
 def rig(lights: int = 150) -> np.ndarray:
-    """Unit directions [L, 3] of a uniform rig of so many lights, camera space."""
+    """Return the unit directions [L, 3] of a uniform rig, camera space."""
     return rig_directions(lights).numpy()
 
 
 def directions_of(lights: int | Array) -> Tensor:
-    """Unit directions [L, 3] that are given, or of a rig of so many lights."""
+    """Return the directions [L, 3], or those of a rig with this number of lights."""
     if isinstance(lights, Light):
-        raise TypeError("lights is a Light, not directions [L, 3] or their number")
+        raise TypeError("lights is a Light; use directions [L, 3] or their number")
     return rig_directions(int(lights)) if np.ndim(lights) == 0 else unit_directions(lights)
 
 
+def rig_by_text(rig: str) -> Tensor:
+    """Return the unit directions [L, 3] that `--lights` specifies."""
+    parsed = parse_lights(rig)
+    if isinstance(parsed, int):
+        return rig_directions(parsed)
+    azimuth, elevation = torch.tensor(parsed).T
+    return azel_to_direction(azimuth, elevation)
+
+
 def unit_directions(values: Any) -> Tensor:
-    """Directions [L, 3] on the CPU; raises ValueError unless they are of length 1."""
+    """Return directions [L, 3] on the CPU; raises ValueError unless their lengths are 1."""
     directions = as_tensor(values)
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions have shape {list(directions.shape)}, not [L, 3]")
@@ -291,59 +433,48 @@ def unit_directions(values: Any) -> Tensor:
 
 
 def linear_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> Tensor:
-    """Scene-linear pixels [H, W, 3] or [H, W] on the CPU; raises ValueError for others, with their name."""
-    check_kind(name, pixels, shape)
-    linear = as_tensor(pixels)
-    check_finite(name, linear.detach().numpy())
-    return linear
+    """Return scene-linear pixels [H, W, 3] or [H, W] on the CPU; raises as `uncopied_pixels` does."""
+    uncopied_pixels(name, pixels, shape)
+    return as_tensor(pixels)
 
 
-def uncopied_pixels(name: str, photo: Array) -> np.ndarray:
-    """A photo's pixels [H, W, 3], which are not copied; raises ValueError for others."""
-    check_kind(name, photo)
-    pixels = np.asarray(photo.detach().cpu() if isinstance(photo, Tensor) else photo, np.float32)
-    check_finite(name, pixels)
-    return pixels
+def uncopied_pixels(name: str, pixels: Any, shape: str = "[H, W, 3]") -> np.ndarray:
+    """Return pixels [H, W, 3] or [H, W] without copying them.
 
-
-def check_kind(name: str, pixels: Any, shape: str = "[H, W, 3]") -> None:
-    """Raise an error, with their name, for what is no array [H, W, 3] or [H, W] of floats."""
+    Raises TypeError or ValueError if they are not an array of finite floats of that shape.
+    """
     if not isinstance(pixels, np.ndarray | Tensor):
-        raise TypeError(f"{name} is {type(pixels).__name__}, not an array {shape}; read a file by read_image")
+        kind = type(pixels).__name__
+        raise TypeError(f"{name} is {kind}, not an array {shape}; read a file with read_image")
     if pixels.ndim != shape.count(",") + 1 or (shape.endswith("3]") and pixels.shape[2] != 3):
         raise ValueError(f"{name} has shape {list(pixels.shape)}, not {shape}")
     if not (pixels.is_floating_point() if isinstance(pixels, Tensor) else pixels.dtype.kind == "f"):
-        raise ValueError(f"{name} holds {pixels.dtype}; give scene-linear floats, as read_image does")
-
-
-def check_finite(name: str, values: np.ndarray) -> None:
-    """Raise ValueError for pixels that are no numbers."""
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name} holds values that are not finite")
+        raise ValueError(f"{name} has type {pixels.dtype}; use scene-linear floats, as read_image returns")
+    array = np.asarray(pixels.detach().cpu() if isinstance(pixels, Tensor) else pixels, np.float32)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} contains values that are not finite")
+    return array
 
 
 def one_of(choices: Any, name: str, value: str) -> None:
-    """Raise ValueError for a word that is not one of a Literal's."""
+    """Raise ValueError if the word is not one of a Literal's."""
     if value not in get_args(choices):
         raise ValueError(f"{name} is {value!r}, not one of {', '.join(get_args(choices))}")
 
 
 def as_tensor(values: Any) -> Tensor:
-    """Values as a float32 tensor on the CPU, to which gradients flow if it was a tensor."""
-    return (
-        (values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32)))
-        .float()
-        .cpu()
-    )
+    """Return a float32 tensor on the CPU; gradients flow to a tensor."""
+    tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, np.float32))
+    return tensor.float().cpu()
 
 
 def _joined(one: Array, two: Array) -> Array:
-    """Arrays [..., L, 3] one after the other; tensors where either is one."""
+    """Concatenate arrays [..., L, 3] along L; the result is a tensor if either is one."""
     if isinstance(one, np.ndarray) and isinstance(two, np.ndarray):
         return np.concatenate([one, two], -2)
     return torch.cat([as_tensor(one), as_tensor(two)], -2)
 
 
 def _either(one: Any, two: Any, join: Callable[[Any, Any], Any]) -> Any:
-    """Both values joined, or the one that is not None."""
+    """Join two values, or return the one that is not None."""
     return two if one is None else one if two is None else join(one, two)

@@ -1,4 +1,4 @@
-"""Directions of light, lat-long maps and rigs; each convention is defined here and nowhere else.
+"""Directions of light, lat-long maps and rigs; all conventions are defined here.
 
 A light direction is the unit vector from the face toward the light, in camera space (x to the image's right,
 y up, z toward the camera). Lat-long maps are OpenEXR's ENVMAP_LATLONG: the centre is +z (behind the camera),
@@ -15,20 +15,19 @@ import torch
 from torch import Tensor
 
 RIG_LIGHTS = 150  # of the paper's light stage
-_RELAX_STEPS = 200  # in which a rig's lights repel each other
-_RELAX_NEIGHBOURS = 18  # that repel a light
+_RELAX_STEPS, _RELAX_NEIGHBOURS = 200, 18  # steps of repulsion, and lights that repel each light
 LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear Rec.709
 _STORED_RIGS = Path(__file__).parent.parent / "assets" / "rigs.npz"
-_BLUR_DEG = 12.0  # of the light whose brightest direction is sought; less than the rig's spacing, 18 degrees
-_BLUR_ROWS = 90  # of the grid of directions on which it is sought
+_BLUR_DEG = 12.0  # of `brightest_direction`; less than the rig's spacing of 18 degrees
+_BLUR_ROWS = 90  # of its grid of directions
 
 
 @dataclass(frozen=True, eq=False)
 class RigLight:
-    """A light as a weighted sum of single lights: unit directions [L, 3] in camera space, rgb weights [L, 3].
+    """A weighted sum of single lights: unit directions [L, 3] in camera space, rgb weights [L, 3].
 
     A light of weight 1 gives a white Lambertian surface that faces it radiance 1. Weights are non-negative,
-    except those of a spherical-harmonic model's light.
+    except when they come from spherical harmonics.
     """
 
     directions: Tensor
@@ -36,7 +35,7 @@ class RigLight:
 
 
 def azel_to_direction(azimuth_deg: Tensor | float, elevation_deg: Tensor | float) -> Tensor:
-    """d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 lights the image's right side."""
+    """Return d = (cos el sin az, sin el, cos el cos az) [..., 3]; azimuth > 0 is to the image's right."""
     azimuth = torch.deg2rad(torch.as_tensor(azimuth_deg))
     return _on_sphere(azimuth, torch.deg2rad(torch.as_tensor(elevation_deg)) + torch.zeros_like(azimuth))
 
@@ -47,24 +46,24 @@ def _on_sphere(azimuth: Tensor, elevation: Tensor) -> Tensor:
 
 
 def direction_to_azel(directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Azimuth in [-180, 180] and elevation in [-90, 90] degrees [...] of directions [..., 3], any length."""
+    """Return azimuth (-180 to 180) and elevation (-90 to 90) in degrees of directions [..., 3]."""
     x, y, z = directions.unbind(-1)
     return torch.rad2deg(torch.atan2(x, z)), torch.rad2deg(torch.atan2(y, torch.hypot(x, z)))
 
 
 def uv_to_direction(uv: Tensor) -> Tensor:
-    """Unit directions [..., 3] of lat-long positions [..., 2]: azimuth 180 - 360 u, elevation 90 - 180 v."""
+    """Convert lat-long positions [..., 2] to unit directions: azimuth 180 - 360 u, elevation 90 - 180 v."""
     return _on_sphere(math.pi * (1 - 2 * uv[..., 0]), math.pi * (0.5 - uv[..., 1]))
 
 
 def direction_to_uv(directions: Tensor) -> Tensor:
-    """Lat-long positions [..., 2] in [0, 1] of directions [..., 3] of any length."""
+    """Convert directions [..., 3] of any length to lat-long positions [..., 2] in [0, 1]."""
     azimuth_deg, elevation_deg = direction_to_azel(directions)
     return torch.stack([0.5 - azimuth_deg / 360, 0.5 - elevation_deg / 180], -1)
 
 
 def latlong_directions(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Unit directions of the centres of a lat-long map's pixels [H, W, 3]."""
+    """Return the unit directions [H, W, 3] of a lat-long map's pixel centres."""
     v = (torch.arange(height, dtype=torch.float64) + 0.5) / height
     u = (torch.arange(width, dtype=torch.float64) + 0.5) / width
     grid_v, grid_u = torch.meshgrid(v, u, indexing="ij")
@@ -72,16 +71,17 @@ def latlong_directions(height: int, width: int, dtype: torch.dtype = torch.float
 
 
 def latlong_solid_angles(height: int, width: int, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Exact solid angles of a lat-long map's pixels [H, W] in steradians; they sum to 4 pi at any size."""
+    """Return exact solid angles [H, W] in steradians of a lat-long map's pixels; they sum to 4 pi."""
     elevation = math.pi * (0.5 - torch.arange(height + 1, dtype=torch.float64) / height)
     band = elevation[:-1].sin() - elevation[1:].sin()
     return (band * (2 * math.pi / width))[:, None].expand(height, width).to(dtype)
 
 
 def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
-    """Unit directions [n, 3] float32, uniform on the sphere and the same in every call.
+    """Return unit directions [n, 3] float32, uniform on the sphere and the same in every call.
 
-    A golden spiral about +y, then a fixed number of steps in which each light is repelled by its neighbours.
+    A golden spiral around +y is followed by a fixed number of steps in which neighbouring lights repel each
+    other.
     """
     if n < 1:
         raise ValueError(f"a rig needs at least one light, not {n}")
@@ -90,7 +90,7 @@ def rig_directions(n: int = RIG_LIGHTS) -> Tensor:
 
 @cache  # hundreds of steps
 def _relaxed(n: int) -> np.ndarray:
-    """Directions [n, 3] of a rig: stored for the numbers that a photo needs, or else computed."""
+    """Return a rig's directions [n, 3]: stored for the numbers that a photo needs, otherwise computed."""
     with np.load(_STORED_RIGS) as stored:
         return np.asarray(stored[str(n)]) if str(n) in stored else repelled(n)
 
@@ -104,7 +104,7 @@ def repelled(n: int) -> np.ndarray:
 
 
 def golden_spiral(points: int) -> np.ndarray:
-    """Unit vectors [points, 3] in a spiral about +y, each with an equal share of the sphere."""
+    """Return unit vectors [points, 3] on a spiral around +y, each with an equal fraction of the sphere."""
     index = np.arange(points)
     azimuth = index * math.pi * (3 - math.sqrt(5))
     y = 1 - (2 * index + 1) / points
@@ -113,8 +113,8 @@ def golden_spiral(points: int) -> np.ndarray:
 
 
 def _repel(points: np.ndarray, step: float) -> np.ndarray:
-    """Move unit vectors [L, 3] apart by at most `step` of their mean spacing."""
-    from scipy.spatial import cKDTree  # a photo does without it
+    """Move unit vectors [L, 3] apart by at most `step` times their mean spacing."""
+    from scipy.spatial import cKDTree  # not needed for a photo
 
     spacing = math.sqrt(4 * math.pi / len(points))
     distance, neighbour = cKDTree(points).query(points, k=min(_RELAX_NEIGHBOURS + 1, len(points)))
@@ -127,10 +127,9 @@ def _repel(points: np.ndarray, step: float) -> np.ndarray:
 
 
 def brightest_direction(light: RigLight) -> Tensor:
-    """The unit direction [3] in which the blurred luminance of a light is greatest; 0 for a dark light.
+    """Return the unit direction [3] with the greatest blurred luminance; 0 for a dark light.
 
-    The blur, a von Mises-Fisher lobe, adds up the weights of neighbouring lights that share one light
-    source.
+    The blur, a von Mises-Fisher lobe, adds the weights of neighbouring lights that represent the same source.
     """
     luminance = light.weights.double() @ torch.tensor(LUMINANCE, dtype=torch.float64)
     where = latlong_directions(_BLUR_ROWS, 2 * _BLUR_ROWS, torch.float64).reshape(-1, 3)

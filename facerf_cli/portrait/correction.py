@@ -1,22 +1,22 @@
-"""Corrections of a model by its photo, so that the photo's own light gives the photo back.
+"""Corrections of a model by its photo, so that the photo's own light reproduces the photo.
 
-Errors of a network (the white of an eye too bright, a crease too shallow) are about the same under lights
-that shade the person alike. Under the photo's light they are known: the photo divided by its explanation is a
-quotient image (Riklin-Raviv and Shashua, *The quotient image*, 2001). `Quotient` is for the field of a face,
-`Correction` for the transport of a portrait.
+A network's errors (the white of an eye too bright, a crease too shallow) are similar under lights that shade
+the person alike. Under the photo's light they are known: the photo divided by its explanation is a ratio
+image (Riklin-Raviv and Shashua, *The quotient image*, 2001). `Quotient` corrects the face field, `Correction`
+the light transport of a portrait.
 
-For that, with the model's image s_l of light l, the photo P and its explanation E = sum_l w_l s_l, the
-corrected image of a light is
+For `Correction`, with the model's image s_l of light l, the photo P and its explanation E = sum_l w_l s_l,
+the corrected image of a light is
 
     s_l + (p_l / p) (Q - 1) (s_l + f k_l),    Q = (P + f) / (E + f),    k_l = mean s_l / mean E,
 
 where p_l is the likeness of s_l and E, f a small floor, and p the mean of p_l in each pixel over the photo's
-lights, weighted by their share of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum of
-lights is the sum of their corrections. Where a light makes a pixel brighter than the photo's light does, its
-likeness falls in proportion: a shadow's error, which is a large share of little light, stays as small there.
-What darkens is a factor of s_l alone, no less than 0, so that no light is negative.
-Where the photo is nearly black its colours are noise, and Q is of one value in all channels. Q is blurred by
-a pixel: enlarged to the photo's resolution its edges would be stairs.
+lights, weighted by their fraction of E + f there. So sum_l w_l s_l becomes P, and the correction of any sum
+of lights is the sum of their corrections. Where a light makes a pixel brighter than the photo's light does,
+its likeness falls in proportion: the error of a shadow, which is large relative to little light, stays as
+small there. Darkening is a factor of only s_l, at least 0, so that no light is negative. Where the photo is
+nearly black its colours are noise, so Q has one value in all channels. Q is blurred by a pixel, because its
+edges would be stairs at the photo's resolution.
 """
 
 from dataclasses import dataclass, replace
@@ -27,16 +27,16 @@ from torch import Tensor
 
 from facerf_cli.raster.texture import blurred_within
 
-_FLOOR = 0.05  # f, as a share of the mean of the photo's person
+_FLOOR = 0.05  # f, relative to the person's mean in the photo
 _RANGE = (0.2, 5.0)  # of Q
-_BLUR_PX = 1.0  # standard deviation of its blur
-_DARK = 4.0  # floors: the radiance below which a photo's colours are noise
-SHARPNESS = 20.0  # exponent of the likeness
+_BLUR_PX = 1.0  # standard deviation of Q's blur
+_DARK = 4.0  # radiance, in floors, below which a photo's colours are noise
+_SHARPNESS = 20.0  # exponent of the likeness
 _LARGEST = 1.5  # of p_l / p
-_SMALL_PX = 48  # side at which likeness is measured
-_FACE_FLOOR = 0.2  # as a share of the photo's mean radiance: keeps quotients in shadows near 1
-_FACE_RANGE = (0.3, 3.0)  # of the quotients
-_FACE_SHARPNESS = 8.0  # exponent of the likeness: the higher, the more alike a light must shade the face
+_SMALL_PX = 48  # side of the images for the likeness
+_FACE_FLOOR = 0.2  # relative to the photo's mean radiance: keeps ratios in shadows near 1
+_FACE_RANGE = (0.3, 3.0)  # of the ratios
+_FACE_SHARPNESS = 8.0  # exponent of the likeness: higher values correct fewer lights
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,14 +52,18 @@ class Correction:
 
     @staticmethod
     def of(photo: Tensor, olats: Tensor, weights: Tensor, person: Tensor) -> "Correction":
-        """Correct images [L, 3, S, S] whose sum by weights [L, 3] explains a photo [3, S, S].
+        """Correct images [L, 3, S, S] whose sum with weights [L, 3] explains a photo [3, S, S].
 
-        person [S, S] is the share of each pixel that the person has.
+        person [S, S] is the person's coverage of each pixel.
         """
         explained = torch.einsum("lc,lcij->cij", weights, olats)
         total = person.sum().clamp_min(1.0)
         floor = _FLOOR * float((photo.mean(0) * person).sum() / total)
-        ratio = _ratio(photo, explained, floor)
+        ratio = (photo + floor) / (explained + floor).clamp_min(1e-9)
+        brightness = photo.mean(0, keepdim=True)
+        grey = (brightness + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
+        coloured = brightness**2 / (brightness**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
+        ratio = torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
         mean = float((explained.mean(0) * person).sum() / total)
         excess = blurred_within(ratio - 1, person, _BLUR_PX) * person
         plain = Correction(excess, torch.ones_like(person), floor, mean, explained.mean(0), person)
@@ -71,7 +75,7 @@ class Correction:
         return replace(plain, mean_likeness=mean_likeness.clamp_min(1e-3))
 
     def terms(self, grey: Tensor) -> tuple[Tensor, Tensor]:
-        """Factors and additions [3, l, S, S] that correct images of single lights, grey ones [l, S, S]."""
+        """Return factors and additions [3, l, S, S] that correct single-light images, grey ones [l, S, S]."""
         brightness = self._brightness(grey)
         power = self._likeness(grey, brightness) / self.mean_likeness
         power, raised = power.clamp(max=_LARGEST), self.floor * brightness
@@ -81,40 +85,31 @@ class Correction:
         return factor.clamp_min_(0), more * raised
 
     def _brightness(self, grey: Tensor) -> Tensor:
-        """k_l [l, 1, 1]."""
+        """Return k_l [l, 1, 1]."""
         means = (grey * self.person).sum((1, 2)) / self.person.sum().clamp_min(1.0)
         return (means / max(self.mean, 1e-9))[:, None, None]
 
     def _likeness(self, grey: Tensor, brightness: Tensor) -> Tensor:
-        """p_l [l, S, S]."""
+        """Return p_l [l, S, S]."""
         small, explained = _small(grey, self.person), _small(self.explained, self.person)
         lengths = small.flatten(-2).norm(dim=-1) * explained.norm()
         cosine = (small * explained).sum((-2, -1)) / lengths.clamp_min(1e-12)
         allowed = brightness * (self.explained + self.floor)
         brighter = (grey + self.floor * brightness) / allowed.clamp_min(1e-9)
-        return cosine.clamp(0, 1)[:, None, None] ** SHARPNESS / brighter.clamp_min(1)
-
-
-def _ratio(photo: Tensor, explained: Tensor, floor: float) -> Tensor:
-    """Q [3, S, S], of one value in all channels where the photo is so dark that its colour is noise."""
-    ratio = (photo + floor) / (explained + floor).clamp_min(1e-9)
-    shown = photo.mean(0, keepdim=True)
-    grey = (shown + floor) / (explained.mean(0, keepdim=True) + floor).clamp_min(1e-9)
-    coloured = shown**2 / (shown**2 + (_DARK * floor) ** 2).clamp_min(1e-12)
-    return torch.lerp(grey, ratio, coloured).clamp(*_RANGE)
+        return cosine.clamp(0, 1)[:, None, None] ** _SHARPNESS / brighter.clamp_min(1)
 
 
 def _small(grey: Tensor, person: Tensor) -> Tensor:
-    """Grey images [n, s, s] of grey ones [n, S, S] or [S, S], over the person."""
-    shown = (grey * person).reshape(1, -1, *person.shape)
-    return F.interpolate(shown, (_SMALL_PX, _SMALL_PX), mode="area")[0]
+    """Resize grey images [n, S, S] or [S, S] over the person to [n, s, s]."""
+    masked = (grey * person).reshape(1, -1, *person.shape)
+    return F.interpolate(masked, (_SMALL_PX, _SMALL_PX), mode="area")[0]
 
 
 @dataclass(frozen=True)
 class Quotient:
     """Photo over its reconstruction [3, t, t], and the visible reconstruction, grey [t, t].
 
-    `albedo` [3, t, t], if not None, are factors of the field's albedo, which the reconstruction has.
+    `albedo` [3, t, t], if not None, are factors of the field's albedo that the reconstruction includes.
     """
 
     ratio: Tensor
@@ -130,12 +125,11 @@ class Quotient:
         return Quotient(1 + visible * (ratio - 1), explained.mean(0) * visible, albedo)
 
     def corrected(self, olats: Tensor) -> Tensor:
-        """Multiply OLAT textures [l, 3, T, T] by the quotient, to a power that is each light's likeness.
+        """Multiply OLAT textures [l, 3, T, T] by the ratio image, to the power of each light's likeness.
 
-        The factors of albedo are the same for all.
-
-        Likeness is the cosine between the OLAT and the reconstruction. It compares the shading of the face,
-        not light directions: a photo under a dome of light hardly corrects a light from the side.
+        The factors of albedo are the same for all lights. Likeness is the cosine between the OLAT and the
+        reconstruction. It compares the shading of the face, not light directions: a photo in uniform light
+        hardly corrects a light from the side.
         """
         side = olats.shape[-2:]
         if self.albedo is not None:

@@ -1,14 +1,14 @@
-"""People in a photo: their faces, each with landmarks, and what is seen around them.
+"""Detect the people in a photo: their faces, with landmarks and the Parsing Network's view.
 
-The photo is searched as a whole, then in parts and turned. MediaPipe's two detectors (Bazarevsky et al.,
-*BlazeFace*, 2019) look at its squares. Around each face that they propose, a network finds a mesh
-(Grishchenko et al., *Attention Mesh*, 2020), twice; it also says if a face is there. The Parsing Network
-looks at each face that is found.
+The whole photo is searched, then parts of it and rotated copies. MediaPipe's two detectors (Bazarevsky et
+al., *BlazeFace*, 2019) process its squares. Around each proposed face a network predicts a mesh (Grishchenko
+et al., *Attention Mesh*, 2020), twice, and the probability of a face. The Parsing Network then processes each
+face.
 """
 
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -23,7 +23,7 @@ from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.confidence import check_seen, lie_on_one
-from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, whole_photo
+from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, unit_centres, whole_photo
 from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.run.threads import in_threads
 
@@ -33,14 +33,14 @@ _LIDS = [  # points around the opening of each eye
     [263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466],
 ]
 _AROUND_68 = 1.8  # side of the square around the 68 landmarks, in their extents
-_MESH_SIDES = 1.5  # side of the square that a mesh is found in, in sides of the face's box
+_MESH_SIDES = 1.5  # side of the square for a mesh, in sides of the face's box
 _MESH_PX = 192
 _AFAR = 2.5  # side of the square that shows a photo from afar, in sides of the photo
-_OVERLAP = 1.5  # how many parts along a side cover the photo, over those that just would
+_OVERLAP = 1.5  # number of parts along a side, relative to the least number that covers the photo
 _LEAST_MESH_SCORE, _LEAST_PX = 0.5, 8.0  # of a face; noise has smaller ones
-_SAME = 0.5  # distance of the middles of two boxes below which they hold one face, in sides of the larger
-_EYES = (33, 263)  # outer corners, the picture's left one first
-# MediaPipe's 468 points that stand for the 68 landmarks (Multi-PIE order).
+_SAME = 0.5  # largest distance of the middles of two boxes of one face, in sides of the larger
+_EYES = (33, 263)  # outer corners, the image's left one first
+# MediaPipe's points at the 68 landmarks (Multi-PIE order).
 _OF_68 = np.array(
     [
         *(127, 234, 93, 132, 58, 136, 150, 176, 152, 400, 379, 365, 288, 361, 323, 454, 356),  # jaw
@@ -54,28 +54,25 @@ _OF_68 = np.array(
 log = logging.getLogger(LOGGER_NAME)
 
 _NO_FACE = "no face found; try a larger or brighter image that shows the whole face"
-_FACE_SIDES = 1.7  # side of the square that landmarks are read from, in extents of the landmarks
+_FACE_SIDES = 1.7  # side of the square for the Parsing Network, in extents of the landmarks
 _TURNS = (math.pi / 2, -math.pi / 2, math.pi)
-_DARK = 100  # of 255: brightest percentile of a photo that is brightened before it is searched
-_UNCLEAR = 0.05  # relative error of given landmarks from which on they may lie off the face
-_FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is found
+_DARK = 100  # of 255: photos whose 99th percentile is below it are brightened
+_UNCLEAR = 0.05  # relative error of a user's landmarks above which they may lie off the face
+_FINEST_PX = 500.0  # side of a part of the photo in which a face of 24 pixels is detected
 
 
 @dataclass(frozen=True)
 class _Detector:
-    """A detector: the side of its input, cells a side and anchors a cell of its scales, least score."""
+    """Detector: side of its input, (cells per side, anchors per cell) of its scales, and least score."""
 
     side_px: int
     scales: tuple[tuple[int, int], ...]
     least_score: float
 
     def anchors(self) -> np.ndarray:
-        """Middles [N, 2] of the anchors, in sides of the input."""
-        middles = []
-        for cells, each in self.scales:
-            at = (np.arange(cells) + 0.5) / cells
-            middles.append(np.repeat(np.stack(np.meshgrid(at, at), -1).reshape(-1, 2), each, 0))
-        return np.concatenate(middles)
+        """Return the middles [N, 2] of the anchors, in fractions of the input's side."""
+        grids = (np.repeat(unit_centres(cells).reshape(-1, 2), each, 0) for cells, each in self.scales)
+        return np.concatenate([*grids])
 
 
 _NEAR = _Detector(128, ((16, 2), (8, 6)), 0.5)
@@ -84,9 +81,9 @@ _FAR = _Detector(192, ((48, 1),), 0.6)
 
 @dataclass(frozen=True, eq=False)
 class FaceMesh:
-    """A face: points [478, 3] in the photo's pixels (z on the same scale, smaller toward the camera).
+    """Mesh of a face: points [478, 3] in the photo's pixels (z on the same scale, smaller toward the camera).
 
-    `score` in 0..1 says how surely a face is there, `square` where its mesh was found.
+    `score` in 0..1 is the probability of a face; `square` is the input that the mesh was predicted from.
     """
 
     points_px: np.ndarray
@@ -95,25 +92,25 @@ class FaceMesh:
 
     @property
     def landmarks_px(self) -> np.ndarray:
-        """The 68 landmarks [68, 2]."""
+        """68 landmarks [68, 2]."""
         return self.points_px[_OF_68, :2]
 
 
 @dataclass(frozen=True, eq=False)
 class SeenEyes:
-    """N eyes in a photo's pixels: irises [N, 3], centres and radii, and the lids around them [N, 16, 2]."""
+    """N eyes in a photo's pixels: centres and radii of irises [N, 3], and lids around them [N, 16, 2]."""
 
     irises_px: np.ndarray
     lids_px: np.ndarray
 
     def scaled(self, scale: float) -> "SeenEyes":
-        """The eyes in the photo at another size."""
+        """Return the eyes in the resized photo."""
         return SeenEyes(self.irises_px * scale, self.lids_px * scale)
 
 
 @dataclass(frozen=True, eq=False)
 class _Box:
-    """A proposed face: its square, level with the eyes, and score."""
+    """Proposed face: its square, level with the eyes, and score."""
 
     square: Square
     score: float
@@ -123,9 +120,9 @@ _Proposed = TypeVar("_Proposed", _Box, FaceMesh)
 
 
 def first_squares(image_srgb: np.ndarray) -> list[Square]:
-    """Squares of an image [H, W, 3] to search first: all of it, it from afar, and parts of two thirds.
+    """Return squares of an image [H, W, 3] to search first: all of it, from afar, and parts of two thirds.
 
-    A face that fills the photo is known from afar alone; nearer its eyes look like faces.
+    A face that fills the photo is detected only from afar; from nearby its eyes look like faces.
     """
     side_px = float(max(image_srgb.shape[:2]))
     whole = whole_photo(image_srgb)
@@ -133,7 +130,7 @@ def first_squares(image_srgb: np.ndarray) -> list[Square]:
 
 
 def parts_of(image: np.ndarray, side_px: float) -> list[Square]:
-    """Overlapping squares that cover the photo."""
+    """Return overlapping squares that cover the photo."""
     rows, columns = (
         np.linspace(
             min(side_px, length) / 2,
@@ -146,16 +143,13 @@ def parts_of(image: np.ndarray, side_px: float) -> list[Square]:
 
 
 def find_meshes(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[FaceMesh]:
-    """Find faces in squares of an sRGB uint8 image [H, W, 3], the surest first."""
-    found: list[FaceMesh] = []
-    for box in distinct(detected(people, image_srgb, squares)):
-        if mesh := mesh_near(people, image_srgb, box.square):
-            found.append(mesh)
-    return distinct(found)
+    """Find faces in squares of an sRGB uint8 image [H, W, 3], in descending order of score."""
+    boxes = distinct(detected(people, image_srgb, squares))
+    return distinct([mesh for box in boxes if (mesh := mesh_near(people, image_srgb, box.square))])
 
 
 def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) -> FaceMesh | None:
-    """The mesh of a face that is expected in a square; None where there is none."""
+    """Return the mesh of a face that is expected in a square, or None."""
     mesh = mesh_in(people.face_mesh, image_srgb, square)
     if mesh.score > _LEAST_MESH_SCORE:
         mesh = mesh_in(people.face_mesh, image_srgb, face_square(mesh.points_px))
@@ -164,7 +158,7 @@ def mesh_near(people: PeopleNetworks, image_srgb: np.ndarray, square: Square) ->
 
 
 def eyes_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> SeenEyes:
-    """Both eyes of a face, by its landmarks [68, 2]; or none."""
+    """Return the eyes of a face with landmarks [68, 2]: both, or none."""
     mesh = mesh_near(people, image_srgb, Square.around(landmarks_px, _AROUND_68, above=0.1))
     if mesh is None:
         return SeenEyes(np.zeros((0, 3)), np.zeros((0, len(_LIDS[0]), 2)))
@@ -174,7 +168,7 @@ def eyes_of(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.nda
 
 
 def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -> float:
-    """Mean distance of a mesh's landmarks from those that the mirrored image shows, in their extent."""
+    """Return the mean distance of a mesh's landmarks from those in the mirrored image, in their extent."""
     square, width = mesh.square, image_srgb.shape[1]
     mirrored = replace(square, x_px=width - square.x_px, turn_rad=-square.turn_rad)
     other_px = mesh_in(network, image_srgb[:, ::-1], mirrored).landmarks_px[MIRROR_68]
@@ -183,17 +177,17 @@ def unsteadiness(network: StoredGraph, image_srgb: np.ndarray, mesh: FaceMesh) -
 
 
 def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[_Box]:
-    """Boxes that the detectors propose in squares; one face has many."""
+    """Return the boxes that the detectors propose in squares; one face has many."""
     detectors = (people.near_faces, _NEAR), (people.far_faces, _FAR)
 
-    def seen(one: tuple[StoredGraph, _Detector]) -> dict[str, Tensor]:
-        network, detector = one
+    def run(pair: tuple[StoredGraph, _Detector]) -> dict[str, Tensor]:
+        network, detector = pair
         images = [square.cut(image_srgb, detector.side_px, outside=0.0) for square in squares]
-        found: dict[str, Tensor] = network(torch.stack(images) * 2 - 1)
-        return found
+        out: dict[str, Tensor] = network(torch.stack(images) * 2 - 1)
+        return out
 
     boxes: list[_Box] = []
-    for (_, detector), out in zip(detectors, in_threads(seen, detectors), strict=True):
+    for (_, detector), out in zip(detectors, in_threads(run, detectors), strict=True):
         anchors = detector.anchors()
         scores = out["scores"][..., 0].sigmoid().numpy()
         all_values = out["boxes"].reshape(len(squares), -1, 8, 2).numpy() / detector.side_px
@@ -206,12 +200,14 @@ def detected(people: PeopleNetworks, image_srgb: np.ndarray, squares: Sequence[S
                 score[likely],
                 strict=True,
             ):
-                boxes.append(_Box(_level(square, middle, float(size.max()), eyes), float(its_score)))
+                x_px, y_px = square.to_photo(middle)
+                side_px = _MESH_SIDES * float(size.max()) * square.side_px
+                level = Square(float(x_px), float(y_px), side_px, _turn_rad(square.to_photo(eyes)))
+                boxes.append(_Box(level, float(its_score)))
     return boxes
 
 
 def mesh_in(network: StoredGraph, image_srgb: np.ndarray, square: Square) -> FaceMesh:
-    """The mesh of a face in a square around it."""
     out = {
         name: value.reshape(-1).numpy()
         for name, value in network(square.cut(image_srgb, _MESH_PX, outside=0.0)[None]).items()
@@ -228,39 +224,35 @@ def mesh_in(network: StoredGraph, image_srgb: np.ndarray, square: Square) -> Fac
 
 
 def face_square(points_px: np.ndarray) -> Square:
-    """The square, level with the eyes, in which a mesh is found again from its points [478, 3]."""
-    left, right = points_px[list(_EYES), :2]
-    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
+    """Return the square, level with the eyes, in which to predict a mesh again from its points [478, 3]."""
+    turn_rad = _turn_rad(points_px[list(_EYES), :2])
     level = Square(0.0, 0.0, 1.0, turn_rad)
-    along = level.to_share(points_px[:468, :2])
+    along = level.to_unit_square(points_px[:468, :2])
     low, high = along.min(0), along.max(0)
     x_px, y_px = level.to_photo((low + high) / 2)
     return Square(float(x_px), float(y_px), _MESH_SIDES * float((high - low).max()), turn_rad)
 
 
-def _level(square: Square, middle: np.ndarray, size: float, eyes: np.ndarray) -> Square:
-    """The square for the mesh of a face; its middle and eyes [2, 2] are in sides of a square around it."""
-    left, right = square.to_photo(eyes)
-    x_px, y_px = square.to_photo(middle)
-    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    return Square(float(x_px), float(y_px), _MESH_SIDES * size * square.side_px, turn_rad)
+def _turn_rad(eyes_px: np.ndarray) -> float:
+    left, right = eyes_px
+    return -math.atan2(right[1] - left[1], right[0] - left[0])
 
 
-def distinct(found: list[_Proposed]) -> list[_Proposed]:
-    """The surest of what lies on each other."""
+def distinct(proposed: list[_Proposed]) -> list[_Proposed]:
+    """Keep only the box or mesh with the highest score among overlapping ones."""
+
+    def apart(first: Square, second: Square) -> bool:
+        side_px = max(first.side_px, second.side_px) / _MESH_SIDES
+        return math.hypot(first.x_px - second.x_px, first.y_px - second.y_px) > _SAME * side_px
+
     kept: list[_Proposed] = []
-    for one in sorted(found, key=lambda one: -one.score):
-        if all(_apart(one.square, other.square) for other in kept):
-            kept.append(one)
+    for face in sorted(proposed, key=lambda face: -face.score):
+        if all(apart(face.square, other.square) for other in kept):
+            kept.append(face)
     return kept
 
 
-def _apart(first: Square, second: Square) -> bool:
-    side_px = max(first.side_px, second.side_px) / _MESH_SIDES
-    return math.hypot(first.x_px - second.x_px, first.y_px - second.y_px) > _SAME * side_px
-
-
-# Numbers of the mesh's points that the network finds again, finer, in a crop around lips and eyes.
+# Indices of the mesh's points that the network refines in a crop around lips and eyes.
 _REFINED = {
     "lips": [
         *(61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 185, 40, 39, 37, 0, 267, 269, 270, 409),
@@ -286,16 +278,15 @@ _REFINED = {
 
 
 class NoFaceError(InputError):
-    """No face is found in an image."""
+    """No face was detected in an image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Face:
-    """A face in a photo: its box and its landmarks [68, 2] in the photo's pixels.
+    """Face in a photo: its box and its landmarks [68, 2] in the photo's pixels.
 
-    `view` is what the Parsing Network sees around it, also other landmarks and their errors; None where it
-    has not looked. `others` are the photo's other heads; None where they were not searched. `number` counts
-    the faces from the left, from 0.
+    `view` is the Parsing Network's view of it, with further landmarks and their errors, or None. `others` are
+    the photo's other heads; None if they were not detected. `number` is its index from the left.
     """
 
     box_px: Box
@@ -307,13 +298,12 @@ class Face:
 
     @property
     def area_px(self) -> float:
-        """The area of the box."""
         left, top, right, bottom = self.box_px
         return (right - left) * (bottom - top)
 
 
 def face_at(landmarks_px: np.ndarray) -> Face:
-    """The face of given landmarks [68, 2], in their bounds."""
+    """Return the face with the user's landmarks [68, 2], in their bounds."""
     (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
     return Face((left, top, right, bottom), math.inf, landmarks_px)
 
@@ -321,35 +311,31 @@ def face_at(landmarks_px: np.ndarray) -> Face:
 def choose_face(faces: list[Face], which: str, name: str) -> list[Face]:
     """Choose among faces ordered from left to right: the largest, all, or the one at an index from 0.
 
-    'largest' multiplies size by detector score: a badge on a sleeve can be as large as the face above it.
+    'largest' multiplies size by detector score, because a badge on a sleeve can be as large as the face above
+    it.
     """
     if which == "all":
         return faces
     if which == "largest":
         if len(faces) > 1:
             log.info(
-                "%s: has %d faces, of which the largest is taken (--face all, or 0 for the leftmost)",
-                name,
-                len(faces),
+                "%s: using the largest of %d faces (--face all, or 0 for the leftmost)", name, len(faces)
             )
         return [max(faces, key=lambda face: face.area_px * face.score)]
     if not which.isdecimal():
-        raise UsageError(f"--face {which}: not a choice; give largest, all or a number from 0")
+        raise UsageError(f"--face {which}: invalid value; use largest, all or an index from 0")
     if int(which) >= len(faces):
-        raise InputError(f"{name}: has {len(faces)} face(s), and no --face {which}; the leftmost is 0")
+        raise InputError(f"{name}: has {len(faces)} face(s); use --face 0 (leftmost) to {len(faces) - 1}")
     return [faces[int(which)]]
 
 
 @step("find")
 def find_faces(
-    people: PeopleNetworks,
-    pixels_linear: np.ndarray,
-    name: str,
-    which: str = "largest",
+    people: PeopleNetworks, pixels_linear: np.ndarray, name: str, which: str = "largest"
 ) -> list[Face]:
     """Find faces in a scene-linear image [H, W, 3]; `which` is largest, all or an index, see `choose_face`.
 
-    Raises NoFaceError, with the image's name, where there is none.
+    Raises NoFaceError, with the image's name, if there is none.
     """
     faces = detect_faces(people, to_display(pixels_linear), everyone=which != "largest")
     if not faces:
@@ -357,37 +343,40 @@ def find_faces(
     return choose_face(faces, which, name)
 
 
-def detect_faces(
-    people: PeopleNetworks,
-    image_srgb: np.ndarray,
-    everyone: bool = False,
-) -> list[Face]:
-    """Find the faces in an sRGB uint8 image [H, W, 3], ordered from left to right; empty for none.
+def detect_faces(people: PeopleNetworks, image_srgb: np.ndarray, everyone: bool = False) -> list[Face]:
+    """Detect the faces in an sRGB uint8 image [H, W, 3], ordered from left to right.
 
-    Turned and small faces are looked for where no other is found, or for `everyone`.
+    Rotated and small faces are searched only if no other is found, or for `everyone`.
     """
     check_display(image_srgb)
-    image_srgb = _brightened(image_srgb)
+    image_srgb, side_px = _brightened(image_srgb), float(max(image_srgb.shape[:2]))
+    attempts = [
+        first_squares(image_srgb),
+        [whole_photo(image_srgb, turn_rad) for turn_rad in _TURNS],
+        parts_of(image_srgb, side_px / 3),
+    ]
+    if side_px / 3 > _FINEST_PX:
+        attempts.append(parts_of(image_srgb, _FINEST_PX))
     meshes: list[FaceMesh] = []
-    for squares in _attempts(image_srgb):
+    for squares in attempts:
         meshes = distinct([*meshes, *find_meshes(people, image_srgb, squares)])
         if meshes and not everyone:
             break
     faces = [face for mesh in meshes if (face := _face_of(people, image_srgb, mesh))]
     faces.sort(key=lambda face: face.box_px[0])
     heads = [OtherHead(face.landmarks_px) for face in faces]
-    return [replace(one, others=heads[:n] + heads[n + 1 :], number=n) for n, one in enumerate(faces)]
+    return [replace(face, others=heads[:n] + heads[n + 1 :], number=n) for n, face in enumerate(faces)]
 
 
 def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
-    """Find the face that was at landmarks [68, 2] a frame ago in an sRGB uint8 image [H, W, 3]; or None."""
+    """Find the face that had landmarks [68, 2] in the previous frame in an sRGB uint8 image [H, W, 3]."""
     check_display(image_srgb)
     mesh = mesh_near(people, image_srgb, _around(landmarks_px))
     return _face_of(people, image_srgb, mesh) if mesh else None
 
 
 def face_with(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face:
-    """Look at the face of given landmarks [68, 2] in an sRGB uint8 image [H, W, 3].
+    """Return the face with the user's landmarks [68, 2] in an sRGB uint8 image [H, W, 3].
 
     Raises InputError, with the likely cause, for landmarks that clearly lie off the face.
     """
@@ -402,14 +391,14 @@ def face_with(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.n
         lie_on_one(landmarks_px, detected(), size_px)  # raises one that names the cause
         raise
     face, view = _looked_at(people, image, landmarks_px, mesh_near(people, image, _around(landmarks_px)))
-    unclear = view.relative_error > _UNCLEAR and image.any()  # in a black photo nothing is seen anywhere
+    unclear = view.relative_error > _UNCLEAR and image.any()  # a black photo has no visible face anywhere
     if unclear and not lie_on_one(landmarks_px, detected(), size_px):
         check_seen(view)
     return face
 
 
 def _brightened(image: np.ndarray) -> np.ndarray:
-    """A dark image, brighter: neither detectors nor meshes know such photos."""
+    """Brighten a dark image, because neither detectors nor meshes are trained on such photos."""
     stride = max(1, max(image.shape[:2]) // 512)
     brightest = float(np.percentile(image[::stride, ::stride], 99))
     if brightest >= _DARK:
@@ -418,18 +407,8 @@ def _brightened(image: np.ndarray) -> np.ndarray:
     return np.asarray((image * gain).clip(0, 255).astype(np.uint8))
 
 
-def _attempts(image: np.ndarray) -> Iterator[list[Square]]:
-    """Squares to search, the likeliest first: the whole photo, then ever smaller parts of it."""
-    side_px = float(max(image.shape[:2]))
-    yield first_squares(image)
-    yield [whole_photo(image, turn_rad) for turn_rad in _TURNS]
-    yield parts_of(image, side_px / 3)
-    if side_px / 3 > _FINEST_PX:
-        yield parts_of(image, _FINEST_PX)
-
-
 def _face_of(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face | None:
-    """The face of a mesh; None where the Parsing Network sees no head there."""
+    """Return the face of a mesh, or None if the Parsing Network finds no head there."""
     face, view = _looked_at(people, image, mesh.landmarks_px.astype(np.float64), mesh)
     return None if view.presence < LEAST_PRESENCE else replace(face, score=mesh.score)
 
@@ -437,7 +416,7 @@ def _face_of(people: PeopleNetworks, image: np.ndarray, mesh: FaceMesh) -> Face 
 def _looked_at(
     people: PeopleNetworks, image: np.ndarray, landmarks_px: np.ndarray, mesh: FaceMesh | None
 ) -> tuple[Face, SquareView]:
-    """The face with landmarks [68, 2], and what is seen there; its mesh says how steady it is."""
+    """Return the face with landmarks [68, 2] and its view; a mesh measures how steady it is."""
     (view,) = look(people.parsing, image, [_around(landmarks_px)])
     apart_px = np.linalg.norm(view.landmarks_px[:68] - landmarks_px, axis=-1)
     view = replace(
@@ -450,8 +429,7 @@ def _looked_at(
 
 
 def _around(face: np.ndarray) -> Square:
-    """The square that shows a face with landmarks [68, 2] large and upright."""
-    left, right = face[list(OUTER_EYE_CORNERS)]
-    turn_rad = -math.atan2(right[1] - left[1], right[0] - left[0])
-    upright = Square.around(face, _FACE_SIDES)
-    return replace(upright, side_px=max(upright.side_px, 1.0), turn_rad=turn_rad)
+    """Return the square in which a face with landmarks [68, 2] is large and upright."""
+    square = Square.around(face, _FACE_SIDES)
+    turn_rad = _turn_rad(face[list(OUTER_EYE_CORNERS)])
+    return replace(square, side_px=max(square.side_px, 1.0), turn_rad=turn_rad)

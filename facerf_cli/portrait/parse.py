@@ -1,4 +1,4 @@
-"""Squares of a photo, as the Parsing Network sees them; its classes, and its landmarks beyond the 68."""
+"""Squares of a photo as input of the Parsing Network; its classes, and its landmarks beyond the 68."""
 
 import math
 from collections.abc import Sequence
@@ -38,20 +38,14 @@ MORE_LANDMARKS = tuple(
     for name in ("iris", *(f"iris {k}" for k in range(IRIS_POINTS)), "ear top", "ear lobe", "ear back")
 )
 LANDMARKS = 68 + len(MORE_LANDMARKS)
-LEAST_PRESENCE = 0.5  # from which on a head is there
-_POOLED = 12  # pixels around the middle of a crop that measuring its sharpness needs
+LEAST_PRESENCE = 0.5  # of a head
+_POOLED = 12  # margin of the middle of a crop for measuring its sharpness, in pixels
 _OF_THE_FACE = ("skin", "brows", "eyes", "lips", "mouth", "beard", "ears", "neck")
-_SURE = (0.35, 0.65)  # share of a pixel from which on it counts as covered, and as wholly covered
+_COVERED = (0.35, 0.65)  # coverage of a pixel that counts as 0, and as 1
 
 
 def class_index(name: str) -> int:
-    """Index of a class."""
     return CLASSES.index(name)
-
-
-def mirrored_landmarks() -> tuple[int, ...]:
-    """Index of the landmark of `MORE_LANDMARKS` that each one becomes in a mirrored image."""
-    return tuple(MORE_LANDMARKS.index(_mirrored(name)) for name in MORE_LANDMARKS)
 
 
 def _mirrored(name: str) -> str:
@@ -61,12 +55,21 @@ def _mirrored(name: str) -> str:
     return " ".join(["left" if side == "right" else "right", part, *point])
 
 
-MIRROR = np.concatenate([MIRROR_68, 68 + np.array(mirrored_landmarks())])
+# Index of the landmark that each landmark becomes in a mirrored image.
+MIRROR = np.concatenate(
+    [MIRROR_68, 68 + np.array([MORE_LANDMARKS.index(_mirrored(name)) for name in MORE_LANDMARKS])]
+)
+
+
+def unit_centres(side: int) -> np.ndarray:
+    """Return the pixel centres [side, side, 2] of a square, as fractions of its side."""
+    at = (np.arange(side) + PIXEL_CENTRE) / side
+    return np.stack(np.meshgrid(at, at), -1)
 
 
 @dataclass(frozen=True)
 class Square:
-    """A square of a photo: its centre and side in the photo's pixels, turned counter-clockwise."""
+    """Square of a photo: its centre and side in the photo's pixels, rotated counter-clockwise."""
 
     x_px: float
     y_px: float
@@ -75,9 +78,10 @@ class Square:
 
     @staticmethod
     def around(landmarks_px: np.ndarray, sides: float, above: float = 0.0) -> "Square":
-        """An upright square around a face with landmarks [68, 2].
+        """Return an upright square around a face with landmarks [68, 2].
 
-        Its side, and how far its centre lies above theirs, are in extents: the larger side of their bounds.
+        Its side, and the distance of its centre above theirs, are in extents: the larger side of their
+        bounds.
         """
         low, high = landmarks_px.min(0), landmarks_px.max(0)
         extent_px = float((high - low).max())
@@ -85,11 +89,11 @@ class Square:
         return Square(float(x_px), float(y_px) - above * extent_px, sides * extent_px)
 
     def to_photo(self, share: np.ndarray) -> np.ndarray:
-        """Convert places [..., 2], in sides of the square from its corner, to the photo's pixels."""
+        """Convert positions [..., 2], in fractions of the side from the corner, to the photo's pixels."""
         return (np.asarray(share) - 0.5) @ self._matrix.T + (self.x_px, self.y_px)
 
-    def to_share(self, photo_px: np.ndarray) -> np.ndarray:
-        """Convert the photo's pixels [..., 2] to places in sides of the square."""
+    def to_unit_square(self, photo_px: np.ndarray) -> np.ndarray:
+        """Convert the photo's pixels [..., 2] to fractions of the side from the corner."""
         return (np.asarray(photo_px) - (self.x_px, self.y_px)) @ np.linalg.inv(self._matrix).T + 0.5
 
     @property
@@ -100,7 +104,7 @@ class Square:
     def cut(self, image_srgb: np.ndarray, size_px: int, outside: float | None = None) -> Tensor:
         """Resample an sRGB image [H, W, 3], uint8 or in 0..1, to [3, size, size] in 0..1.
 
-        Beyond the image its border goes on, or there is `outside`.
+        Pixels outside the image repeat its border, or have the value `outside`.
         """
         height, width = image_srgb.shape[:2]
         corners = self.to_photo(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
@@ -112,23 +116,22 @@ class Square:
         region = image_srgb[low[1] : low[1] + count[1] * step, low[0] : low[0] + count[0] * step]
         means = block_means(region, step if min(region.shape[:2]) >= step else 1)
         small = torch.from_numpy(means).permute(2, 0, 1)[None] / (255 if image_srgb.dtype == np.uint8 else 1)
-        at = (np.arange(size_px) + PIXEL_CENTRE) / size_px
-        place = self.to_photo(np.stack(np.meshgrid(at, at), -1))
+        positions_px = self.to_photo(unit_centres(size_px))
         size = np.array(small.shape[:1:-1])
-        grid = torch.from_numpy(2 * (place - low) / step / size - 1).float()[None]
+        grid = torch.from_numpy(2 * (positions_px - low) / step / size - 1).float()[None]
         cut = F.grid_sample(small, grid, padding_mode="border", align_corners=False)[0]
         if outside is None:
             return cut
-        within = ((place >= 0) & (place <= (width, height))).all(-1)
+        within = ((positions_px >= 0) & (positions_px <= (width, height))).all(-1)
         return torch.where(torch.from_numpy(within), cut, outside)
 
     def laid_over(
-        self, seen: Tensor, size: tuple[int, int], photo_px: tuple[int, ...], rim: float
+        self, view: Tensor, size: tuple[int, int], photo_px: tuple[int, ...], rim: float
     ) -> tuple[Tensor, Tensor]:
-        """A view [C, S, S] of an upright square on a map [C, h, w] of a photo of H x W pixels.
+        """Place a view [C, S, S] of an upright square on a map [C, h, w] of a photo of H x W pixels.
 
-        Also its weight [h, w]: 1 well inside the square, falling to 0 at its border over `rim` sides; it
-        stays 1 where the border lies beyond the photo.
+        Also return its weight [h, w]: 1 well inside the square, falling to 0 at its border over `rim` sides.
+        It stays 1 where the border lies outside the photo.
         """
         axes, weights = [], []
         for count, length, middle_px in zip(size, photo_px, (self.y_px, self.x_px), strict=False):
@@ -141,22 +144,22 @@ class Square:
             axes.append(2 * at - 1)
             weights.append(low * high)
         grid = torch.stack(torch.meshgrid(axes[1], axes[0], indexing="xy"), -1)[None]
-        placed = F.grid_sample(seen[None], grid, padding_mode="border", align_corners=False)[0]
+        placed = F.grid_sample(view[None], grid, padding_mode="border", align_corners=False)[0]
         return placed, weights[0][:, None] * weights[1]
 
 
 def whole_photo(image_srgb: np.ndarray, turn_rad: float = 0.0) -> Square:
-    """The square that shows a whole image [H, W, 3], turned."""
+    """Return the square around a whole image [H, W, 3], rotated."""
     height, width = image_srgb.shape[:2]
     return Square(width / 2, height / 2, float(max(height, width)), turn_rad)
 
 
 @dataclass(frozen=True, eq=False)
 class SquareView:
-    """View of a square by the network: logits [C, S, S] of the classes; landmarks [N, 2] in the photo.
+    """The network's view of a square: logits [C, S, S] of the classes; landmarks [N, 2] in the photo.
 
-    error_px [N] are the landmarks' expected errors; presence,
-    in 0..1, says how surely a head is there; sharpness: see `sharpness_of`; unsteadiness: see `find.py`.
+    error_px [N] are the landmarks' expected errors; presence in 0..1 is the probability of a head. For
+    sharpness see `sharpness_of`, for unsteadiness `find.py`.
     """
 
     square: Square
@@ -169,25 +172,24 @@ class SquareView:
 
     @property
     def classes(self) -> Tensor:
-        """Shares [C, S, S] of the classes, which sum to 1; computed each time."""
+        """Probabilities [C, S, S] of the classes, computed at each access."""
         return self.logits.softmax(0)
 
     @property
     def extent_px(self) -> float:
-        """Larger side of the bounds of the 68 landmarks."""
         return float(np.ptp(self.landmarks_px[:68], axis=0).max())
 
     @property
     def relative_error(self) -> float:
-        """Median expected error of the 68 landmarks, in their extent."""
+        """Median expected error of the 68 landmarks, relative to their extent."""
         return float(np.median(self.error_px[:68])) / max(self.extent_px, 1e-6)
 
 
 def sharpness_of(crops: Tensor) -> Tensor:
-    """Contrast of finest over that of coarser detail [B] in the middle of crops [B, 3, S, S].
+    """Return the contrast of finest over that of coarser detail [B] in the middle of crops [B, 3, S, S].
 
-    In a square around a face of 256 pixels, 0.4 and more where it is in focus; 0.2 and 0.14 where its image
-    is blurred by a hundredth and a fiftieth of its extent (standard deviation), whatever it shows.
+    In a square of 256 pixels around a face it is at least 0.4 if the face is in focus. It is 0.2 and 0.14 if
+    the image is blurred by a hundredth and a fiftieth of the face's extent (standard deviation).
     """
     edge = crops.shape[-1] // 4 - _POOLED
     grey = crops[..., edge:-edge, edge:-edge].mean(1, keepdim=True)
@@ -203,19 +205,19 @@ def _box_mean(grey: Tensor, reach: int) -> Tensor:
 
 @torch.inference_mode()
 def look(network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Square]) -> list[SquareView]:
-    """Look at squares of an sRGB uint8 image [H, W, 3]."""
+    """Run the Parsing Network on squares of an sRGB uint8 image [H, W, 3]."""
     device = next(network.parameters()).device
     crops = torch.stack([square.cut(image_srgb, network.side) for square in squares])
     sharpness = sharpness_of(crops)
-    found = Parsing(*(part.cpu() for part in network(crops.to(device))))
-    places, log_error = found.landmarks.double(), found.log_error.double()
+    parsing = Parsing(*(part.cpu() for part in network(crops.to(device))))
+    landmarks, log_error = parsing.landmarks.double(), parsing.log_error.double()
     return [
         SquareView(
             square,
-            found.logits[index].float(),
-            square.to_photo(places[index].numpy()),
+            parsing.logits[index].float(),
+            square.to_photo(landmarks[index].numpy()),
             log_error[index].exp().numpy() * square.side_px,
-            float(found.presence[index].sigmoid()),
+            float(parsing.presence[index].sigmoid()),
             float(sharpness[index]),
         )
         for index, square in enumerate(squares)
@@ -223,43 +225,43 @@ def look(network: ParsingNetwork, image_srgb: np.ndarray, squares: Sequence[Squa
 
 
 def uncovered(view: SquareView, crop: Crop) -> np.ndarray:
-    """Share [S, S] of each pixel of a crop that shows the face itself, without hair, glasses or a hand.
+    """Return how far each pixel [S, S] of a crop shows the face, without hair, glasses or a hand, in 0..1.
 
-    Outside of what the network saw it is 1.
+    Outside of the network's view it is 1.
     """
-    return _bare(view.classes, view.square.to_share(_places(crop)))
+    return _uncovered_at(view.classes, view.square.to_unit_square(_positions_px(crop)))
 
 
 def uncovered_in(classes: Tensor, size_px: tuple[int, int], crop: Crop) -> np.ndarray:
-    """The share of `uncovered`, by the classes [C, h, w] of a whole photo of H x W pixels."""
-    return _bare(classes, _places(crop) / (size_px[1], size_px[0]))
+    """Compute `uncovered` from the classes [C, h, w] of a whole photo of H x W pixels."""
+    return _uncovered_at(classes, _positions_px(crop) / (size_px[1], size_px[0]))
 
 
 def uncovered_by(matte: np.ndarray, crop: Crop) -> np.ndarray:
-    """The share of `uncovered` by a matte [H, W] of the photo: what is not its person covers the face."""
-    return share_bare(1 - crop.apply(matte[..., None])[..., 0])
+    """Compute `uncovered` from a matte [H, W] of the photo: other people and things cover the face."""
+    return uncovered_fraction(1 - crop.apply(matte[..., None])[..., 0])
 
 
-def _places(crop: Crop) -> np.ndarray:
-    """Centres [S, S, 2] of a crop's pixels in the photo's."""
+def _positions_px(crop: Crop) -> np.ndarray:
+    """Return the centres [S, S, 2] of a crop's pixels in the photo."""
     centres = (np.arange(crop.size_px) + PIXEL_CENTRE) / crop.scale
     return np.stack(np.meshgrid(centres + crop.x0_px, centres + crop.y0_px), -1)
 
 
-def _bare(classes: Tensor, shares: np.ndarray) -> np.ndarray:
-    """Share of the face itself [S, S] at places [S, S, 2], in sides of the map of classes [C, h, w]."""
-    grid = torch.from_numpy(2 * shares - 1).float()[None]
+def _uncovered_at(classes: Tensor, positions: np.ndarray) -> np.ndarray:
+    """Sample at positions [S, S, 2], in fractions of the width and height of classes [C, h, w]."""
+    grid = torch.from_numpy(2 * positions - 1).float()[None]
     sampled = F.grid_sample(covering(classes)[None, None], grid, align_corners=False)[0, 0]
-    return share_bare(sampled.numpy())
+    return uncovered_fraction(sampled.numpy())
 
 
 def covering(classes: Tensor) -> Tensor:
-    """Share [h, w] of what is not of the face, by classes [C, h, w]."""
-    own = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
-    return classes[~own].sum(0).float()
+    """Return the coverage [h, w] by classes [C, h, w] that are not of the face."""
+    of_face = torch.tensor([name in _OF_THE_FACE for name in CLASSES])
+    return classes[~of_face].sum(0).float()
 
 
-def share_bare(covered: np.ndarray) -> np.ndarray:
-    """Share of the face itself in pixels that other things cover by a share."""
-    low, high = _SURE
+def uncovered_fraction(covered: np.ndarray) -> np.ndarray:
+    """Return the visibility in 0..1 of a face covered by a fraction of other things."""
+    low, high = _COVERED
     return (1 - (covered - low) / (high - low)).clip(0, 1)

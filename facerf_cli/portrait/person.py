@@ -1,9 +1,9 @@
-"""A person in the square that the Portrait Network sees: image, classes, and the proxy's geometry.
+"""A person in the Portrait Network's square: image, classes, and the geometry of the proxy.
 
-Its normals may come from another method, such as DAViD or Sapiens, in place of the networks'
-(`with_normals`). In camera space x is to the image's right. y is up and z toward the camera, as here
-(OpenGL), or y is down and z away from it (OpenCV), and few methods say which: each axis gets the sign by
-which the normals agree with those of the fitted face.
+Its normals may come from another method, such as DAViD or Sapiens (`with_normals`). In their camera space x
+is to the image's right. y is up and z toward the camera, as here (OpenGL), or y is down and z away from it
+(OpenCV), which few methods document. So each axis gets the sign for which the normals agree with the fitted
+face.
 """
 
 import logging
@@ -42,25 +42,25 @@ from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.run.logs import LOGGER_NAME, step
 
-SIDE_PX = 192  # pixels of the square around head and shoulders that the Portrait Network is trained on
-SEEN_PX = 224  # and in which it sees a photo: face and hair come out better, ears and neck a little worse
-SIDES = 3.0  # its side in extents of the landmarks: the larger side of their bounds
-_WIDEST = 7.0  # and the largest side of the square around the whole person
-_NEAR_IRIS = 1.5  # reach of the pixels whose light an iris mirrors, in its radii
-_FINEST = 3  # pixels along one of the maps, up to which shadows are traced
-_OVERHANG = 0.03  # of a person over the square, in sides, that needs no wider one; and its margin
-_LENGTHS = (0.5, 1.5)  # of what is a normal; black in a PNG is longer
-_SURE = 0.5  # share of skin from which on a pixel has a say in the axes
-_AGREED = 0.7  # mean cosine to the fitted face from which on normals are the photo's
+SIDE_PX = 192  # pixels of the square around head and shoulders in the Portrait Network's training
+SEEN_PX = 224  # and in use, which improves face and hair and makes ears and neck slightly worse
+SIDES = 3.0  # side of the square in extents of the landmarks: the larger side of their bounds
+_WIDEST = 7.0  # largest side of the square around the whole person, in these extents
+_NEAR_IRIS = 1.5  # radius around an iris whose light the iris reflects, in its radii
+_FINEST = 3  # largest number of shadow samples along a pixel of the maps
+_OVERHANG = 0.03  # tolerated overhang of a person over the square, in its sides; and its margin
+_LENGTHS = (0.5, 1.5)  # range of the length of valid normals; black in a PNG is longer
+_SURE = 0.5  # least fraction of skin of the pixels that determine the axes
+_AGREED = 0.7  # least mean cosine between the photo's normals and the fitted face
 
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
 class SeenPerson:
-    """A person of a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy.
+    """Person in a photo: image [3, S, S] scene-linear and classes [C, S, S] in a square, and the proxy.
 
-    `normals` [H, W, 3] of the photo are given (`with_normals`), 0 where there are none.
+    `normals` [H, W, 3] of the photo come from the user (`with_normals`), 0 where unknown.
     """
 
     square: Crop
@@ -80,16 +80,16 @@ class SeenPerson:
 
     @property
     def exposed(self) -> Tensor:
-        """The image [3, S, S] in the units of the network's input."""
+        """Image [3, S, S] in the units of the network's input."""
         return self.image / self.exposure
 
     @property
     def own_pixels(self) -> Tensor:
-        """1 where the person covers most of a pixel [S, S], else 0."""
+        """1 where the person covers most of a pixel [S, S], otherwise 0."""
         return (1 - self.classes[0] > 0.5).float()
 
     def around_iris(self, number: int) -> tuple[Shadows, Tensor]:
-        """The lights that reach the pixels around an iris, and the places [h, w, 2] of these in -1..1."""
+        """Return the visibility around an iris, and the positions [h, w, 2] of its pixels in -1..1."""
         x_px, y_px, radius_px = self.eyes.irises_px[number]
         reach, last = max(1, round(_NEAR_IRIS * radius_px * self.square.scale)), self.square.size_px - 1
         at = self.square.to_crop(np.array([[x_px, y_px]]))[0].clip(0, last).astype(int)
@@ -103,12 +103,12 @@ class SeenPerson:
 
     @property
     def sides(self) -> float:
-        """Side of the square in faces, the larger sides of the bounds of landmarks."""
-        low, high = _bounds(self.fit.crop.to_photo(self.fit.landmarks_px.numpy()))
-        return self.square.side_px / float((high - low).max())
+        """Side of the square relative to the face: the larger side of the bounds of landmarks."""
+        extents_px = np.ptp(self.fit.crop.to_photo(self.fit.landmarks_px.numpy()), axis=0)
+        return self.square.side_px / float(extents_px.max())
 
     def within(self, square: Crop, photo: np.ndarray) -> "SeenPerson":
-        """The same person in another square of the photo [H, W, 3]."""
+        """Return the same person in another square of the photo [H, W, 3]."""
         return replace(
             self,
             square=square,
@@ -119,19 +119,19 @@ class SeenPerson:
 
     @cached_property
     def shadows(self) -> Shadows:
-        """The lights that reach each pixel, at half the square's side."""
+        """Visibility of lights from each pixel, at half the square's side."""
         half = replace(self.square, size_px=self.square.size_px // 2)
         return Shadows(self.proxy, proxy_maps(self.proxy, square_camera(self.fit, half)))
 
     @cached_property
     def finer(self) -> ProxyMaps:
-        """The proxy, not filled, as fine as the photo, up to `_FINEST` pixels for each of the maps."""
+        """Proxy, not filled, at the photo's resolution, up to `_FINEST` pixels per pixel of the maps."""
         times = min(_FINEST, math.ceil(1 / self.square.scale))
         fine = replace(self.square, size_px=self.square.size_px * times)
         return proxy_maps(self.proxy, square_camera(self.fit, fine), filled=False)
 
     def inputs(self, rig: Tensor) -> PortraitInputs:
-        """The network's inputs [1, ...], by the visibility of a rig [L, 3] all around."""
+        """Return the network's inputs [1, ...], with the visibility of a rig [L, 3]."""
         visible = self.shadows.along(rig)
         own = own_shading(self.image, self.classes, self.maps.normals, rig, visible, self.sides)
         reached = reached_by(rig, visible, self.square.size_px)
@@ -140,29 +140,29 @@ class SeenPerson:
 
 
 def surface_of(maps: ProxyMaps) -> tuple[Tensor, Tensor, Tensor]:
-    """Normals [1, 3, S, S], depth [1, 1, S, S] in decimetres from the mean, and cover of a proxy."""
+    """Return a proxy's normals [1, 3, S, S], depth [1, 1, S, S] in decimetres from its mean, and coverage."""
     z, covered = maps.positions_m[2], maps.covered
     depth = (z - (z * covered).sum() / covered.sum()) / 0.1
     return maps.normals[None], depth.clamp(-3, 3)[None, None], covered[None, None]
 
 
 def portrait_square(landmarks_px: np.ndarray) -> Crop:
-    """The square of a photo around landmarks [68, 2] in its pixels."""
-    low, high = _bounds(landmarks_px)
+    """Return the square of a photo around landmarks [68, 2] in its pixels."""
+    low, high = landmarks_px.min(0), landmarks_px.max(0)
     side_px = SIDES * float((high - low).max())
     x_px, y_px = (low + high) / 2
     return Crop(float(x_px) - side_px / 2, float(y_px) - side_px / 2, side_px, SEEN_PX)
 
 
 def wider_square(square: Crop, matte: np.ndarray) -> Crop | None:
-    """The square that holds a person's matte [H, W], too, if a square around head and shoulders does not.
+    """Return a square that also contains a person's matte [H, W], or None if the given square does.
 
-    It is no larger than `_WIDEST` faces; then it lies toward where most of the person is.
+    It is at most as large as `_WIDEST` faces; then it is moved toward most of the person.
     """
-    shown = matte > 0.5
-    if not shown.any():
+    covered = matte > 0.5
+    if not covered.any():
         return None
-    columns, rows = (np.flatnonzero(shown.any(axis)) for axis in (0, 1))
+    columns, rows = (np.flatnonzero(covered.any(axis)) for axis in (0, 1))
     start_px, end_px = np.array([square.x0_px, square.y0_px]), square.side_px
     low = np.minimum([columns[0], rows[0]], start_px)
     high = np.maximum([columns[-1] + 1, rows[-1] + 1], start_px + end_px)
@@ -170,15 +170,10 @@ def wider_square(square: Crop, matte: np.ndarray) -> Crop | None:
     if beyond_px < _OVERHANG * square.side_px:
         return None
     side_px = min(float((high - low).max()) * (1 + 2 * _OVERHANG), _WIDEST / SIDES * square.side_px)
-    # as near to the middle of the person as the square of the head allows
+    # as close to the middle of the person as the head's square allows
     least, most = start_px + square.side_px - side_px, start_px
     x_px, y_px = np.clip((low + high) / 2 - side_px / 2, least, most)
     return Crop(float(x_px), float(y_px), side_px, SEEN_PX)
-
-
-def _bounds(landmarks_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Upper left and lower right corner of landmarks [68, 2]."""
-    return landmarks_px.min(0), landmarks_px.max(0)
 
 
 @step("look")
@@ -191,56 +186,55 @@ def look_at_person(
     matte: np.ndarray | None = None,
     others: Sequence[OtherHead] | None = None,
 ) -> SeenPerson:
-    """Segment a person in a photo and shape the proxy of the fitted face, in the square around the landmarks.
+    """Segment a person in a photo and fit the proxy of the face, in the square around the landmarks.
 
     Args:
         people: The networks that find and cut out people.
         model: The face model of the fit.
         photo: Scene-linear [H, W, 3].
         fit: The fitted face.
-        segmentation: The person's, if it is known.
-        matte: The person's share [H, W], if it is given.
-        others: The photo's other heads; None: they are looked for.
+        segmentation: The person's segmentation; None computes it.
+        matte: The person's matte [H, W] from the user.
+        others: The photo's other heads; None detects them.
 
     Raises:
-        InputError: No skin is seen, by which the person is exposed.
+        InputError: No skin is visible, so the exposure is unknown.
     """
     landmarks_px = fit.crop.to_photo(fit.landmarks_px.numpy())
     square = portrait_square(landmarks_px)
-    shown = to_display(photo)
-    segmentation = segmentation or segment(people, shown, landmarks_px, matte, others)
+    display = to_display(photo)
+    segmentation = segmentation or segment(people, display, landmarks_px, matte, others)
     classes = _classes_in(segmentation, square)
     if classes[class_index("skin")].sum() < 1:
-        raise InputError("no skin is seen around the landmarks; check them, or relight --reflectance field")
+        raise InputError("no skin is visible around the landmarks; check them, or use --reflectance field")
     proxy = proxy_of(model, fit, classes, square)
     maps = proxy_maps(proxy, square_camera(fit, square))
-    eyes = eyes_of(people, shown, landmarks_px)
+    eyes = eyes_of(people, display, landmarks_px)
     return SeenPerson(square, _image_in(photo, square), classes, proxy, maps, fit, segmentation, eyes)
 
 
 def _image_in(photo: np.ndarray, square: Crop) -> Tensor:
-    """A square [3, S, S] of a photo [H, W, 3]."""
+    """Return a square [3, S, S] of a photo [H, W, 3]."""
     return torch.from_numpy(without_fireflies(square.apply(photo))).permute(2, 0, 1)
 
 
 def _classes_in(segmentation: Segmentation, square: Crop) -> Tensor:
-    """Shares [C, S, S] of the classes in a square; beyond the photo there is background."""
+    """Return the classes [C, S, S] in a square; outside the photo there is background."""
     height, width = segmentation.matte.shape
     at = (np.arange(square.size_px) + PIXEL_CENTRE) / square.size_px
     x, y = np.meshgrid(*square.to_photo(np.stack([at, at], -1) * square.size_px).T)
     grid = torch.from_numpy(np.stack([2 * x / width - 1, 2 * y / height - 1], -1)).float()[None]
-    found = F.grid_sample(segmentation.classes[None], grid, align_corners=False)[0]
-    found[0] += (1 - found.sum(0)).clamp_min(0)
-    return found
+    classes = F.grid_sample(segmentation.classes[None], grid, align_corners=False)[0]
+    classes[0] += (1 - classes.sum(0)).clamp_min(0)
+    return classes
 
 
 def unit_normals(normals: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-    """Unit normals [H, W, 3] of a photo's size, from those of its aspect [h, w, 3]; 0 where none are."""
+    """Resize normals [h, w, 3] to a photo's size and normalize them [H, W, 3]; 0 where unknown."""
     (height, width), (rows, columns) = size_px, normals.shape[:2]
     if abs(width - height / rows * columns) > 2 * max(1.0, height / rows):  # sides were rounded
-        raise InputError(
-            f"the normals have {columns} x {rows} pixels, the photo {width} x {height}; give its own"
-        )
+        sizes = f"{columns} x {rows} pixels, the photo {width} x {height}"
+        raise InputError(f"the normals have {sizes}; use normals of this photo")
     if (rows, columns) != size_px:
         normals = resized(normals, height, width)
     length = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -249,33 +243,34 @@ def unit_normals(normals: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
 
 
 def with_normals(person: SeenPerson, normals: np.ndarray) -> SeenPerson:
-    """The person with unit normals [H, W, 3] of its photo, whose axes the fitted face tells.
+    """Use unit normals [H, W, 3] of the person's photo; the fitted face determines the sign of each axis.
 
-    Raises InputError where they do not agree with it.
+    Raises InputError if they do not agree with the face.
     """
-    given = _in_square(person, normals)
-    sure = (person.classes[SKIN] > _SURE) & (person.maps.covered > 0) & (given.norm(dim=0) > _LENGTHS[0])
-    products = (given * person.maps.normals)[:, sure].sum(1)
-    agreed = float(products.abs().sum() / max(1, int(sure.sum())))
-    if agreed < _AGREED:
+    in_square = _in_square(person, normals)
+    known = in_square.norm(dim=0) > _LENGTHS[0]
+    sure = (person.classes[SKIN] > _SURE) & (person.maps.covered > 0) & known
+    products = (in_square * person.maps.normals)[:, sure].sum(1)
+    cosine = float(products.abs().sum() / max(1, int(sure.sum())))
+    if cosine < _AGREED:
         raise InputError(
-            f"the normals are not those of the face (mean cosine {agreed:.2f}); give the photo's own, in "
-            "camera space, x in the red channel"
+            f"the normals do not match the face (mean cosine {cosine:.2f}); use normals of this photo in "
+            "camera space, with x in the red channel"
         )
-    if turned := [name for name, product in zip("xyz", products, strict=True) if product < 0]:
-        log.info("given normals: %s turned, by the fitted face", " and ".join(turned))
+    if flipped := [name for name, product in zip("xyz", products, strict=True) if product < 0]:
+        log.info("normals: flipped %s to match the fitted face", " and ".join(flipped))
     return replace(person, normals=normals * np.where(products.numpy() < 0, -1, 1).astype(np.float32))
 
 
 def maps_with_normals(maps: PortraitMaps, person: SeenPerson) -> PortraitMaps:
-    """The maps of a person with its given normals, if there are any, as far as the person is seen."""
+    """Blend the user's normals, if any, into the maps where the person is visible."""
     if person.normals is None:
         return maps
-    given = _in_square(person, person.normals)
-    share = (1 - person.classes[0]) * (given.norm(dim=0) > _LENGTHS[0])
-    return maps._replace(normals=F.normalize(torch.lerp(maps.normals, given[None], share), dim=1))
+    normals = _in_square(person, person.normals)
+    weight = (1 - person.classes[0]) * (normals.norm(dim=0) > _LENGTHS[0])
+    return maps._replace(normals=F.normalize(torch.lerp(maps.normals, normals[None], weight), dim=1))
 
 
 def _in_square(person: SeenPerson, normals: np.ndarray) -> Tensor:
-    """Means [3, S, S] of normals of the photo over the pixels of the person's square."""
+    """Average normals of the photo over the pixels [3, S, S] of the person's square."""
     return torch.from_numpy(person.square.apply(normals)).permute(2, 0, 1)

@@ -1,8 +1,8 @@
 """Proxy geometry of a person in a photo: the fitted face on a mean head with ears, neck, hair and bust.
 
-It gives each pixel a normal and a position, and tells which lights reach it. Shadows of nose, brow, chin,
-hair and head come from it; what it gets wrong, the Portrait Network corrects. Its shading under the light
-that explains the photo best is a first guess of the photo's light, from which that network starts.
+It gives each pixel a normal, a position and the visibility of each light: shadows of nose, brow, chin, hair
+and head. The Portrait Network corrects its errors. Its shading under the light that explains the photo best
+is a first estimate of the photo's light, which is an input of that network.
 """
 
 from collections.abc import Callable, Iterator
@@ -33,25 +33,25 @@ from facerf_cli.raster.texture import blurred, inpaint, vertex_normals
 from facerf_cli.run.threads import in_threads
 
 ASSET = Path(__file__).parents[1] / "assets" / "proxy_person.safetensors"
-_HAIR_M = 0.07  # most that the scalp is pushed out by
-_ANGLES, _SMOOTH = 48, 2.0  # around the head, in which the hair's outline is measured, and its smoothing
-OFF_M = 0.003  # of rays, from the surface: hides its facets
+_HAIR_M = 0.07  # largest thickness of hair
+_ANGLES, _SMOOTH = 48, 2.0  # directions for the hair's outline, and standard deviation of its smoothing
+OFF_M = 0.003  # distance of ray origins from the surface: hides its facets
 RADIUS_DEG, _RAYS = 3.0, 2  # of the disc of a light, and rays to it from each point
-_SOFT_PX = 0.7  # standard deviation of a blur of visibility
+_SOFT_PX = 0.7  # standard deviation of the blur of visibility
 _SEED = 7
-_SOLVED_PX, _SOLVED_SIDES = 48, 3.0  # side at which the light is estimated, in a square of so many faces
-_SURE = 0.8  # share of skin, and cover of the proxy, of the pixels that are explained
-_RIDGE = 0.05  # of the weights, per root of the number of pixels: many lights explain a photo alike
+_SOLVED_PX, _SOLVED_SIDES = 48, 3.0  # side for estimating the light, in a square this many faces wide
+_SURE = 0.8  # least fraction of skin of the pixels that are explained
+_RIDGE = 0.05  # of the weights, per root of the number of pixels, because many lights explain a photo
 _LEAST_PIXELS = 30
-_BRIGHTEST = 3.0  # over the mean: clipped, so that highlights count little
+_BRIGHTEST = 3.0  # clipping relative to the mean, so that highlights count little
 
 
 @dataclass(frozen=True, eq=False)
 class _MeanPerson:
-    """The mean person, head frame: vertices [N, 3], triangles [F, 3].
+    """Mean person in the head's frame: vertices [N, 3], triangles [F, 3].
 
     A vertex follows the displacement of the face's vertices `carriers` [N, 4] by `weights` [N, 4] times
-    `follows` [N]; `hair` [N] is the share of the hair's thickness by which it is pushed out.
+    `follows` [N]; `hair` [N] is the fraction of the hair's thickness by which it is pushed out.
     """
 
     vertices_m: Tensor
@@ -65,7 +65,7 @@ class _MeanPerson:
 
 @dataclass(frozen=True, eq=False)
 class Proxy:
-    """The mesh of a person in camera space: vertices and unit normals [N, 3], triangles [F, 3]."""
+    """Mesh of a person in camera space: vertices and unit normals [N, 3], triangles [F, 3]."""
 
     vertices: Tensor
     normals: Tensor
@@ -74,14 +74,13 @@ class Proxy:
 
     @staticmethod
     def of(vertices: Tensor, triangles: Tensor) -> "Proxy":
-        """Compute the normals and the scene."""
         scene = build_scene(vertices.numpy(), triangles.numpy())
         return Proxy(vertices, vertex_normals(vertices, triangles), triangles, scene)
 
 
 @dataclass(frozen=True, eq=False)
 class ProxyMaps:
-    """The proxy seen in a square of side S, camera space; where it is not covered, filled from around.
+    """The proxy in a square of side S, camera space; where it covers nothing, extended from around.
 
     normals [3, S, S] unit; positions_m [3, S, S]; covered [S, S] 0 or 1.
     """
@@ -92,7 +91,7 @@ class ProxyMaps:
 
 
 def proxy_of(model: MorphableModel, fit: FaceFit, classes: Tensor, square: Crop) -> Proxy:
-    """Shape the proxy of a fitted face; classes [C, S, S] are what is seen in the square around it."""
+    """Shape the proxy of a fitted face from the classes [C, S, S] in the square around it."""
     person = _mean_person()
     face = model.vertices(fit.alpha[None], fit.beta[None])[0]
     mean = person.face_m
@@ -106,7 +105,7 @@ def proxy_of(model: MorphableModel, fit: FaceFit, classes: Tensor, square: Crop)
 
 
 def square_camera(fit: FaceFit, square: Crop) -> Camera:
-    """The camera of a square of the photo that a face was fitted in."""
+    """Return the camera of a square of the photo that a face was fitted in."""
     whole = photo_camera(fit.crop, square.size_px, square.size_px)
     return Camera(
         whole.focal_px * square.scale,
@@ -118,22 +117,22 @@ def square_camera(fit: FaceFit, square: Crop) -> Camera:
 
 
 def proxy_maps(proxy: Proxy, camera: Camera, filled: bool = True) -> ProxyMaps:
-    """Render normals and positions; not `filled`, they are 0 where the proxy does not cover the square."""
+    """Render normals and positions; if not `filled`, they are 0 where the proxy covers nothing."""
     fragments = rasterize(proxy.vertices, proxy.triangles, camera)
-    seen = interpolate(torch.cat([proxy.normals, proxy.vertices], 1), proxy.triangles, fragments)
+    attributes = torch.cat([proxy.normals, proxy.vertices], 1)
+    maps = interpolate(attributes, proxy.triangles, fragments).permute(2, 0, 1)
     covered = fragments.covered.float()
     if not covered.any():
         raise InputError(f"the fitted face lies outside the image; {GIVE_LANDMARKS}")
-    maps = inpaint(seen.permute(2, 0, 1), covered) if filled else seen.permute(2, 0, 1)
+    maps = inpaint(maps, covered) if filled else maps
     return ProxyMaps(F.normalize(maps[:3], dim=0), maps[3:], covered)
 
 
 class Shadows:
-    """Lights that reach each pixel of a proxy's maps, where it shades itself.
+    """Visibility of lights from each pixel of a proxy's maps, which the proxy itself occludes.
 
-    A surface that faces away is not reached. What all lights share is computed once: the pixels that are
-    covered [s, s], the rays' origins [N, 3], and numbers [rays, 2, N, 1] in 0..1, which place their ends on
-    the disc of a light.
+    A surface that faces away sees no light. Independent of the light are: the covered pixels [s, s], the
+    rays' origins [N, 3], and numbers [rays, 2, N, 1] in 0..1, which place the rays on the disc of a light.
     """
 
     def __init__(self, proxy: Proxy, maps: ProxyMaps) -> None:
@@ -141,7 +140,7 @@ class Shadows:
         normals, points = (field.numpy()[:, self._inside].T for field in (maps.normals, maps.positions_m))
         self.origins = (points + OFF_M * normals).astype(np.float32)
         self._scene = proxy.scene
-        # by pixel of the square, so that those of neighbouring frames of a shot are alike
+        # by pixel of the square, so that neighbouring frames of a shot have the same noise
         numbers = np.random.default_rng(_SEED).random((_RAYS, 2, *self._inside.shape)).astype(np.float32)
         self.numbers = numbers[:, :, self._inside][..., None]
         self._places = [places_on_disc(RADIUS_DEG, *pair) for pair in self.numbers]
@@ -149,13 +148,13 @@ class Shadows:
         self._discs = [disc / np.linalg.norm(disc, axis=1, keepdims=True) for disc in discs]
 
     def along(self, directions: Tensor) -> Tensor:
-        """Share [L, s, s] of lights from camera-space directions [L, 3] that arrives."""
+        """Return the visibility [L, s, s] of lights in camera-space directions [L, 3]."""
         axes = directions.numpy()
         frames = np.stack([axes, *tangents(axes)], 1).astype(np.float32)  # [L, 3, 3]
         return self._reached(len(axes), lambda number: (disc @ frames[number] for disc in self._discs))
 
     def toward(self, places_m: Tensor) -> Tensor:
-        """Share [P, s, s] of lights at camera-space places [P, 3] that arrives."""
+        """Return the visibility [P, s, s] of lights at camera-space positions [P, 3]."""
         offsets = places_m.numpy()[:, None] - self.origins  # [P, N, 3]
         distances_m = np.linalg.norm(offsets, axis=2)
         axes = offsets / distances_m[..., None].clip(min=1e-6)
@@ -168,17 +167,16 @@ class Shadows:
     def _reached(
         self, lights: int, rays: Callable[[int], Iterator[np.ndarray]], reach_m: np.ndarray | None = None
     ) -> Tensor:
-        """Visibility [L, s, s] of lights, from the unit `rays` [N, 3] to each, within a reach [L, N]."""
-        found = np.zeros((lights, *self._inside.shape), np.float32)
+        """Trace the unit `rays` [N, 3] to each light, within a reach [L, N]; return visibility [L, s, s]."""
+        visible = np.zeros((lights, *self._inside.shape), np.float32)
 
         def trace(number: int) -> None:
             reach = None if reach_m is None else reach_m[number]
             blocked = [occluded(self._scene, self.origins, ray, reach) for ray in rays(number)]
-            found[number, self._inside] = 1 - np.mean(blocked, 0)
+            visible[number, self._inside] = 1 - np.mean(blocked, 0)
 
         list(in_threads(trace, range(lights)))
-        filled = inpaint(torch.from_numpy(found), self.covered)
-        return blurred(filled, _SOFT_PX)
+        return blurred(inpaint(torch.from_numpy(visible), self.covered), _SOFT_PX)
 
 
 def _with_hair(vertices: Tensor, hair: Tensor, camera: Camera, classes: Tensor) -> Tensor:
@@ -217,7 +215,7 @@ def _bin_of(offset: np.ndarray) -> np.ndarray:
 
 
 def _reach(offset_px: Tensor, chosen: Tensor) -> np.ndarray:
-    """Largest distance [A] of the chosen places [N, 2] from the middle, by angle; 0 without any."""
+    """Return the largest distance [A] per angle of the chosen points [N, 2]; 0 without points."""
     offset = offset_px[chosen].numpy()
     reach = np.zeros(_ANGLES)
     np.maximum.at(reach, _bin_of(offset), np.linalg.norm(offset, axis=1))
@@ -227,7 +225,7 @@ def _reach(offset_px: Tensor, chosen: Tensor) -> np.ndarray:
 def _mean_person() -> _MeanPerson:
     tensors, metadata = load_checkpoint(ASSET)
     if metadata.get("layout_version") != LAYOUT_VERSION:
-        raise InputError(f"{ASSET}: made for another UV layout; make it again")
+        raise InputError(f"{ASSET}: has another UV layout; run tools/proxy_person.py")
     model = load_face_model(BUILTIN)
     face = model.vertices(torch.zeros(1, len(model.identity)), torch.zeros(1, len(model.expression)))[0]
     tensors["triangles"], tensors["carriers"] = tensors["triangles"].long(), tensors["carriers"].long()
@@ -239,13 +237,13 @@ def own_shading(
 ) -> Tensor:
     """Shade a proxy by a photo's estimated light: [1, S, S], with a mean of 1 over the skin.
 
-    The skin is taken to be of one colour and matt.
+    The skin is assumed to be diffuse and of one colour.
 
     Args:
         image: Scene-linear [3, S, S].
-        classes: Shares [C, S, S].
-        normals: Of the proxy [3, S, S].
-        rig: Unit directions [L, 3] all around.
+        classes: Probabilities [C, S, S].
+        normals: Normals of the proxy [3, S, S].
+        rig: Unit directions [L, 3] around the person.
         visible: Visibility [L, s, s] of each light.
         sides: Width of the square, in faces.
     """
@@ -265,13 +263,12 @@ def own_shading(
     solved = least_non_negative(system.T @ system, system.T @ padded.double().numpy())
     weights = torch.from_numpy(solved).float()
     coarse = torch.einsum("l,lij->ij", weights, _olats(_at(normals, visible.shape[-1]), rig, visible))
-    shading = _at(coarse[None], side)
-    share = classes[SKIN]
-    return shading / ((shading[0] * share).sum() / share.sum().clamp_min(1e-3)).clamp_min(1e-3)
+    shading, skin = _at(coarse[None], side), classes[SKIN]
+    return shading / ((shading[0] * skin).sum() / skin.sum().clamp_min(1e-3)).clamp_min(1e-3)
 
 
 def _olats(normals: Tensor, rig: Tensor, visible: Tensor) -> Tensor:
-    """Shading [L, s, s] of a white matt proxy under each light, with a little light in shadows."""
+    """Shade a white diffuse proxy under each light [L, s, s], with a little light in shadows."""
     cosine = torch.einsum("lc,cij->lij", rig, F.normalize(normals, dim=0)).clamp_min(0)
     return visible * cosine + 0.02
 

@@ -1,12 +1,11 @@
 """Classes and matte of a person over the whole frame of a photo, as layers.
 
-The matte is that of `people.py`; the Parsing Network says what its pixels are. It looks at the whole body
-and, for detail, at head and chest and at squares of several sizes around the head.
+`matte.py` solves the matte; the Parsing Network classifies its pixels. The network processes the whole body
+and, for detail, head and chest and squares of several sizes around the head.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +20,7 @@ from facerf_cli.network.parsing import ParsingNetwork
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait.confidence import matte_facts
 from facerf_cli.portrait.find import find_meshes, first_squares
-from facerf_cli.portrait.matte import shrunk, solid
+from facerf_cli.portrait.matte import HeadPlace, matte_of, person_among, shrunk, solid
 from facerf_cli.portrait.parse import (
     CLASSES,
     LEAST_PRESENCE,
@@ -31,26 +30,25 @@ from facerf_cli.portrait.parse import (
     class_index,
     look,
 )
-from facerf_cli.portrait.people import HeadPlace, PersonShares, matte_of, person_among
 from facerf_cli.raster.camera import PIXEL_CENTRE
 
-# Sides of the squares around head, head and chest, and body, in extents of the landmarks, and how far their
-# centres lie above the middle of the landmarks. Views of the head are averaged; smaller ones, which show
-# more, weigh more, by an inverse power of their sides.
+# Sides of the squares around head, head and chest, and body, in extents of the landmarks, and the distance of
+# their centres above the middle of the landmarks. Views of the head are averaged; smaller ones, which show
+# more detail, have larger weights: an inverse power of their sides.
 _NEAR_SIDES, _NEAR_ABOVE = (1.6, 2.2, 3.2), 0.1
 _CHEST_SIDES, _CHEST_ABOVE = 4.0, -0.5
 _BODY_SIDES, _BODY_ABOVE = 8.0, -1.6
 _STEEPNESS = 4.0  # the power
-_FEATHER = 0.08  # border of a near square where it gives way to larger ones, in its sides
-_LOOSE = [class_index(name) for name in ("hair", "beard", "glasses", "headwear")]  # mattes of these stay
-_HAIR = 1.3  # hair is so many times as likely as the network says, which takes thin hair for the skin below
-_LEAST_SHARE = 1e-3  # of a pixel, that every class of the person may have
-_SMALL_PX = 384  # longest side at which classes are joined
-_CLASSLESS = 0.3  # share of the person to the Parsing Network, below which a pixel takes others' classes
-# Of ears, which the network's own landmarks place.
+_FEATHER = 0.08  # border of a near square over which it blends into larger ones, in its sides
+_LOOSE = [class_index(name) for name in ("hair", "beard", "glasses", "headwear")]  # not made solid
+_HAIR = 1.3  # factor of the odds of hair, because the network classifies thin hair as the skin below
+_LEAST_SHARE = 1e-3  # least fraction of a pixel for each class of the person
+_SMALL_PX = 384  # longest side at which classes are combined
+_CLASSLESS = 0.3  # least coverage from the Parsing Network; below it a pixel takes the nearest one's classes
+# Ears, which are placed by the network's landmarks.
 _EAR_LIFT = 1.25  # logarithm of the largest factor of the odds
 _EAR_WIDTH = 0.045  # standard deviation of the distance from the line, in extents of the landmarks
-_EAR_REACH = 3.0  # in these, beyond which nothing changes
+_EAR_REACH = 3.0  # largest distance with an effect, in standard deviations
 _EAR_OTHERS = [class_index(name) for name in ("background", "skin", "hair", "neck")]
 _EAR_LINES = [
     [68 + MORE_LANDMARKS.index(f"{side} ear {part}") for part in ("top", "back", "lobe")]
@@ -59,22 +57,22 @@ _EAR_LINES = [
 _SKIN_CLASSES = [class_index(name) for name in ("skin", "neck", "hand")]
 _FACE_CLASSES = [class_index(name) for name in ("skin", "neck", "ears", "lips", "beard")]
 _HAND, _GARMENT = class_index("hand"), class_index("garment")
-_MAYBE = 0.3  # share of skin in a pixel from which it is looked at
-_CERTAIN, _SURE_BESIDE = 0.9, 0.8  # shares of certain skin, in the face and beside a part
-_FACE_REACH = 0.7  # of certain skin of the face from its middle, in heights of the head
-_CLOTH_EDGE = 0.12  # change of log brightness over a pixel, at which parts end
+_MAYBE = 0.3  # least fraction of skin in a pixel that may be cloth
+_CERTAIN, _SURE_BESIDE = 0.9, 0.8  # fractions of certain skin, in the face and beside a region
+_FACE_REACH = 0.7  # largest distance of certain face skin from its middle, in heights of the head
+_CLOTH_EDGE = 0.12  # change of log brightness per pixel at which regions end
 _EDGE_PX = 3  # half the width of such an edge
-_BLACK, _NOISE = 5e-4, 2e-3  # linear light that hides the chromaticity of the face, and of other parts
-_DARK = 0.03  # of sRGB, below which edges are noise
-_MARGIN = 1.16  # by which a ratio of channels must lie outside those of the face
-_LEAST_PART, _TOUCHES = 0.005, 0.25  # share of the person, and of the outline that borders certain skin
+_BLACK, _NOISE = 5e-4, 2e-3  # linear light that hides the chromaticity of the face, and of other regions
+_DARK = 0.03  # sRGB value below which edges are noise
+_MARGIN = 1.16  # factor by which a ratio of channels must lie outside the face's
+_LEAST_PART, _TOUCHES = 0.005, 0.25  # fraction of the person, and of the outline that borders certain skin
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Shares [C, h, w] of the classes at a small size, and the matte [H, W] at the photo's.
+    """Probabilities [C, h, w] of the classes at a small size, and the matte [H, W] at the photo's size.
 
-    `facts` of the matte say how far it can be relied on; a frame of a shot has none.
+    `facts` measure the reliability of the matte; a frame of a shot has none.
     """
 
     classes: Tensor
@@ -82,25 +80,28 @@ class Segmentation:
     facts: Mapping[str, float] = field(default_factory=dict)
 
     def cut(self, alpha: np.ndarray | None) -> "Segmentation":
-        """The person without what the photo's own alpha [H, W] leaves out; None leaves out nothing."""
+        """Multiply the matte by the photo's own alpha [H, W], if any."""
         return self if alpha is None else replace(self, matte=self.matte * alpha)
 
     def layer(self, name: str, rows: slice = slice(None)) -> np.ndarray:
-        """Share [h, W] float32 of a class; those of all classes but the background sum to the matte."""
-        share = self._shares[class_index(name) - 1][None].numpy()
-        return np.asarray(enlarged(share, self.matte.shape, rows)[0] * self.matte[rows])
+        """Return the coverage [h, W] float32 of a class; classes of the person sum to the matte."""
+        return self.layers(rows, [name])[f"class.{name}"]
 
-    @cached_property
-    def _shares(self) -> Tensor:
-        """Shares [C - 1, h, w] of the person; where nothing is seen of it, those of the whole person."""
+    def layers(self, rows: slice, names: Sequence[str] = CLASSES[1:]) -> dict[str, np.ndarray]:
+        """Return the coverage [h, W] of the person's classes in some rows, by layer name of an EXR.
+
+        Pixels without a predicted class have the mean fractions of the whole person.
+        """
         person = self.classes[1:]
         whole = person.sum((1, 2), keepdim=True)
         person = person + _LEAST_SHARE * whole / whole.sum().clamp_min(1e-6)
-        return person / person.sum(0).clamp_min(1e-6)
-
-    def layers(self, rows: slice) -> dict[str, np.ndarray]:
-        """Shares [h, W] of all classes of the person in some rows, by the names that they have in an EXR."""
-        return {f"class.{name}": self.layer(name, rows) for name in CLASSES[1:]}
+        fractions = (person / person.sum(0).clamp_min(1e-6)).numpy()
+        return {
+            f"class.{name}": np.asarray(
+                enlarged(fractions[[class_index(name) - 1]], self.matte.shape, rows)[0] * self.matte[rows]
+            )
+            for name in names
+        }
 
 
 def segment(
@@ -115,57 +116,54 @@ def segment(
     Args:
         people: The networks that find and cut out people.
         image_srgb: uint8 [H, W, 3].
-        landmarks_px: Of the person's face [68, 2].
-        matte: The person's share [H, W], if it is given.
-        others: The photo's other heads; None: they are looked for.
+        landmarks_px: Landmarks of the person's face [68, 2].
+        matte: The person's matte [H, W] from the user; None solves it.
+        others: The photo's other heads; None detects them.
     """
     small = small_image(image_srgb)
     if matte is not None:
-        found = within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
-        return replace(
-            found, classes=with_cloth(found.classes, small, _head(landmarks_px, image_srgb, small))
-        )
-    classes, shares, head = _look(people, image_srgb, landmarks_px, small, others)
-    classes = with_cloth(_within_share(classes, shares.person), small, head)
-    found = segmentation_of(classes, image_srgb, landmarks_px)
-    places = _places((small.shape[1], small.shape[2]), found.matte.shape).astype(int)
-    small_matte = found.matte[places[..., 1], places[..., 0]]
-    return replace(found, facts=matte_facts(shares.anybody, 1 - classes[0].numpy(), small_matte, head))
+        segmentation = within_matte(parsed(people.parsing, image_srgb, landmarks_px, small), matte)
+        head = _head(landmarks_px, image_srgb, small)
+        return replace(segmentation, classes=with_cloth(segmentation.classes, small, head))
+    classes, anybody, head = _classes_of_person(people, image_srgb, landmarks_px, small, others)
+    segmentation = segmentation_of(classes, image_srgb, landmarks_px)
+    at = _centres_px((small.shape[1], small.shape[2]), segmentation.matte.shape).astype(int)
+    small_matte = segmentation.matte[at[..., 1], at[..., 0]]
+    return replace(segmentation, facts=matte_facts(anybody, 1 - classes[0].numpy(), small_matte, head))
 
 
-def seen_classes(
+def predicted_classes(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
-    """Shares [C, h, w] of the classes, which sum to 1; `small` is the `small_image`. See `segment`."""
-    classes, shares, head = _look(people, image_srgb, landmarks_px, small)
-    return with_cloth(_within_share(classes, shares.person), small, head)
+    """Return only the classes [C, h, w] of `segment`, which sum to 1; `small` is the `small_image`."""
+    return _classes_of_person(people, image_srgb, landmarks_px, small)[0]
 
 
-def _look(
+def _classes_of_person(
     people: PeopleNetworks,
     image_srgb: np.ndarray,
     landmarks_px: np.ndarray,
     small: Tensor,
     others: Sequence[OtherHead] | None = None,
-) -> tuple[Tensor, PersonShares, HeadPlace]:
-    """Shares of the classes as the Parsing Network sees them, those of the person, and the head's place."""
+) -> tuple[Tensor, np.ndarray, HeadPlace]:
+    """Return the classes [C, h, w] of a person, the coverage [h, w] by all people, and the head."""
     classes = parsed(people.parsing, image_srgb, landmarks_px, small)
     head = _head(landmarks_px, image_srgb, small)
     others = list(_neighbours(people, image_srgb, landmarks_px)) if others is None else others
-    around = [one.scaled(small.shape[2] / image_srgb.shape[1]) for one in others]
-    shares = person_among(people, small.permute(1, 2, 0).numpy(), head, around, 1 - classes[0].numpy())
-    return classes, shares, head
+    around = [other.scaled(small.shape[2] / image_srgb.shape[1]) for other in others]
+    small_rgb, person = small.permute(1, 2, 0).numpy(), 1 - classes[0].numpy()
+    person, anybody = person_among(people, small_rgb, head, around, person)
+    return with_cloth(_within_share(classes, person), small, head), anybody, head
 
 
 def _head(landmarks_px: np.ndarray, image_srgb: np.ndarray, small: Tensor) -> HeadPlace:
-    """The head of landmarks [68, 2] of an image, in pixels of the small one."""
     return HeadPlace.of(landmarks_px * (small.shape[2] / image_srgb.shape[1]))
 
 
 def _neighbours(
     people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray
 ) -> Iterator[OtherHead]:
-    """The other heads in an image, those that the Parsing Network sees, too."""
+    """Yield the other heads in an image that the Parsing Network confirms."""
     middle, extent_px = landmarks_px.mean(0), np.ptp(landmarks_px, axis=0).max()
     for mesh in find_meshes(people, image_srgb, first_squares(image_srgb)):
         if np.linalg.norm(mesh.landmarks_px.mean(0) - middle) > extent_px / 2:
@@ -175,13 +173,13 @@ def _neighbours(
 
 
 def segmentation_of(classes: Tensor, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Segmentation:
-    """The segmentation of an image [H, W, 3] by the classes [C, h, w] of a person with landmarks [68, 2]."""
+    """Solve the matte of a person with classes [C, h, w] and landmarks [68, 2] in an image [H, W, 3]."""
     matte = matte_of(1 - classes[0].numpy(), image_srgb, landmarks_px)
     return Segmentation(classes, solid(matte, classes[_LOOSE].sum(0).numpy()))
 
 
 def within_matte(classes: Tensor, matte: np.ndarray) -> Segmentation:
-    """The person that a matte [H, W] shows; what the classes [C, h, w] leave open in it is completed."""
+    """Segment the person in a matte [H, W]; pixels without predicted classes [C, h, w] are completed."""
     share = shrunk(matte, (classes.shape[1], classes.shape[2]))
     return Segmentation(_within_share(classes, share), matte)
 
@@ -189,7 +187,7 @@ def within_matte(classes: Tensor, matte: np.ndarray) -> Segmentation:
 def parsed(
     parsing: ParsingNetwork, image_srgb: np.ndarray, landmarks_px: np.ndarray, small: Tensor
 ) -> Tensor:
-    """Shares [C, h, w] of the classes as the Parsing Network sees them."""
+    """Combine the Parsing Network's views of a person into classes [C, h, w]."""
     height, width = image_srgb.shape[:2]
     body = _within(Square.around(landmarks_px, _BODY_SIDES, _BODY_ABOVE), height, width)
     chest = Square.around(landmarks_px, _CHEST_SIDES, _CHEST_ABOVE)
@@ -198,24 +196,28 @@ def parsed(
     views = look(parsing, image_srgb, [body, chest, *near])
     background = torch.eye(len(CLASSES))[0, :, None, None]
     (wide, inside), (middle, feather), *close = (
-        one.square.laid_over(one.classes, size, image_srgb.shape, _FEATHER) for one in views
+        view.square.laid_over(view.classes, size, image_srgb.shape, _FEATHER) for view in views
     )
     classes = torch.lerp(torch.where(inside > 0, wide, background), middle, feather)
     mean, weight, share = (torch.zeros(count, *size) for count in (len(CLASSES), 1, 1))
-    for (one, feather), sides in zip(close, _NEAR_SIDES, strict=True):
-        weighed = feather * sides**-_STEEPNESS
-        mean.addcmul_(one, weighed)
-        weight += weighed
+    for (view_classes, feather), sides in zip(close, _NEAR_SIDES, strict=True):
+        view_weight = feather * sides**-_STEEPNESS
+        mean.addcmul_(view_classes, view_weight)
+        weight += view_weight
         share = torch.maximum(share, feather)
     classes.lerp_(mean / weight.clamp_min(1e-6), share)
-    classes = with_ears(_with_likelier_hair(classes), views[2], _places(size, image_srgb.shape))
+    person, hair = classes[1:].clone(), class_index("hair") - 1
+    person[hair] *= _HAIR
+    kept = classes[1:].sum(0) / person.sum(0).clamp_min(1e-6)
+    classes = torch.cat([classes[:1], person * kept])
+    classes = with_ears(classes, views[2], _centres_px(size, image_srgb.shape))
     return classes / classes.sum(0).clamp_min(1e-6)
 
 
 def _within_share(classes: Tensor, person: np.ndarray) -> Tensor:
-    """Classes [C, h, w] of a person with a share [h, w] of each pixel.
+    """Scale classes [C, h, w] to the coverage [h, w] of a person.
 
-    Where the Parsing Network sees nobody, a pixel has the classes of the nearest one where it does.
+    Where the Parsing Network predicts no person, a pixel has the classes of the nearest pixel where it does.
     """
     share = torch.from_numpy(person).float()
     nearest = distance_transform_edt(1 - classes[0] < _CLASSLESS, return_distances=False, return_indices=True)
@@ -226,14 +228,14 @@ def _within_share(classes: Tensor, person: np.ndarray) -> Tensor:
 
 
 def small_image(image_srgb: np.ndarray) -> Tensor:
-    """An sRGB uint8 image at the size of its classes [3, h, w], in 0..1."""
+    """Resize an sRGB uint8 image to the size of its classes [3, h, w], in 0..1."""
     size = fitted(image_srgb.shape[0], image_srgb.shape[1], _SMALL_PX)
     small = shrunk(image_srgb, size) / np.float32(255)
     return torch.from_numpy(small).permute(2, 0, 1)
 
 
 def _within(square: Square, height: int, width: int) -> Square:
-    """The square moved, and made smaller where it must be, to show little of what lies beyond the photo."""
+    """Move and, if necessary, shrink the square so that little of it lies outside the photo."""
     side_px = min(square.side_px, float(max(height, width)))
     x_px, y_px = (
         min(max(at, side_px / 2), length - side_px / 2) if length > side_px else length / 2
@@ -242,27 +244,19 @@ def _within(square: Square, height: int, width: int) -> Square:
     return Square(x_px, y_px, side_px)
 
 
-def _places(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
-    """Centres [h, w, 2] of the pixels of a small image, in the photo's pixels."""
+def _centres_px(size: tuple[int, int], shape: tuple[int, ...]) -> np.ndarray:
+    """Return the pixel centres [h, w, 2] of a small image, in the photo's pixels."""
     y = (np.arange(size[0]) + PIXEL_CENTRE) * shape[0] / size[0]
     x = (np.arange(size[1]) + PIXEL_CENTRE) * shape[1] / size[1]
     return np.stack(np.meshgrid(x, y), -1)
 
 
-def _with_likelier_hair(classes: Tensor) -> Tensor:
-    """Classes [C, h, w] with `_HAIR` times the hair, as a share of the same person."""
-    person, hair = classes[1:].clone(), class_index("hair") - 1
-    person[hair] *= _HAIR
-    kept = classes[1:].sum(0) / person.sum(0).clamp_min(1e-6)
-    return torch.cat([classes[:1], person * kept])
-
-
 def with_ears(classes: Tensor, view: SquareView, places_px: np.ndarray) -> Tensor:
-    """Classes [C, h, w] with likelier ears at pixels that lie at places [h, w, 2] in the photo.
+    """Raise the odds of ears in classes [C, h, w] at pixels whose positions in the photo are [h, w, 2].
 
-    Ears are small, and get the benefit of the doubt near the line through the landmarks of top, back and
-    lobe. Odds are multiplied, so that what the network is sure of (hair over the ears, a hat) stays. Shares
-    move between ears and background, skin, hair and neck; others stay.
+    Ears are small and get the benefit of the doubt near the line through the landmarks of top, back and lobe.
+    Odds are multiplied, so certain predictions (hair over the ears, a hat) stay. Only ears, background, skin,
+    hair and neck change.
     """
     lifted, ears = classes.clone(), class_index("ears")
     other = classes[_EAR_OTHERS].sum(0)
@@ -274,34 +268,32 @@ def with_ears(classes: Tensor, view: SquareView, places_px: np.ndarray) -> Tenso
 
 
 def _nearness(view: SquareView, places_px: np.ndarray) -> np.ndarray:
-    """Nearness [h, w] in 0..1 of places [h, w, 2] to the lines of both ears."""
+    """Return the proximity [h, w] in 0..1 of positions [h, w, 2] to the lines of both ears."""
     near = np.zeros(places_px.shape[:2])
     width_px = _EAR_WIDTH * max(view.extent_px, 1.0)
     for line in (view.landmarks_px[ear] for ear in _EAR_LINES):
         low, high = line.min(0) - _EAR_REACH * width_px, line.max(0) + _EAR_REACH * width_px
         around = ((places_px > low) & (places_px < high)).all(-1)
-        apart = np.min([_distance(places_px[around], *pair) for pair in pairwise(line)], 0)
-        near[around] = np.maximum(near[around], np.exp(-0.5 * (apart / width_px) ** 2))
+        distances_px = []
+        for start, end in pairwise(line):
+            along, offset = end - start, places_px[around] - start
+            fraction = ((offset @ along) / max(float(along @ along), 1e-9)).clip(0, 1)
+            distances_px.append(np.linalg.norm(offset - fraction[..., None] * along, axis=-1))
+        nearest_px = np.min(distances_px, 0)
+        near[around] = np.maximum(near[around], np.exp(-0.5 * (nearest_px / width_px) ** 2))
     return near
 
 
-def _distance(places: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distance [N] of places [N, 2] from the segment between two points [2]."""
-    along = end - start
-    share = (((places - start) @ along) / max(float(along @ along), 1e-9)).clip(0, 1)
-    return np.asarray(np.linalg.norm(places - start - share[..., None] * along, axis=-1))
-
-
 def with_cloth(classes: Tensor, image: Tensor, head: HeadPlace) -> Tensor:
-    """Return shares [C, h, w] of the classes in which parts of skin that cannot be skin are garments.
+    """Turn regions of skin that cannot be skin into garment, in classes [C, h, w].
 
-    The Parsing Network takes collars and elbows of dark suits for skin or a hand, which would be lit as such.
-    The photo's colours tell them from the person's own skin. A part ends at edges of the photo. It is cloth
-    if most of its chromaticities lie outside those of all of the face, lit and shaded, it is large enough,
-    and little of its outline borders certain skin.
+    The Parsing Network classifies collars and elbows of dark suits as skin or hand, which would be lit as
+    such. The photo's colours distinguish them from the person's skin. A region ends at edges of the photo. It
+    is cloth if most of its chromaticities lie outside those of the whole face, lit and shaded, it is large
+    enough, and little of its outline borders certain skin.
 
     Args:
-        classes: Shares of the classes, which sum to 1.
+        classes: Probabilities of the classes, which sum to 1.
         image: sRGB [3, h, w] in 0..1.
         head: The person's head, in pixels of the image.
     """
@@ -333,8 +325,8 @@ def with_cloth(classes: Tensor, image: Tensor, head: HeadPlace) -> Tensor:
             outline = binary_dilation(part) & ~part
             if certain[outline].mean() < _TOUCHES:
                 cloth |= part
-    given = classes.clone()
+    changed = classes.clone()
     moved = classes[_SKIN_CLASSES] * torch.from_numpy(cloth)
-    given[_SKIN_CLASSES] -= moved
-    given[_GARMENT] += moved.sum(0)
-    return given
+    changed[_SKIN_CLASSES] -= moved
+    changed[_GARMENT] += moved.sum(0)
+    return changed

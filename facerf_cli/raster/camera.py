@@ -1,4 +1,4 @@
-"""Axes, the fixed camera and the head pose, each defined only here.
+"""Axes, the fixed camera and the head pose; all are defined only here.
 
 Camera space is right-handed, in metres: x to the image's right, y up, z out of the face toward the camera.
 The camera is at the origin and looks along -z, so visible points have z < 0; the head pose varies (paper,
@@ -14,19 +14,24 @@ from torch import Tensor
 
 CROP_FOCAL_PER_SIDE = 4.0  # focal length of a face crop, in sides of the crop
 PIXEL_CENTRE = 0.5
-_SMALL_ANGLE2 = 1e-4  # squared radians; below it the series of `so3_exp` is exact to 1e-12
-_GIMBAL_LOCK = 1e-6  # cosine of the pitch below which yaw and roll are not distinct
+_SMALL_ANGLE2 = 1e-4  # squared radians below which the series of `so3_exp` is exact to 1e-12
+_GIMBAL_LOCK = 1e-6  # cosine of the pitch below which yaw and roll are indistinct
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion; lengths and positions are in pixels of its image."""
+    """Pinhole camera without distortion; lengths and positions are in pixels of its image."""
 
     focal_px: float
     width_px: int
     height_px: int
     cx_px: float
     cy_px: float
+
+    def scaled(self, scale: float) -> "Camera":
+        """Return the camera of the resized image, whose size is rounded up."""
+        width_px, height_px = math.ceil(self.width_px * scale), math.ceil(self.height_px * scale)
+        return Camera(self.focal_px * scale, width_px, height_px, self.cx_px * scale, self.cy_px * scale)
 
 
 PLANE = Camera(1.0, 0, 0, 0.0, 0.0)  # focal length 1, origin on the axis: the same image for every camera
@@ -46,7 +51,7 @@ def project(points_camera: Tensor, camera: Camera) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class PosedCamera:
-    """A calibrated pinhole camera in the world, which is in metres and right-handed; float64."""
+    """Calibrated pinhole camera in the world, which is in metres and right-handed; float64."""
 
     focal_px: tuple[float, float]  # along x and along y
     centre_px: tuple[float, float]
@@ -74,7 +79,7 @@ def pixel_rays(px: Tensor, camera: Camera) -> Tensor:
 
 
 def rays_of_rows(camera: Camera, size: tuple[int, int], rows: slice) -> Tensor:
-    """Viewing rays [n, w, 3] through pixels of some rows of the camera's image at another size (h, w)."""
+    """Return viewing rays [n, w, 3] of some rows of the camera's image at another size (h, w)."""
     y = (torch.arange(size[0])[rows] + PIXEL_CENTRE) * (camera.height_px / size[0])
     x = (torch.arange(size[1]) + PIXEL_CENTRE) * (camera.width_px / size[1])
     return pixel_rays(torch.stack(torch.meshgrid(x, y, indexing="xy"), -1), camera)
@@ -92,7 +97,7 @@ def pose_to_rotation(yaw_deg: float | Tensor, pitch_deg: float | Tensor, roll_de
 
 
 def rotation_to_pose(head_to_camera: Tensor) -> tuple[float, float, float]:
-    """Return (yaw, pitch, roll) in degrees of a rotation [3, 3]; at pitch +-90 the roll is set to 0."""
+    """Return (yaw, pitch, roll) in degrees of a rotation [3, 3]; at a pitch of +-90 the roll is 0."""
     r = head_to_camera.detach().double().cpu()
     pitch = math.asin(max(-1.0, min(1.0, r[2, 1].item())))
     if math.hypot(r[0, 1].item(), r[1, 1].item()) < _GIMBAL_LOCK:  # only yaw +- roll is defined

@@ -1,13 +1,13 @@
-"""A z-buffer in plain torch: the visible triangle of each pixel, its barycentric weights and its depth.
+"""Z-buffer in plain torch: the visible triangle of each pixel, its barycentric weights and its depth.
 
-All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with
-the covered area and not with the bounding boxes. Meshes of a batch share these steps. A device waits for
-the host once for all of them, to know the rows: runs and pixels are bounded there, not counted as on the
-CPU. A pixel belongs to a triangle if its centre lies inside. A run includes its left end and excludes its
+All triangles are split into pixel rows at once, and all rows into runs of pixels, so the work grows with the
+covered area and not with the bounding boxes. Meshes of a batch share these steps. A GPU waits for the host
+once for all of them, for the number of rows; runs and pixels have an upper bound there, while the CPU counts
+them. A pixel belongs to a triangle if its centre lies inside. A run includes its left end and excludes its
 right, a triangle includes its upper end and excludes its lower, and both triangles of a shared edge compute
-the same crossing, so each pixel on an edge is covered exactly once.
-Visibility has no gradient (paper, 'Network Architecture'); the barycentric weights of the visible triangle
-have one. All arithmetic is elementwise, so the result does not depend on how triangles are split into parts.
+the same crossing, so each pixel on an edge is covered exactly once. Visibility has no gradient (paper,
+'Network Architecture'); the barycentric weights of the visible triangle have one. All arithmetic is
+elementwise, so the result does not depend on how triangles are split into parts.
 """
 
 import math
@@ -20,33 +20,32 @@ from torch import Tensor
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
 
 NEAR_M = 0.01  # a triangle is dropped if a corner is nearer than this, or behind the camera
-_SLIVER_PX2 = 1e-9  # a projected triangle with less than half this area is degenerate and is dropped
-_CHUNK_PX = 1 << 24  # bounding-box pixels that are processed at a time; bounds the memory
-_SPARE = 1024  # places for what is no pixel; at one place a device would add them one after another
+_SLIVER_PX2 = 1e-9  # a projected triangle with less than half this area is degenerate and dropped
+_CHUNK_PX = 1 << 24  # bounding-box pixels that are processed together; limits the memory
+_SPARE = 1024  # elements for invalid pixels; a GPU would write a single one serially
 _FAR_KEY = torch.iinfo(torch.int64).max  # of a pixel without a triangle
 
 
 @dataclass(frozen=True, eq=False)
 class Fragments:
-    """The visible point of each pixel of an image, or of the images of a batch."""
+    """Visible point of each pixel of an image, or of the images of a batch."""
 
     triangle: Tensor  # [..., H, W] int64, -1 for none
     barycentric: Tensor  # [..., H, W, 3] perspective-correct, differentiable in the vertices; 0 for none
     depth_m: Tensor  # [..., H, W] distance along the viewing axis (-z), differentiable; inf for none
-    pixel: Tensor  # [P] places in the flat images: of the covered pixels, or of all on a device
+    pixel: Tensor  # [P] indices of the covered pixels, or on a GPU of all pixels, in the flat images
 
     @property
     def covered(self) -> Tensor:
-        """Pixels [..., H, W] bool with a visible triangle."""
         return self.triangle >= 0
 
 
 @dataclass(frozen=True, eq=False)
 class _Screen:
-    """Triangles [N], projected in float64; float32 is too coarse for slivers."""
+    """Triangles [N], projected in float64, because float32 is too coarse for slivers."""
 
-    triangle: Tensor  # [N] index in the mesh, or in all meshes one after another
-    first_px: Tensor  # [N] place of the first pixel of the triangle's image in the flat images
+    triangle: Tensor  # [N] index in all concatenated meshes
+    first_px: Tensor  # [N] index of the first pixel of the triangle's image in the flat images
     corners_px: Tensor  # [N, 3, 2]
     inverse_depth: Tensor  # [N, 3]
     first_row: Tensor  # [N] int64
@@ -54,20 +53,19 @@ class _Screen:
     box_px: Tensor  # [N] pixels of the bounding box inside the image
 
     def part(self, index: Tensor) -> "_Screen":
-        """Select some of the triangles."""
         return _Screen(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
 
 
 def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fragments:
     """Rasterize vertices [..., V, 3] and triangles [F, 3] of either winding.
 
-    At equal depth the lower index wins. The barycentric weights and the depth have gradients to the vertices;
-    the choice of triangle has none.
+    At equal depth the lower index wins. The barycentric weights and the depth are differentiable in the
+    vertices; the choice of triangle is not.
     """
     size = (*vertices_camera.shape[:-2], camera.height_px, camera.width_px)
     meshes, vertices = math.prod(size[:-2]), vertices_camera.flatten(0, -2)
     first = torch.arange(meshes, device=triangles.device) * vertices_camera.shape[-2]
-    corners = (triangles + first[:, None, None]).flatten(0, 1)  # [M F, 3] of M meshes one after the other
+    corners = (triangles + first[:, None, None]).flatten(0, 1)  # [M F, 3] of M meshes
     with torch.no_grad():
         triangle = _visible_triangles(vertices.detach(), corners, camera, meshes)
     pixel = _places(triangle >= 0)
@@ -82,14 +80,14 @@ def rasterize(vertices_camera: Tensor, triangles: Tensor, camera: Camera) -> Fra
 
 
 def _places(chosen: Tensor) -> Tensor:
-    """Places where a mask [N] is true; all on a device, which would wait to know how many there are."""
+    """Return the indices where a mask [N] is true; on a GPU all, because counting them would wait."""
     if _counts(chosen):
         return torch.nonzero(chosen).squeeze(-1)
     return torch.arange(len(chosen), device=chosen.device)
 
 
 def _counts(tensor: Tensor) -> bool:
-    """Tell if the sizes of a tensor's device are known to the host at once."""
+    """Return whether the host knows the sizes of results on the tensor's device without waiting."""
     return tensor.device.type == "cpu"
 
 
@@ -106,7 +104,7 @@ def interpolate(attributes: Tensor, triangles: Tensor, fragments: Fragments) -> 
 
 
 def front_facing(vertices_camera: Tensor, triangles: Tensor) -> Tensor:
-    """Tell of each triangle [..., F] of meshes [..., V, 3] if its counter-clockwise side faces the camera."""
+    """Return whether the counter-clockwise side of each triangle [..., F] of [..., V, 3] faces the camera."""
     a, b, c = vertices_camera[..., triangles, :].unbind(-2)
     return (torch.linalg.cross(b - a, c - a) * a).sum(-1) < 0
 
@@ -127,27 +125,24 @@ def _visible_triangles(vertices_camera: Tensor, triangles: Tensor, camera: Camer
 
 
 def _on_screen(vertices_camera: Tensor, triangles: Tensor, camera: Camera, meshes: int) -> _Screen:
-    """Project the meshes; triangles that cover no pixel are dropped or, on a device, get no rows."""
+    """Project the meshes; triangles that cover no pixel are dropped or, on a GPU, get no rows."""
     vertices = vertices_camera.double()
     px = project(vertices, camera)
     in_front = (vertices[:, 2] < -NEAR_M) & px.isfinite().all(-1)
     corners_px = px[triangles]  # [F, 3, 2]
-    low, high = (_within(_first_centre(end), camera) for end in (corners_px.amin(1), corners_px.amax(1)))
+    ends = (_first_centre(end).unbind(-1) for end in (corners_px.amin(1), corners_px.amax(1)))
+    low, high = (
+        torch.stack([x.clamp(0, camera.width_px), y.clamp(0, camera.height_px)], -1) for x, y in ends
+    )
     a, b, c = corners_px.unbind(1)
     area2_px = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    seen = in_front[triangles].all(-1) & (high > low).all(-1) & (area2_px.abs() > _SLIVER_PX2)
-    keep = _places(seen)
+    covers = in_front[triangles].all(-1) & (high > low).all(-1) & (area2_px.abs() > _SLIVER_PX2)
+    keep = _places(covers)
     first, last = low[keep].long(), high[keep].long()
-    size = torch.where(seen[keep, None], last - first, 0)
+    size = torch.where(covers[keep, None], last - first, 0)
     inverse_depth = -1 / vertices[:, 2][triangles[keep]]
     first_px = keep * meshes // max(len(triangles), 1) * (camera.width_px * camera.height_px)
     return _Screen(keep, first_px, corners_px[keep], inverse_depth, first[:, 1], size[:, 1], size.prod(-1))
-
-
-def _within(px: Tensor, camera: Camera) -> Tensor:
-    """Positions [..., 2], none of them outside the image."""
-    x, y = px.unbind(-1)
-    return torch.stack([x.clamp(0, camera.width_px), y.clamp(0, camera.height_px)], -1)
 
 
 def _first_centre(position_px: Tensor) -> Tensor:
@@ -168,7 +163,7 @@ def _chunks(screen: _Screen) -> Iterator[tuple[_Screen, int, int]]:
 
 
 def _totals(screen: _Screen) -> tuple[int, int]:
-    """Rows and bounding-box pixels of all triangles; here a device waits."""
+    """Return the rows and bounding-box pixels of all triangles; a GPU waits here."""
     rows, box_px = torch.stack([screen.rows.sum(), screen.box_px.sum()]).cpu().tolist()
     return rows, box_px
 
@@ -176,7 +171,7 @@ def _totals(screen: _Screen) -> tuple[int, int]:
 def _cover(screen: _Screen, width_px: int, rows: int, box_px: int, nowhere: int) -> tuple[Tensor, Tensor]:
     """Return all pairs of a triangle and a pixel centre inside it: index into `screen` [P], pixel [P].
 
-    On a device P is the area of the boxes, and pairs beyond the last have pixels from `nowhere` on.
+    On a GPU, P is the area of the boxes, and pairs beyond the last have pixels from `nowhere` on.
     """
     owner, row = _expand(screen.first_row, screen.rows, rows)
     left, right = _row_crossings(screen.corners_px, owner, row.double() + PIXEL_CENTRE)
@@ -189,9 +184,9 @@ def _cover(screen: _Screen, width_px: int, rows: int, box_px: int, nowhere: int)
 
 
 def _expand(first: Tensor, count: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """Expand runs of integers to `size` places: the run's index, and first + 0, 1, ... count - 1.
+    """Expand runs of integers to `size` elements: the run's index, and first + 0, 1, ... count - 1.
 
-    Places beyond the last run go on with it.
+    Elements beyond the last run continue it.
     """
     begin = count.cumsum(0) - count
     count = torch.cat([count[:-1], size - begin[-1:]])
@@ -228,37 +223,33 @@ def _fragment_depth(screen: _Screen, owner: Tensor, pixel: Tensor, camera: Camer
     base = ia - slope_x * (a[:, 0] - PIXEL_CENTRE) - slope_y * (a[:, 1] - PIXEL_CENTRE)
     column, row = _column_row(pixel, camera)
     inverse = base[owner] + slope_x[owner] * column + slope_y[owner] * row
-    low, high = (
-        screen.inverse_depth.amin(-1),
-        screen.inverse_depth.amax(-1),
-    )  # slivers round badly
+    low, high = screen.inverse_depth.amin(-1), screen.inverse_depth.amax(-1)  # slivers round badly
     return (1 / inverse.clamp(low[owner], high[owner])).float()
 
 
 def _hit(
-    vertices_camera: Tensor, triangles: Tensor, seen: Tensor, pixel: Tensor, camera: Camera
+    vertices_camera: Tensor, triangles: Tensor, visible: Tensor, pixel: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor]:
-    """Return barycentric weights [P, 3] and depth [P], float64, of triangles `seen` [P] at pixels [P].
+    """Return barycentric weights [P, 3] and depth [P], float64, of triangles `visible` [P] at pixels [P].
 
-    Without a triangle (-1) they are 0 and infinite. For corners a, b, c and weights w:
-    w_a a + w_b b + w_c c = depth * ray. By Cramer's rule w_a = depth * ray . (b x c) / (a . (b x c)), and
-    cyclically. Float64, because of cancellation.
+    Without a triangle (-1) they are 0 and infinite. For corners a, b, c and weights w: w_a a + w_b b + w_c c
+    = depth * ray. By Cramer's rule w_a = depth * ray . (b x c) / (a . (b x c)), and cyclically. Float64,
+    because of cancellation.
     """
     corners = vertices_camera.double().nan_to_num()[triangles].permute(1, 2, 0).contiguous()  # [3, xyz, F]
     a, b, c = corners
     cofactors = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)])  # [3, xyz, F]
     column_row = torch.stack(_column_row(pixel, camera), -1)
     ray = pixel_rays(column_row.double() + PIXEL_CENTRE, camera).T.contiguous()
-    hit, seen = seen >= 0, seen.clamp_min(0)  # of the first triangle where there is none: numbers, no NaN
-    parts = [_dot(cofactor.index_select(1, seen), ray) for cofactor in cofactors]
+    hit, visible = visible >= 0, visible.clamp_min(0)  # pixels without a triangle use the first: no NaN
+    parts = [_dot(cofactor.index_select(1, visible), ray) for cofactor in cofactors]
     total = torch.where(hit, parts[0] + parts[1] + parts[2], 1)
     volume = _dot(a, cofactors[0])
     weights = torch.stack([torch.where(hit, part / total, 0) for part in parts], -1)
-    return weights, torch.where(hit, volume[seen] / total, torch.inf)
+    return weights, torch.where(hit, volume[visible] / total, torch.inf)
 
 
 def _column_row(pixel: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Column and row of pixels of flat images of the camera."""
     return pixel % camera.width_px, pixel // camera.width_px % camera.height_px
 
 

@@ -1,8 +1,8 @@
-"""Textures in UV space: render to an image, unwrap from an image, inpaint, and bake normals.
+"""Textures in UV space: sample, unwrap from an image, inpaint, and bake normals.
 
-A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid is at
-(j, i) / (side - 1). Meshes, images and textures may be those of a batch. Textures are [C, T, T]; u runs
-right, v down, and the centre of texel (row i, column j) is at ((j + 0.5) / T, (i + 0.5) / T).
+A mesh here is a uniform grid in UV: vertex (row i, column j) of a side x side grid is at (j, i) / (side - 1).
+Meshes, images and textures may be batches. Textures are [C, T, T]; u runs right, v down, and the centre of
+texel (row i, column j) is at ((j + 0.5) / T, (i + 0.5) / T).
 """
 
 import math
@@ -14,10 +14,10 @@ from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, pixel_rays, project
-from facerf_cli.raster.rasterize import interpolate, rasterize
+from facerf_cli.raster.rasterize import rasterize
 
-_TINY = 1e-12  # avoids division by zero
-_STEP_QUANTILE = 0.95  # of the distance between texels in an image, by which it is scaled down
+_TINY = 1e-12  # avoids division by 0
+_STEP_QUANTILE = 0.95  # of the distance between texels in an image, which determines its scale
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,15 @@ class UnwrapSettings:
     """Conditions for a texel to count as visible."""
 
     hidden_m: float = 0.0025  # a texel is hidden if a surface is this far in front of it
-    unseen_cosine: float = 0.12  # of normal and viewing ray: invisible at and below this,
-    seen_cosine: float = 0.35  # fully visible at and above this, smooth in between
+    unseen_cosine: float = 0.12  # of normal and viewing ray: invisible up to this,
+    seen_cosine: float = 0.35  # fully visible from this, smooth in between
     depth_side_px: int = 512  # least length of the depth map's longer side
-    samples: int = 4  # at most samples x samples in a texel; a larger image is scaled down first
-    measured: bool = True  # the texels' sizes choose the image's scale and the samples; else all are taken
+    samples: int = 4  # at most samples x samples per texel; a larger image is scaled down first
+    measured: bool = True  # choose the image's scale and the samples by the texels' sizes
 
 
 def vertex_normals(vertices: Tensor, triangles: Tensor) -> Tensor:
-    """Unit normals of vertices [..., V, 3], means of the triangles' by area; +z without any area."""
+    """Return unit normals of vertices [..., V, 3], weighted by the triangles' area; +z without any area."""
     a, b, c = vertices[..., triangles, :].unbind(-2)
     area_normals = torch.linalg.cross(b - a, c - a).repeat_interleave(3, -2)
     return _unit(torch.zeros_like(vertices).index_add(-2, triangles.reshape(-1), area_normals))
@@ -53,7 +53,7 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def smoothstep(x: Tensor) -> Tensor:
-    """Smooth step of 0..1, flat at both ends."""
+    """Return the smooth step of 0..1, flat at both ends."""
     x = x.clamp(0, 1)
     return x * x * (3 - 2 * x)
 
@@ -89,28 +89,8 @@ def sample_texture(texture: Tensor, uv: Tensor) -> Tensor:
     """Sample a texture [..., C, T, T] at (u, v) [..., H, W, 2]: [..., H, W, C], clamped at the border."""
     grid = (2 * uv - 1).flatten(0, -4) if uv.dim() > 3 else (2 * uv - 1)[None]
     images = texture.reshape(-1, *texture.shape[-3:]).expand(len(grid), -1, -1, -1)
-    found = F.grid_sample(images, grid.to(texture.dtype), padding_mode="border", align_corners=False)
-    return found.permute(0, 2, 3, 1).view(*uv.shape[:-1], found.shape[1])
-
-
-def render_texture(
-    texture: Tensor, vertices_camera: Tensor, triangles: Tensor, uv: Tensor, camera: Camera
-) -> tuple[Tensor, Tensor]:
-    """Render a textured mesh to an image [H, W, C], black outside of it, and a coverage [H, W] of 0 or 1.
-
-    Differentiable in the texture and, through the interpolation, in the vertices.
-
-    Args:
-        texture: [C, T, T].
-        vertices_camera: [V, 3] in camera space, in metres.
-        triangles: [F, 3].
-        uv: Of the vertices [V, 2], v down.
-        camera: The image's camera.
-    """
-    fragments = rasterize(vertices_camera, triangles, camera)
-    coverage = fragments.covered.to(texture.dtype)
-    image = sample_texture(texture, interpolate(uv, triangles, fragments))
-    return image * coverage[..., None], coverage
+    sampled = F.grid_sample(images, grid.to(texture.dtype), padding_mode="border", align_corners=False)
+    return sampled.permute(0, 2, 3, 1).view(*uv.shape[:-1], sampled.shape[1])
 
 
 def unwrap(
@@ -130,14 +110,16 @@ def unwrap(
 
     Args:
         image: [..., C, H, W].
-        vertices_camera: Of the grid [V, 3] in camera space, in metres.
+        vertices_camera: Vertices of the grid [V, 3] in camera space, in metres.
         triangles: [F, 3].
         camera: The image's camera.
         texture_side: T.
-        settings: Samples a texel, and what counts as hidden.
+        settings: Samples per texel and limits of visibility.
     """
     if image.shape[-2:] != (camera.height_px, camera.width_px):
-        raise ValueError(f"image {tuple(image.shape)}: the camera's is {camera.height_px, camera.width_px}")
+        raise ValueError(
+            f"image {tuple(image.shape)}, but the camera has {camera.height_px, camera.width_px}"
+        )
     samples = settings.samples
     if settings.measured:
         image, camera, samples = _match_scale(image, vertices_camera, camera, texture_side, samples)
@@ -154,27 +136,20 @@ def unwrap(
 
 
 def _shares(px: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pixels [..., 2] as shares of the image's width and height."""
     return px[..., 0] / camera.width_px, px[..., 1] / camera.height_px
 
 
 def _match_scale(
     image: Tensor, vertices_camera: Tensor, camera: Camera, texture_side: int, samples: int
 ) -> tuple[Tensor, Camera, int]:
-    """Scale the image down by a power of two, and choose samples per texel, for about one sample a pixel."""
+    """Scale the image down by a power of two and choose samples per texel, for about one sample per pixel."""
     side = math.isqrt(vertices_camera.shape[-2])
     px = bake_attributes(project(vertices_camera.detach(), camera), side, texture_side)
     step_px = torch.cat([px.diff(dim=along).norm(dim=-3).flatten() for along in (-2, -1)])
     step = float(step_px.nan_to_num(0, 0).sort().values[int(_STEP_QUANTILE * len(step_px))])
     shrink = 2 ** max(0, math.ceil(math.log2(max(step, 1) / samples)))
     if shrink > 1:
-        camera = Camera(
-            camera.focal_px / shrink,
-            math.ceil(camera.width_px / shrink),
-            math.ceil(camera.height_px / shrink),
-            camera.cx_px / shrink,
-            camera.cy_px / shrink,
-        )
+        camera = camera.scaled(1 / shrink)
         image = F.avg_pool2d(image, shrink, ceil_mode=True, count_include_pad=False)
     return image, camera, min(samples, max(1, math.ceil(step / shrink)))
 
@@ -188,24 +163,19 @@ def _visibility(
     facing = smoothstep((cosine - settings.unseen_cosine) / (settings.seen_cosine - settings.unseen_cosine))
     u, v = _shares(project(points, camera), camera)
     inside = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1) & (points[..., 2] < 0)
-    nearer_m = _in_front_by(points, normals, vertices_camera, triangles, _depth_camera(camera, settings))
+    depth_scale = max(1.0, settings.depth_side_px / max(camera.width_px, camera.height_px))
+    nearer_m = _in_front_by(points, normals, vertices_camera, triangles, camera.scaled(depth_scale))
     return facing * (inside & (nearer_m < settings.hidden_m))
-
-
-def _depth_camera(camera: Camera, settings: UnwrapSettings) -> Camera:
-    """Return the camera of the depth map: the image's, scaled up to the least size."""
-    scale = max(1.0, settings.depth_side_px / max(camera.width_px, camera.height_px))
-    width_px, height_px = math.ceil(camera.width_px * scale), math.ceil(camera.height_px * scale)
-    return Camera(camera.focal_px * scale, width_px, height_px, camera.cx_px * scale, camera.cy_px * scale)
 
 
 def _in_front_by(
     points: Tensor, normals: Tensor, vertices_camera: Tensor, triangles: Tensor, camera: Camera
 ) -> Tensor:
-    """Return how many metres the nearest surface is in front of each point [..., T, T]; negative if behind.
+    """Return the distance in metres of the nearest surface in front of each point [..., T, T].
 
-    The depth map is exact at pixel centres, so the point is moved to the centre of its pixel along its
-    tangent plane; otherwise a slanted surface would hide itself.
+    Points in front of the surface have negative values. The depth map is exact at pixel centres, so the point
+    is moved to the centre of its pixel along its tangent plane; otherwise a slanted surface would hide
+    itself.
     """
     depth_m = rasterize(vertices_camera, triangles, camera).depth_m
     px = project(points, camera).nan_to_num(0, 0, 0)
@@ -214,8 +184,8 @@ def _in_front_by(
     ray = pixel_rays(torch.stack([column, row], -1) + PIXEL_CENTRE, camera)
     toward = _dot(normals, ray).clamp(max=-_TINY)
     plane_depth_m = _dot(normals, points) / toward
-    place = (row * camera.width_px + column).flatten(-2)
-    return plane_depth_m - depth_m.flatten(-2).gather(-1, place).view_as(plane_depth_m)
+    pixel = (row * camera.width_px + column).flatten(-2)
+    return plane_depth_m - depth_m.flatten(-2).gather(-1, pixel).view_as(plane_depth_m)
 
 
 def inpaint(texture: Tensor, visible: Tensor) -> Tensor:
@@ -239,11 +209,11 @@ def _inpaint(texture: Tensor, visible: Tensor) -> Tensor:
 
 
 def blurred(maps: Tensor, sigma_px: float) -> Tensor:
-    """Blur maps [C, H, W] by a Gaussian; beyond their border they go on as there."""
+    """Blur maps [C, H, W] by a Gaussian; their borders are repeated."""
     return torch.from_numpy(gaussian_filter(maps.numpy(), (0, sigma_px, sigma_px), mode="nearest"))
 
 
 def blurred_within(maps: Tensor, weight: Tensor, sigma_px: float) -> Tensor:
-    """Means of maps [C, H, W] by a Gaussian around each pixel, under weights [H, W]; 0 where these are 0."""
+    """Average maps [C, H, W] by a Gaussian with weights [H, W]; 0 where these are 0."""
     both = blurred(torch.cat([maps * weight, weight[None]]), sigma_px)
     return both[:-1] / both[-1:].clamp_min(1e-6)

@@ -18,7 +18,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from facerf_cli.light.studio_points import PointLights
+from facerf_cli.light.light import PointLights
 from facerf_cli.light.transport import first_hits_m, on_disc, places_on_disc
 from facerf_cli.portrait.parse import class_index
 from facerf_cli.portrait.proxy import OFF_M, RADIUS_DEG, Proxy, ProxyMaps

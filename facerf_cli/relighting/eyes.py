@@ -30,8 +30,8 @@ from torch import Tensor
 
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Rows, Window, block_means
+from facerf_cli.light.light import is_of_rig
 from facerf_cli.light.sphere import RIG_LIGHTS
-from facerf_cli.light.studio_points import is_of_rig
 from facerf_cli.portrait.find import SeenEyes
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.raster.texture import inpaint, smoothstep

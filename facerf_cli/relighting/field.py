@@ -14,8 +14,8 @@ from facerf_cli.baselines.base import Reflectance
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.face.topology import interior_texture, region_mask
 from facerf_cli.light.estimate import LightEvidence
+from facerf_cli.light.light import PointLights
 from facerf_cli.light.sphere import rig_directions
-from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import is_grey, mixed_precision, without_cast
 from facerf_cli.network.reflectance import ReflectanceNetwork
 from facerf_cli.portrait.correction import Quotient

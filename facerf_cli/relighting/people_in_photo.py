@@ -26,7 +26,7 @@ from facerf_cli.image.colour import ExposureRule, chosen_exposure_ev
 from facerf_cli.image.strips import Window, enlarged, in_strips
 from facerf_cli.light.light import Light
 from facerf_cli.portrait.matte import PersonColours
-from facerf_cli.portrait.parse import class_index, covering, share_bare
+from facerf_cli.portrait.parse import class_index, covering, uncovered_fraction
 from facerf_cli.portrait.person import SeenPerson
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.raster.rasterize import front_facing, rasterize
@@ -275,7 +275,7 @@ class PersonInPhoto:
 
     def _face_weight(self, part: Window) -> np.ndarray:
         """Return the weight [h, w] of the face field in a part of its window."""
-        bare = share_bare(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
+        bare = uncovered_fraction(enlarged(self._covered, self.size_px, part.rows)[0])[:, part.columns]
         return np.asarray(self.view.mask[part.inside(self.view.window)].numpy() * bare)
 
     def _layer(self, name: str, window: Window, of_views: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -21,9 +21,9 @@ from facerf_cli.light.envmap import lights_around
 from facerf_cli.light.estimate import (
     LightEvidence,
     RefinedLight,
-    estimate_lamps,
+    estimate_key_light,
     joined,
-    lamp_error,
+    key_light_error,
     refine_light,
 )
 from facerf_cli.light.sphere import RigLight, rig_directions
@@ -123,7 +123,7 @@ def _estimated(frames: Sequence[_Frame]) -> RigLight:
     olats = torch.cat(
         [one.well_observed_texels(torch.cat([one.under(key), one.ambient])) for one in frames], -1
     )
-    weights = estimate_lamps(olats, _photo(frames), len(key))
+    weights = estimate_key_light(olats, _photo(frames))
     return RigLight(torch.cat([key, rig_directions(_AMBIENT_LIGHTS)]), weights)
 
 
@@ -136,7 +136,7 @@ def _key_direction(frames: Sequence[_Frame]) -> Tensor:
         """Return the error of each key light from its OLATs [l, 3, t, t] in each frame."""
         pairs = zip(olats, frames, strict=True)
         texels = torch.cat([one.well_observed_texels(of_one.mean(1)) for of_one, one in pairs], -1)
-        return [lamp_error(key, ambient, photo) for key in texels]
+        return [key_light_error(key, ambient, photo) for key in texels]
 
     if not len(photo):  # too little is visible
         return rig_directions(_AMBIENT_LIGHTS)[:1]

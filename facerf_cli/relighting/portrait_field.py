@@ -19,9 +19,8 @@ from torch import Tensor
 from facerf_cli.face.head import Head
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import grid_uv
-from facerf_cli.light.light import Light
+from facerf_cli.light.light import Light, PointLights
 from facerf_cli.light.sphere import RigLight, rig_directions
-from facerf_cli.light.studio_points import PointLights
 from facerf_cli.network.inputs import MEAN_RADIANCE, is_grey
 from facerf_cli.network.portrait import HAIRY, PortraitInputs, PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.correction import Correction

@@ -27,7 +27,7 @@ from facerf_cli.portrait.person import SeenPerson, look_at_person, portrait_squa
 from facerf_cli.portrait.segment import (
     Segmentation,
     parsed,
-    seen_classes,
+    predicted_classes,
     segmentation_of,
     small_image,
     within_matte,
@@ -245,7 +245,7 @@ class SteadyShot:
             if self._mattes is not None:
                 classes = parsed(people.parsing, image, landmarks_px, small)
             else:
-                classes = seen_classes(people, image, landmarks_px, small)
+                classes = predicted_classes(people, image, landmarks_px, small)
             self._near[frame] = _FrameObservation(classes, small)
         return self._near[frame]
 

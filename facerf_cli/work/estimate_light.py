@@ -29,10 +29,10 @@ from facerf_cli.files.write import write_display, write_exr
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb, srgb_to_linear
 from facerf_cli.image.strips import resized
 from facerf_cli.light.envmap import ball, envmap_weights, resampled, rig_to_latlong
+from facerf_cli.light.light import rig_by_text
 from facerf_cli.light.picture import FOV_DEG, light_of_picture
 from facerf_cli.light.sh import rig_coefficients
 from facerf_cli.light.sphere import RigLight, brightest_direction, direction_to_azel
-from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.network.features import FeatureNetwork
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize

@@ -15,8 +15,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.image_metadata import read_header
 from facerf_cli.light.entries import Sampling, StudioLight
 from facerf_cli.light.envmap import NO_KEYS, lights_around, rotated_weights, turned, without_keys
-from facerf_cli.light.light import Light
-from facerf_cli.light.studio_points import far_samples, intensity_of, is_narrow, rig_by_text
+from facerf_cli.light.light import Light, far_samples, intensity_of, is_narrow, rig_by_text
 from facerf_cli.run.logs import LOGGER_NAME, step
 from facerf_cli.work.light_setups import ROOM, LightSetup
 

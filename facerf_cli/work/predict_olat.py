@@ -20,8 +20,7 @@ from facerf_cli.files.read import LinearImage
 from facerf_cli.files.sheets import contact_sheet, mark_light
 from facerf_cli.files.write import write_display
 from facerf_cli.image.strips import resized
-from facerf_cli.light.light import Light
-from facerf_cli.light.studio_points import rig_by_text
+from facerf_cli.light.light import Light, rig_by_text
 from facerf_cli.person import Target, fit, olat_images
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.field import Field

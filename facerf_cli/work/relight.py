@@ -22,8 +22,7 @@ from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
 from facerf_cli.image.light_wrap import LightWrap
 from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
 from facerf_cli.light.envmap import Backdrop
-from facerf_cli.light.light import Light
-from facerf_cli.light.studio_points import intensity_of
+from facerf_cli.light.light import Light, intensity_of
 from facerf_cli.person import Person, Target, fit
 from facerf_cli.raster.camera import Camera, rays_of_rows
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto

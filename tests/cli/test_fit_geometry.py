@@ -20,12 +20,12 @@ from facerf_cli.network.checkpoint import load_checkpoint, save_checkpoint
 from facerf_cli.network.files import SHIPPED
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import project
-from facerf_cli.raster.texture import render_texture
 from facerf_cli.relighting.models import SHIPPED_NETWORKS, Sides, load_models
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
 from tests.exr_layers import exr_layers
 from tests.folders import only_row
+from tests.textured import render_texture
 
 NAMES = ("texture.exr", "texture.png", "normals.exr", "normals.png", "mesh.glb", "mesh.obj", "mesh.mtl")
 ENDINGS = {f"_{name}" for name in (*NAMES, "fit.jpg", "fit.npz")}

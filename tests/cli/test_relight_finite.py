@@ -33,7 +33,7 @@ def test_a_photo_of_one_colour_with_landmarks_is_refused(
     flat = tmp_path / "flat.png"
     write_display(flat, np.full(read_image(PHOTO).pixels.shape, 0.2, np.float32))
     said = refused(flat, landmarks, tmp_path / "out", capsys)
-    assert str(landmarks) in said and "no face is seen" in said
+    assert str(landmarks) in said and "not on a face" in said
 
 
 def test_a_photo_with_one_pixel_without_bounds_is_refused(

@@ -25,7 +25,7 @@ def test_faces_by_size_sureness_and_number(landmarks_px, caplog, monkeypatch):
     small, large = (Face((0, 0, side, side), 1.0, landmarks_px) for side in (20, 50))
     faces = [small, large]
     assert choose_face(faces, "largest", "p") == [large] and choose_face(faces, "all", "p") == faces
-    assert "p: has 2 faces, of which the largest is taken" in caplog.text
+    assert "p: using the largest of 2 faces" in caplog.text
     assert choose_face(faces, "0", "p") == [small]
     refused(InputError, "2 face", choose_face, faces, "2", "p")
     for which in ("-1", "biggest", ""):

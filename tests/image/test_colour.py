@@ -57,7 +57,7 @@ def test_usual_images_do_not_import_colour_science() -> None:
         "import sys, numpy as np\n"
         "from facerf_cli.image import colour\n"
         "from facerf_cli.files.icc import space_of_profile\n"
-        "from facerf_cli.light.studio_points import StudioLight, intensity_of\n"
+        "from facerf_cli.light.light import StudioLight, intensity_of\n"
         "from tests import icc_profiles\n"
         "spaces = colour.SRGB, colour.ACESCG, colour.LINEAR_REC2020\n"
         "profiles = icc_profiles.DISPLAY_P3, icc_profiles.PROPHOTO\n"

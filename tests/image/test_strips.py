@@ -13,7 +13,7 @@ from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_display, write_exr, write_tiff
 from facerf_cli.image import strips as module
 from facerf_cli.image.strips import Window, block_means, box_means, enlarged, in_strips, strips
-from facerf_cli.portrait.matte import PersonColours, lifted, shrunk
+from facerf_cli.portrait.matte import PersonColours, enlarge_matte, shrunk
 from tests.kinds import Patch
 from tests.oracles.person_colours import slow_person_colours
 
@@ -124,9 +124,9 @@ def test_colours_of_a_person_are_those_of_the_whole_image(most_px: int, monkeypa
 def test_a_matte_is_enlarged_by_strips_as_at_once(monkeypatch: Patch) -> None:
     photo = DRAW.integers(0, 256, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     rough, guide = DRAW.random((30, 14), np.float32), DRAW.random((30, 14, 3), np.float32)
-    found = lifted(rough, guide, photo)
+    found = enlarge_matte(rough, guide, photo)
     monkeypatch.setattr(module, "STRIP_PX", 1 << 20)
-    np.testing.assert_allclose(found, lifted(rough, guide, photo), atol=1e-6)
+    np.testing.assert_allclose(found, enlarge_matte(rough, guide, photo), atol=1e-6)
 
 
 def test_a_window_says_where_its_parts_lie_in_an_array() -> None:

@@ -171,7 +171,7 @@ def test_broken_pixels_are_counted() -> None:
     envmap = torch.zeros(4, 8, 3)
     check_envmap(envmap)
     envmap[1, 2, 0], envmap[3, 3] = torch.nan, torch.inf
-    refused(InputError, "2 pixels", check_envmap, envmap)
+    refused(InputError, "2 NaN", check_envmap, envmap)
 
 
 def _sun(rotations_deg: list[float], lights: int, sampling: Sampling) -> torch.Tensor:
@@ -366,7 +366,7 @@ def back_and_forth(weights: Tensor, height: int) -> tuple[Tensor, float]:
     return envmap, float((envmap_weights(envmap, RIG) - weights).abs().max() / weights.abs().max())
 
 
-def lone_lamps() -> Tensor:
+def single_lights() -> Tensor:
     weights = torch.zeros(len(RIG), 3)
     weights[40], weights[90] = torch.tensor([1.0, 0.5, 0.2]), torch.tensor([0.1, 0.1, 0.5])
     return weights
@@ -377,7 +377,7 @@ def harsh_weights() -> Tensor:
     return torch.rand(len(RIG), 3, generator=torch.Generator().manual_seed(3)) ** 4
 
 
-@pytest.mark.parametrize("draw, height", [(lone_lamps, 128), (harsh_weights, 300)])
+@pytest.mark.parametrize("draw, height", [(single_lights, 128), (harsh_weights, 300)])
 def test_the_map_gives_the_weights_back(draw: Callable[[], Tensor], height: int) -> None:
     envmap, error = back_and_forth(draw(), height)
     assert error < 0.01

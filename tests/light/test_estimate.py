@@ -9,10 +9,10 @@ from facerf_cli.errors import InputError
 from facerf_cli.light import estimate
 from facerf_cli.light.estimate import (
     LightEvidence,
-    estimate_lamps,
+    estimate_key_light,
     estimate_signed_weights,
     estimate_smooth_weights,
-    lamp_error,
+    key_light_error,
     least_non_negative,
     refine_light,
 )
@@ -108,7 +108,7 @@ def test_a_covered_image_gives_the_same_light() -> None:
     spoilt = image.clone()
     spoilt[:, ::10] = 0.0  # hair
     none = torch.zeros_like(image, dtype=torch.bool)
-    first = estimate_lamps(olats, spoilt, 1)
+    first = estimate_key_light(olats, spoilt)
     for found in (first, estimate_smooth_weights(evidence.directions, olats, spoilt, none)):
         remade = torch.einsum("lc,lcn->cn", found, olats)
         assert (remade - image).norm() < 0.05 * image.norm()
@@ -153,7 +153,7 @@ def test_a_lone_light_is_not_smeared_out(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_a_black_image_and_none_have_no_light() -> None:
-    assert estimate_lamps(*flat(shaded_ball()), 1).abs().max() == 0
+    assert estimate_key_light(*flat(shaded_ball())).abs().max() == 0
     evidence = shaded_ball()
     red = LightEvidence(
         evidence.directions,
@@ -174,7 +174,7 @@ def test_a_black_image_and_none_have_no_light() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_where_nothing_is_seen_there_is_no_light() -> None:
-    found = estimate_lamps(torch.zeros(24, 3, 0), torch.zeros(3, 0), 1)
+    found = estimate_key_light(torch.zeros(24, 3, 0), torch.zeros(3, 0))
     assert found.shape == (24, 3) and (found == 0).all()
 
 
@@ -187,7 +187,7 @@ def test_light_from_around_is_even_as_far_as_the_image_allows() -> None:
     olats, image = flat(lit(evidence, weights))
     first = [lamp, *(k for k in range(LIGHTS) if k != lamp)]
     noise = 0.02 * image.mean() * torch.randn(image.shape, generator=torch.Generator().manual_seed(3))
-    even = estimate_lamps(olats[first], image + noise, 1)
+    even = estimate_key_light(olats[first], image + noise)
     free = free_weights(olats[first], image + noise)
     assert even[1:].std() < 0.005 < 0.03 < free[1:].std()
     assert (even[0] - 0.9).abs().max() < 0.1
@@ -197,7 +197,7 @@ def test_the_error_of_a_lamp_is_least_where_it_is() -> None:
     evidence = shaded_ball()
     grey = evidence.olats[..., evidence.mask].mean(1)
     image = 0.8 * grey[5] + 0.3 * grey.mean(0)
-    errors = [lamp_error(lamp, grey.mean(0), image) for lamp in grey]
+    errors = [key_light_error(key, grey.mean(0), image) for key in grey]
     assert errors[5] == min(errors) and errors[5] < 1e-6 < sorted(errors)[1]
 
 

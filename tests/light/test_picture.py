@@ -78,5 +78,5 @@ def test_a_wide_angle_shows_more_of_the_sphere() -> None:
 def test_python_takes_it_as_a_light() -> None:
     light = Light.from_picture(beach().numpy(), lights=24)
     assert len(light.directions) >= 24 and float(light.weights.min()) >= 0 and float(light.weights.sum()) > 0
-    refused(ValueError, "give 1 to 170", Light.from_picture, beach(), fov_deg=200)
+    refused(ValueError, "use 1 to 170", Light.from_picture, beach(), fov_deg=200)
     refused(ValueError, "picture has shape [4, 4]", Light.from_picture, beach()[:4, :4, 0])

@@ -25,8 +25,8 @@ from facerf_cli.portrait.confidence import (
     matte_facts,
 )
 from facerf_cli.portrait.find import detect_faces
+from facerf_cli.portrait.matte import HeadPlace
 from facerf_cli.portrait.parse import LANDMARKS, Square, SquareView
-from facerf_cli.portrait.people import HeadPlace
 from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.models import SHIPPED_NETWORKS
 from tests.portrait.seen import places, seen_of

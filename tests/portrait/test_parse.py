@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from facerf_cli.face.crop import Crop
-from facerf_cli.portrait.parse import LANDMARKS, MIRROR, MORE_LANDMARKS, Square, mirrored_landmarks, uncovered
+from facerf_cli.portrait.parse import LANDMARKS, MIRROR, MORE_LANDMARKS, Square, uncovered
 from tests.portrait.seen import places, seen_of
 
 
@@ -27,7 +27,7 @@ def test_a_square_shows_what_lies_there(turn_deg: float, side_px: float) -> None
     inside = ((places > 8) & (places < [292, 192])).all(-1)
     assert np.abs(cut[0] - (places[..., 0] - 0.5) / 299)[inside].max() < 0.02
     assert np.abs(cut[1] - (places[..., 1] - 0.5) / 199)[inside].max() < 0.02
-    assert np.abs(square.to_share(places) - np.stack(np.meshgrid(at, at), -1)).max() < 1e-9
+    assert np.abs(square.to_unit_square(places) - np.stack(np.meshgrid(at, at), -1)).max() < 1e-9
 
 
 def test_positive_turns_borders_and_large_photos() -> None:
@@ -42,7 +42,7 @@ def test_positive_turns_borders_and_large_photos() -> None:
     noise = np.random.default_rng(0).integers(0, 256, (512, 512, 3)).astype(np.uint8)
     cut = Square(256.0, 256.0, 512.0).cut(noise, 16).numpy()
     assert cut.std() < 0.02 and abs(cut.mean() - 0.5) < 0.01
-    mirror = np.array(mirrored_landmarks())
+    mirror = MIRROR[68:] - 68
     assert (mirror[mirror] == np.arange(len(mirror))).all()
     names = dict(zip(MORE_LANDMARKS, (MORE_LANDMARKS[k] for k in mirror), strict=True))
     assert names["left ear lobe"] == "right ear lobe" and names["right iris"] == "left iris"

@@ -93,7 +93,7 @@ def test_heads_cast_shadows() -> None:
     camera = square_camera(fit(), SQUARE)
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 0.0), (0.0, 75.0))])
     maps = proxy_maps(proxy(), camera)
-    visible = Shadows(proxy(), proxy_maps(proxy(), camera)).along(lights)
+    visible = Shadows(proxy(), maps).along(lights)
     assert visible.shape == (3, SIDE, SIDE) and visible.min() >= 0 and visible.max() <= 1
     face = (maps.covered > 0) & (torch.arange(SIDE)[:, None] > 36) & (torch.arange(SIDE)[:, None] < 60)
     left = face & (torch.arange(SIDE) < 44) & (torch.arange(SIDE) > 34)
@@ -106,22 +106,17 @@ def test_heads_cast_shadows() -> None:
 
 def test_shadows_of_points_are_cast_toward_their_places() -> None:
     """A point far away is a far light; what stands behind a point casts no shadow."""
-    camera = square_camera(fit(), SQUARE)
+    maps = proxy_maps(proxy(), square_camera(fit(), SQUARE))
+    shadows = Shadows(proxy(), maps)
     lights = torch.stack([azel_to_direction(*at) for at in ((80.0, 0.0), (0.0, 75.0))])
-    far = Shadows(proxy(), proxy_maps(proxy(), camera)).toward(3000 * lights)
-    torch.testing.assert_close(
-        far, Shadows(proxy(), proxy_maps(proxy(), camera)).along(lights), atol=0.5, rtol=0
-    )
-    assert (
-        far - Shadows(proxy(), proxy_maps(proxy(), camera)).along(lights)
-    ).abs().mean() < 2e-3  # rays that graze
-    points = torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -1.6]])
-    before, behind = Shadows(proxy(), proxy_maps(proxy(), camera)).toward(points)
+    far, along = shadows.toward(3000 * lights), shadows.along(lights)
+    torch.testing.assert_close(far, along, atol=0.5, rtol=0)
+    assert (far - along).abs().mean() < 2e-3  # grazing rays
+    before, behind = shadows.toward(torch.tensor([[0.0, 0.0, -0.6], [0.0, 0.0, -1.6]]))
     face = slice(40, 56), slice(42, 54)
     assert before[face].mean() > 0.9 and behind[face].mean() < 0.01
-    neck, above = proxy_maps(proxy(), camera).positions_m[:, 72, 48], azel_to_direction(0.0, 60.0)
-    places = torch.stack([neck + length_m * above for length_m in (0.02, 0.5)])
-    below_chin, over_head = Shadows(proxy(), proxy_maps(proxy(), camera)).toward(places)[:, 72, 48]
+    neck, above = maps.positions_m[:, 72, 48], azel_to_direction(0.0, 60.0)
+    below_chin, over_head = shadows.toward(torch.stack([neck + 0.02 * above, neck + 0.5 * above]))[:, 72, 48]
     assert below_chin > 0.9 and over_head < 0.1  # the chin is behind the first
 
 
@@ -166,7 +161,7 @@ def ball() -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("light", [8, 18, 29])
-def test_a_lamp_is_found(light: int) -> None:
+def test_a_key_light_is_found(light: int) -> None:
     normals, classes, visible = ball()
     cosine = torch.einsum("c,cij->ij", RIG[light], normals).clamp_min(0)
     image = 0.4 * cosine.expand(3, -1, -1) * torch.tensor([1.0, 0.7, 0.5]).view(3, 1, 1)

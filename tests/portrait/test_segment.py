@@ -12,8 +12,8 @@ from facerf_cli.image.colour import linear_to_srgb
 from facerf_cli.image.strips import in_strips
 from facerf_cli.network.stored_graph import PeopleNetworks
 from facerf_cli.portrait import segment as module
+from facerf_cli.portrait.matte import HeadPlace
 from facerf_cli.portrait.parse import CLASSES, LANDMARKS, MORE_LANDMARKS, Square, SquareView, class_index
-from facerf_cli.portrait.people import HeadPlace
 from facerf_cli.portrait.segment import Segmentation, segment, with_cloth, with_ears
 from tests.portrait.seen import places, seen_of, white_people
 
@@ -94,7 +94,7 @@ def test_both_squares_show_the_face_and_the_larger_one_stays_in_the_photo(
     body, *_, near = squares
     assert near.side_px < body.side_px <= WIDTH
     for square in (body, near):
-        share = square.to_share(FACE.mean(0))
+        share = square.to_unit_square(FACE.mean(0))
         assert (share > 0.1).all() and (share < 0.9).all()
     assert body.x_px - body.side_px / 2 >= 0 and body.x_px + body.side_px / 2 <= WIDTH
 
@@ -126,7 +126,7 @@ def test_the_nearest_view_weighs_most(monkeypatch: pytest.MonkeyPatch, people: P
         ]
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
+    at_face = module.predicted_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[CLASSES.index("skin")] == pytest.approx(0.745, abs=0.01)  # 1.6^-4 over the sum
     assert at_face[CLASSES.index("neck")] > 0.2
 
@@ -142,7 +142,7 @@ def test_hair_is_likelier_than_seen(monkeypatch: pytest.MonkeyPatch, people: Peo
         return found
 
     monkeypatch.setattr(module, "look", look)
-    at_face = module.seen_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
+    at_face = module.predicted_classes(people, photo(), FACE, module.small_image(photo()))[:, 70, 160]
     assert at_face[CLASSES.index("hair")] / at_face[CLASSES.index("skin")] == pytest.approx(1.3, rel=1e-3)
 
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from facerf_cli.raster.camera import Camera, crop_camera, project
+from facerf_cli.raster.camera import Camera, project
 from facerf_cli.raster.rasterize import front_facing, interpolate, rasterize
 from tests.fake_device import OnDevice, in_use
 from tests.kinds import Patch
@@ -164,7 +164,3 @@ def test_gradients_to_vertices_and_attributes() -> None:
     assert torch.autograd.gradcheck(
         image, (vertices.requires_grad_(), attributes.requires_grad_()), eps=1e-7, atol=1e-5, fast_mode=True
     )
-
-
-def test_crop_camera_is_the_designs() -> None:
-    assert crop_camera(256) == Camera(1024.0, 256, 256, 128.0, 128.0)

@@ -11,12 +11,12 @@ from facerf_cli.raster.texture import (
     bake_attributes,
     inpaint,
     normal_map,
-    render_texture,
     sample_texture,
     unwrap,
     vertex_normals,
 )
 from tests.refusals import refused
+from tests.textured import render_texture
 
 CAMERA = Camera(focal_px=900.0, width_px=300, height_px=220, cx_px=160.0, cy_px=104.0)
 SIDE = 65

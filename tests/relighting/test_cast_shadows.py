@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.light import Light, stacked
+from facerf_cli.light.light import KeyLight, Light, far_samples, stacked
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import KeyLight, far_samples
 from facerf_cli.person import Target
 from facerf_cli.portrait.proxy import OFF_M, Proxy, ProxyMaps
 from facerf_cli.relighting.cast_shadows import CastShadow, change, visibility

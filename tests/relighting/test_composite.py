@@ -18,11 +18,12 @@ from facerf_cli.image.strips import Window
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction, latlong_directions, rig_directions
 from facerf_cli.raster.camera import Camera, pose_to_rotation, project
-from facerf_cli.raster.texture import inpaint, normal_map, render_texture, unwrap
+from facerf_cli.raster.texture import inpaint, normal_map, unwrap
 from facerf_cli.relighting.detail import FaceDetail
 from facerf_cli.relighting.face_alone import FaceAlone, FaceInPhoto
 from facerf_cli.relighting.people_in_photo import Background, PeopleInPhoto
 from facerf_cli.relighting.relightable import Relit, RenderRequest
+from tests.textured import render_texture
 
 HEIGHT_PX, WIDTH_PX, TEXTURE = 330, 420, 256
 CROP = Crop(105.3, 60.7, 219.0, 160)

@@ -13,9 +13,8 @@ from torch import Tensor
 from facerf_cli.image.colour import luminance
 from facerf_cli.image.strips import Window
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.light import Light
+from facerf_cli.light.light import Light, far_samples
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.light.studio_points import far_samples
 from facerf_cli.portrait.find import SeenEyes
 from facerf_cli.relighting import detail as module
 from facerf_cli.relighting.eyes import Eyes, blur_px, mirrored_in_cornea, opening, outlined

@@ -12,9 +12,8 @@ from torch import Tensor
 from facerf_cli.face.morphable import load_face_model
 from facerf_cli.face.topology import grid_triangles
 from facerf_cli.light.entries import StudioLight
-from facerf_cli.light.light import Light
+from facerf_cli.light.light import Light, PointLights, far_samples
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import PointLights, far_samples
 from facerf_cli.person import Person, Target
 from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.relighting.field import far_lights_of, near_texture

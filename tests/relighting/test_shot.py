@@ -80,7 +80,7 @@ class Watched:
         self.held: list[weakref.ref[Any]] = []
         monkeypatch.setattr(shot, "to_display", lambda photo: photo)
         monkeypatch.setattr(shot, "small_image", lambda photo: torch.full((3, 6, 8), 0.5))
-        monkeypatch.setattr(shot, "seen_classes", self.look)
+        monkeypatch.setattr(shot, "predicted_classes", self.look)
         monkeypatch.setattr(
             shot, "segmentation_of", lambda classes, photo, small: SimpleNamespace(classes=classes)
         )

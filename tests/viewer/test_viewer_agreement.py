@@ -27,9 +27,8 @@ from facerf_cli.image.colour import (
 from facerf_cli.image.strips import resized
 from facerf_cli.light.entries import StudioLight
 from facerf_cli.light.envmap import envmap_weights
-from facerf_cli.light.light import Light
+from facerf_cli.light.light import Light, far_samples
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, rig_directions
-from facerf_cli.light.studio_points import far_samples
 from facerf_cli.main import main
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import find_faces

@@ -9,8 +9,8 @@ import pytest
 
 from facerf_cli import viewer
 from facerf_cli.light.entries import EVEN, OWN, WORDS, StudioLight, lit_images
+from facerf_cli.light.light import far_samples, intensity_of
 from facerf_cli.light.sphere import azel_to_direction
-from facerf_cli.light.studio_points import far_samples, intensity_of
 from facerf_cli.viewer.page import packed_lights
 from tests.viewer.browser import chromium, driven
 

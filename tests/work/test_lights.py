@@ -14,8 +14,8 @@ from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
+from facerf_cli.light.light import rig_by_text
 from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
-from facerf_cli.light.studio_points import rig_by_text
 from facerf_cli.main import main, repeat_options
 from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
 from facerf_cli.work.lights import (
@@ -53,15 +53,14 @@ def test_maps_may_be_files_folders_and_patterns_told_apart_by_folder(tmp_path: P
 
 
 def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    rig, nothing = rig_directions(60), torch.zeros(0, 3)
+    rig = rig_directions(60)
     lamp = (rig @ azel_to_direction(60, 30)).clamp_min(0)[:, None] ** 20
     weights = 0.01 + lamp * torch.tensor([1, 0.8, 0.6])
     write_light(tmp_path / "a_light.json", LightRecord(rig, weights))
-    write_light(tmp_path / "b.json", LightRecord(nothing, nothing, sh=torch.ones(9, 3)))
     (tmp_path / "c.json").write_text("{}")
-    given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
+    given = [str(tmp_path / name) for name in ("a_light.json", "c.json")]
     setups = readable(collect_setups(LightSources(envmap=given, rotate="90"), tmp_path / "out"))
-    assert [setup.name for setup in setups] == ["a_light_rot90", "b_rot90"]
+    assert [setup.name for setup in setups] == ["a_light_rot90"]
     assert "c.json has no 'format'; add it" in caplog.text
     (setup,) = collect_setups(LightSources(envmap=given[:1]), tmp_path / "out")
     found = lights_over_stack((setup,), rig, "cell").weights[0]
@@ -111,7 +110,7 @@ def test_wrong_lamps(text: str) -> None:
 
 def test_a_rig_out_of_range_and_a_light_given_twice(tmp_path: Path) -> None:
     (tmp_path / "rig.txt").write_text("0 0\n0 100\n")
-    refused(UsageError, "rig.txt: ... give -90", parse_lights, str(tmp_path / "rig.txt"))
+    refused(UsageError, "rig.txt: ... use -90", parse_lights, str(tmp_path / "rig.txt"))
     refused(UsageError, "once", collect_setups, LightSources(light=["1,2", "1.0,2"]), Path("out"))
 
 
@@ -387,50 +386,50 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
         [(60, 0), (-40, 0)],
     ]
     assert all(setup.names == ("key", "fill") for setup in setups)
-    refused(UsageError, "sweeps of 2 and 3 frames", lit_images, ["a=0:90:3,0", "b=0:90:2,0"])
+    refused(UsageError, "use the same N", lit_images, ["a=0:90:3,0", "b=0:90:2,0"])
 
 
 @pytest.mark.parametrize(
     "entry, said",
     [
-        ("at=0,0,1;colour=red", "'colour=red': no such light or key ... keys are at, from"),
-        ("at=0,0", "at '0,0': give X,Y,Z"),
-        ("at=0,0,0.1", "at '0,0,0.1': the distance from the face is out of range; give 0.15"),
-        ("at=0,0,1;from=0,0", "give one of at=X,Y,Z"),
-        ("kelvin=3200", "give one of at=X,Y,Z"),
-        ("at=0,0,1;kelvin=50", "kelvin '50': out of range; give 1667 to 25000"),
-        ("at=0,0,1;rgb=1,-1,1", "rgb '1,-1,1': out of range"),
-        ("at=0,0,1;size_deg=3", "size_deg is of far lights"),
-        ("from=0,0;size=1", "size is of near lights"),
-        ("at=0,0,1;at=0,0,2", "at is given twice"),
-        ("az=60,el=10", "give ; between keys, as in 'from=60,10;stops=1'"),
-        ("from=0:90,3", "from '0:90': give degrees, or FROM:TO:N"),
-        ("0:90:2,0:9:3", "give one N"),
-        ("az=0:360:24;el=10", "az and el: no such keys; use from=0:360:24,10"),
+        ("at=0,0,1;colour=red", "'colour=red' ... keys: at, from"),
+        ("at=0,0", "at '0,0' ... use X,Y,Z"),
+        ("at=0,0,0.1", "at '0,0,0.1' ... use 0.15"),
+        ("at=0,0,1;from=0,0", "use at=X,Y,Z"),
+        ("kelvin=3200", "use at=X,Y,Z"),
+        ("at=0,0,1;kelvin=50", "kelvin '50' ... use 1667 to 25000"),
+        ("at=0,0,1;rgb=1,-1,1", "rgb '1,-1,1' ... use 0"),
+        ("at=0,0,1;size_deg=3", "size_deg ... far lights ... remove it"),
+        ("from=0,0;size=1", "size ... near lights ... remove it"),
+        ("at=0,0,1;at=0,0,2", "at ... use a separate --light"),
+        ("az=60,el=10", "use 'from=60,10;stops=1'"),
+        ("from=0:90,3", "from '0:90' ... FROM:TO:N"),
+        ("0:90:2,0:9:3", "use the same N"),
+        ("az=0:360:24;el=10", "use from=0:360:24,10"),
         ("name=a;az=20", "use from=20,0"),
         ("a=40,20,1,2,3", "use 40,20;rgb=1,2,3"),
-        ("from=0,0:200:4", "the elevation is out of range"),
-        ("from=around;size_deg=3", "size_deg is of far lights (from=AZ,EL)"),
-        ("at=0,0,1;rotate=30", "rotate is of maps (map=); leave it out"),
-        ("from=20,0;face=1.5", "face '1.5': give the number of one"),
-        ("name=;at=0,0,1", "'': give each light a name of its own"),
-        ("=40,20", "'': give each light a name"),
-        ("rembrant", "no such light or key; give AZ,EL, a rig file (.toml) or one of beauty, "),
-        ("key=rembrant", "'key=rembrant': no such light or key"),
-        ("key=40,20;colour=red", "'colour=red': no such light or key"),
-        ("key=40,20,stops=-1", "give ; between keys"),
-        ("key=40,20;at=0,0,3", "keys are of one light; give each light a --light of its own"),
-        ("a=40,20;b=left;stops=1", "keys are of one light"),
-        ("key=40,20;60,30", "some lights have names; give each one, as in key=40,20, or none"),
-        ("name=a;key=40,20", "the light has two names"),
-        ("size=rembrandt;stops=1", "give one of at=X,Y,Z"),
-        ("key=rembrandt;size=3", "size is of near lights"),
-        ("from=up", "from 'up': give AZ,EL or one of left, right"),
-        ("missing.toml", "missing.toml: no such rig file"),
-        ("own;at=0,0,1", "keys are of one light"),
-        ("own;size=1", "size is of near lights"),
-        ("own;size_deg=5", "size_deg is of far lights"),
-        ("own;rotate=5", "rotate is of maps"),
+        ("from=0,0:200:4", "use -90 (below) to 90 (above)"),
+        ("from=around;size_deg=3", "size_deg ... far lights (from=AZ,EL)"),
+        ("at=0,0,1;rotate=30", "rotate ... maps (map=); remove it"),
+        ("from=20,0;face=1.5", "face '1.5': use a whole number"),
+        ("name=;at=0,0,1", "'': use a different name"),
+        ("=40,20", "'': use a different name"),
+        ("rembrant", "use AZ,EL, a rig file (.toml) or one of beauty, "),
+        ("key=rembrant", "'key=rembrant' ... use AZ,EL"),
+        ("key=40,20;colour=red", "'colour=red' ... use AZ,EL"),
+        ("key=40,20,stops=-1", "use 'from=60,10;stops=1'"),
+        ("key=40,20;at=0,0,3", "use a separate --light for each light"),
+        ("a=40,20;b=left;stops=1", "use a separate --light for each light"),
+        ("key=40,20;60,30", "name all of them (key=40,20) or none"),
+        ("name=a;key=40,20", "remove name="),
+        ("size=rembrandt;stops=1", "use at=X,Y,Z"),
+        ("key=rembrandt;size=3", "size ... near lights ... remove it"),
+        ("from=up", "from 'up' ... use AZ,EL or one of left, right"),
+        ("missing.toml", "missing.toml ... check the path"),
+        ("own;at=0,0,1", "use a separate --light for each light"),
+        ("own;size=1", "size ... near lights ... remove it"),
+        ("own;size_deg=5", "size_deg ... far lights ... remove it"),
+        ("own;rotate=5", "rotate ... maps (map=); remove it"),
     ],
 )
 def test_faults_say_what_to_give(entry: str, said: str) -> None:
@@ -453,12 +452,12 @@ def test_a_rig_file_is_one_image_with_a_layer_for_each_light(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "text, said",
     [
-        ("[key]\nat = [0, 0, 1]\nwatts = 3\n", "key: 'watts': no such key"),
-        ("[key]\nname = 'a'\nat = [0, 0, 1]\n", "key: 'name': no such key"),
-        ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0': give X,Y,Z"),
-        ("['a b']\nat = [0, 0, 1]\n", "'a b': give each light a name"),
-        ("[key]\nfrom = 'up'\n", "key: from 'up': give AZ,EL or one of left, right"),
-        ("[a]\nfrom = '0:9:2,0'\n[b]\nfrom = '0:9:3,0'\n", "sweeps of 2 and 3 frames"),
+        ("[key]\nat = [0, 0, 1]\nwatts = 3\n", "key: 'watts' ... use at, from"),
+        ("[key]\nname = 'a'\nat = [0, 0, 1]\n", "key: 'name' ... use at, from"),
+        ("[key]\nat = [0, 0]\n", "key: at '0.0,0.0' ... use X,Y,Z"),
+        ("['a b']\nat = [0, 0, 1]\n", "'a b': use a different name"),
+        ("[key]\nfrom = 'up'\n", "key: from 'up' ... use AZ,EL or one of left, right"),
+        ("[a]\nfrom = '0:9:2,0'\n[b]\nfrom = '0:9:3,0'\n", "use the same N"),
     ],
 )
 def test_a_fault_of_a_rig_file_names_file_and_light(tmp_path: Path, text: str, said: str) -> None:

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from facerf_cli.image.colour import REC709_CHROMATICITIES, luminance, rgb_to_xyz
 from facerf_cli.light.entries import StudioLight
+from facerf_cli.light.light import PointLights, blackbody_rgb, far_samples, intensity_of
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
-from facerf_cli.light.studio_points import PointLights, blackbody_rgb, far_samples, intensity_of
 
 CENTRE = torch.tensor([0.1, -0.2, -1.0])
 
