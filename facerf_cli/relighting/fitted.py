@@ -12,8 +12,8 @@ from torch import Tensor
 from facerf_cli.baselines.base import Reflectance
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import FaceTexture, Head
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.view import photo_camera
+from facerf_cli.image.colour import to_display
 from facerf_cli.light.light import Light
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.portrait.segment import Segmentation, segment
