@@ -110,7 +110,7 @@ def test_an_item_whose_input_changed_is_measured_again(tmp_path: Path, notes: Pa
 def test_damaged_figures_are_named(tmp_path: Path) -> None:
     assert evaluate(tmp_path) == 0
     (tmp_path / "cases/bea.json").write_text("{}")
-    refused(InputError, "bea.json: ", evaluate, tmp_path)
+    refused(InputError, "bea.json", evaluate, tmp_path)
     assert not (tmp_path / "summary.json").exists()
 
 
