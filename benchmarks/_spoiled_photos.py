@@ -12,9 +12,8 @@ from _common import PHOTOS, SHARED
 from PIL import Image, ImageDraw, ImageFilter
 from scipy.ndimage import gaussian_filter
 
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import OUTER_EYE_CORNERS
-from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_display
 from facerf_cli.image.strips import resized
 from facerf_cli.portrait.find import Face, detect_faces
 from facerf_cli.portrait.segment import segment

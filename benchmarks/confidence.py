@@ -20,7 +20,7 @@ import torch
 from _common import SHARED, arguments, required
 from _spoiled_photos import Scene, all_scenes, face_near, spoiled
 
-from facerf_cli.face.landmarks import to_display
+from facerf_cli.image.colour import to_display
 from facerf_cli.portrait.confidence import confidence_of, face_facts
 from facerf_cli.portrait.segment import segment
 from facerf_cli.relighting.models import SHIPPED_NETWORKS

@@ -39,8 +39,7 @@ from skimage.registration import optical_flow_ilk
 from skimage.transform import warp
 
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import to_display
-from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear
+from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, to_display
 from facerf_cli.light.sphere import RigLight, rig_directions
 from facerf_cli.person import Person
 from facerf_cli.portrait.find import find_faces

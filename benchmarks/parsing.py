@@ -35,9 +35,9 @@ from skimage.transform import resize
 
 from facerf_cli.capture.yale_b import read_yale_b
 from facerf_cli.evaluation.yale_b import SETTINGS_SUBJECTS
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.files.read import read_image
+from facerf_cli.image.colour import to_display
 from facerf_cli.portrait.find import Face, detect_faces, face_at
 from facerf_cli.portrait.parse import CLASSES
 from facerf_cli.portrait.segment import segment

@@ -20,9 +20,9 @@ from facerf_cli.errors import UsageError
 from facerf_cli.face.crop import check_landmarks
 from facerf_cli.face.fit import FaceFit, Geometry
 from facerf_cli.face.head import FaceTexture, Head
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import photo_camera
+from facerf_cli.image.colour import to_display
 from facerf_cli.image.strips import covering, in_strips
 from facerf_cli.light.envmap import Backdrop, check_envmap
 from facerf_cli.light.light import (

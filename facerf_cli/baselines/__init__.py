@@ -1,4 +1,4 @@
-"""The reflectance models with which the paper compares ('Light Estimation'); see docs/paper.md."""
+"""Reflectance models that the paper compares with ('Light Estimation'); see docs/paper.md."""
 
 from typing import TYPE_CHECKING, Literal
 
@@ -7,18 +7,16 @@ if TYPE_CHECKING:
     from facerf_cli.face.head import Head
     from facerf_cli.relighting.models import Models
 
-# Models of a face: the paper's neural field, or one that it is compared with.
-Kind = Literal["field", "diffuse-sh", "specular-sh", "prt"]
-# Models that relight a photo: of the whole portrait, or of its face.
-RelightKind = Literal["portrait", "field", "diffuse-sh", "specular-sh", "prt"]
+Kind = Literal["field", "diffuse-sh", "specular-sh", "prt"]  # models of a face: neural field and baselines
+RelightKind = Literal["portrait", "field", "diffuse-sh", "specular-sh", "prt"]  # models that relight a photo
 
 
 def explain_by_baseline(models: "Models", head: "Head", kind: Kind) -> "Explained":
-    """Estimate the reflectance and the light of a head's photo by one of these models."""
-    if kind == "diffuse-sh":  # relighting by the fields loads none of these
-        from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh as explained
+    """Estimate reflectance and light from a head's photo with a baseline."""
+    if kind == "diffuse-sh":  # relighting with the neural fields imports no baseline
+        from facerf_cli.baselines.diffuse_sh import explain_by_diffuse_sh as explain
     elif kind == "specular-sh":
-        from facerf_cli.baselines.specular_sh import explain_by_specular_sh as explained
+        from facerf_cli.baselines.specular_sh import explain_by_specular_sh as explain
     else:
-        from facerf_cli.baselines.prt import explain_by_prt as explained
-    return explained(models, head.fit, head.face)
+        from facerf_cli.baselines.prt import explain_by_prt as explain
+    return explain(models, head.fit, head.face)

@@ -1,8 +1,7 @@
-"""The interface of the field and the baselines: the reflectance of a face and the light of its photo.
+"""Interface of the neural field and the baselines: reflectance of a face and light of its photo.
 
-Every model is linear in light, except where a baseline clamps negative light. A light is always given as
-weights of a rig's lights (`RigLight`), so that the light which one model estimates from a photo can
-illuminate another model.
+All models are linear in light, except that baselines clamp negative light. A light is always a set of weights
+of a rig's lights (`RigLight`), so that the light estimated by one model can illuminate another.
 """
 
 from dataclasses import dataclass
@@ -14,19 +13,19 @@ from facerf_cli.light.sphere import RigLight
 
 
 class Reflectance(Protocol):
-    """The reflectance of one face, estimated from one photo."""
+    """Reflectance of one face, estimated from one photo."""
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
-        """Relight the texture: linear textures [M, 3, T, T] under M weighted sums of lights.
+        """Compute the linear textures [M, 3, T, T] under M weighted sums of lights.
 
-        directions [L, 3] of the lights are in camera space, weights are [M, L, 3]. `turn` [3, 3] rotates the
+        The lights' directions [L, 3] are in camera space; weights are [M, L, 3]. `turn` [3, 3] rotates the
         head from its pose in the photo; the lights stay fixed to the camera.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """Reflectance and light of a photo: together they approximate the photo's texture."""
+    """Reflectance and light that together approximate a photo's texture."""
 
     reflectance: Reflectance
     light: RigLight

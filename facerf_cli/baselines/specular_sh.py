@@ -1,10 +1,10 @@
-"""Baseline `specular-sh`: a face of diffuse and specular albedo in the light of spherical harmonics.
+"""Baseline `specular-sh`: a face with diffuse and specular albedo under spherical-harmonic light.
 
-The assumption is that of Smith et al. (*A Morphable Face Albedo Model*, CVPR 2020), on this project's fitted
-mesh and priors; their code and their model of albedo are not used. No part of the face shadows another. The
-diffuse part uses light of order 2 (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance
-Environment Maps*, 2001). The gloss is a Blinn-Phong lobe about the reflected view direction, filtered in
-spherical harmonics (the same authors' *Frequency Space Environment Map Rendering*, 2002).
+It uses the assumption of Smith et al. (*A Morphable Face Albedo Model*, CVPR 2020) on this project's fitted
+mesh and priors, without their code and their albedo model. The face casts no shadows. The diffuse part uses
+light of order 2 (Ramamoorthi and Hanrahan, *An Efficient Representation for Irradiance Environment Maps*,
+2001). The gloss is a Blinn-Phong lobe about the reflected view direction, filtered in spherical harmonics
+(the same authors' *Frequency Space Environment Map Rendering*, 2002).
 """
 
 import math
@@ -18,12 +18,12 @@ from torch import Tensor
 from facerf_cli.baselines.base import Explained
 from facerf_cli.baselines.synthesis import (
     SIDE,
-    light_given,
     light_prior,
     scene_of,
     shrunk,
     skin_prior,
     solve,
+    solve_light,
     with_detail,
 )
 from facerf_cli.face.fit import FaceFit
@@ -35,49 +35,43 @@ from facerf_cli.raster.texture import bake_attributes, normal_map
 from facerf_cli.relighting.models import Models
 
 DIFFUSE_ORDER, GLOSS_ORDER = 2, 6
-EXPONENT = 12.0  # of the Blinn-Phong lobe, which then has no degrees above GLOSS_ORDER
-_NODES = 256  # of the quadrature of the lobe
+EXPONENT = 12.0  # of the Blinn-Phong lobe; has no degrees above GLOSS_ORDER
+_NODES = 256  # of the lobe's quadrature
 
 
 @dataclass(frozen=True, eq=False)
 class FaceSurface:
-    """Unit normals and positions [3, T, T] (m) of the texels, in camera space and the pose of the photo.
+    """Geometry of the texels in camera space, in the photo's pose."""
 
-    `centre_m` [3] is the point about which the head rotates.
-    """
-
-    normals: Tensor
-    positions_m: Tensor
-    centre_m: Tensor
+    normals: Tensor  # [3, T, T], unit vectors
+    positions_m: Tensor  # [3, T, T]
+    centre_m: Tensor  # [3], centre of the head's rotation
 
     def views(self, turn: Tensor | None) -> Tensor:
-        """Unit directions [3, T, T] toward the camera of the head rotated by `turn`, in the photo's pose."""
+        """Compute unit directions [3, T, T] to the camera if `turn` rotates the head, in the photo's pose."""
         if turn is None:
             return F.normalize(-self.positions_m, dim=0)
-        camera_m = self.centre_m - turn.T @ self.centre_m  # the camera relative to the head in its old pose
+        camera_m = self.centre_m - turn.T @ self.centre_m  # the camera relative to the unrotated head
         return F.normalize(camera_m[:, None, None] - self.positions_m, dim=0)
 
 
 @dataclass(frozen=True, eq=False)
 class SpecularSh:
-    """Diffuse albedo [3, T, T] and gloss [1, T, T] of a surface; a `Reflectance`.
-
-    Gloss is the reflectance at normal incidence.
-    """
+    """`Reflectance` with diffuse albedo and gloss."""
 
     surface: FaceSurface
-    albedo: Tensor
-    gloss: Tensor
+    albedo: Tensor  # [3, T, T]
+    gloss: Tensor  # [1, T, T], reflectance at normal incidence
 
     def relit(self, directions: Tensor, weights: Tensor, turn: Tensor | None = None) -> Tensor:
-        """See `Reflectance`."""
-        in_photo = directions if turn is None else directions @ turn  # rows: the inverse of the turn
+        """Relight the texture; see `Reflectance`."""
+        in_photo = directions if turn is None else directions @ turn  # row vectors: the inverse rotation
         light = rig_coefficients(RigLight(in_photo, weights), GLOSS_ORDER)
         shading, shining = self.parts(light, turn)
         return (self.albedo * shading + self.gloss * shining).clamp_min(0)
 
     def parts(self, light: Tensor, turn: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Radiance [M, 3, T, T] of a white diffuse face, and of gloss 1, for coefficients [M, K, 3]."""
+        """Compute the radiance [M, 3, T, T] of a white diffuse face and of gloss 1, for light [M, K, 3]."""
         transfer = diffuse_transfer(self.surface.normals)
         mirror = mirror_transfer(self.surface.normals, self.surface.views(turn))
         low = transfer.shape[-1]
@@ -86,7 +80,7 @@ class SpecularSh:
 
 
 def explain_by_specular_sh(models: Models, fit: FaceFit, face: FaceTexture) -> Explained:
-    """Estimate the most probable albedo, gloss and light of a fitted photo."""
+    """Estimate the most probable albedo, gloss and light from a fitted photo."""
     vertices = fit.vertices_camera(models.face)
     small = _surface(vertices, fit, SIDE)
     transfer = diffuse_transfer(small.normals)
@@ -95,13 +89,13 @@ def explain_by_specular_sh(models: Models, fit: FaceFit, face: FaceTexture) -> E
     transfer = F.pad(transfer, (0, missing)).flatten(0, 1).expand(3, -1, -1)
     scene = scene_of(face, transfer, mirror.flatten(0, 1))
     skin, light = skin_prior(), light_prior(GLOSS_ORDER)
-    found = solve(scene, skin.diffuse, skin.gloss, light)
+    solution = solve(scene, skin.diffuse, skin.gloss, light)
     side = face.texture.shape[-1]
-    albedo, gloss = skin.diffuse.at(found.albedo, side), skin.gloss.at(found.gloss, side)
+    albedo, gloss = skin.diffuse.at(solution.albedo, side), skin.gloss.at(solution.gloss, side)
     surface = _surface(vertices, fit, side)
-    shading, shining = SpecularSh(surface, albedo, gloss).parts(found.light[None])
-    albedo = with_detail(albedo, face, shading[0], gloss.exp() * shining[0])
-    coefficients = light_given(scene, shrunk(albedo), shrunk(gloss), light)
+    shading, specular = SpecularSh(surface, albedo, gloss).parts(solution.light[None])
+    albedo = with_detail(albedo, face, shading[0], gloss.exp() * specular[0])
+    coefficients = solve_light(scene, shrunk(albedo), shrunk(gloss), light)
     return Explained(SpecularSh(surface, albedo.exp(), gloss.exp()), coefficients_to_rig(coefficients))
 
 
@@ -111,13 +105,13 @@ def _surface(vertices: Tensor, fit: FaceFit, side: int) -> FaceSurface:
 
 
 def diffuse_transfer(normals: Tensor) -> Tensor:
-    """Radiance [T, T, 9] of a white Lambertian face of normals [3, T, T], per coefficient of the light."""
+    """Compute the radiance [T, T, 9] of a white Lambertian face with normals [3, T, T] per coefficient."""
     lobes = [cosine_lobe(degree) / math.pi for degree in range(DIFFUSE_ORDER + 1)]
     return sh_basis(normals.permute(1, 2, 0), DIFFUSE_ORDER) * _by_degree(tuple(lobes))
 
 
 def mirror_transfer(normals: Tensor, views: Tensor) -> Tensor:
-    """Radiance [T, T, K] of gloss 1 for normals and views [3, T, T], per coefficient of the light."""
+    """Compute the radiance [T, T, K] of gloss 1 for normals and views [3, T, T] per coefficient."""
     cosine = (normals * views).sum(0).clamp(0, 1)
     mirrored = 2 * cosine * normals - views
     mirrored = F.normalize(mirrored, dim=0).permute(1, 2, 0)
@@ -126,18 +120,17 @@ def mirror_transfer(normals: Tensor, views: Tensor) -> Tensor:
 
 
 def _by_degree(factors: tuple[float, ...]) -> Tensor:
-    """Repeat a factor for each degree as one for each coefficient [K]."""
+    """Expand one factor per degree to one per coefficient [K]."""
     return torch.cat([torch.full((2 * degree + 1,), factor) for degree, factor in enumerate(factors)])
 
 
 def _blinn_phong(exponent: float, order: int) -> tuple[float, ...]:
-    """Factors at degrees 0 to `order` of a lobe cos^exponent(angle / 2) whose integral is 1.
+    """Compute the factors at degrees 0 to `order` of a lobe cos^exponent(angle / 2) with integral 1.
 
-    In the plane of both, the angle of the half vector to the normal is half that of the light to the
-    reflected view direction.
+    In their plane, the angle from half vector to normal is half the angle from light to reflected view.
     """
-    cosine, share = np.polynomial.legendre.leggauss(_NODES)
-    lobe = share * ((1 + cosine) / 2) ** (exponent / 2)
+    cosine, weight = np.polynomial.legendre.leggauss(_NODES)
+    lobe = weight * ((1 + cosine) / 2) ** (exponent / 2)
     lobe /= lobe.sum()
     unit = np.eye(order + 1)
     return tuple(

@@ -31,7 +31,6 @@ from facerf_cli.face.fit import (
     quality_of,
     save_fit,
 )
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.face.view import draw_fit
@@ -40,7 +39,7 @@ from facerf_cli.files.documents import Document, Name, read_document, write_docu
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.sheets import contact_sheet, filled_page, mark_light
 from facerf_cli.files.write import HALF_MAX, write_display
-from facerf_cli.image.colour import auto_exposure_ev
+from facerf_cli.image.colour import auto_exposure_ev, to_display
 from facerf_cli.light.envmap import envmap_weights
 from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.portrait.find import choose_face, detect_faces

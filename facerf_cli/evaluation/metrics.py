@@ -1,8 +1,8 @@
-"""Metrics of a prediction, each with its definition, source and colour space; and their means.
+"""Image metrics, each with its definition and source, and means with confidence intervals.
 
-Images are [H, W, 3] or [H, W]. The mask [H, W] in 0..1 weights the pixels: a mean is over the mask's weight,
-and over channels alike. Values are as the caller gives them, scene-linear Rec.709 or display-encoded; 1 is
-white. A metric fits the exposure of the prediction only if its definition says so.
+Images are [H, W, 3] or [H, W], scene-linear Rec.709 or display-encoded as the caller chooses; 1 is white. The
+mask [H, W] in 0..1 weights the pixels of every mean; channels have equal weight. A metric fits the exposure
+of the prediction only if its definition mentions a scale.
 """
 
 from collections.abc import Hashable, Iterable, Sequence
@@ -14,12 +14,10 @@ from skimage.metrics import structural_similarity
 from facerf_cli.image.colour import ita_deg, luminance
 
 PSNR_HIGHEST_DB = 100.0  # reported for equal images, whose PSNR is infinite
-_SMALLEST = 1e-12  # of a denominator; avoids 0 / 0 for a black prediction
+_SMALLEST = 1e-12  # smallest denominator; avoids 0 / 0 for a black prediction
+_SSIM_REACH_PX = 5  # half width of the SSIM window (Wang et al., 2004)
 
-# SSIM as Wang et al. (2004) define it, for a data range of 1.
-_SSIM_REACH_PX = 5  # of its window
-
-# Skin tones by the lowest ITA in degrees of each class (Del Bino and Bernerd, 2013).
+# Skin tones with the lowest ITA of each class, in degrees (Del Bino and Bernerd, 2013).
 TONES = {
     "very light": 55.0,
     "light": 41.0,
@@ -28,28 +26,27 @@ TONES = {
     "brown": -30.0,
     "dark": -91.0,
 }
-_SKIN = 0.5  # a mask above this counts as skin
-_GREY = 1e-6  # a colour whose channels differ by less has no ITA
+_SKIN = 0.5  # mask value above which a pixel counts as skin
+_GREY = 1e-6  # channel difference below which a colour has no ITA
 
 # Bootstrap intervals.
-_RESAMPLES = 10_000
+_RESAMPLES, _SEED = 10_000, 0
 _DRAWN_AT_ONCE = 1 << 22  # indices; bounds the memory
-_SEED = 0
-_LOW, _HIGH = 2.5, 97.5  # percentiles
+_PERCENTILES = (2.5, 97.5)
 
 
 def best_scale(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     """Return the scale a >= 0, one for all channels, that minimizes |a P - T|^2 in the mask: <P, T> / <P, P>.
 
-    Zhou et al., *Deep Single-Image Portrait Relighting*, ICCV 2019. The scale of a black prediction is 0, and
-    so is a negative one.
+    Zhou et al., *Deep Single-Image Portrait Relighting*, ICCV 2019. A black prediction has the scale 0;
+    negative scales are replaced by 0.
     """
     p, t, weight = _inside(prediction, truth, mask)
     return max(0.0, float((weight * p * t).sum() / max((weight * p * p).sum(), _SMALLEST)))
 
 
 def si_mse(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return the scale-invariant mean squared error: the least mean |a P - T|^2 over one scale a >= 0.
+    """Return the scale-invariant mean squared error: the mean of |a P - T|^2 for a = `best_scale`.
 
     Zhou et al., ICCV 2019; the paper's Si-MSE ('Results'). Nothing is clipped. The paper's Table 1 uses
     linear values.
@@ -65,26 +62,18 @@ def si_mse_clipped(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) 
 
 
 def si_mse_channels(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return `si_mse` with a scale for each channel, which ignores the colour of light and skin.
-
-    One photo does not distinguish red light from red skin.
-    """
+    """Return `si_mse` with one scale per channel: one photo cannot separate red light from red skin."""
     return float(np.mean([si_mse(prediction[..., c], truth[..., c], mask) for c in range(3)]))
 
 
 def mse(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return the mean squared error of images clipped to 0..1, as a display shows them, without a scale."""
+    """Return the mean squared error of images clipped to 0..1, without a scale."""
     p, t, weight = _inside(np.clip(prediction, 0, 1), np.clip(truth, 0, 1), mask)
     return float((weight * (p - t) ** 2).sum() / weight.sum())
 
 
-def psnr(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
-    """Return the peak signal-to-noise ratio -10 log10(`mse`) in dB, at most `PSNR_HIGHEST_DB`."""
-    return psnr_of(mse(prediction, truth, mask))
-
-
-def psnr_of(squared: float) -> float:
-    """Convert a mean squared error to a PSNR in dB, for a peak of 1."""
+def psnr(squared: float) -> float:
+    """Convert a mean squared error to the PSNR for a peak of 1, in dB, at most `PSNR_HIGHEST_DB`."""
     return float(-10 * np.log10(max(squared, 10 ** (-PSNR_HIGHEST_DB / 10))))
 
 
@@ -92,8 +81,8 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     """Return the structural similarity of clip(a P, 0, 1), a = `best_scale`, to clip(T, 0, 1); 1 if equal.
 
     Wang et al., *Image Quality Assessment: From Error Visibility to Structural Similarity*, 2004: Gaussian
-    window of sigma 1.5 px over 11 px, data range 1, channels separate. Both images are multiplied by the
-    mask, and the map is averaged over it, so pixels outside count as equal and black.
+    window of sigma 1.5 px over 11 px, data range 1, separate channels. Both images are multiplied by the
+    mask, and the SSIM map is averaged with its weights, so pixels outside count as equal and black.
     """
     scale = best_scale(prediction, truth, mask)
     box = _box(mask, _SSIM_REACH_PX)
@@ -101,7 +90,7 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
     shape = (*weight.shape, -1)
     p = np.clip(scale * prediction[box].astype(np.float64), 0, 1).reshape(shape) * weight[..., None]
     t = np.clip(truth[box].astype(np.float64), 0, 1).reshape(shape) * weight[..., None]
-    reach = _SSIM_REACH_PX  # the library refuses images that are smaller than its window
+    reach = _SSIM_REACH_PX  # the library rejects images that are smaller than its window
     p, t = (np.pad(image, ((reach, reach), (reach, reach), (0, 0)), mode="symmetric") for image in (p, t))
     _, similar = structural_similarity(
         p, t, data_range=1, channel_axis=-1, gaussian_weights=True, use_sample_covariance=False, full=True
@@ -111,28 +100,28 @@ def ssim(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> float:
 
 
 def light_error_deg(direction: np.ndarray, truth: np.ndarray) -> float:
-    """Return the angle in degrees between two directions toward the light [3], of any length except 0."""
+    """Return the angle in degrees between two directions toward the light [3] of any nonzero length."""
     lengths = np.linalg.norm(direction), np.linalg.norm(truth)
     if not min(lengths) > 0:
         raise ValueError(f"directions of lengths {lengths[0]} and {lengths[1]} have no angle")
-    # From both products, since the cosine alone is inaccurate for small angles.
+    # The arctangent of both products stays accurate for small angles.
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(direction, truth)), np.dot(direction, truth))))
 
 
 def tone_of(ita: float) -> str:
-    """Return the class in `TONES` of an ITA in degrees."""
+    """Return the class in `TONES` for an ITA in degrees."""
     return next((name for name, lowest in TONES.items() if ita > lowest), "dark")
 
 
 def tone_drift_deg(
     prediction: np.ndarray, truth: np.ndarray, skin: np.ndarray, albedo: np.ndarray
 ) -> float | None:
-    """Return the ITA of predicted skin minus that of the truth, in degrees; above 0 is too light.
+    """Return the ITA of predicted skin minus the ITA of the truth, in degrees; above 0 is too light.
 
-    prediction and truth [H, W, 3] are linear, under white light from near the camera; `skin` [H, W] is above
-    one half where both show skin. Both are scaled by the factor that gives the truth's median skin the
-    luminance of the true `albedo` [3], so a wrong exposure counts as a wrong tone. None without skin, and if
-    the truth is grey.
+    prediction and truth [H, W, 3] are linear, under white light from near the camera; `skin` [H, W] exceeds
+    one half where both show skin. One factor scales both images, so that the truth's median skin has the
+    luminance of the true `albedo` [3]; therefore a wrong exposure counts as a wrong tone. Without skin, or if
+    the truth is grey, the result is None.
     """
     inside = skin > _SKIN
     if not inside.any():
@@ -147,7 +136,7 @@ def tone_drift_deg(
 def _inside(
     prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return both images where the mask is above 0, [N, C] in double precision, and the weights [N, C]."""
+    """Return both images' pixels where the mask is above 0 [N, C], and their weights [N, C]; float64."""
     if prediction.shape != truth.shape or truth.shape[:2] != mask.shape or truth.ndim not in (2, 3):
         raise ValueError(f"images {prediction.shape} and {truth.shape} and a mask {mask.shape}")
     inside = mask > 0
@@ -158,18 +147,18 @@ def _inside(
 
 
 def _box(mask: np.ndarray, margin_px: int) -> tuple[slice, slice]:
-    """Return the mask's bounding box with a margin, cut at the image's border."""
+    """Return the mask's bounding box with a margin, clipped to the image."""
 
     def span(sums: np.ndarray) -> slice:
-        at = np.flatnonzero(sums > 0)
-        return slice(max(0, at[0] - margin_px), at[-1] + 1 + margin_px)
+        nonzero = np.flatnonzero(sums > 0)
+        return slice(max(0, nonzero[0] - margin_px), nonzero[-1] + 1 + margin_px)
 
     return span(mask.sum(1)), span(mask.sum(0))
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A mean over images, its 95 % interval over groups, and the images' median and standard deviation."""
+    """Mean of a metric over images, its 95 % interval over groups, and the images' median and deviation."""
 
     mean: float
     median: float
@@ -180,16 +169,16 @@ class Interval:
     groups: int
 
     def as_dict(self) -> dict[str, float]:
-        """Return the fields for JSON; `images` has the key 'pictures'."""
+        """Return the fields for JSON, with the key 'pictures' for `images`."""
         return {"pictures" if name == "images" else name: value for name, value in vars(self).items()}
 
 
 def mean_interval(values: Iterable[tuple[Hashable, float]]) -> Interval | None:
-    """Return the mean of (group, value) pairs and its interval; None without any pairs.
+    """Return the mean of (group, value) pairs with its interval; None without pairs.
 
-    The images of one person are similar, so persons (groups) are resampled with all of their images: a
-    cluster bootstrap with percentile intervals (Efron and Tibshirani, *An introduction to the bootstrap*,
-    1993). The interval of a single group is NaN.
+    Images of one person are similar, so people (groups) are resampled with all of their images: a cluster
+    bootstrap with percentile intervals (Efron and Tibshirani, *An introduction to the bootstrap*, 1993). The
+    interval of a single group is NaN.
     """
     by_group: dict[Hashable, list[float]] = {}
     for group, value in values:
@@ -197,13 +186,12 @@ def mean_interval(values: Iterable[tuple[Hashable, float]]) -> Interval | None:
     if not by_group:
         return None
     everything = np.concatenate([np.asarray(group, float) for group in by_group.values()])
-    low, high = _percentiles(list(by_group.values()))
+    low, high = _bootstrap(list(by_group.values()))
     mean, median, sd = (float(f(everything)) for f in (np.mean, np.median, np.std))
     return Interval(mean, median, low, high, sd, len(everything), len(by_group))
 
 
-def _percentiles(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
-    """Return the interval of the mean over images, with groups drawn with replacement."""
+def _bootstrap(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
     if len(groups) < 2:
         return float("nan"), float("nan")
     totals = np.array([sum(group) for group in groups])
@@ -213,5 +201,5 @@ def _percentiles(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
         part = means[first : first + at_once]
         drawn = random.integers(len(groups), size=(len(part), len(groups)))
         part[:] = totals[drawn].sum(1) / counts[drawn].sum(1)
-    low, high = np.percentile(means, [_LOW, _HIGH])
+    low, high = np.percentile(means, _PERCENTILES)
     return float(low), float(high)

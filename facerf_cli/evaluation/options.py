@@ -1,4 +1,7 @@
-"""The options of `facerf evaluate`, a class for each protocol; light to import."""
+"""Options of the commands of `facerf evaluate`, one dataclass per protocol.
+
+This module imports neither torch nor numpy, because the help reads it.
+"""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -19,9 +22,9 @@ _KINDS = get_args(RelightKind)
 
 
 def name_of(path: Path) -> str:
-    """The name of a method: a folder's, a checkpoint's, or for the best and the last of a run its folder's.
+    """Return a method's name: the folder, the file's stem, or for best and last checkpoints the run's folder.
 
-    '.' is resolved, a link is not.
+    '.' is resolved; links are not.
     """
     path = Path(os.path.abspath(path))
     if path.is_dir():
@@ -31,14 +34,14 @@ def name_of(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Measures:
-    """The values and metrics of images; LPIPS is measured if VGG-16's weights are given.
+    """Compared values and optional metrics.
 
     Attributes:
-        space: Measure scene-linear values, or values encoded by sRGB.
-        lpips: Read the linear heads of LPIPS (v0.1, VGG) from a file.
-        vgg_weights: Measure LPIPS, too, with VGG-16: imagenet downloads it; or a file.
-        face_distance: Measure Face dis, too, where no table of the paper has it (extra dlib), and that of the
-            source, for comparison.
+        space: Compare scene-linear values, or values encoded as sRGB.
+        lpips: File with the linear heads of LPIPS (v0.1, VGG).
+        vgg_weights: Also measure LPIPS, with the weights of VGG-16; imagenet downloads them.
+        face_distance: Also measure Face dis in tables without it, for the methods and for the source
+            (extra dlib).
     """
 
     space: Space = option("linear", panel=MEASURES)
@@ -48,41 +51,37 @@ class Measures:
 
 
 def _parse_kinds(names: Sequence[str]) -> tuple[RelightKind, ...]:
-    """The reflectance models of `--reflectance`; raises UsageError for a name of none."""
     if unknown := [name for name in names if name not in _KINDS]:
-        raise UsageError(f"--reflectance {unknown[0]}: give {', '.join(_KINDS)}")
+        raise UsageError(f"--reflectance {unknown[0]}: use {', '.join(_KINDS)}")
     return tuple(kind for name in names for kind in _KINDS if kind == name)
 
 
 @dataclass(frozen=True)
 class NamedPath:
-    """A checkpoint, a run's folder or a folder of images, under the name of its method."""
+    """Path of a checkpoint, a run or a folder of images, with the name of its method in the tables."""
 
     name: str
     path: Path
 
     @staticmethod
     def parse(text: str) -> "NamedPath":
-        """Parse PATH or NAME=PATH."""
         name, equals, path = text.rpartition("=")
         return NamedPath(name if equals else name_of(Path(path)), Path(path))
 
 
 def _named(flag: str, kind: str) -> Any:
-    """Make the field of an option that names methods."""
     return option(
         (),
         metavar=f"{kind}|NAME={kind}",
         flags=(flag,),
         shown_default="none",
         typed=list[str] | None,
-        parse=lambda given: tuple(map(NamedPath.parse, given)),
+        parse=lambda texts: tuple(map(NamedPath.parse, texts)),
         panel=METHODS,
     )
 
 
 def _kinds(*default: RelightKind) -> Any:
-    """Make the field of `--reflectance`."""
     return option(
         default,
         metavar="KIND",
@@ -95,13 +94,13 @@ def _kinds(*default: RelightKind) -> Any:
 
 @dataclass(frozen=True)
 class EvaluateOptions(BatchOptions):
-    """The methods and the measures of a run; protocols that offer the other fields declare them again.
+    """Methods and metrics of a run. A protocol redeclares the other fields that it offers as options.
 
     Attributes:
-        reflectance: Measure field, diffuse-sh, specular-sh or prt, of whole photos also portrait;
-            repeatable, and the others are compared with the first.
-        against: Measure another checkpoint of the field, under its name or that of its run. Repeatable.
-        pictures: Keep every source, truth, mask and prediction as EXR in DIR/pictures, for `compare`.
+        reflectance: Reflectance model to measure: field, diffuse-sh, specular-sh, prt, or for whole photos
+            portrait. Repeatable; the others are compared with the first.
+        against: Another checkpoint of the face field to measure, named after its file or run. Repeatable.
+        pictures: Keep every source, ground truth, mask and prediction as EXR in DIR/pictures, for `compare`.
     """
 
     reflectance: tuple[RelightKind, ...] = _kinds("field")
@@ -112,27 +111,27 @@ class EvaluateOptions(BatchOptions):
     methods: tuple[NamedPath, ...] = ()
     keep_eyes: bool = False
     joint_fit: bool = False
-    network_alone: bool = True  # the photo does not correct the field
+    network_alone: bool = True  # without the correction by the photo's ratio image
     non_negative: bool = True  # the light's least squares
     refine: str = "none"
     facts: Path | None = None
     mean_checkpoint: Path | None = None
     dataset: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # None: photos
-    truth: Path = field(default=Path(), metadata=NOT_IN_RECIPE)  # of `compare`
+    truth: Path = field(default=Path(), metadata=NOT_IN_RECIPE)  # the cases of `compare`
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of all methods: reflectance models, checkpoints, and folders of images."""
-        return (*self.reflectance, *(one.name for one in (*self.against, *self.methods)))
+        """Names of all methods: reflectance models, checkpoints and folders of images."""
+        return (*self.reflectance, *(method.name for method in (*self.against, *self.methods)))
 
     @property
-    def ours(self) -> bool:
-        """True if facerf renders images of a method."""
+    def renders(self) -> bool:
+        """True if facerf renders the images of a method."""
         return bool(self.reflectance or self.against)
 
     @property
     def has_field(self) -> bool:
-        """True if the neural field is among the methods."""
+        """True if a method uses the neural face field."""
         return bool({"field", "portrait"} & set(self.reflectance) or self.against)
 
     def item(self, path: Path, name: str) -> Item:
@@ -140,26 +139,26 @@ class EvaluateOptions(BatchOptions):
 
     def check(self) -> None:
         """Raise UsageError for options that would fail every item, or that exclude each other."""
-        if twice := sorted({name for name in self.names if self.names.count(name) > 1}):
-            raise UsageError(f"two methods have the name {twice[0]!r}; rename one, or give NAME=PATH")
-        for one in self.against:
-            if not one.path.exists():
-                raise UsageError(f"--against {one.path}: no such file; give one that exists")
+        if duplicates := sorted({name for name in self.names if self.names.count(name) > 1}):
+            raise UsageError(f"two methods have the name {duplicates[0]!r}; rename one, or use NAME=PATH")
+        for checkpoint in self.against:
+            if not checkpoint.path.exists():
+                raise UsageError(f"--against {checkpoint.path}: no such file; check the path")
         if self.measures.lpips is not None and self.measures.vgg_weights is None:
             raise UsageError("--lpips: needs VGG-16; add --vgg-weights imagenet, or a file of its weights")
 
 
 @dataclass(frozen=True)
 class FaceOptions(EvaluateOptions):
-    """Options of protocols that compare faces of a prepared dataset, alone in their crops.
+    """Options of the protocols that render and compare only the face, inside its crop.
 
     Attributes:
-        split: Measure this split of DATASET; all if no network was trained on it.
-        every: Measure every Nth pair of DATASET's split only.
+        split: Split of DATASET to measure; use all only if no network was trained on it.
+        every: Measure only every Nth pair of DATASET's split.
         preset: Measure as many images as the paper did.
         joint_fit: Use the heads of DATASET, which are fitted to all calibrated cameras of a person at once,
-            instead of each image alone.
-        keep_eyes: Compare open eyes, too (default: not, as in the paper).
+            instead of fitting each image separately.
+        keep_eyes: Also compare open eyes; the paper excludes them.
     """
 
     split: Literal["train", "validation", "test", "all"] = option("test", panel=DATA, everyday=True)
@@ -172,23 +171,20 @@ class FaceOptions(EvaluateOptions):
     def check(self) -> None:
         super().check()
         if self.preset and self.every > 1:
-            raise UsageError(
-                "--preset and --every exclude each other: a preset has a fixed number of images; leave one "
-                "out"
-            )
+            raise UsageError("--preset fixes the number of images; remove --preset or --every")
 
 
 @dataclass(frozen=True)
 class FactsOptions:
-    """A list of images.
+    """Option of the protocols that read people and metadata of images from a file.
 
     Attributes:
-        facts: Read a row for each image: name, person, and columns for the list of images; in `compare` those
-            that are text break the tables down.
+        facts: CSV with one row per image: name, person, and additional columns for images.csv. In `compare`,
+            text columns also break down the tables.
     """
 
     facts: Path | None = option(
-        None, metavar="CSV", shown_default="a person is an image's topmost folder", panel=DATA
+        None, metavar="CSV", shown_default="a person is the image's topmost folder", panel=DATA
     )
 
 
@@ -207,8 +203,8 @@ class TransferOptions(SolveOptions, FaceOptions):
     """Options of `evaluate transfer`.
 
     Attributes:
-        photos: Read photos, two of each person or in folders.
-        held_to_photo: Correct the field by the quotient of its photo, as `relight` does.
+        photos: The inputs are photos: two per person, or one folder per person.
+        held_to_photo: Correct the field with the photo's ratio image, like `relight`.
     """
 
     photos: bool = option(False, in_recipe=False, flags=("--photos",), panel=DATA)
@@ -220,22 +216,22 @@ class GeometryOptions(FactsOptions, FaceOptions):
     """Options of `evaluate geometry`.
 
     Attributes:
-        mean_checkpoint: Use a checkpoint of `facerf train --mean-face` for the mean face.
+        mean_checkpoint: Checkpoint of `facerf train --mean-face` that renders the mean face.
     """
 
     against: tuple[NamedPath, ...] = ()
     joint_fit: bool = False
     mean_checkpoint: Path | None = option(
-        None, metavar="FILE", shown_default="that of the fitted face", panel=METHODS
+        None, metavar="FILE", shown_default="the checkpoint of the fitted face", panel=METHODS
     )
 
 
 @dataclass(frozen=True)
 class CasesOptions(FaceOptions):
-    """Options of `evaluate cases`, which keeps every image and measures none.
+    """Options of `evaluate cases`, which writes every image and measures none.
 
     Attributes:
-        same_pose: Take the pairs alone whose target camera is that of the source.
+        same_pose: Write only pairs in which source and target have the same camera.
     """
 
     same_pose: bool = option(False, flags=("--same-pose",), panel=DATA)
@@ -251,10 +247,10 @@ class YaleOptions(FieldOptions, EvaluateOptions):
     """Options of `evaluate yale-b`.
 
     Attributes:
-        shifts: Align images by rows subject,light,dy,dx: pixels down and right that move an image onto its
-            subject's frontal one.
-        subjects: Measure these subjects only, such as yaleB05,yaleB15. Repeatable.
-        room: Light from all around that comes with each flash, as a room sends it back: a share of it.
+        shifts: CSV of subject,light,dy,dx: pixels down and to the right that align an image with its
+            subject's frontal image.
+        subjects: Measure only these subjects, such as yaleB05,yaleB15. Repeatable.
+        room: Uniform ambient light added to each flash, as a fraction of the flash.
     """
 
     reflectance: tuple[RelightKind, ...] = _kinds("portrait")
@@ -265,7 +261,7 @@ class YaleOptions(FieldOptions, EvaluateOptions):
         in_recipe=False,
         shown_default="all",
         typed=list[str] | None,
-        parse=lambda given: tuple(name.strip() for text in given for name in text.split(",") if name.strip()),
+        parse=lambda texts: tuple(name.strip() for text in texts for name in text.split(",") if name.strip()),
         panel=DATA,
     )
     room: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=DATA)
@@ -276,34 +272,34 @@ class CompareOptions(FieldOptions, FactsOptions, EvaluateOptions):
     """Options of `evaluate compare`.
 
     Attributes:
-        methods: Measure a folder of images (.exr .hdr .npy, linear; .png .jpg .tif ...) with the truths'
-            names. Repeatable.
-        masks: Compare inside masks: images with the truths' names, white inside.
+        methods: Folder of images to measure (.exr .hdr .npy, linear; .png .jpg .tif ...), with the names of
+            the ground truths. Repeatable.
+        masks: Folder of masks with the names of the ground truths; white pixels are compared.
     """
 
     reflectance: tuple[RelightKind, ...] = _kinds()
     methods: tuple[NamedPath, ...] = _named("--method", "DIR")
     masks: Path | None = option(
-        None, metavar="DIR", shown_default="those of CASES, the truths' alpha, else everything", panel=DATA
+        None, metavar="DIR", shown_default="the masks of CASES, else alpha, else all", panel=DATA
     )
     pictures: bool = False
 
     def check(self) -> None:
         super().check()
         if not self.names:
-            raise UsageError("compare: no method; give --method NAME=FOLDER, or --reflectance field")
-        for read in (*(one.path for one in self.methods), self.truth, self.masks):
-            if read and not read.is_dir():
-                raise UsageError(f"{read}: no such folder; give one that exists")
-            if read and Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(read)):
-                raise UsageError(f"-o {self.output}: lies in {read}, which is read; give another folder")
+            raise UsageError("compare: no method; add --method NAME=FOLDER, or --reflectance field")
+        for folder in (*(method.path for method in self.methods), self.truth, self.masks):
+            if folder and not folder.is_dir():
+                raise UsageError(f"{folder}: no such folder; check the path")
+            if folder and Path(os.path.realpath(self.output)).is_relative_to(os.path.realpath(folder)):
+                raise UsageError(f"-o {self.output}: lies in the input folder {folder}; use another folder")
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The content of a run: what each item holds, and files that shape the figures beside the items' own.
+    """Content of a run: the data of each item, and additional input files that the results depend on.
 
-    `groups` counts the sources or couples of a dataset; those without a face are missing in the tables.
+    `groups` is the number of sources or couples of a dataset; those without a face are missing in the tables.
     """
 
     items: Mapping[Item, Any] = field(metadata=NOT_IN_RECIPE)

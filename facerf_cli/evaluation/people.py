@@ -1,4 +1,4 @@
-"""Faces that protocols measure, and the methods that relight them: people of a dataset, and photos."""
+"""Measured faces, from prepared datasets and photos, and the methods that relight them."""
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -48,21 +48,18 @@ log = logging.getLogger(LOGGER_NAME)
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A reflectance model under the name of its figures; its images are those of `facerf relight`.
-
-    Without `network_alone` a field is corrected by its photo, which then comes back by construction.
-    """
+    """Reflectance model with its name in the tables; it renders the images of `facerf relight`."""
 
     name: str
     kind: RelightKind
     models: Models
-    network_alone: bool = True
+    network_alone: bool = True  # without the ratio image, which makes the field reproduce its photo exactly
     estimator: Estimator = DEFAULT_ESTIMATOR
 
-    def explained(self, head: Head) -> Explained:
-        """Reflectance and light of a head's photo."""
+    def explain(self, head: Head) -> Explained:
+        """Estimate reflectance and light from a head's photo."""
         if self.kind == "portrait":
-            raise UsageError("--reflectance portrait: is measured on whole photos; use evaluate yale-b")
+            raise UsageError("--reflectance portrait: requires whole photos; use evaluate yale-b")
         if self.kind != "field":
             return explain_by_baseline(self.models, head, self.kind)
         light = estimate_light(self.models, head, estimator=self.estimator).light
@@ -71,13 +68,13 @@ class Method:
     def image(
         self, head: Head, reflectance: Reflectance, light: RigLight, fit: FaceFit | None = None
     ) -> np.ndarray:
-        """The face alone [S, S, 3] under one light, in the pose and the crop of a fit, else in its own."""
+        """Render only the face [S, S, 3] under one light, in the pose and crop of `fit` or its own."""
         return Person(self.models, None, head, reflectance).image(light, Target(fit))
 
     def images(
         self, photo: np.ndarray | None, head: Head, lights: Light, target: Target
     ) -> Iterator[np.ndarray]:
-        """Yield an image under each weighted sum of lights; in the photo, if it is given."""
+        """Yield an image under each weighted sum of lights, inside the photo if there is one."""
         reflectance = reflectance_of(self.models, head, self.kind, self.network_alone, photo=photo)
         composition = Person(self.models, photo, head, reflectance).prepare(target)
         for relit in composition.relit(lights):
@@ -86,29 +83,27 @@ class Method:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The means of a run: its methods, and how faces are found, fitted and compared.
+    """Everything that the comparisons of a run share.
 
-    Each image is a separate photo, whose face is found, and fitted or regressed as `geometry` says. With
-    `geometry` None heads are those that were fitted to all calibrated cameras of a person at once. Eyes are
-    left out unless `keep_eyes`, since the field of open eyes is not learnt (paper, 'Results'). `mean` has the
-    networks that were trained with the mean face.
+    Each image's face is detected, and fitted or regressed according to `geometry`. If `geometry` is None,
+    use the heads that a dataset fitted to all calibrated cameras of a person at once.
     """
 
-    models: Models
+    models: Models  # detect and fit faces
     sides: Sides
     geometry: Geometry | None = None
-    keep_eyes: bool = False
+    keep_eyes: bool = False  # compare open eyes, which the face field does not learn (paper, 'Results')
     methods: Sequence[Method] = ()
-    mean: Models | None = None
-    photo: PhotoOptions | None = None  # of photos, not of a dataset
+    mean: Models | None = None  # trained with the mean face
+    photo: PhotoOptions | None = None  # how photos are read; unused for datasets
     described: Mapping[str, Case] = field(default_factory=dict)  # the rows of --facts
 
     def find(self, image: np.ndarray, name: str) -> Face:
-        """The largest face in an image; InputError where none is found."""
+        """Detect the largest face in an image; raises InputError without a face."""
         return find_faces(self.models.networks.people, image, name)[0]
 
     def heads(self, photo: np.ndarray, face: Face) -> Iterator[tuple[Method, Head]]:
-        """Yield each method with its head of a face; methods over the same networks share the fit."""
+        """Yield each method with its head of a face; methods with the same models share the fit."""
         heads: dict[int, Head] = {}
         for method in self.methods:
             key = id(method.models)
@@ -119,46 +114,40 @@ class Bench:
 
 @dataclass(frozen=True, eq=False)
 class HeadView:
-    """A head in its crop [S, S], in its photo's pose or in that of `fit`, and where it is compared.
-
-    `uv` holds the (u, v) of each pixel. `mask` [S, S] in 0..1 is the paper's M_t where the crop shows the
-    photo.
-    """
+    """Head rendered in the pose and the crop of `fit`."""
 
     head: Head
     fit: FaceFit
-    uv: Tensor
-    mask: np.ndarray
+    uv: Tensor  # [S, S, 2], (u, v) of each pixel
+    mask: np.ndarray  # [S, S] in 0..1, the compared pixels: the paper's M_t inside the photo
 
     @property
     def face(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mask [S, S] and landmarks [68, 2] of the face in the head's crop."""
+        """Mask [S, S] and landmarks [68, 2] in the head's crop."""
         return self.mask, self.head.landmarks_px
 
     def region(self, name: str) -> np.ndarray:
-        """The mask [S, S] in 0..1 of a named region of the face (`face/topology.py`)."""
+        """Return the mask [S, S] in 0..1 of a named region of the face (`face/topology.py`)."""
         return sample_texture(region_mask(name, _MASK_SIDE)[None], self.uv)[..., 0].numpy()
 
 
 @dataclass(frozen=True, eq=False)
-class Portrait:
-    """One face of a photo; every method's models fit or regress its head, in one crop.
+class ComparedFace:
+    """Face of a photo. Each method's models fit or regress its head, in a common crop.
 
-    `face` is the face as it was found, or a fit that was made beforehand. The photo's alpha tells what is
-    neither compared nor used. `name` is the photo's in errors. Of a dataset there are its person and the pair
-    whose source it is, too.
+    Transparent pixels of the photo are neither compared nor used.
     """
 
-    name: str
+    name: str  # of the photo, in errors
     case: Case
     photo: LinearImage
-    face: Face | FaceFit
+    face: Face | FaceFit  # as detected, or fitted in advance
     bench: Bench
-    origin: "tuple[DatasetPerson, Pair] | None" = None
+    origin: "tuple[DatasetPerson, Pair] | None" = None  # for a dataset: the pair whose source is the photo
     _views: dict[int, tuple[Models, HeadView]] = field(default_factory=dict)
 
-    def by(self, models: Models) -> HeadView:
-        """The portrait by a method's models; InputError where nothing of the face is visible."""
+    def fit_with(self, models: Models) -> HeadView:
+        """Return the head as fitted by a method's models; raises InputError if no part of it is visible."""
         if id(models) not in self._views:
             image, face, sides = self.photo.pixels, self.face, self.bench.sides
             if isinstance(face, FaceFit):
@@ -171,8 +160,8 @@ class Portrait:
         return self._views[id(models)][1]
 
     def pose_of(self, view: HeadView, models: Models) -> HeadView:
-        """Another portrait's head in this portrait's pose."""
-        own = self.by(models).fit
+        """Pose another portrait's head like this one."""
+        own = self.fit_with(models).fit
         posed = replace(own, alpha=view.fit.alpha, beta=view.fit.beta)
         return self._view(models, view.head, posed)
 
@@ -185,73 +174,71 @@ class Portrait:
             mask = mask * (1 - sample_texture(region_mask("eyes", _MASK_SIDE)[None], uv)[..., 0])
         inside = mask.numpy() * self._inside(fit.crop)
         if not inside.max() > 0:
-            raise InputError(
-                f"{self.name}: nothing of the fitted face is visible in the image; give its --landmarks"
-            )
+            raise InputError(f"{self.name}: the fitted face is not visible in the image; pass --landmarks")
         return HeadView(head, fit, uv, inside)
 
     def _inside(self, crop: Crop) -> np.ndarray:
-        """The share of the photo in each pixel of a crop [S, S], in 0..1."""
+        """Return the photo's coverage [S, S] in 0..1 of each pixel of a crop."""
         alpha = self.photo.alpha
         inside = crop.valid(*self.photo.pixels.shape[:2]).astype(np.float32)
         return inside if alpha is None else inside * crop.apply(alpha[..., None])[..., 0]
 
 
 def common_mask(views: Iterable[HeadView]) -> np.ndarray:
-    """The mask [S, S] inside those of all views."""
+    """Intersect the masks [S, S] of all views."""
     return np.minimum.reduce([view.mask for view in views])
 
 
 @dataclass(frozen=True, eq=False)
 class DatasetPerson:
-    """A subject of a prepared dataset, and groups of its pairs, whose sources are compared group by group."""
+    """Subject of a prepared dataset, with groups of pairs whose sources are compared together."""
 
     dataset: Dataset
     name: str
-    bench: Bench | None = None  # until it is compared
+    bench: Bench | None = None  # set by `compared`
     groups: Sequence[Sequence[Pair]] = ()
-    _lit: dict[str, Portrait] = field(default_factory=dict)
+    _lit: dict[str, ComparedFace] = field(default_factory=dict)
     _headers: dict[str, StackHeader] = field(default_factory=dict)
 
     def compared(self, compare: "Compare", bench: Bench) -> Iterator[Comparison]:
-        """Compare each group; one in one of whose images no face is found is named and left out.
+        """Compare each group; skip and log groups with an undetected face.
 
-        Raises UsageError where the joint fits are of another face model.
+        Raises UsageError if the dataset's fits use another face model.
         """
         if bench.geometry is None and bench.models.face.name != self.dataset.face_model:
             raise UsageError(
-                f"{self.dataset.folder}: its joint fits are of {self.dataset.face_model}; give it as "
-                "--face-model"
+                f"{self.dataset.folder}: its heads are fitted with the face model {self.dataset.face_model}; "
+                "pass it as --face-model"
             )
         person = replace(self, bench=bench)
         for pairs in self.groups:
             try:
-                found = list(compare([person.portrait(pair) for pair in pairs], bench))
+                comparisons = list(compare([person.source_of(pair) for pair in pairs], bench))
             except NoFaceError as error:
-                log.warning("%s: left out (%s)", " and ".join(map(_name, pairs)), error)
+                log.warning("%s: skipped (%s)", " and ".join(map(_name, pairs)), error)
             else:
-                yield from found
+                yield from comparisons
 
-    def portrait(self, pair: Pair) -> Portrait:
-        """The face in the source of a pair; NoFaceError where none is found in it."""
-        portrait = self._portrait(self.source(pair), pair.source_camera, _name(pair))
-        case = replace(portrait.case, facts=self.facts | {"map": pair.envmap})
-        return replace(portrait, case=case, origin=(self, pair))
+    def source_of(self, pair: Pair) -> ComparedFace:
+        """Return the face in the source of a pair; raises NoFaceError without a face."""
+        face = self._compared_face(self.source(pair), pair.source_camera, _name(pair))
+        case = replace(face.case, facts=self.facts | {"map": pair.envmap})
+        return replace(face, case=case, origin=(self, pair))
 
-    def lit(self, camera: str) -> Portrait:
-        """The person in a camera under all lights: under one light no detector finds a face."""
+    def under_all_lights(self, camera: str) -> ComparedFace:
+        """Return the person in a camera under all lights; no detector finds a face under a single light."""
         if camera not in self._lit:
             image = self.header(camera).source
-            self._lit[camera] = self._portrait(image, camera, f"{self.name}/{camera}")
+            self._lit[camera] = self._compared_face(image, camera, f"{self.name}/{camera}")
         return self._lit[camera]
 
     def header(self, camera: str) -> StackHeader:
-        """The header of a camera's stack, read once."""
+        """Read the header of a camera's stack, once."""
         if camera not in self._headers:
             self._headers[camera] = read_olat_header(self.dataset.stack_path(self.name, camera))
         return self._headers[camera]
 
-    def _portrait(self, image: np.ndarray, camera: str, name: str) -> Portrait:
+    def _compared_face(self, image: np.ndarray, camera: str, name: str) -> ComparedFace:
         header = self.header(camera)
         assert self.bench is not None
         face: Face | FaceFit
@@ -264,33 +251,32 @@ class DatasetPerson:
                 face = self.bench.find(image, name)
             except InputError as error:
                 raise NoFaceError(str(error)) from None
-        return Portrait(name, Case(name, self.name), LinearImage(image, header.seen), face, self.bench)
+        return ComparedFace(name, Case(name, self.name), LinearImage(image, header.seen), face, self.bench)
 
     def source(self, pair: Pair) -> np.ndarray:
-        """The source image [S, S, 3] of a pair, read or rendered from its recipe."""
+        """Read the source image [S, S, 3] of a pair, or render it if it is not stored."""
         path = image_path(self.dataset, *pair.key)
         if path.is_file():
             return read_image(path).pixels
         return render_source(self.dataset, pair).permute(1, 2, 0).float().numpy()
 
     def light(self, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
-        """The true light of a pair's source: camera-space directions [L, 3], rgb weights [L, 3]."""
+        """Return the true light of a pair's source: camera-space directions [L, 3] and rgb weights [L, 3]."""
         directions = self.header(pair.source_camera).directions
-        # Nothing is written into a dataset that is measured on.
-        if not weights_path(self.dataset).is_file():
+        if not weights_path(self.dataset).is_file():  # load_pairs would write into the measured dataset
             return directions, pair_weights(self.dataset, pair).numpy()
         pairs, weights = load_pairs(self.dataset)[self.name]
         return directions, np.array(weights[pairs.index(pair)])
 
     @property
     def facts(self) -> dict[str, str | float]:
-        """The class of their skin tone, if the capture holds it."""
+        """Class and ITA of the skin tone, if the capture contains them."""
         ita = self._skin("ita_deg")
         return {"tone": "unknown"} if ita is None else {"tone": tone_of(ita), "ita_deg": ita}
 
     @property
     def albedo(self) -> np.ndarray | None:
-        """The true mean albedo [3] of their bare skin, linear Rec.709; None if it is not known."""
+        """True mean albedo [3] of the bare skin, linear Rec.709; None if unknown."""
         melanin, blood = self._skin("melanin"), self._skin("haemoglobin")
         if melanin is None or blood is None:
             return None
@@ -298,7 +284,7 @@ class DatasetPerson:
         return mixed[0, :, 0, 0].numpy()
 
     def _skin(self, trait: str) -> float | None:
-        """A number of their skin in the capture; faces of random colours have none."""
+        """Return a skin parameter of the capture; None if it is missing or the face has random colours."""
         traits = self.dataset.traits.get(self.name, {})
         value = traits.get(trait)
         if not isinstance(value, int | float) or traits.get("random_texture"):
@@ -306,30 +292,28 @@ class DatasetPerson:
         return float(value)
 
 
-Compare = Callable[[Sequence[Portrait], Bench], Iterable[Comparison]]
+Compare = Callable[[Sequence[ComparedFace], Bench], Iterable[Comparison]]
 
 
 @dataclass(frozen=True)
 class PhotoFaces:
-    """A photo whose faces are compared one by one, or two of a person whose faces are compared together."""
+    """Photo whose faces are compared one by one, or two photos of a person, compared with each other."""
 
     items: tuple[Item, ...]
     person: str = ""
 
     def compared(self, compare: Compare, bench: Bench) -> Iterator[Comparison]:
-        """Compare each face, or the faces of both."""
         for faces in zip(*(self.faces(item, bench) for item in self.items), strict=False):
             yield from compare(faces, bench)
 
-    def faces(self, item: Item, bench: Bench) -> Iterator[Portrait]:
-        """Yield the chosen faces of a photo."""
+    def faces(self, item: Item, bench: Bench) -> Iterator[ComparedFace]:
         assert bench.photo is not None
         image = read_photo(item, bench.photo)
         for face in fit_faces(item, image, bench.photo):
             case = case_of(f"{item.name}{face.tag}", bench.described)
             facts = {"quality": face.fit.quality, **case.facts}
             case = replace(case, person=self.person or case.person, facts=facts)
-            yield Portrait(str(item.input_path), case, image, face.found, bench)
+            yield ComparedFace(str(item.input_path), case, image, face.found, bench)
 
 
 def _name(pair: Pair) -> str:
@@ -338,9 +322,9 @@ def _name(pair: Pair) -> str:
 
 @cache
 def bench_of(options: EvaluateOptions, photo: PhotoOptions) -> Bench:
-    """The methods, in the order of their names, and how faces are read, once a process.
+    """Load what the comparisons of a run share, once per process.
 
-    Faces are read as the first method's networks expect, where the options do not say.
+    By default, faces are fitted as the first checkpoint's networks were trained.
     """
     models, methods = load_models_once(photo), methods_of(options, photo)
     geometry = None if options.joint_fit else photo.geometry or models.default_geometry
@@ -351,7 +335,7 @@ def bench_of(options: EvaluateOptions, photo: PhotoOptions) -> Bench:
 
 
 def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
-    """The methods, in the order of their names."""
+    """Load the methods, in the order of `EvaluateOptions.names`."""
     models, features = load_models_once(photo), None
     if options.refine == "features":
         light = LightOptions(photo=photo, vgg_weights=options.measures.vgg_weights)
@@ -359,21 +343,20 @@ def methods_of(options: EvaluateOptions, photo: PhotoOptions) -> list[Method]:
     estimator = Estimator(options.non_negative, features)
     make = partial(Method, network_alone=options.network_alone, estimator=estimator)
     methods = [make(kind, kind, models) for kind in options.reflectance]
-    for one in options.against:
-        other = _load(one.path, photo)
-        other.networks.load(("reflectance",))  # fails before anything is measured
-        methods.append(make(one.name, "field", other))
+    for checkpoint in options.against:
+        other = _load(checkpoint.path, photo)
+        other.networks.load(("reflectance",))  # errors appear before anything is measured
+        methods.append(make(checkpoint.name, "field", other))
     return methods
 
 
 def _load(path: Path, photo: PhotoOptions) -> Models:
-    """The models of another checkpoint."""
     return load_models((checkpoint_file(path),), photo.face_model, load_models_once(photo).device, photo.form)
 
 
 def networks_used(options: EvaluateOptions) -> Collection[str]:
-    """Names of the networks that the options of the field's methods use; those of faces always."""
-    if not options.ours:
+    """Return the names of the networks that a run uses."""
+    if not options.renders:
         return {"parsing"} if options.measures.face_distance or options.dataset else ()
     refined = options.refine == "features" and options.measures.vgg_weights is None
     return networks_of(options.reflectance) | ({"light_features"} if refined else set())

@@ -1,7 +1,7 @@
-"""The protocols of `facerf evaluate`: `PROTOCOLS` has them by the command's name.
+"""Protocols of `facerf evaluate`, by the names of their commands.
 
-A protocol chooses what is measured, compares it item by item, and says what its tables show. A new one is a
-row more; `run.py` measures, keeps and sums up.
+A protocol chooses the measured items, compares them one by one, and describes its tables; `run.py` does the
+rest. To add a protocol, add an entry to `PROTOCOLS`.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from facerf_cli.capture.yale_b import YaleB
 from facerf_cli.evaluation.comparisons import (
     compare_images,
     compare_olats,
@@ -36,19 +35,12 @@ from facerf_cli.work.photo_options import SolveOptions
 
 @dataclass(frozen=True)
 class Protocol:
-    """A command of `facerf evaluate`; each function takes the protocol's own options.
-
-    Attributes:
-        name: The command.
-        choose: Choose what is measured, by the options and the inputs of the command line.
-        compare: Yield the comparisons of what one item holds.
-        layout: The tables; None: images alone are written, for `compare`.
-    """
+    """Command of `facerf evaluate`; its functions take the options of the command."""
 
     name: str
-    choose: Callable[[Any, Sequence[str]], Chosen]
-    compare: Callable[[Any, Bench, Any], Iterable[Comparison]]
-    layout: Layout | None
+    choose: Callable[[Any, Sequence[str]], Chosen]  # the items, from the options and the inputs
+    compare: Callable[[Any, Bench, Any], Iterable[Comparison]]  # yield the comparisons of an item's content
+    layout: Layout | None  # of the tables; None: only write images, for `compare`
 
 
 def _faces(
@@ -57,41 +49,36 @@ def _faces(
     return faces.compared(compare, bench)
 
 
-def _subject(options: YaleOptions, bench: Bench, subject: tuple[YaleB, str]) -> Iterable[Comparison]:
-    return compare_subject(*subject, bench, options.room)
-
-
 def notes(options: EvaluateOptions, chosen: Chosen) -> Iterator[str]:
-    """Yield what a run chose, for the lines below its tables."""
+    """Describe a run's choices in lines below its tables."""
     if options.has_field:
-        by = "the network alone" if options.network_alone else "corrected by the photo that it is read from"
-        yield f"The field is {by}."
+        ratio = "without" if options.network_alone else "with"
+        yield f"The face field is used {ratio} the photo's ratio image."
     if isinstance(options, SolveOptions):
         squares = "non-negative, smooth least squares" if options.non_negative else "signed least squares"
         refined = "" if options.refine == "none" else f", refined by {options.refine}"
-        yield f"The field's light is estimated by {squares}{refined}."
+        yield f"The face field's light is estimated by {squares}{refined}."
     if isinstance(options, FaceOptions) and chosen.groups is not None:
-        heads = "heads are those fitted to all cameras of a person at once"
-        alone = "each image is fitted alone, and those in which no face is found are left out"
-        yield f"Split {options.split}: {chosen.groups} were chosen; {heads if options.joint_fit else alone}."
+        joint = "heads are fitted to all cameras of a person at once"
+        separate = "each image is fitted separately, and images without a detected face are skipped"
+        heads = joint if options.joint_fit else separate
+        yield f"Split {options.split}: {chosen.groups} were chosen; {heads}."
     if isinstance(options, GeometryOptions):
         mean = options.mean_checkpoint
-        trained = mean.stem if mean else "the same network, trained on fitted faces only"
-        yield f"The mean face is rendered by {trained}; both are compared where both show the face."
+        trained = mean.stem if mean else "the same network, which was trained only on fitted faces"
+        yield f"The mean face is rendered by {trained}; both faces are compared where both are visible."
     if isinstance(options, YaleOptions):
-        yield from _yale_b_notes(options, chosen)
-
-
-def _yale_b_notes(options: YaleOptions, chosen: Chosen) -> Iterator[str]:
-    database, _ = next(iter(chosen.items.values()))
-    if options.room:
-        yield f"Each flash comes with {options.room:.3g} of its light from all around, as of a room (--room)."
-    by = "aligned to their subject's frontal one by the given shifts" if database.shifts else "not aligned"
-    yield f"Images are {by}."
-    marked, known = sum(map(len, database.marked.values())), len(database.left_out)
-    yield f"Left out of all subjects there: {marked} images marked as damaged, {known} known to be."
-    if settings := sorted({name for _, name in chosen.items.values()} & set(SETTINGS_SUBJECTS)):
-        yield f"Settings were chosen on {', '.join(settings)}."
+        database, _ = next(iter(chosen.items.values()))
+        if options.room:
+            yield f"Each flash is accompanied by uniform light of {options.room:.3g} times its own (--room)."
+        aligned = (
+            "aligned with their subject's frontal image (--shifts)" if database.shifts else "not aligned"
+        )
+        yield f"Images are {aligned}."
+        marked, known = sum(map(len, database.marked.values())), len(database.left_out)
+        yield f"Excluded from the database: {marked} images marked damaged and {known} known bad."
+        if settings := sorted({name for _, name in chosen.items.values()} & set(SETTINGS_SUBJECTS)):
+            yield f"Settings were chosen on {', '.join(settings)}."
 
 
 _ALL = (
@@ -136,7 +123,7 @@ _ALL = (
     Protocol(
         "yale-b",
         choose_subjects,
-        _subject,
+        compare_subject,
         Layout(
             "Extended Yale B: real people relit to real point lights",
             ("si_mse", "ssim"),

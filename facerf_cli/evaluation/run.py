@@ -1,4 +1,4 @@
-"""One run of `facerf evaluate` from items to tables: measure, keep figures and images, sum up."""
+"""Run a protocol of `facerf evaluate`: measure the items, store their results, and write the tables."""
 
 import json
 import logging
@@ -43,18 +43,17 @@ from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import face_model, prepare_photos
 
 SUMMARY, IMAGES, PAGE = "summary.json", "images.csv", "report.html"
-_KEPT = 14  # strips of an item
-_MEASURING = 9  # raised where the same recipe gives other figures
+_STRIPS = 14  # stored per item
+_MEASURING = 9  # version of the metrics; raised when equal options give other results
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
 class Evaluation(Job):
-    """A run of a protocol; settings only, sent to the processes that take the items.
+    """Run of a protocol; contains only settings, which are sent to worker processes.
 
-    An item's rows are DIR/cases/ITEM.json, so finished items are skipped and an interrupted run continues. At
-    the end: DIR/summary.json, DIR/images.csv, DIR/report.html, and a table on stdout. If an item failed or a
-    prediction is missing, each is named and no summary is written.
+    Each item writes DIR/cases/ITEM.json, so an interrupted run continues. At the end, the run writes
+    DIR/summary.json, DIR/images.csv and DIR/report.html and prints tables, unless an item failed.
     """
 
     protocol: Protocol
@@ -64,48 +63,43 @@ class Evaluation(Job):
 
     @property
     def verb(self) -> str:
-        """The verb as it is typed."""
         return f"evaluate {self.protocol.name}"
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """The metrics of the tables: the protocol's, and Face dis if it is asked for."""
-        own = self.protocol.layout.metrics if self.protocol.layout else ("si_mse",)
-        more = ("face_distance",) if self.options.measures.face_distance else ()
-        return tuple(dict.fromkeys((*own, *more)))
+        """Metrics of the tables: the protocol's metrics, and Face dis with --face-distance."""
+        layout, measures = self.protocol.layout, self.options.measures
+        metrics = layout.metrics if layout else ("si_mse",)
+        return tuple(dict.fromkeys((*metrics, *(["face_distance"] if measures.face_distance else []))))
 
     def run(self) -> int:
-        """Measure the items and write their tables; return the exit code, 0 done, 1 some failed."""
+        """Measure the items and write the tables; return the exit code: 0 done, 1 some items failed."""
         items, options = list(self.chosen.items), self.options
         if not items:
-            raise UsageError(f"{self.verb}: nothing to evaluate; give other inputs")
-
-        if options.overwrite == "never" and (other := self._made_otherwise()):
+            raise UsageError(f"{self.verb}: nothing to evaluate; use other inputs")
+        if options.overwrite == "never" and (stale := self._stale()):
             raise UsageError(
-                f"{options.output}: {len(other)} items ({other[0].name}, ...) were evaluated with other "
-                "options, another checkpoint or other inputs; leave out --overwrite never, or give another "
-                "folder"
+                f"{options.output}: {len(stale)} items ({stale[0].name}, ...) were evaluated with other "
+                "options, checkpoints or inputs; remove --overwrite never, or use another folder"
             )
         code = run_items(self, items, replace(options, print_outputs=False), self.photo.settings)
         if code:
-            log.error(
-                "no summary is written while images are missing; finished items are kept, so run it again"
-            )
+            log.error("no summary is written while images are missing; run again to finish the others")
         elif not options.dry_run and sums_up(items, self.outputs_of, options):
             self._remove_summary()
-            if options.shard.of > 1 and (other := self._made_otherwise()):
-                log.info("%d items of other shards are of an earlier run, so there is no summary", len(other))
+            if options.shard.of > 1 and (stale := self._stale()):
+                log.info("no summary is written: %d items of other shards are out of date", len(stale))
             else:
                 self._sum_up()
         return code
 
     def ready(self, dry_run: bool) -> Self:
-        """Load what all items need, and remove the tables of an earlier run."""
+        """Load networks and metrics, so that errors appear early, and remove outdated tables."""
         measures, uses = self.options.measures, networks_used(self.options)
         if uses:
             prepare_photos(self.photo, uses, with_networks=not dry_run)
         if not dry_run:
-            if uses:  # what would fail each item fails before anything is measured
+            if uses:
                 bench_of(self.options, self.photo)
             if measures.vgg_weights is not None:
                 device = torch_device(self.photo.settings)
@@ -119,8 +113,8 @@ class Evaluation(Job):
             recipe |= recipe_of(part, digest_of)
         return [recipe | {"names": list(self.options.names)}]
 
-    def _made_otherwise(self) -> list[Item]:
-        """The finished items that were made from other inputs or by another recipe: one table has one way."""
+    def _stale(self) -> list[Item]:
+        """Return the finished items whose inputs or options have changed; one table must not mix them."""
         journal = Journal(self.options.output, self.verb, self.options.shard)
         (key,) = map(key_of, self.recipes_of(journal.digest_of))
         return [
@@ -130,98 +124,90 @@ class Evaluation(Job):
         ]
 
     def path_of(self, item: Item) -> Path:
-        """The item's figures."""
         return self.options.output / "cases" / f"{item.name}.json"
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """The files of a finished item: its figures, and the images that were kept."""
+        """Return the files of a finished item: its results and its stored images."""
         path = self.path_of(item)
         try:
-            kept = read_figures(path).pictures if path.exists() else ()
-        except InputError:  # said when the figures are needed
-            kept = ()
-        return [path, *(self.options.output / file for file in kept)]
+            images = read_figures(path).pictures if path.exists() else ()
+        except InputError:  # reported when the results are needed
+            images = ()
+        return [path, *(self.options.output / file for file in images)]
 
     def __call__(self, item: Item) -> Outcome:
-        """Measure an item's comparisons, and write its figures when all are measured."""
         rows: list[Row] = []
         images: list[str] = []
         strips: dict[str, Strip] = {}
         metric, measures = self.metrics[0], self.options.measures
         scaled = metric.startswith("si_") and measures.space == "linear"
         bench = bench_of(self.options, self.photo)
-        for own in self.protocol.compare(self.options, bench, self.chosen.items[item]):
-            case = own.case
-            if self.kept is not None:
-                images += self._keep_images(own, self.kept)
-            if not own.predictions:
+        for comparison in self.protocol.compare(self.options, bench, self.chosen.items[item]):
+            case = comparison.case
+            if self.image_folder is not None:
+                images += self._write_images(comparison, self.image_folder)
+            if not comparison.predictions:
                 rows.append(Row(case.name, case.person, "", case.facts, {}))
                 continue
             faces, device = "face_distance" in self.metrics, torch_device(self.photo.settings)
-            rows += measure(own, measures, faces, device)
-            strips[case.name] = draw_strip(own, scaled, self._marks(case.name, "field"))
+            rows += measure(comparison, measures, faces, device)
+            strips[case.name] = draw_strip(comparison, scaled, self._marks(case.name, "field"))
         if not rows:
             raise InputError(f"{item.input_path}: no image can be measured; check the input")
-        chosen = sorted(cases_to_show(rows, metric, strips, _KEPT))
-        kept = tuple(strips[case] for case in chosen)
-        write_figures(self.path_of(item), ItemFigures(FORMAT, tuple(rows), kept, tuple(images)))
+        stored = tuple(strips[case] for case in sorted(cases_to_show(rows, metric, strips, _STRIPS)))
+        write_figures(self.path_of(item), ItemFigures(FORMAT, tuple(rows), stored, tuple(images)))
         facts = {"pictures": len({row.case for row in rows}), "figures": self.path_of(item)}
         return Outcome(self.outputs_of(item), facts)
 
     @property
-    def kept(self) -> Path | None:
-        """The folder of images that are kept, below the output folder."""
+    def image_folder(self) -> Path | None:
+        """Folder of the stored images below the output folder; None: images are not stored."""
         if self.protocol.layout is None:
             return Path()
         return Path("pictures") if self.options.pictures else None
 
-    def _keep_images(self, comparison: Comparison, folder: Path) -> list[str]:
-        """Write FOLDER/{source,truth,mask,light,METHOD}/CASE.exr, scene-linear; return their paths.
+    def _write_images(self, comparison: Comparison, folder: Path) -> list[str]:
+        """Write FOLDER/{source,truth,mask,light,METHOD}/CASE.exr, scene-linear, and return their paths.
 
-        Predictions are marked as synthetic and name the face model; other images carry the version only.
+        The metadata of predictions declare them synthetic and name the face model.
         """
         case = comparison.case.name
-        given = {TRUTH: comparison.truth, MASK: comparison.mask}
-        given |= {SOURCE: comparison.source} if comparison.source is not None else {}
-        given |= {LIGHT: comparison.light} if comparison.light is not None else {}
+        references = {TRUTH: comparison.truth, MASK: comparison.mask}
+        references |= {SOURCE: comparison.source} if comparison.source is not None else {}
+        references |= {LIGHT: comparison.light} if comparison.light is not None else {}
         if clash := {SOURCE, TRUTH, MASK, LIGHT} & set(comparison.predictions):
             raise InputError(f"the method {clash.pop()!r} has the name of a folder of --pictures; rename it")
-        places = {
-            kind: (folder / kind / f"{case}.exr").as_posix() for kind in (*given, *comparison.predictions)
-        }
-        for kind, image in given.items():
+        written = []
+        for kind, image in (references | dict(comparison.predictions)).items():
             pixels = np.broadcast_to(image.reshape(*image.shape[:2], -1), (*image.shape[:2], 3))
-            mark = {"Software": f"facerf {__version__}"}
-            write_exr(self.options.output / places[kind], pixels, metadata=mark)
-        for method, image in comparison.predictions.items():
-            write_exr(self.options.output / places[method], image, metadata=self._marks(case, method))
-        return list(places.values())
+            version: dict[str, str | int] = {"Software": f"facerf {__version__}"}
+            metadata = version if kind in references else self._marks(case, kind)
+            written.append((folder / kind / f"{case}.exr").as_posix())
+            write_exr(self.options.output / written[-1], pixels, metadata=metadata)
+        return written
 
     def _marks(self, case: str, method: str) -> dict[str, str | int]:
-        """Metadata of a method's image: its checkpoint, as far as its name shows it, and the face model."""
+        """Return the metadata of a method's image: checkpoint and face model."""
         network = {"field": "reflectance", "portrait": "portrait"}.get(method)
-        made_by = serving_files(self.photo.settings.checkpoints)[network].stem if network else method
-        stamp = face_model(self.photo).stamp if self.options.ours else {}
-        return Provenance(case, made_by, **stamp).attributes()
+        checkpoint = serving_files(self.photo.settings.checkpoints)[network].stem if network else method
+        stamp = face_model(self.photo).stamp if self.options.renders else {}
+        return Provenance(case, checkpoint, **stamp).attributes()
 
     def _remove_summary(self) -> None:
-        """Remove the tables of an earlier run, which are about to be out of date."""
         for name in (SUMMARY, IMAGES, PAGE):
             (self.options.output / name).unlink(missing_ok=True)
 
     def _sum_up(self) -> None:
-        """Write and print the tables of finished items. Equal runs give equal files, without the time."""
-        figures = [read_figures(self.path_of(item)) for item in self.chosen.items]
-        rows = [row for of_item in figures for row in of_item.rows]
-        strips = [strip for of_item in figures for strip in of_item.strips]
+        """Write and print the tables of all items. Files contain no time, so equal runs give equal files."""
+        results = [read_figures(self.path_of(item)) for item in self.chosen.items]
+        rows = [row for result in results for row in result.rows]
+        strips = [strip for result in results for strip in result.strips]
         folder, options, layout = self.options.output, self.options, self.protocol.layout
-        if self.kept is not None:
+        if self.image_folder is not None:
             cases = (Case(row.case, row.person, row.facts) for row in rows)
-            write_cases(folder / self.kept / CASES, cases)
+            write_cases(folder / self.image_folder / CASES, cases)
         if layout is None:
-            log.info(
-                "%s lists %d cases; docs/evaluation.md says what a method renders", folder / CASES, len(rows)
-            )
+            log.info("wrote %d cases to %s; see docs/evaluation.md", len(rows), folder / CASES)
             return
         layout = replace(
             layout,
@@ -236,7 +222,7 @@ class Evaluation(Job):
             "command": shlex.join(["facerf", *sys.argv[1:]]),
             "values compared": spaces[options.measures.space],
         }
-        if options.ours:
+        if options.renders:
             run["face model"] = face_model(self.photo).credit
         content = {**run, "protocol": self.protocol.name, **summary.as_dict()}
         texts = {
@@ -249,7 +235,5 @@ class Evaluation(Job):
                 temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
         print_tables(summary)
         if not all(row.person for row in rows):
-            log.info("who is in which image is not known: no intervals; give --facts, a CSV with name,person")
-        log.info(
-            "%s shows the images, worst cases first; %s has a row for each", folder / PAGE, folder / IMAGES
-        )
+            log.info("no confidence intervals: people are unknown; use --facts with a CSV of name,person")
+        log.info("wrote %s and %s", folder / PAGE, folder / IMAGES)

@@ -1,17 +1,14 @@
-"""The images that are measured: pairs of a dataset, photos, and couples of both.
-
-All, every Nth, or as many as the paper measured.
-"""
+"""Select the measured images: pairs of a dataset, photos, and couples of both."""
 
 import logging
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, expand_inputs
-from facerf_cli.dataset.dataset import Dataset, read_dataset
+from facerf_cli.dataset.dataset import read_dataset
 from facerf_cli.dataset.pairs import Pair, pairs_path, read_pairs
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.evaluation.folders import read_facts
@@ -20,7 +17,7 @@ from facerf_cli.evaluation.people import DatasetPerson, PhotoFaces
 from facerf_cli.run.logs import LOGGER_NAME
 
 PairsByPerson = Mapping[str, Sequence[Pair]]
-Groups = Mapping[str, Sequence[Sequence[Pair]]]  # by person: pairs whose sources are compared together
+Groups = Mapping[str, Sequence[Sequence[Pair]]]  # by person; the sources of a group are compared together
 T = TypeVar("T")
 log = logging.getLogger(LOGGER_NAME)
 
@@ -31,10 +28,20 @@ _PAPER_PHOTOS, _PAPER_COUPLES, _PAPER_MAPS, _PAPER_SAME, _PAPER_DIFFERENT = 130,
 def choose_people(
     choose: Callable[[PairsByPerson, FaceOptions], Groups], options: FaceOptions, inputs: Sequence[str]
 ) -> Chosen:
-    """Choose groups of pairs of the people of a dataset."""
+    """Choose groups of pairs for each person of a dataset, with the function `choose`."""
     assert options.dataset is not None
     dataset = read_dataset(options.dataset)
-    groups = choose(pairs_of_split(dataset, options), options)
+    pairs: dict[str, list[Pair]] = {}
+    for pair in read_pairs(dataset):
+        in_pose = not options.same_pose or pair.source_camera == pair.target_camera
+        if options.split in ("all", pair.split) and in_pose:
+            pairs.setdefault(pair.subject, []).append(pair)
+    if not pairs:
+        raise UsageError(
+            f"{dataset.folder}: no pairs in the split {options.split}; run facerf relight-dataset, or "
+            "use another --split"
+        )
+    groups = choose(pairs, options)
     items = {
         options.item(options.dataset / "olat" / name, name): DatasetPerson(dataset, name, groups=groups[name])
         for name in sorted(groups)
@@ -44,7 +51,7 @@ def choose_people(
 
 
 def choose_sources(options: FaceOptions, inputs: Sequence[str]) -> Chosen:
-    """Choose sources of a dataset, or photos: all, or up to the paper's number."""
+    """Choose sources of a dataset, or photos; with --preset, at most the paper's number."""
     if options.dataset:
         return choose_people(source_pairs, options, inputs)
     photos = collect_items(inputs, options.output, PHOTO_SUFFIXES)
@@ -52,19 +59,17 @@ def choose_sources(options: FaceOptions, inputs: Sequence[str]) -> Chosen:
     described = {} if options.facts is None else read_facts(options.facts)
     if unknown := sorted({re.sub(r"_face\d+$", "", name) for name in described} - names):
         raise InputError(
-            f"{options.facts}: {unknown[0]} is no photo of this run; give names such as {min(names)}"
+            f"{options.facts}: no photo of this run is named {unknown[0]}; use names such as {min(names)}"
         )
     most = _up_to(_PAPER_PHOTOS, len(photos), "photos") if options.preset else len(photos)
     return Chosen({photo: PhotoFaces((photo,)) for photo in photos[:most]})
 
 
 def choose_couples(options: FaceOptions, inputs: Sequence[str]) -> Chosen:
-    """Choose couples of sources of a dataset, or of photos: all, or up to the paper's number."""
+    """Choose couples of a dataset's sources, or of photos; with --preset, at most the paper's number."""
     if options.dataset:
         return choose_people(couple_pairs, options, inputs)
-    by_person: dict[str, list[tuple[Item, Item]]] = {}
-    for person, couple in couples_of_photos(inputs, options.output):
-        by_person.setdefault(person, []).append(couple)
+    by_person = couples_of_photos(inputs, options.output)
     if options.preset:
         by_person = evenly(by_person, _PAPER_COUPLES, "couples of photos")
     items = {}
@@ -75,23 +80,8 @@ def choose_couples(options: FaceOptions, inputs: Sequence[str]) -> Chosen:
     return Chosen(items, tuple(couple.items[1].input_path for couple in items.values()))
 
 
-def pairs_of_split(dataset: Dataset, options: FaceOptions) -> dict[str, list[Pair]]:
-    """The pairs of a split, or of all, by person; raises UsageError if there are none."""
-    pairs: dict[str, list[Pair]] = {}
-    for pair in read_pairs(dataset):
-        in_pose = not options.same_pose or pair.source_camera == pair.target_camera
-        if options.split in ("all", pair.split) and in_pose:
-            pairs.setdefault(pair.subject, []).append(pair)
-    if not pairs:
-        raise UsageError(
-            f"{dataset.folder}: no pairs in the split {options.split}; run facerf relight-dataset, or "
-            "give another --split"
-        )
-    return pairs
-
-
 def source_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
-    """Choose every Nth pair of a dataset, or as many sources as the paper measured, evenly over people."""
+    """Choose every Nth pair; with --preset, at most the paper's number of sources."""
     if options.preset:
         chosen = evenly(pairs, _PAPER_PHOTOS, "sources")
     else:
@@ -101,7 +91,7 @@ def source_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
 
 
 def olat_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
-    """Choose every Nth pair, or up to the paper's number of pairs and of maps, evenly over people."""
+    """Choose every Nth pair; with --preset, at most the paper's numbers of pairs and maps."""
     if not options.preset:
         return source_pairs(pairs, options)
     maps = list(dict.fromkeys(pair.envmap for members in pairs.values() for pair in members))
@@ -122,7 +112,7 @@ def olat_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
 
 
 def couple_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
-    """Choose every Nth couple of each person, or up to the paper's number evenly over people."""
+    """Choose every Nth couple of each person; with --preset, at most the paper's number."""
     couples = {name: members for name, own in pairs.items() if (members := couples_of(own))}
     if not couples:
         raise UsageError(
@@ -134,7 +124,7 @@ def couple_pairs(pairs: PairsByPerson, options: FaceOptions) -> Groups:
 
 
 def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
-    """Pair up a person's pairs, each once, in order: sources of different cameras and different maps."""
+    """Combine a person's pairs into couples of different cameras and maps; use each pair at most once."""
     couples: list[tuple[Pair, Pair]] = []
     waiting: list[Pair] = []
     for pair in pairs:
@@ -149,27 +139,24 @@ def couples_of(pairs: Sequence[Pair]) -> list[tuple[Pair, Pair]]:
 
 
 def evenly(groups: Mapping[str, Sequence[T]], paper: int, what: str) -> dict[str, list[T]]:
-    """Choose the first of each group, then the second of each, and so on, up to the paper's number in all."""
+    """Choose the first member of each group, then the second, and so on, up to the paper's total."""
     most = _up_to(paper, sum(map(len, groups.values())), what)
-    rounds = sorted((place, name) for name, members in groups.items() for place in range(len(members)))
+    rounds = sorted((index, name) for name, members in groups.items() for index in range(len(members)))
     chosen: dict[str, list[T]] = {name: [] for name in groups}
-    for place, name in rounds[:most]:
-        chosen[name].append(groups[name][place])
+    for index, name in rounds[:most]:
+        chosen[name].append(groups[name][index])
     return {name: members for name, members in chosen.items() if members}
 
 
-def _up_to(paper: int, found: int, what: str) -> int:
-    """The paper's number, or what there is; a line says where that is less."""
-    if found < paper:
-        log.warning("%d %s are measured, all there are; the paper measured %d", found, what, paper)
-    return min(paper, found)
+def _up_to(paper: int, available: int, what: str) -> int:
+    """Return the paper's number, or the available number after a warning if it is smaller."""
+    if available < paper:
+        log.warning("measuring all %d %s; the paper measured %d", available, what, paper)
+    return min(paper, available)
 
 
-def couples_of_photos(inputs: Sequence[str], output: Path) -> Iterator[tuple[str, tuple[Item, Item]]]:
-    """Yield couples of photos with the name of their person.
-
-    They are two files each as they are named, and two each of a folder in its order.
-    """
+def couples_of_photos(inputs: Sequence[str], output: Path) -> dict[str, list[tuple[Item, Item]]]:
+    """Combine photos into couples by person: consecutive files of the command line or of a folder."""
     inputs = list(expand_inputs(inputs))
     items = collect_items(inputs, output, PHOTO_SUFFIXES)
     by_path = {os.path.abspath(item.input_path): item for item in items}
@@ -178,8 +165,9 @@ def couples_of_photos(inputs: Sequence[str], output: Path) -> Iterator[tuple[str
     for item in items:
         if item not in named:
             groups.setdefault(item.input_path.parent, []).append(item)
-    given: set[frozenset[Path]] = set()
-    advice = "give two of each person, A B A B ..., or a folder for each person"
+    known: set[frozenset[Path]] = set()
+    couples: dict[str, list[tuple[Item, Item]]] = {}
+    advice = "pass two photos per person, A B A B ..., or one folder per person"
     for folder, members in groups.items():
         if len(members) % 2:
             raise UsageError(
@@ -187,9 +175,10 @@ def couples_of_photos(inputs: Sequence[str], output: Path) -> Iterator[tuple[str
             )
         for first, second in zip(members[::2], members[1::2], strict=True):
             files = frozenset(item.input_path.resolve() for item in (first, second))
-            if len(files) < 2 or files in given:
-                raise UsageError(f"{first.input_path} and {second.input_path}: given twice; {advice}")
-            given.add(files)
-            place = Path(first.name).parent.as_posix()
-            of_folder = folder.resolve().name if folder and place == "." else place
-            yield (of_folder if folder else first.name), (first, second)
+            if len(files) < 2 or files in known:
+                raise UsageError(f"{first.input_path} and {second.input_path}: passed twice; {advice}")
+            known.add(files)
+            subfolder = Path(first.name).parent.as_posix()
+            of_folder = folder.resolve().name if folder and subfolder == "." else subfolder
+            couples.setdefault(of_folder if folder else first.name, []).append((first, second))
+    return couples

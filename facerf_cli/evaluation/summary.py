@@ -1,4 +1,4 @@
-"""The tables of a run from its rows: each method over all images and by every fact, and against the first."""
+"""Tables of a run: statistics of each method, over all images and per fact, and differences to the first."""
 
 import math
 import re
@@ -17,43 +17,37 @@ from facerf_cli.evaluation.metrics import Interval, mean_interval
 from facerf_cli.run.logs import counted
 
 ALL = "all images"
-_MOST_VALUES = 12  # of a fact that breaks tables down, where the protocol names none
-_PIPED_WIDTH = 100  # columns of text where standard output is no terminal
+_MOST_VALUES = 12  # a fact with more values breaks down no table, unless the protocol names it
+_PIPED_WIDTH = 100  # columns of text if standard output is not a terminal
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The contents of a protocol's tables.
-
-    `title` is the heading. The first of `metrics` decides which images are the best and the worst. `by` names
-    the facts, as text, that break the tables down; empty: all of few values. `notes` are
-    printed below.
-    """
+    """Contents of a protocol's tables."""
 
     title: str
-    metrics: tuple[str, ...] = ("si_mse",)
-    by: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    metrics: tuple[str, ...] = ("si_mse",)  # the first one ranks the images in the report
+    by: tuple[str, ...] = ()  # text facts that break down the tables; (): all facts with few values
+    notes: tuple[str, ...] = ()  # printed below the tables
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One metric of one method over a group of images, and against the first method.
+    """Statistics of one metric of one method over a group of images.
 
-    Values that are not finite are counted in `left_out`. `difference` is this method's value less the first
-    one's, on the images that both have, and `won` the share of these on which this method is better; a tie
-    counts half. The first method has none, nor one without such images.
+    `difference` is this method's value minus the first method's, on the images that both have; `won` is the
+    fraction of these images where this method is better, counting ties half. The first method has neither.
     """
 
     interval: Interval
-    left_out: int
+    left_out: int  # number of non-finite values, which the statistics exclude
     difference: Interval | None = None
     won: float = math.nan
 
 
 @dataclass(frozen=True)
 class CaseGroup:
-    """The images whose `fact` is `value`; all images if the fact is ''."""
+    """Statistics of the images whose `fact` is `value`; of all images if the fact is ''."""
 
     fact: str
     value: str
@@ -62,34 +56,33 @@ class CaseGroup:
 
 @dataclass(frozen=True)
 class Summary:
-    """All tables of a run: of each metric the rows of every group of images."""
+    """Tables of a run."""
 
     layout: Layout
     methods: tuple[str, ...]
-    metrics: tuple[str, ...]  # the layout's first, then all others that were measured
-    groups: tuple[CaseGroup, ...]  # the first is of all images
+    metrics: tuple[str, ...]  # the layout's metrics, then all others that were measured
+    groups: tuple[CaseGroup, ...]  # all images, then each value of each fact
     images: int
-    persons: int
+    persons: int  # 0 if they are unknown
 
     @property
     def size(self) -> str:
-        """Its images and people in words; of unknown people the images alone."""
         images = counted(self.images, "image")
         return f"{images} of {counted(self.persons, 'person')}" if self.persons else images
 
     @property
     def shown(self) -> list[str]:
-        """The metrics that have a table."""
+        """Metrics that have a table."""
         return [metric for metric in self.layout.metrics if metric in self.metrics]
 
     @property
     def columns(self) -> list[str]:
-        """The headings of the tables; those of differences only where there are several methods."""
+        """Headings of the tables; a single method has no differences."""
         names = ["images", "method", "n", "mean", "sd", "median", "95 % interval", "vs first", "won"]
         return names if len(self.methods) > 1 else names[:7]
 
     def table(self, metric: str) -> list[list[str]]:
-        """The rows of a metric: the methods of each group; only the first metric is broken down by facts."""
+        """Return the rows of a metric, by group and method; only the first metric is broken down by facts."""
         rows = []
         for group in self.groups if metric == self.shown[0] else self.groups[:1]:
             title = f"{group.fact}: {group.value}" if group.fact else ALL
@@ -123,7 +116,6 @@ class Summary:
 
 
 def _entry(cell: Cell) -> dict[str, Any]:
-    """The figures of a cell for JSON."""
     entry = cell.interval.as_dict() | {"left_out": cell.left_out}
     if cell.difference is None:
         return entry
@@ -131,13 +123,8 @@ def _entry(cell: Cell) -> dict[str, Any]:
 
 
 def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
-    """Sum up a run's rows, at least one. Only the layout's metrics are broken down by facts.
-
-    Raises ValueError where an image and a method have two rows.
-    """
-    keys = {(row.case, row.method) for row in rows}
-    if len(keys) < len(rows):
-        raise ValueError(f"{len(rows) - len(keys)} images were measured twice")
+    """Compute the statistics of at least one row. Facts break down only the layout's metrics."""
+    assert len({(row.case, row.method) for row in rows}) == len(rows), "an image was measured twice"
     measured = dict.fromkeys(name for row in rows for name in row.values)
     narrow = tuple(name for name in layout.metrics if name in measured)
     metrics = tuple(dict.fromkeys([*narrow, *measured]))
@@ -149,7 +136,7 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
         for row in rows:
             if fact in row.facts:
                 by_value.setdefault(str(row.facts[fact]), []).append(row)
-        if not layout.by and len(by_value) > _MOST_VALUES:  # such as the files of maps
+        if not layout.by and len(by_value) > _MOST_VALUES:  # such as the names of maps
             continue
         for value in sorted(by_value, key=natural):
             groups.append(CaseGroup(fact, value, _cells(by_value[value], methods, narrow)))
@@ -157,22 +144,22 @@ def summarise(layout: Layout, rows: Sequence[Row]) -> Summary:
     notes = layout.notes
     if dark := {row.case for row in rows if math.isnan(row.values.get("si_mse", 0.0))}:
         notes += (
-            f"Of {counted(len(dark), 'image')} the truth is near black (root mean square below "
-            f"{NEAR_BLACK}): left out of Si-MSE.",
+            f"Si-MSE excludes {counted(len(dark), 'image')} with a near-black ground truth (root mean square "
+            f"below {NEAR_BLACK}).",
         )
     layout = replace(layout, notes=notes)
     return Summary(layout, methods, metrics, tuple(groups), len(cases), 0 if "" in persons else len(persons))
 
 
 def natural(text: str) -> list[tuple[int, float, str]]:
-    """A sort key that puts '5°' before '10°'."""
+    """Return a sort key that puts '5°' before '10°'."""
     parts = re.split(r"(\d+(?:\.\d+)?)", text)
     return [(0, float(part), "") if index % 2 else (1, 0.0, part) for index, part in enumerate(parts)]
 
 
 def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) -> dict[str, dict[str, Cell]]:
-    """The cells that have finite values, by metric and method."""
-    found: dict[str, dict[str, Cell]] = {metric: {} for metric in metrics}
+    """Return the cells with at least one finite value, by metric and method."""
+    cells: dict[str, dict[str, Cell]] = {metric: {} for metric in metrics}
     for metric in metrics:
         measured = [row for row in rows if metric in row.values]
         finite = [row for row in measured if math.isfinite(row.values[metric])]
@@ -187,30 +174,24 @@ def _cells(rows: Sequence[Row], methods: Sequence[str], metrics: Sequence[str]) 
                 both = [
                     (row.person, row.values[metric] - firsts[row.case]) for row in ours if row.case in firsts
                 ]
-                cell = replace(
-                    cell, difference=_interval(both), won=_won(metric, [apart for _, apart in both])
-                )
-            found[metric][method] = cell
-    return found
+                sign = -1.0 if METRICS[metric].lower_is_better else 1.0
+                won = [0.5 if change == 0 else float(sign * change > 0) for _, change in both]
+                cell = replace(cell, difference=_interval(both), won=sum(won) / len(won) if won else math.nan)
+            cells[metric][method] = cell
+    return cells
 
 
 def _interval(values: Sequence[tuple[str, float]]) -> Interval | None:
-    """The mean of (person, value) pairs and its interval, NaN where somebody is not known."""
+    """Return the mean of (person, value) pairs with its interval, which is NaN if a person is unknown."""
     known = all(person for person, _ in values)
     return mean_interval(values if known else [("", value) for _, value in values])
 
 
-def _won(metric: str, differences: Sequence[float]) -> float:
-    better = -1.0 if METRICS[metric].lower_is_better else 1.0
-    won = [0.5 if apart == 0 else float(better * apart > 0) for apart in differences]
-    return sum(won) / len(won) if won else math.nan
-
-
 def print_tables(summary: Summary) -> None:
-    """Print a table for each of the layout's metrics to standard output; plain text if it is piped."""
+    """Print one table per metric of the layout to standard output, as plain text if it is piped."""
     terminal = sys.stdout.isatty()
     console = Console(file=sys.stdout, width=None if terminal else _PIPED_WIDTH, highlight=False)
-    plain = not terminal or console.width <= _PIPED_WIDTH  # rules take columns that a narrow terminal lacks
+    plain = not terminal or console.width <= _PIPED_WIDTH  # a narrow terminal has no room for rules
     console.print(Text(f"{summary.layout.title}: {summary.size}", style="bold"))
     for metric in summary.shown:
         table = Table(
@@ -233,24 +214,24 @@ def print_tables(summary: Summary) -> None:
 
 
 def cell_words(cell: Cell, digits: int) -> list[str]:
-    """Mean, sd, median and interval of a cell, its difference to the first method, and the share won.
+    """Format a cell: mean, sd, median, interval, difference to the first method with its interval, and `won`.
 
-    The difference is followed by its interval. Both have as many digits after the point as show two of their
-    uncertainty, and at most `digits`. The last two are empty for the first method.
+    Values have two significant digits of their uncertainty, at most `digits` after the point. The last two
+    texts are empty for the first method.
     """
-    interval, apart = cell.interval, cell.difference
+    interval, difference = cell.interval, cell.difference
     most = _decimals(interval, digits)
     words = [f"{value:.{most}f}" for value in (interval.mean, interval.sd, interval.median)]
-    known = not math.isnan(interval.low)  # NaN with one person, or where nobody is named
+    known = not math.isnan(interval.low)  # NaN for one person or unknown people
     words.append(f"{interval.low:.{most}f} to {interval.high:.{most}f}" if known else "one person?")
-    if apart is None:
+    if difference is None:
         return [*words, "", ""]
-    most = _decimals(apart, digits)
-    between = f" ({apart.low:+.{most}f} to {apart.high:+.{most}f})" if known else ""
-    return [*words, f"{apart.mean:+.{most}f}{between}", f"{100 * cell.won:.0f} %"]
+    most = _decimals(difference, digits)
+    between = f" ({difference.low:+.{most}f} to {difference.high:+.{most}f})" if known else ""
+    return [*words, f"{difference.mean:+.{most}f}{between}", f"{100 * cell.won:.0f} %"]
 
 
 def _decimals(interval: Interval, most: int) -> int:
-    """Digits after the point that show two significant ones of the interval's half width; at most `most`."""
+    """Return the digits after the point that show two significant digits of the interval's half width."""
     half = (interval.high - interval.low) / 2
     return min(most, max(0, 1 - math.floor(math.log10(half)))) if half > 0 else most

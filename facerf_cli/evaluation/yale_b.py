@@ -1,9 +1,9 @@
-"""The cases of Extended Yale B: sources, targets and the mask, for real faces under real point lights.
+"""Protocol `yale-b`: relight real faces of Extended Yale B to real point lights.
 
-A source is an image under one flash, or under a soft light summed from the subject's own images; its targets
-are single flashes or environments. Images are close to linear in light and taken as linear. All definitions
-are those of the benchmark whose README publishes other methods' figures, so that figures can be compared;
-directions are in camera space (docs/design.md).
+A source is an image under one flash, or under a soft light, summed from the subject's images; its targets are
+single flashes or environments. The images are nearly linear in light and treated as linear. All definitions
+match the benchmark that publishes other methods' results, so results are comparable. Directions are in camera
+space (docs/design.md).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,26 +25,26 @@ from facerf_cli.light.sphere import azel_to_direction
 from facerf_cli.person import Target
 
 SETTINGS_SUBJECTS = ("yaleB05", "yaleB15", "yaleB22", "yaleB30")  # settings may be chosen on these
-ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # between flash and camera
+ANGLES_DEG = (0, 15, 30, 45, 60, 80)  # classes of the angle between flash and camera axis
 FRONTAL = Flash(0, 0)
 SOFT_SOURCES = ("dome", "win_left", "win_right", "overhead")
 ENVIRONMENT_SOURCES = ("frontal", "win_left")
 ENVIRONMENTS = ("env_key_fill", "env_under", "env_two_side", "env_sky")
-_CORE = tuple(  # targets of the soft sources
+_SOFT_TARGETS = tuple(
     Flash(*angles)
     for angles in (
         (0, 0), (-25, 0), (25, 0), (-50, 0), (50, 0), (-70, 0), (70, 0), (-35, 40), (35, 40), (0, -35)
     )
 )  # fmt: skip
-_WIDEST_DEG, _HIGHEST_DEG = 75, 40  # beyond these angles most of the face is dark
+_WIDEST_DEG, _HIGHEST_DEG = 75, 40  # beyond these angles, most of the face is dark
 _SPHERE_POINTS = 20_000  # samples of an environment
-_WHITE, _WHITE_PERCENTILE = 0.9, 99  # an environment's image is exposed so that bright skin has this value
+_WHITE, _WHITE_PERCENTILE = 0.9, 99  # value of bright skin in an environment's image, and its percentile
 
 Radiance = Callable[[np.ndarray], np.ndarray]  # from directions [N, 3] to values [N]
 
 
 def _lobe(azimuth_deg: float, elevation_deg: float, sharpness: float) -> Radiance:
-    """A soft light around a direction, 1 at its centre."""
+    """Return a soft light around a direction, with value 1 at its centre."""
     angles = torch.tensor([azimuth_deg, elevation_deg], dtype=torch.float64)
     centre = azel_to_direction(angles[0], angles[1]).numpy()
     return lambda directions: np.exp(sharpness * (directions @ centre - 1))
@@ -54,7 +54,7 @@ def _ahead(directions: np.ndarray) -> np.ndarray:
     return (directions[:, 2] > 0).astype(float)
 
 
-_RADIANCES: Mapping[str, tuple[tuple[float, Radiance], ...]] = {  # weighted sums, of any unit
+_RADIANCES: Mapping[str, tuple[tuple[float, Radiance], ...]] = {  # weighted sums in an arbitrary unit
     "dome": ((1, _ahead),),
     "win_left": ((1, _lobe(-60, 15, 8)), (0.06, _ahead)),
     "win_right": ((1, _lobe(60, 15, 8)), (0.06, _ahead)),
@@ -68,16 +68,16 @@ _RADIANCES: Mapping[str, tuple[tuple[float, Radiance], ...]] = {  # weighted sum
 
 @dataclass(frozen=True)
 class Relighting:
-    """A source and its target light, each by name; `column` is that of the tables."""
+    """Names of a source and its target light."""
 
-    column: str  # 'frontal', 'soft' or 'environment'
+    column: str  # of the tables: 'frontal', 'soft' or 'environment'
     source: str
     light: str  # a flash or an environment
 
     def case(self, subject: str) -> Case:
-        """The case, named by the path of its prediction in the benchmark.
+        """Return the case, named like the benchmark's file of its prediction.
 
-        Angles are those between a flash and the camera's axis; classes are of the frontal source alone.
+        Only cases with the frontal source have an angle class.
         """
         facts: dict[str, str | float] = {"column": self.column, "source": self.source}
         flash = Flash.named(self.light)
@@ -91,10 +91,7 @@ class Relighting:
 
 
 class YaleSubject:
-    """A subject of the database: images under the `flashes` that have an undamaged one, and their sums.
-
-    `olats` [L, 192, 168] are those images, grey, in 0..1.
-    """
+    """Undamaged grey images `olats` [L, 192, 168] in 0..1 of a subject under `flashes`, and their sums."""
 
     def __init__(self, database: YaleB, name: str) -> None:
         self._folder = database.folder / name
@@ -102,100 +99,99 @@ class YaleSubject:
         self._weights = {light: environment_weights(light, self.flashes) for light in _RADIANCES}
 
     def image(self, light: str) -> np.ndarray:
-        """The subject's image [192, 168], float32, under a flash by name, 'frontal', or an environment.
+        """Return the subject's image [192, 168], float32, under a flash, 'frontal' or an environment.
 
-        Raises InputError for a flash without an undamaged image.
+        An environment's image is a weighted sum, exposed for bright skin and clipped at white. Raises
+        InputError for a flash without an undamaged image.
         """
         flash = FRONTAL if light == "frontal" else Flash.named(light)
         if flash is None:
-            return self._exposed(light)
+            total = np.einsum("l,lij->ij", self.weights(light), self.olats)
+            white = np.percentile(total[face_mask()], _WHITE_PERCENTILE)
+            return (total * _WHITE / white).clip(0, 1).astype(np.float32)
         if flash not in self.flashes:
-            raise InputError(f"{self._folder}: no undamaged image under {flash.name}; leave it out")
+            raise InputError(f"{self._folder}: no undamaged image under {flash.name}; remove the subject")
         return self.olats[self.flashes.index(flash)]
 
-    def _exposed(self, environment: str) -> np.ndarray:
-        """The images' weighted sum under an environment, bright skin at 0.9, clipped at white."""
-        total = np.einsum("l,lij->ij", self.weights(environment), self.olats)
-        white = np.percentile(total[face_mask()], _WHITE_PERCENTILE)
-        return (total * _WHITE / white).clip(0, 1).astype(np.float32)
-
     def weights(self, light: str) -> np.ndarray:
-        """The weight [L] of each flash in a target, which is a flash or an environment; they sum to 1."""
+        """Return the weight [L] of each flash in a flash or an environment; the sum is 1."""
         if light in self._weights:
             return self._weights[light]
         return np.array([float(flash.name == light) for flash in self.flashes])
 
     def relightings(self) -> Iterator[Relighting]:
-        """Yield every case of the subject."""
         for flash in self.flashes:
             within = abs(flash.azimuth_deg) <= _WIDEST_DEG and abs(flash.elevation_deg) <= _HIGHEST_DEG
             if within and flash != FRONTAL:
                 yield Relighting("frontal", "frontal", flash.name)
         for source in SOFT_SOURCES:
-            yield from (Relighting("soft", source, flash.name) for flash in _CORE if flash in self.flashes)
+            targets = [flash.name for flash in _SOFT_TARGETS if flash in self.flashes]
+            yield from (Relighting("soft", source, target) for target in targets)
         for source in ENVIRONMENT_SOURCES:
             yield from (Relighting("environment", source, environment) for environment in ENVIRONMENTS)
 
 
 def environment_weights(name: str, flashes: Sequence[Flash]) -> np.ndarray:
-    """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L]; the sum is 1."""
-    # Directions on a golden spiral about +y, as in the benchmark: the cells depend on them.
+    """Sum an environment's radiance over each flash's Voronoi cell on the sphere [L], normalised to 1."""
+    # The benchmark's samples, on which the cells depend: a golden spiral about +y.
     index = np.arange(_SPHERE_POINTS) + 0.5
     y = 1 - 2 * index / _SPHERE_POINTS
     ring, angle = np.sqrt(1 - y * y), np.pi * (1 + 5**0.5) * index
     directions = np.stack([ring * np.cos(angle), y, ring * np.sin(angle)], 1)
     nearest = np.argmax(directions @ np.stack([flash.direction for flash in flashes]).T, 1)
-    radiance = sum(share * part(directions) for share, part in _RADIANCES[name])
+    radiance = sum(weight * part(directions) for weight, part in _RADIANCES[name])
     summed = np.bincount(nearest, weights=radiance, minlength=len(flashes))
     return summed / summed.sum()
 
 
 def face_mask() -> np.ndarray:
-    """The mask of the comparison, bool [192, 168]: one ellipse for all images."""
+    """Return the compared pixels of all images, bool [192, 168]: an ellipse."""
     y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX] + 0.5
     return ((x - 84) / 70) ** 2 + ((y - 98) / 88) ** 2 <= 1
 
 
 def choose_subjects(options: YaleOptions, inputs: Sequence[str]) -> Chosen:
-    """Choose subjects of a folder of the database, all if none are named."""
+    """Choose the named subjects of the database's folder, by default all."""
     database = read_yale_b(Path(inputs[0]), None if options.shifts is None else read_shifts(options.shifts))
-    if unknown := sorted(set(options.subjects) - set(database.subjects)):
-        there = ", ".join(database.subjects)
-        raise UsageError(f"--subjects {', '.join(unknown)}: not in {database.folder}; give some of {there}")
-    chosen = [name for name in database.subjects if not options.subjects or name in options.subjects]
+    subjects = database.subjects
+    if unknown := sorted(set(options.subjects) - set(subjects)):
+        raise UsageError(
+            f"--subjects {', '.join(unknown)}: not in {database.folder}; choose from {', '.join(subjects)}"
+        )
+    chosen = [name for name in subjects if not options.subjects or name in options.subjects]
     return Chosen({options.item(database.folder / name, name): (database, name) for name in chosen})
 
 
-def compare_subject(database: YaleB, name: str, bench: Bench, room: float = 0.0) -> Iterator[Comparison]:
-    """Yield all of a subject's cases, a source at a time: each method's image next to the subject's own.
+def compare_subject(options: YaleOptions, bench: Bench, subject: tuple[YaleB, str]) -> Iterator[Comparison]:
+    """Yield all cases of a subject, source by source: each method's image and the subject's true image.
 
-    A subject's sources share the landmarks, or the box, of its frontal image. `room` is what comes back from
-    all around, as a share of what a flash sends. Raises InputError where no face is found, or an image cannot
-    be read.
+    All sources use the landmarks, or the box, of the subject's frontal image. Raises InputError without a
+    face, and for unreadable images.
     """
-    subject = YaleSubject(database, name)
-    relightings = list(subject.relightings())
-    face = bench.find(_rgb(subject.image("frontal")), str(database.folder / name))
-    places_px = None if bench.geometry == "network" else face.landmarks_px
-    for source in dict.fromkeys(one.source for one in relightings):
-        of_source = [one for one in relightings if one.source == source]
-        photo = _rgb(subject.image(source))
-        lights = _lights(subject, of_source, room)
+    database, name = subject
+    images = YaleSubject(database, name)
+    relightings = list(images.relightings())
+    face = bench.find(_rgb(images.image("frontal")), str(database.folder / name))
+    landmarks_px = None if bench.geometry == "network" else face.landmarks_px
+    for source in dict.fromkeys(relighting.source for relighting in relightings):
+        of_source = [relighting for relighting in relightings if relighting.source == source]
+        photo = _rgb(images.image(source))
+        lights = _lights(images, of_source, options.room)
         relit = {
             method.name: [
                 image.mean(-1).clip(min=0) for image in method.images(photo, head, lights, Target())
             ]
             for method, head in bench.heads(photo, face)
         }
-        for row, one in enumerate(of_source):
+        for row, relighting in enumerate(of_source):
             yield Comparison(
-                case=one.case(name),
-                truth=_rgb(subject.image(one.light)),
+                case=relighting.case(name),
+                truth=_rgb(images.image(relighting.light)),
                 mask=face_mask().astype(np.float32),
-                predictions={method: _rgb(images[row]) for method, images in relit.items()},
+                predictions={method: _rgb(greys[row]) for method, greys in relit.items()},
                 source=photo,
-                landmarks_px=places_px,
-                source_face=None if places_px is None else (face_mask(), places_px),
+                landmarks_px=landmarks_px,
+                source_face=None if landmarks_px is None else (face_mask(), landmarks_px),
             )
 
 
@@ -204,13 +200,13 @@ def _rgb(grey: np.ndarray) -> np.ndarray:
 
 
 def _lights(subject: YaleSubject, relightings: Sequence[Relighting], room: float) -> Light:
-    """A sum of flashes for each target, with the room's share of each."""
-    weights = torch.from_numpy(np.stack([subject.weights(one.light) for one in relightings])).float()
+    """Return the targets as sums of flashes, each with uniform light of the fraction `room`."""
+    weights = torch.from_numpy(np.stack([subject.weights(target.light) for target in relightings])).float()
     used = weights.sum(0) > 0
     directions = torch.from_numpy(np.stack([flash.direction for flash in subject.flashes])).float()[used]
     weights = weights[:, used]
     if room:
-        around, share = far_samples(StudioLight())
+        around, weight = far_samples(StudioLight())
         directions = torch.cat([directions, around])
-        weights = torch.cat([weights, room * share * weights.sum(1, keepdim=True)], 1)
+        weights = torch.cat([weights, room * weight * weights.sum(1, keepdim=True)], 1)
     return Light(directions, weights[..., None].expand(-1, -1, 3))

@@ -1,4 +1,4 @@
-"""The square crop of a photo around a face: axis-aligned, never rotated (paper, 'Dataset').
+"""Square, axis-aligned crop of a photo around a face (paper, 'Dataset').
 
 Pixel positions follow `raster/camera.py`: centres at index + `PIXEL_CENTRE`, origin at the top-left corner.
 """
@@ -15,22 +15,22 @@ from facerf_cli.image.strips import strips
 from facerf_cli.raster.camera import PIXEL_CENTRE, Camera, crop_camera
 
 Box = tuple[float, float, float, float]  # left, top, right, bottom in a photo's pixels
-# A detector's box in `from_landmarks` crops: the crop's side in sides of the box,
-# and how far above the box's centre the crop's lies.
+# A `from_landmarks` crop relative to a detector's box: the crop's side, and the height of its centre above
+# the box's centre, both in units of the box's side.
 _PER_BOX, _ABOVE_BOX = 1.48, 0.02
-MARGIN = 1.28  # the square's side over the extent of chin, temples and forehead
-GIVE_LANDMARKS = "give its landmarks (--landmarks FILE)"
-_LARGEST = 16  # sides of a crop over the photo's longer side; more would resample beyond all bounds
+MARGIN = 1.28  # the crop's side relative to the extent of chin, temples and forehead
+PASS_LANDMARKS = "pass its landmarks (--landmarks FILE)"
+_LARGEST = 16  # largest crop side relative to the photo's longer side; bounds the cost of resampling
 _SMALLEST_FACE_PX = 4.0  # landmarks within fewer pixels cannot be a face
 _EYES, _MOUTH = slice(36, 48), slice(48, 68)
-# The hairline lies this far above the eyes, in units of the distance from the eyes to the mouth.
+# Height of the hairline above the eyes, in units of the distance from the eyes to the mouth.
 _EYES_M, _MOUTH_M = LANDMARKS_M[_EYES].mean(0), LANDMARKS_M[_MOUTH].mean(0)
 _FOREHEAD = (TOP_M - _EYES_M[1]) / (_EYES_M[1] - _MOUTH_M[1])
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of a photo, `side_px` photo pixels wide from (x0_px, y0_px), seen as size_px x size_px."""
+    """Square of `side_px` photo pixels from (x0_px, y0_px), resampled to size_px x size_px crop pixels."""
 
     x0_px: float
     y0_px: float
@@ -39,39 +39,39 @@ class Crop:
 
     @property
     def camera(self) -> Camera:
-        """The fixed camera of the crop."""
+        """Fixed camera of the crop."""
         return crop_camera(self.size_px)
 
     @property
     def scale(self) -> float:
-        """Crop pixels for each photo pixel."""
+        """Crop pixels per photo pixel."""
         return self.size_px / self.side_px
 
     def of_scaled(self, scale: float) -> "Crop":
-        """The same square of the photo when that is scaled."""
+        """Return the same crop of the scaled photo."""
         return Crop(self.x0_px * scale, self.y0_px * scale, self.side_px * scale, self.size_px)
 
     def to_crop(self, photo_px: np.ndarray) -> np.ndarray:
-        """Convert photo positions [..., 2] to the crop's pixels."""
+        """Convert photo positions [..., 2] to crop pixels."""
         return (np.asarray(photo_px, np.float64) - (self.x0_px, self.y0_px)) * self.scale
 
     def to_photo(self, crop_px: np.ndarray) -> np.ndarray:
-        """Convert crop positions [..., 2] to the photo's pixels."""
+        """Convert crop positions [..., 2] to photo pixels."""
         return np.asarray(crop_px, np.float64) / self.scale + (self.x0_px, self.y0_px)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """Resample an image [H, W, C] to float32 [size, size, C]; beyond its border the edge pixels repeat.
+        """Resample an image [H, W, C] to float32 [size, size, C]; edge pixels repeat beyond the border.
 
-        The filter is Catmull-Rom, widened where a crop pixel is larger than a photo pixel. The result is
-        clipped to the range of the image region, so that radiance stays non-negative. Raises InputError for a
-        crop that is larger than `_LARGEST` photos.
+        The filter is Catmull-Rom, widened if a crop pixel is larger than a photo pixel. The result is clipped
+        to the range of the image region, so that radiance stays non-negative. Raises InputError for a crop
+        larger than `_LARGEST` times the photo.
         """
         if image.ndim != 3:
             raise ValueError(f"image: its shape is {image.shape}, not [H, W, C]")
         longer_px = max(image.shape[:2])
         if not self.side_px <= _LARGEST * longer_px:
             raise InputError(
-                f"the face is {self.side_px:.0f} pixels wide, and the photo {longer_px}; {GIVE_LANDMARKS}"
+                f"the face is {self.side_px:.0f} pixels wide, the photo {longer_px}; {PASS_LANDMARKS}"
             )
         rows = _resampler(image.shape[0], self.y0_px, self.side_px, self.size_px)
         columns = _resampler(image.shape[1], self.x0_px, self.side_px, self.size_px)
@@ -84,7 +84,7 @@ class Crop:
         for part in strips(region.shape):
             values = np.ascontiguousarray(region[part], np.float32)
             tall += rows[:, top + part.start : top + part.stop] @ values.reshape(len(values), -1)
-            # rows first: many times as fast as all at once
+            # reducing the rows first is many times faster
             low, high = np.minimum(low, values.min(0).min(0)), np.maximum(high, values.max(0).max(0))
         tall = tall.reshape(self.size_px, width, channels).transpose(1, 0, 2).reshape(width, -1)
         cut = (columns[:, left:right] @ tall).reshape(self.size_px, self.size_px, channels)
@@ -92,18 +92,18 @@ class Crop:
         return np.ascontiguousarray(bounded, np.float32)
 
     def valid(self, height_px: int, width_px: int) -> np.ndarray:
-        """A bool mask [size, size]: True where a crop pixel has its centre inside a photo of that size."""
+        """Return the crop pixels whose centre lies inside a photo of that size, bool [size, size]."""
         centres_px = np.arange(self.size_px) + PIXEL_CENTRE
         x, y = self.to_photo(np.stack([centres_px, centres_px], -1)).T
         return ((y >= 0) & (y <= height_px))[:, None] & ((x >= 0) & (x <= width_px))
 
 
 def from_landmarks(landmarks_px: np.ndarray, size_px: int) -> Crop:
-    """The crop around landmarks [68, 2] in photo pixels: chin, temples, forehead and a margin."""
+    """Crop around landmarks [68, 2] in photo pixels, including chin, temples, forehead and a margin."""
     landmarks_px = check_landmarks(landmarks_px)
     up = landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0)
     forehead_px = landmarks_px[[0, *range(17, 27), 16]]
-    # Brows and temples move along the face's up direction, so the forehead is inside at any roll.
+    # Moving brows and temples along the face's up direction includes the forehead at any roll.
     along = (forehead_px - landmarks_px[_EYES].mean(0)) @ up / (up @ up)
     points = np.concatenate([landmarks_px, forehead_px + (_FOREHEAD - along)[:, None] * up])
     low, high = points.min(0), points.max(0)
@@ -113,18 +113,18 @@ def from_landmarks(landmarks_px: np.ndarray, size_px: int) -> Crop:
 
 
 def from_box(box_px: Box, size_px: int) -> Crop:
-    """The crop around a detector's box, about that of `from_landmarks` for the same face."""
+    """Crop around a detector's box, approximately like `from_landmarks` for the same face."""
     left, top, right, bottom = box_px
     box_side_px = (right - left + bottom - top) / 2
     if not 0 < box_side_px < math.inf:
-        raise InputError(f"box {box_px}: not a box of a face; give left, top, right and bottom in pixels")
+        raise InputError(f"box {box_px}: not a face box; use left, top, right and bottom in pixels")
     side_px = _PER_BOX * box_side_px
     x_px, y_px = (left + right) / 2, (top + bottom) / 2 - _ABOVE_BOX * box_side_px
     return Crop(x_px - side_px / 2, y_px - side_px / 2, side_px, size_px)
 
 
 def box_of(crop: Crop) -> Box:
-    """The box around which `from_box` cuts a crop."""
+    """Return the box for which `from_box` returns this crop."""
     box_side_px = crop.side_px / _PER_BOX
     x_px = crop.x0_px + crop.side_px / 2
     y_px = crop.y0_px + crop.side_px / 2 + _ABOVE_BOX * box_side_px
@@ -133,37 +133,37 @@ def box_of(crop: Crop) -> Box:
 
 
 def check_landmarks(landmarks_px: np.ndarray) -> np.ndarray:
-    """The landmarks as float64 [68, 2]; raises InputError where they cannot be a face."""
+    """Return the landmarks as float64 [68, 2]; raises InputError if they cannot be a face."""
     landmarks_px = np.asarray(landmarks_px, np.float64)
     if landmarks_px.shape != (68, 2):
-        raise InputError(f"landmarks: their shape is {landmarks_px.shape}; give 68 pairs of x and y")
+        raise InputError(f"landmarks: their shape is {landmarks_px.shape}; use 68 pairs of x and y")
     if not np.isfinite(landmarks_px).all():
         raise InputError("landmarks: some values are not finite; detect them again or correct the file")
     eyes_to_mouth_px = np.linalg.norm(landmarks_px[_EYES].mean(0) - landmarks_px[_MOUTH].mean(0))
     if min(np.ptp(landmarks_px, axis=0).min(), eyes_to_mouth_px) < _SMALLEST_FACE_PX:
-        raise InputError("landmarks: they lie on one spot or one line; give a face of at least a few pixels")
+        raise InputError("landmarks: they lie on one point or line; use a face of at least a few pixels")
     return landmarks_px
 
 
 def check_in_photo(landmarks_px: np.ndarray, height_px: int, width_px: int) -> np.ndarray:
-    """The landmarks [68, 2]; raises InputError unless their middle lies in the photo and they fit into two.
+    """Return the landmarks [68, 2]; raises InputError if they probably belong to another photo or unit.
 
-    The border may cut a face; a file of another photo or in another unit is refused.
+    Their median must lie in the photo and their extent within twice its size; the border may cut a face.
     """
     middle_px, extent_px = np.median(landmarks_px, 0), np.ptp(landmarks_px, axis=0).max()
     inside = (middle_px >= 0).all() and (middle_px <= (width_px, height_px)).all()
     if not inside or extent_px > 2 * max(height_px, width_px):
         raise InputError(
             f"landmarks: outside the image: around ({middle_px[0]:.0f}, {middle_px[1]:.0f}) and "
-            f"{extent_px:.0f} pixels wide, in a photo of {width_px} x {height_px}; give its own"
+            f"{extent_px:.0f} pixels wide, in a photo of {width_px} x {height_px}; use the photo's landmarks"
         )
     return landmarks_px
 
 
 def _resampler(length: int, start_px: float, side_px: float, size_px: int) -> csr_array:
-    """Weights [size, length] of a one-dimensional Catmull-Rom resampling with repeated ends."""
+    """Return the weights [size, length] of one-dimensional Catmull-Rom resampling with repeated ends."""
     step = side_px / size_px
-    width = max(step, 1.0)  # photo pixels for a unit of the kernel
+    width = max(step, 1.0)  # photo pixels per unit of the kernel
     centres_px = start_px + (np.arange(size_px) + PIXEL_CENTRE) * step
     taps = math.ceil(4 * width) + 1
     index = np.floor(centres_px - PIXEL_CENTRE - 2 * width).astype(np.int64)[:, None] + np.arange(taps + 1)
@@ -182,6 +182,6 @@ def _catmull_rom(x: np.ndarray) -> np.ndarray:
 
 
 def _used(weights: csr_array) -> tuple[int, int]:
-    """First and one past the last photo pixel that any crop pixel reads."""
+    """Return the range of photo pixels that any crop pixel reads."""
     used = weights.indices[weights.data != 0]
     return int(used.min()), int(used.max()) + 1

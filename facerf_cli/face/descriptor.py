@@ -1,4 +1,4 @@
-"""A descriptor of identity by dlib, an extra: the paper's Face dis, and `--identity`."""
+"""Face-recognition descriptor from dlib (an extra), for the paper's Face dis and for `--identity`."""
 
 import importlib
 from functools import cache
@@ -20,19 +20,17 @@ _FILE = "dlib_face_recognition_resnet_model_v1.dat"
 
 
 def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndarray:
-    """The descriptor [128] of a face in an sRGB image [H, W, 3] in 0..1; landmarks [68, 2] in its pixels.
+    """Compute the descriptor [128] of a face in an sRGB image [H, W, 3] in 0..1, from its landmarks [68, 2].
 
-    King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a
-    150 px image that the landmarks align. Descriptors of one person are mostly less than 0.6 apart; compute
-    both with the landmarks of the ground truth, on images with the same mask (paper, 'Results': Face dis).
+    King, *High quality face recognition with deep metric learning*, 2017: a ResNet of 29 layers on a 150 px
+    image aligned by the landmarks. The distance between descriptors of one person is usually below 0.6.
+    Compute both with the landmarks of the ground truth, on images with the same mask (paper, 'Results').
     """
     if landmarks_px.shape != (68, 2) or image_srgb.ndim != 3 or image_srgb.shape[2] != 3:
-        raise ValueError(
-            f"image {image_srgb.shape}, landmarks {landmarks_px.shape}: give [H, W, 3] and [68, 2]"
-        )
+        raise ValueError(f"image {image_srgb.shape}, landmarks {landmarks_px.shape}")
     dlib, recognition = _recognition()
     image = np.round(np.clip(image_srgb, 0, 1) * 255).astype(np.uint8)
-    # in dlib's positions and boxes the centre of a pixel is a whole number
+    # dlib's pixel centres are integers
     points = [dlib.point(*map(round, point)) for point in (landmarks_px - PIXEL_CENTRE).tolist()]
     (left, top), (right, bottom) = landmarks_px.min(0).tolist(), landmarks_px.max(0).tolist()
     box = dlib.rectangle(round(left), round(top), round(right), round(bottom))
@@ -42,7 +40,7 @@ def face_descriptor(image_srgb: np.ndarray, landmarks_px: np.ndarray) -> np.ndar
 
 @cache  # a network of 20 MB
 def _recognition() -> tuple[Any, Any]:
-    """The library and its network; raises FacerfError where it is not installed."""
+    """Load the library and its network; raises FacerfError if it is not installed."""
     path = descriptor_path()
     if find_spec("dlib") is None:
         raise FacerfError("dlib is missing; install it with: pip install 'facerf[dlib]'")
@@ -51,12 +49,12 @@ def _recognition() -> tuple[Any, Any]:
 
 
 def descriptor_path() -> Path:
-    """Path of the network in `face_recognition_models`, without importing it: the import needs pkg_resources.
+    """Locate the network in `face_recognition_models` without importing it; the import needs pkg_resources.
 
-    Raises FacerfError where the file is missing.
+    Raises FacerfError if the file is missing.
     """
     spec = find_spec(_MODELS_PACKAGE)
     path = Path(spec.origin).parent / "models" / _FILE if spec and spec.origin else None
     if path is None or not path.is_file():
-        raise FacerfError(f"{_FILE}: the model is missing; install it with: pip install 'facerf[dlib]'")
+        raise FacerfError(f"{_FILE} is missing; install it with: pip install 'facerf[dlib]'")
     return path

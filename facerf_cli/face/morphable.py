@@ -1,4 +1,4 @@
-"""Morphable models on the canonical topology (paper, 'Reflectance Field Representation'), and their files."""
+"""Morphable models on the canonical topology, and their files (paper, 'Reflectance Field Representation')."""
 
 import zipfile
 from collections.abc import Mapping
@@ -15,9 +15,9 @@ from facerf_cli.face.topology import GRID, LAYOUT_VERSION, landmark_weights, on_
 from facerf_cli.run.logs import one_line
 
 BUILTIN = "builtin"
-MEAN = "-mean"  # ends the name of a model of pose alone
+MEAN = "-mean"  # suffix of the name of a model with only a pose
 BUILTIN_PATH = Path(__file__).parent.parent / "assets" / "builtin_face.npz"
-EXPRESSION_STD = 0.3  # the share of a full blendshape that a coefficient of 1 means, in imported models
+EXPRESSION_STD = 0.3  # fraction of a full blendshape at coefficient 1, in imported models
 _MAX_COEFFICIENTS = 500
 _MAX_LETTERS = 2000  # of a name or a licence
 MAX_ARRAYS, _MAX_BYTES = 64, 1 << 30  # of a file
@@ -25,22 +25,21 @@ MAX_ARRAYS, _MAX_BYTES = 64, 1 << 30  # of a file
 
 @dataclass(frozen=True, eq=False)  # caches compare models by identity
 class MorphableModel:
-    """A linear face model; lengths in metres, head frame, bases scaled by their standard deviations.
+    """Linear face model in metres, head frame.
 
-    mean [V, 3], identity [Ki, V, 3], expression [Ke, V, 3]; every coefficient has a standard normal prior
-    and zeros give the neutral mean.
+    Every coefficient has a standard normal prior; zeros give the neutral mean.
     """
 
     name: str
     licence: str
-    mean: Tensor
-    identity: Tensor
-    expression: Tensor
+    mean: Tensor  # [V, 3]
+    identity: Tensor  # [Ki, V, 3], scaled by the standard deviations
+    expression: Tensor  # [Ke, V, 3], scaled by the standard deviations
     expression_names: tuple[str, ...]
 
     @property
     def stamp(self) -> dict[str, str]:
-        """Name and licence as metadata of everything made with the model."""
+        """Name and licence, for the metadata of outputs made with the model."""
         return {"face_model": self.name, "face_model_licence": self.licence}
 
     @property
@@ -49,17 +48,17 @@ class MorphableModel:
         return f"{self.name} ({self.licence})"
 
     def vertices(self, alpha: Tensor, beta: Tensor) -> Tensor:
-        """The vertices mean + M_id alpha + M_exp beta [B, V, 3] for alpha [B, Ki] and beta [B, Ke]."""
+        """Compute vertices mean + M_id alpha + M_exp beta [B, V, 3] from alpha [B, Ki] and beta [B, Ke]."""
         offset = alpha @ self.identity.flatten(1) + beta @ self.expression.flatten(1)
         return self.mean + offset.view(len(offset), -1, 3)
 
     def landmarks(self, vertices: Tensor) -> Tensor:
-        """The 68 landmarks [B, 68, 3] of vertices [B, V, 3]."""
+        """Interpolate the 68 landmarks [B, 68, 3] of vertices [B, V, 3]."""
         corners, weights = on_device(vertices.device, landmark_weights)
         return (vertices[:, corners] * weights[..., None].to(vertices.dtype)).sum(2)
 
     def pose_only(self) -> "MorphableModel":
-        """The model with shapes of zero, so that its fit is a pose alone (paper, 'Ablative Study')."""
+        """Return a model with zero shapes, so that a fit only yields the pose (paper, 'Ablative Study')."""
         return replace(
             self,
             name=self.name + MEAN,
@@ -69,20 +68,20 @@ class MorphableModel:
         )
 
     def to(self, device: torch.device | str) -> "MorphableModel":
-        """The same model with its arrays on `device`."""
+        """Return a copy with its arrays on `device`."""
         mean, identity, expression = (x.to(device) for x in (self.mean, self.identity, self.expression))
         return replace(self, mean=mean, identity=identity, expression=expression)
 
 
 def load_face_model(name_or_path: str | Path = BUILTIN) -> MorphableModel:
-    """Load the built-in model (once a process) or a file of `facerf face-model import`.
+    """Load the built-in model, once per process, or a file of `facerf face-model import`.
 
-    Raises InputError for a missing or a different file.
+    Raises InputError for a missing file or any other file.
     """
     return _builtin() if str(name_or_path) == BUILTIN else _read(Path(name_or_path))
 
 
-@cache  # one object, by which other caches are keyed
+@cache  # other caches are keyed by this object
 def _builtin() -> MorphableModel:
     return _read(BUILTIN_PATH)
 
@@ -90,7 +89,7 @@ def _builtin() -> MorphableModel:
 def _read(path: Path) -> MorphableModel:
     if not path.is_file():
         raise InputError(
-            f"{path}: no such face model; give '{BUILTIN}' or a file of `facerf face-model import`"
+            f"{path}: no such face model; use '{BUILTIN}' or a file of `facerf face-model import`"
         )
     try:
         _require_size(path, _MAX_BYTES)
@@ -98,7 +97,7 @@ def _read(path: Path) -> MorphableModel:
             return _from_arrays(path, arrays)
     except InputError:
         raise
-    except Exception as error:  # whatever damage makes zipfile and numpy raise
+    except Exception as error:  # damaged files raise many kinds in zipfile and numpy
         raise InputError(
             f"{path}: not a facerf face model ({one_line(str(error))}); "
             "import it with `facerf face-model import`"
@@ -108,7 +107,7 @@ def _read(path: Path) -> MorphableModel:
 def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> MorphableModel:
     if int(arrays["layout_version"]) != LAYOUT_VERSION:
         raise InputError(
-            f"{path}: it has another UV layout; import the face model again with this version of facerf"
+            f"{path}: uses another UV layout; import the face model again with this version of facerf"
         )
     mean = floats(arrays, "mean", (GRID * GRID, 3))
     identity, expression = (floats(arrays, key, (None, GRID * GRID, 3)) for key in ("identity", "expression"))
@@ -118,50 +117,50 @@ def _from_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> MorphableModel
 
 
 def floats(arrays: Mapping[str, np.ndarray], key: str, shape: tuple[int | None, ...]) -> Tensor:
-    """An array as float32; raises ValueError for another shape (None: any of a basis), NaN or infinity."""
+    """Return an array as float32; raises ValueError for another shape (None: any length), NaN or infinity."""
     array = arrays[key]
     expected = (len(array), *shape[1:]) if shape[0] is None else shape
     if array.shape != expected or (shape[0] is None and len(array) > _MAX_COEFFICIENTS):
         raise ValueError(f"{key} has shape {array.shape}, not {shape}")
     tensor = torch.from_numpy(array.astype(np.float32))
     if not tensor.isfinite().all():
-        raise ValueError(f"{key} holds values that are not finite")
+        raise ValueError(f"{key} contains non-finite values")
     return tensor
 
 
 def _printable(array: np.ndarray) -> str:
-    """A name or licence as one line of limited length, safe for metadata and the terminal."""
+    """Convert a name or licence to one line of limited length, safe for metadata and the terminal."""
     return "".join(letter for letter in one_line(str(array))[:_MAX_LETTERS] if letter.isprintable())
 
 
 def read_npz(path: Path, most_bytes: int = _MAX_BYTES) -> dict[str, np.ndarray]:
-    """Read the arrays of an .npz by name, without pickles; `most_bytes` bounds them together.
+    """Read the arrays of an .npz by name, without pickles, up to a total of `most_bytes`.
 
-    Raises ValueError with a reason in one line for any other file, and for too many or too large arrays.
+    Raises ValueError with a one-line reason for other files, and for too many or too large arrays.
     """
     try:
         _require_size(path, most_bytes)
         with np.load(path, allow_pickle=False) as file:
             arrays = dict(file)
         if not all(isinstance(array, np.ndarray) for array in arrays.values()):
-            raise ValueError("it holds a file that is not an array")
+            raise ValueError("it contains a file that is not an array")
         return arrays
-    except Exception as error:  # whatever damage makes zipfile and numpy raise
+    except Exception as error:  # damaged files raise many kinds in zipfile and numpy
         raise ValueError(one_line(str(error))) from None
 
 
 def _require_size(path: Path, most_bytes: int) -> None:
-    """Raise ValueError for an .npz of too many or too large arrays, which a small file may be unpacked to."""
+    """Raise ValueError for an .npz with too many arrays, or arrays that are too large when unpacked."""
     with zipfile.ZipFile(path) as archive:
         entries = archive.infolist()
     if len(entries) > MAX_ARRAYS:
-        raise ValueError(f"it holds {len(entries)} arrays; at most {MAX_ARRAYS} are read")
+        raise ValueError(f"it contains {len(entries)} arrays, more than {MAX_ARRAYS}")
     if sum(entry.file_size for entry in entries) > most_bytes:
-        raise ValueError(f"its arrays are too large; {most_bytes} bytes are read at most")
+        raise ValueError(f"its arrays are too large: more than {most_bytes} bytes")
 
 
 def save_face_model(path: Path, model: MorphableModel) -> None:
-    """Write a model as .npz without pickles; bases in half precision (steps below 0.02 mm)."""
+    """Write a model to an .npz without pickles; bases are in half precision (steps below 0.02 mm)."""
     with path.open("wb") as file:
         np.savez_compressed(
             file,

@@ -1,4 +1,4 @@
-"""The canonical topology: one grid of vertices in UV space that every face model is resampled to.
+"""Canonical topology: the grid of vertices in UV space to which every face model is resampled.
 
 The grid is bilaterally symmetric and lies on a cylinder about a vertical axis inside the head. The head frame
 is right-handed, in metres: x to the image's right, y up, z out of the face; its origin lies on the cylinder's
@@ -7,12 +7,12 @@ azimuth, v runs down from the forehead to below the chin. The 68 landmarks (Mult
 (u, v) in every model, so a texture network trained on one model fits all others. A change to the grid or the
 landmarks needs a new `LAYOUT_VERSION`.
 
-Named regions are soft masks in UV space; their outlines are an asset. `eyes` (between the
-lids), `brows`, `lips` (with the slit of the mouth), `nostrils`, `neck` (below the jaw line) and `skin` sum to
-one everywhere; `mouth` (the slit alone) and `face` (inside jaw and forehead, for compositing) overlap them.
+Named regions are soft masks in UV space; their outlines are an asset. `eyes` (between the lids), `brows`,
+`lips` (with the slit of the mouth), `nostrils`, `neck` (below the jaw line) and `skin` sum to one everywhere;
+`mouth` (only the slit) and `face` (inside jaw and forehead, for compositing) overlap them.
 
 The interior of the face is the mask M_t(omega_h) of the paper's 'Photometric loss': the region `face` without
-its soft rim, where the mesh faces the camera. It includes brows, eyes and mouth, as in the paper.
+its soft border, where the mesh faces the camera. It includes brows, eyes and mouth, like the paper's mask.
 """
 
 from collections.abc import Callable
@@ -34,9 +34,9 @@ TOP_M, BOTTOM_M = 0.092, -0.082  # heights of v = 0 and v = 1
 UV_SIZE_MM = np.array([np.radians(2 * HALF_ANGLE_DEG) * 115, (TOP_M - BOTTOM_M) * 1000])  # at radius 115 mm
 
 CONTOUR = tuple(range(17))  # the landmarks along the jaw, from ear to ear
-INNER_MOUTH_CORNERS = (60, 64)  # the two that the paper's 66 landmarks leave out
+INNER_MOUTH_CORNERS = (60, 64)  # missing from the paper's 66 landmarks
 OUTER_EYE_CORNERS = (36, 45)  # their distance is the inter-ocular distance everywhere in facerf
-# The landmark that mirrors each one.
+# Index of each landmark's mirror image.
 MIRROR_68 = np.array(
     [
         *[*range(16, -1, -1), *range(26, 16, -1), 27, 28, 29, 30, *range(35, 30, -1)],
@@ -56,23 +56,22 @@ _MEASURES_MM = """
 61 -10   -32.4 121  | 62   0  -32.5 122.5 | 66  0   -34.6 122.5 | 67 -10.5 -34.5 120.5
 """
 
-# Rays in UV space run from the nose to the jaw line. On each only the outer band can be the silhouette, on
-# which the contour landmarks slide (paper, 'Landmark loss').
+# Rays in UV space run from the nose to the jaw line. Only the outer band of each ray can be the silhouette,
+# along which contour landmarks slide (paper, 'Landmark loss').
 RAYS_PER_LANDMARK, POINTS_PER_RAY = 8, 10
 CONTOUR_RAYS = (len(CONTOUR) - 1) * RAYS_PER_LANDMARK + 1
 NOSE = (28, 33)  # the rays begin midway between these landmarks
-_BAND = (0.6, 1.0)  # part of a ray, 0 at the nose and 1 at the jaw line, where the silhouette can lie
+_BAND = (0.6, 1.0)  # range of a ray, 0 at the nose and 1 at the jaw line, where the silhouette can lie
 
 OUTLINES_PATH = Path(__file__).parent.parent / "assets" / "face_regions.npz"  # tools/face_regions.py
 REGIONS = ("skin", "eyes", "brows", "lips", "mouth", "nostrils", "neck", "face")
 _NOT_SKIN = ("eyes", "brows", "lips", "nostrils", "neck")
 _PAIRED = ("eyes", "brows", "nostrils")  # outlined on the image's left, then mirrored
-# Width on the mean face over which a mask falls from 1 to 0 across its outline.
+# Width of the transition from 1 to 0 across a mask's outline, on the mean face.
 _EDGE_MM = {"eyes": 1.0, "brows": 3.0, "lips": 1.6, "mouth": 1.0, "nostrils": 2.5, "neck": 5.0, "face": 16.0}
 
 
 def _landmarks_m() -> np.ndarray:
-    """The landmarks [68, 3] of the mean face in metres, head frame."""
     points = np.full((68, 3), np.nan)
     for cell in _MEASURES_MM.replace("\n", "|").split("|"):
         if cell.strip():
@@ -82,11 +81,11 @@ def _landmarks_m() -> np.ndarray:
     return points / 1000
 
 
-LANDMARKS_M = _landmarks_m()  # [68, 3]
+LANDMARKS_M = _landmarks_m()  # [68, 3], of the mean face, head frame
 
 
 def cylinder_uv(points_m: np.ndarray) -> np.ndarray:
-    """Map head-frame points [..., 3] in metres to (u, v) [..., 2] by azimuth and height."""
+    """Convert head-frame points [..., 3] in metres to (u, v) [..., 2], by azimuth and height."""
     azimuth_deg = np.degrees(np.arctan2(points_m[..., 0], points_m[..., 2]))
     u = 0.5 + azimuth_deg / (2 * HALF_ANGLE_DEG)
     v = (TOP_M - points_m[..., 1]) / (TOP_M - BOTTOM_M)
@@ -94,7 +93,7 @@ def cylinder_uv(points_m: np.ndarray) -> np.ndarray:
 
 
 def cylinder_rays(uv: np.ndarray, radius_m: float = 0.4) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions [..., 3] of rays from outside the head through (u, v) to the axis."""
+    """Return origins and unit directions [..., 3] of rays from outside through (u, v) to the axis."""
     azimuth = np.radians((uv[..., 0] - 0.5) * 2 * HALF_ANGLE_DEG)
     y = TOP_M - uv[..., 1] * (TOP_M - BOTTOM_M)
     outward = np.stack([np.sin(azimuth), np.zeros_like(azimuth), np.cos(azimuth)], -1)
@@ -107,7 +106,7 @@ LANDMARK_UV = cylinder_uv(LANDMARKS_M)  # [68, 2]
 
 
 def grid_uv() -> Tensor:
-    """The (u, v) [V, 2] of every vertex, row by row from the forehead down; V = GRID * GRID."""
+    """Return the (u, v) [V, 2] of all vertices, row by row from the forehead down; V = GRID * GRID."""
     side = torch.linspace(0, 1, GRID)
     v, u = torch.meshgrid(side, side, indexing="ij")
     return torch.stack([u, v], -1).reshape(-1, 2)
@@ -115,7 +114,7 @@ def grid_uv() -> Tensor:
 
 @cache  # for every render
 def grid_triangles() -> Tensor:
-    """Vertex ids [F, 3], counter-clockwise seen from outside; diagonals mirrored about the midline."""
+    """Return vertex ids [F, 3], counter-clockwise from outside, with diagonals mirrored about the midline."""
     row, col = torch.meshgrid(torch.arange(GRID - 1), torch.arange(GRID - 1), indexing="ij")
     top_left = (row * GRID + col).reshape(-1)
     top_right, bottom_left = top_left + 1, top_left + GRID
@@ -128,13 +127,13 @@ def grid_triangles() -> Tensor:
 
 @cache
 def on_device(device: torch.device, constant: Callable[..., Any], *arguments: Any) -> Any:
-    """A constant tensor, such as `grid_triangles`, or some of them, on a device; they are sent there once."""
-    found = constant(*arguments)
-    return found.to(device) if isinstance(found, Tensor) else tuple(part.to(device) for part in found)
+    """Return a constant tensor or tuple of tensors, such as `grid_triangles`, on a device; copy it once."""
+    value = constant(*arguments)
+    return value.to(device) if isinstance(value, Tensor) else tuple(part.to(device) for part in value)
 
 
 def locate(uv: np.ndarray) -> tuple[Tensor, Tensor]:
-    """Vertex ids [N, 3] and barycentric weights [N, 3] of the grid triangle around each (u, v) [N, 2]."""
+    """Return vertex ids [N, 3] and barycentric weights [N, 3] of the triangle around each (u, v) [N, 2]."""
     position = np.clip(uv, 0, 1) * (GRID - 1)
     cell = np.minimum(position.astype(np.int64), GRID - 2)
     fraction = position - cell
@@ -156,13 +155,13 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def landmark_weights() -> tuple[Tensor, Tensor]:
-    """Vertex ids [68, 3] and barycentric weights [68, 3] of the landmarks, equal for all models."""
+    """Return vertex ids [68, 3] and barycentric weights [68, 3] of the landmarks, equal for all models."""
     return locate(LANDMARK_UV)
 
 
-@cache  # slow at many texels, and for every photo
+@cache  # slow at many texels
 def region_mask(name: str, side: int) -> Tensor:
-    """The mask [T, T] in 0..1 of the region `name`; row 0 is the forehead; symmetric in u."""
+    """Return the mask [T, T] in 0..1 of a region, symmetric in u; row 0 is the forehead."""
     if name == "skin":
         return (1 - torch.stack([region_mask(part, side) for part in _NOT_SKIN]).sum(0)).clamp(0, 1)
     outline, centre = _outline_mm(name) / UV_SIZE_MM, (np.arange(side) + 0.5) / side
@@ -179,15 +178,14 @@ def region_mask(name: str, side: int) -> Tensor:
 
 
 def inside_mm(name: str, uv: np.ndarray) -> np.ndarray:
-    """Distance [...] in mm from (u, v) [..., 2] to a region's outline, on the unrolled cylinder; > 0 inside.
+    """Return the distance [...] in mm of (u, v) [..., 2] from a region's outline, positive inside.
 
-    For paired regions the distance is to the one on the image's left (u < 0.5).
+    Distances are on the unrolled cylinder. Paired regions use the outline on the image's left (u < 0.5).
     """
     return _inside_outline(uv * UV_SIZE_MM, _outline_mm(name))
 
 
 def _outline_mm(name: str) -> np.ndarray:
-    """The closed outline [N, 2] of a region on the unrolled cylinder, in millimetres."""
     if name not in _outlines_mm():
         raise ValueError(f"{name!r}: not a region of the face; choose one of {', '.join(REGIONS)}")
     return _outlines_mm()[name]
@@ -195,12 +193,13 @@ def _outline_mm(name: str) -> np.ndarray:
 
 @cache
 def _outlines_mm() -> dict[str, np.ndarray]:
+    """Load the closed outlines [N, 2] of all regions on the unrolled cylinder."""
     with np.load(OUTLINES_PATH, allow_pickle=False) as file:
         return dict(file)
 
 
 def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
-    """Distance [...] of `points` [..., 2] to the closed `outline` [N, 2], positive inside (even-odd rule)."""
+    """Return the distance [...] of points [..., 2] from a closed outline [N, 2], positive inside."""
     x, y = (np.ascontiguousarray(points[..., axis], np.float32) for axis in (0, 1))  # faster than pairs
     nearest = np.full_like(x, np.inf)  # squared
     inside = np.zeros(x.shape, bool)
@@ -219,32 +218,33 @@ def _inside_outline(points: np.ndarray, outline: np.ndarray) -> np.ndarray:
 
 
 def interior_texture(side: int) -> Tensor:
-    """The interior in UV space [1, T, T]: 0 on the outline of the region `face`, 1 from 8 mm inside it."""
+    """Return the interior in UV space [1, T, T]: 0 on the outline of the region `face`, 1 at 8 mm inside."""
     return (2 * region_mask("face", side) - 1).clamp_min(0)[None]
 
 
 @torch.no_grad()
 def interior_mask(vertices_camera: Tensor, fragments: Fragments, uv: Tensor, texture_side: int) -> Tensor:
-    """The interior M_t [..., 1, H, W] in 0..1 of a rendered mesh.
+    """Compute the interior M_t [..., 1, H, W] in 0..1 of a rendered mesh.
 
-    vertices_camera [..., V, 3] is the mesh, fragments and uv [..., H, W, 2] what each pixel sees of it.
+    vertices_camera [..., V, 3] is the mesh; fragments and uv [..., H, W, 2] describe its visible point per
+    pixel.
     """
     front = front_facing(vertices_camera, on_device(uv.device, grid_triangles))
-    of_pixels = front.gather(-1, fragments.triangle.flatten(-2).clamp_min(0)).view_as(fragments.triangle)
+    pixel_front = front.gather(-1, fragments.triangle.flatten(-2).clamp_min(0)).view_as(fragments.triangle)
     inside = sample_texture(on_device(uv.device, interior_texture, texture_side), uv)[..., 0]
-    return (inside * (fragments.covered & of_pixels)).unsqueeze(-3)
+    return (inside * (fragments.covered & pixel_front)).unsqueeze(-3)
 
 
 def band_uv() -> np.ndarray:
-    """The (u, v) [R, P, 2] of the points of the band, outermost last, right ear to left ear."""
+    """Return the (u, v) [R, P, 2] of the band's points, from the right ear to the left, outermost last."""
     ends = _between_landmarks(LANDMARK_UV)
     centre = np.array([0.5, LANDMARK_UV[list(NOSE), 1].mean()])
-    share = np.linspace(*_BAND, POINTS_PER_RAY)[:, None]
-    return centre + share * (ends - centre)[:, None]
+    fraction = np.linspace(*_BAND, POINTS_PER_RAY)[:, None]
+    return centre + fraction * (ends - centre)[:, None]
 
 
 def contour_rays() -> Tensor:
-    """The grid's vertices [R, P] closest to the points of the band."""
+    """Return the grid's vertices [R, P] closest to the band's points."""
     column_row = np.round(band_uv() * (GRID - 1)).astype(np.int64)
     column_row = column_row.clip(0, GRID - 1)
     return torch.from_numpy(column_row[..., 1] * GRID + column_row[..., 0])
@@ -252,9 +252,9 @@ def contour_rays() -> Tensor:
 
 @torch.no_grad()
 def silhouette_ids(vertices_px: Tensor, head_to_camera: Tensor) -> Tensor:
-    """The vertices [B, R] of the outline: for each ray the one that lies furthest out in the image.
+    """Return the outline's vertices [B, R]: the outermost vertex of each ray in the image.
 
-    vertices_px [B, V, 2] are the mesh's pixels, head_to_camera [B, 3, 3] the poses. Indices have no gradient.
+    vertices_px [B, V, 2] are the mesh's pixels, head_to_camera [B, 3, 3] the poses.
     """
     rays = on_device(vertices_px.device, contour_rays)
     outward = on_device(vertices_px.device, _outward).to(head_to_camera) @ head_to_camera.mT  # [B, R, 3]
@@ -263,7 +263,7 @@ def silhouette_ids(vertices_px: Tensor, head_to_camera: Tensor) -> Tensor:
 
 
 def outermost(px: Tensor, outward: Tensor) -> Tensor:
-    """The index [B, R] of each ray's outermost point among P pixels [B, R, P, 2].
+    """Return the index [B, R] of each ray's outermost point among P pixels [B, R, P, 2].
 
     outward [B, R, 3] are the rays' directions out of the face in camera space.
     """
@@ -272,7 +272,7 @@ def outermost(px: Tensor, outward: Tensor) -> Tensor:
 
 
 def _outward() -> Tensor:
-    """Unit directions [R, 3] in the head frame in which the rays leave a face seen from the front."""
+    """Return the rays' unit directions [R, 3] out of a frontal face, head frame."""
     away = (_between_landmarks(LANDMARKS_M) - LANDMARKS_M[list(NOSE)].mean(0)) * [1, 1, 0]
     return torch.from_numpy(away / np.linalg.norm(away, axis=-1, keepdims=True)).float()
 

@@ -1,7 +1,4 @@
-"""A fitted face rendered by a camera: (u, v), normal and position of each pixel, and a soft mask.
-
-Also a drawing for visual checks: a fit over its photo.
-"""
+"""Render a fitted face to (u, v), normals, positions and a soft mask, and draw a fit over its photo."""
 
 from dataclasses import dataclass
 
@@ -22,9 +19,9 @@ from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import sample_texture, smoothstep, vertex_normals
 
 _TINY = 1e-8
-_FEATHER = 0.04  # width of the mask's soft border, inward, in crop sides
+_FEATHER = 0.04  # inward width of the mask's soft border, as a fraction of the crop's side
 _MASK_SIDE = 256  # texels; a finer mask takes seconds to draw
-# Of drawings.
+# Drawings.
 _CELLS = 16  # cells of the wire mesh along u and along v
 _SHADE, _LINE = 0.35, 0.5  # opacity of the shaded mesh and of its wires
 _WIRE_COLOUR = np.array([0.1, 0.5, 1.0], np.float32)
@@ -34,21 +31,18 @@ _DOT = 1 / 160  # radius over the crop's side
 
 @dataclass(frozen=True, eq=False)
 class FaceView:
-    """A fitted face rendered by its photo's camera, ready to be textured any number of times.
-
-    All tensors cover the window [h, w] of the photo [H, W].
-    """
+    """Fitted face rendered by its photo's camera; tensors cover the window [h, w] of the photo [H, W]."""
 
     size_px: tuple[int, int]  # of the photo
     window: Window
     uv: Tensor  # [h, w, 2]
     coverage: Tensor  # [h, w] 0 or 1
-    mask: Tensor  # [h, w] 0..1, the face inside jaw and hairline with a soft border
+    mask: Tensor  # [h, w] in 0..1, the face inside jaw and hairline with a soft border
     vertices_camera: Tensor  # [V, 3]
     camera: Camera  # of the window
 
     def surface(self, rows: slice) -> Tensor:
-        """Unit normals and positions [n, w, 6] in rows of the window, camera space, m."""
+        """Compute unit normals and positions [n, w, 6] in rows of the window; camera space, metres."""
         if rows.start == rows.stop:
             return torch.zeros(0, self.camera.width_px, 6)
         triangles = grid_triangles()
@@ -59,11 +53,11 @@ class FaceView:
 
     @property
     def normal(self) -> Tensor:
-        """Unit normals [h, w, 3], camera space."""
+        """Unit normals [h, w, 3] in camera space."""
         return self.surface(slice(0, len(self.uv)))[..., :3]
 
     def render(self, texture: Tensor, part: Window | slice = slice(None)) -> Tensor:
-        """Render a texture [C, T, T] in the window [h, w, C], or in a part of it, zero off the mesh."""
+        """Render a texture [C, T, T] in the window [h, w, C] or a part of it; zero outside the mesh."""
         return sample_texture(texture, self.uv[part]) * self.coverage[part][..., None]
 
     def full(self, values: Tensor) -> np.ndarray:
@@ -74,7 +68,7 @@ class FaceView:
 
 
 def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
-    """The crop's camera extended to the whole photo, in the photo's pixels."""
+    """Extend the crop's camera to the whole photo, in the photo's pixels."""
     half = crop.side_px / 2
     focal_px = crop.camera.focal_px / crop.scale
     return Camera(focal_px, width_px, height_px, crop.x0_px + half, crop.y0_px + half)
@@ -82,32 +76,33 @@ def photo_camera(crop: Crop, height_px: int, width_px: int) -> Camera:
 
 def view_face(vertices_camera: Tensor, camera: Camera, side_px: float) -> FaceView:
     """Render the mesh [V, 3] with a camera; `side_px` is the crop's side in the camera's pixels."""
-    top, left, seen = face_window(vertices_camera, camera)
+    top, left, window_camera = face_window(vertices_camera, camera)
     triangles = grid_triangles()
-    size = seen.height_px, seen.width_px
+    size = window_camera.height_px, window_camera.width_px
     uv, coverage, mask = torch.empty(*size, 2), torch.empty(size), torch.empty(size)
     region = region_mask("face", _MASK_SIDE)[None]
     for rows in strips(size):
-        fragments = rasterize(vertices_camera, triangles, rows_of_camera(seen, rows))
+        fragments = rasterize(vertices_camera, triangles, rows_of_camera(window_camera, rows))
         uv[rows] = interpolate(grid_uv(), triangles, fragments)
         coverage[rows] = fragments.covered.float()
         mask[rows] = sample_texture(region, uv[rows])[..., 0]
     inside = (mask * coverage > 0.02).numpy()
-    if not inside.all():  # where the face turns away the UV mask is steep in the image, so it is softened
+    if not inside.all():  # soften the UV mask, which is steep in the image where the face turns away
         edge_px = torch.from_numpy(distance_transform_edt(inside)).float()
         mask = mask * smoothstep(edge_px / max(_FEATHER * side_px, 1))
     window = Window(slice(top, top + size[0]), slice(left, left + size[1]))
-    return FaceView((camera.height_px, camera.width_px), window, uv, coverage, mask, vertices_camera, seen)
+    photo_px = camera.height_px, camera.width_px
+    return FaceView(photo_px, window, uv, coverage, mask, vertices_camera, window_camera)
 
 
 def rows_of_camera(camera: Camera, rows: slice) -> Camera:
-    """The camera of some rows of an image."""
+    """Restrict a camera to some rows of its image."""
     height_px, cy_px = rows.stop - rows.start, camera.cy_px - rows.start
     return Camera(camera.focal_px, camera.width_px, height_px, camera.cx_px, cy_px)
 
 
 def face_window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Camera]:
-    """First row and column of the part of the image around the mesh (and a pixel more), and its camera."""
+    """Return the first row and column of the image window around the mesh, with a margin, and its camera."""
     in_front = torch.cat([vertices_camera[:, :2], vertices_camera[:, 2:].clamp(max=-_TINY)], 1)
     x, y = project(in_front, camera).T
     left, right = (int(v.floor().clamp(0, camera.width_px - 1)) for v in (x.min() - 1, x.max() + 1))
@@ -117,13 +112,13 @@ def face_window(vertices_camera: Tensor, camera: Camera) -> tuple[int, int, Came
 
 
 def see_face(vertices_camera: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Rasterize the mesh [V, 3]: the (u, v) of each pixel [H, W, 2] and the coverage [H, W], 0 or 1."""
+    """Rasterize the mesh [V, 3] to (u, v) [H, W, 2] and coverage [H, W], 0 or 1."""
     fragments = rasterize(vertices_camera, grid_triangles(), camera)
     return interpolate(grid_uv(), grid_triangles(), fragments), fragments.covered.float()
 
 
 def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
-    """Images [N, C, H, W] of textures [N, C, T, T] on a face seen by `see_face`, black off the mesh."""
+    """Render textures [N, C, T, T] on the pixels of `see_face` to [N, C, H, W], black outside the mesh."""
     images = sample_texture(textures.flatten(0, 1), uv) * coverage[..., None]  # [H, W, N C]
     return images.permute(2, 0, 1).reshape(*textures.shape[:2], *coverage.shape)
 
@@ -131,13 +126,13 @@ def render_face(textures: Tensor, uv: Tensor, coverage: Tensor) -> Tensor:
 def draw_fit(photo: np.ndarray, fit: FaceFit, model: MorphableModel) -> np.ndarray:
     """Draw the half-transparent mesh and landmarks over a linear photo [H, W, 3] at automatic exposure.
 
-    Green are the targets of the fit, orange its landmarks without the sliding contour.
+    The fit's targets are green; its landmarks, without the sliding contour, are orange.
     """
     image = (photo * np.float32(2 ** auto_exposure_ev(photo))).clip(0, 1)
     height, width = photo.shape[:2]
     vertices = fit.vertices_camera(model)
     view = view_face(vertices, photo_camera(fit.crop, height, width), fit.crop.side_px)
-    region = image[view.window]  # a view: drawn in place
+    region = image[view.window]  # drawn in place
     covered = view.coverage.numpy()[..., None]
     shade = view.normal[..., 2:].clamp(0, 1).numpy()
     region += _SHADE * covered * (shade - region)
@@ -151,14 +146,14 @@ def draw_fit(photo: np.ndarray, fit: FaceFit, model: MorphableModel) -> np.ndarr
 
 
 def _wires(uv: np.ndarray, line_px: float) -> np.ndarray:
-    """Opacity [h, w] in 0..1 of lines of constant u and v, about `line_px` wide on the screen."""
+    """Compute the opacity [h, w] in 0..1 of lines of constant u and v, about `line_px` wide in the image."""
     lines = np.zeros(uv.shape[:2], np.float32)
     if min(lines.shape) < 2:
         return lines
     for coordinate in np.moveaxis(_CELLS * uv, -1, 0):
         down, right = np.gradient(coordinate)
-        off_px = np.abs(coordinate - np.round(coordinate)) / np.maximum(np.hypot(down, right), 1e-6)
-        lines = np.maximum(lines, np.clip((line_px + 1) / 2 - off_px, 0, 1))
+        distance_px = np.abs(coordinate - np.round(coordinate)) / np.maximum(np.hypot(down, right), 1e-6)
+        lines = np.maximum(lines, np.clip((line_px + 1) / 2 - distance_px, 0, 1))
     return lines
 
 

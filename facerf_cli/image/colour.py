@@ -335,6 +335,23 @@ def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> floa
     return round(float(np.log2(AUTO_EXPOSURE_TARGET_LINEAR / high)), 2) if high > _BLACK else 0.0
 
 
+def display_ev(linear: np.ndarray) -> float:
+    """Return `auto_exposure_ev` of an image [H, W, 3], measured on a grid of at most 2048 pixels a side."""
+    stride = max(1, max(linear.shape[:2]) // 1024)
+    return auto_exposure_ev(linear[::stride, ::stride])
+
+
+def to_display(linear: np.ndarray, exposure_ev: float | None = None) -> np.ndarray:
+    """Convert a scene-linear image [H, W, 3] to sRGB uint8, by default at the exposure `display_ev`."""
+    gain = np.float32(2.0 ** (display_ev(linear) if exposure_ev is None else exposure_ev))
+    rows = max(1, _BLOCK_VALUES // max(1, linear[0].size))
+    display = np.empty(linear.shape, np.uint8)
+    for start in range(0, len(linear), rows):
+        block = slice(start, start + rows)
+        display[block] = np.round(linear_to_srgb((linear[block] * gain).clip(0, 1)) * 255)
+    return display
+
+
 def anchored_exposure_ev(
     relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray | None = None
 ) -> float:

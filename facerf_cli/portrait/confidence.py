@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import display_ev, to_display
 from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
+from facerf_cli.image.colour import display_ev, to_display
 from facerf_cli.portrait.matte import HeadPlace
 from facerf_cli.portrait.parse import SquareView, class_index, covering, unit_centres
 

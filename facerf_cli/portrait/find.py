@@ -17,10 +17,10 @@ import torch
 from torch import Tensor
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.crop import GIVE_LANDMARKS, Box, box_of, check_in_photo, from_landmarks
+from facerf_cli.face.crop import PASS_LANDMARKS, Box, box_of, check_in_photo, from_landmarks
 from facerf_cli.face.head import OtherHead
-from facerf_cli.face.landmarks import check_display, to_display
 from facerf_cli.face.topology import MIRROR_68, OUTER_EYE_CORNERS
+from facerf_cli.image.colour import to_display
 from facerf_cli.network.stored_graph import PeopleNetworks, StoredGraph
 from facerf_cli.portrait.confidence import check_seen, lie_on_one
 from facerf_cli.portrait.parse import LEAST_PRESENCE, Square, SquareView, look, unit_centres, whole_photo
@@ -339,7 +339,7 @@ def find_faces(
     """
     faces = detect_faces(people, to_display(pixels_linear), everyone=which != "largest")
     if not faces:
-        raise NoFaceError(f"{name}: {_NO_FACE}, or {GIVE_LANDMARKS}")
+        raise NoFaceError(f"{name}: {_NO_FACE}, or {PASS_LANDMARKS}")
     return choose_face(faces, which, name)
 
 
@@ -348,7 +348,6 @@ def detect_faces(people: PeopleNetworks, image_srgb: np.ndarray, everyone: bool 
 
     Rotated and small faces are searched only if no other is found, or for `everyone`.
     """
-    check_display(image_srgb)
     image_srgb, side_px = _brightened(image_srgb), float(max(image_srgb.shape[:2]))
     attempts = [
         first_squares(image_srgb),
@@ -370,7 +369,6 @@ def detect_faces(people: PeopleNetworks, image_srgb: np.ndarray, everyone: bool 
 
 def face_near(people: PeopleNetworks, image_srgb: np.ndarray, landmarks_px: np.ndarray) -> Face | None:
     """Find the face that had landmarks [68, 2] in the previous frame in an sRGB uint8 image [H, W, 3]."""
-    check_display(image_srgb)
     mesh = mesh_near(people, image_srgb, _around(landmarks_px))
     return _face_of(people, image_srgb, mesh) if mesh else None
 

@@ -21,9 +21,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import OtherHead
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
-from facerf_cli.image.colour import without_fireflies
+from facerf_cli.image.colour import to_display, without_fireflies
 from facerf_cli.image.strips import resized
 from facerf_cli.network.portrait import SKIN, PortraitInputs, PortraitMaps, reached_by, skin_exposure
 from facerf_cli.network.stored_graph import PeopleNetworks

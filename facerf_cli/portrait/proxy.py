@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.crop import GIVE_LANDMARKS, Crop
+from facerf_cli.face.crop import PASS_LANDMARKS, Crop
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -123,7 +123,7 @@ def proxy_maps(proxy: Proxy, camera: Camera, filled: bool = True) -> ProxyMaps:
     maps = interpolate(attributes, proxy.triangles, fragments).permute(2, 0, 1)
     covered = fragments.covered.float()
     if not covered.any():
-        raise InputError(f"the fitted face lies outside the image; {GIVE_LANDMARKS}")
+        raise InputError(f"the fitted face lies outside the image; {PASS_LANDMARKS}")
     maps = inpaint(maps, covered) if filled else maps
     return ProxyMaps(F.normalize(maps[:3], dim=0), maps[3:], covered)
 

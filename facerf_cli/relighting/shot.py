@@ -18,8 +18,8 @@ from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop, from_landmarks
 from facerf_cli.face.fit import FaceFit, fit_batch, fit_landmarks, trust_inside
 from facerf_cli.face.head import Head, unwrap_face
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.image.colour import to_display
 from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.portrait import PortraitMaps
 from facerf_cli.portrait.parse import uncovered_in

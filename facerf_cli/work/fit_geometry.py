@@ -8,14 +8,13 @@ import numpy as np
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.face.fit import save_fit
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import grid_triangles, grid_uv
 from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.meshes import TexturedMesh, write_glb, write_obj
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display, write_exr
-from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.image.colour import srgb_to_linear, to_display
 from facerf_cli.raster.camera import CROP_FOCAL_PER_SIDE
 from facerf_cli.raster.texture import vertex_normals
 from facerf_cli.work.photo_options import PhotoOptions

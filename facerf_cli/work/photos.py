@@ -17,11 +17,11 @@ from facerf_cli.batch.settings import torch_device
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.face.fit import FaceFit
 from facerf_cli.face.head import Head
-from facerf_cli.face.landmarks import read_landmarks, to_display
+from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.face.morphable import BUILTIN, MorphableModel, load_face_model
 from facerf_cli.files.arrays import read_array
 from facerf_cli.files.read import LinearImage, read_image
-from facerf_cli.image.colour import named_space
+from facerf_cli.image.colour import named_space, to_display
 from facerf_cli.image.strips import resized
 from facerf_cli.network.files import serving_files
 from facerf_cli.person import find_faces

@@ -13,12 +13,11 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.recipe import recipe_of
 from facerf_cli.batch.run import Outcome
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import display_ev
 from facerf_cli.face.view import photo_camera
 from facerf_cli.files.image_metadata import plate_metadata
 from facerf_cli.files.read import LinearImage, read_image
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.image.colour import linear_to_srgb, most_exposure_ev
+from facerf_cli.image.colour import display_ev, linear_to_srgb, most_exposure_ev
 from facerf_cli.image.light_wrap import LightWrap
 from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
 from facerf_cli.light.envmap import Backdrop

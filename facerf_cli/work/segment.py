@@ -8,11 +8,10 @@ import numpy as np
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.files.documents import write_document
 from facerf_cli.files.read import LinearImage
 from facerf_cli.files.write import write_display, write_exr
-from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.image.colour import srgb_to_linear, to_display
 from facerf_cli.image.strips import in_strips
 from facerf_cli.portrait.find import Face
 from facerf_cli.portrait.matte import PersonColours

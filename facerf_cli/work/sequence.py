@@ -15,11 +15,11 @@ import numpy as np
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import read_landmarks, to_display
+from facerf_cli.face.landmarks import read_landmarks
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.film import Film
 from facerf_cli.files.read import LinearImage
-from facerf_cli.image.colour import SRGB, named_space, to_linear_rec709, unit_floats
+from facerf_cli.image.colour import SRGB, named_space, to_display, to_linear_rec709, unit_floats
 from facerf_cli.portrait.find import face_at, face_with
 from facerf_cli.portrait.segment import Segmentation
 from facerf_cli.relighting import White

@@ -1,7 +1,10 @@
+from types import SimpleNamespace
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 
-from facerf_cli.baselines.diffuse_sh import Diffuse, explain_texture, refitted
+from facerf_cli.baselines.diffuse_sh import Diffuse, explain_by_diffuse_sh, refitted
 from facerf_cli.face.head import FaceTexture
 from facerf_cli.light.sphere import azel_to_direction, rig_directions
 from facerf_cli.network.diffuse_sh import shading
@@ -64,7 +67,9 @@ def test_what_is_shipped_explains_an_evenly_lit_face_by_an_even_light() -> None:
     network = SHIPPED_NETWORKS.diffuse_sh
     skin = torch.tensor([0.45, 0.3, 0.22]).view(3, 1, 1).expand(3, 64, 64)
     normals = F.interpolate(network.mean_normals[None], (64, 64), mode="area")[0]
-    found = explain_texture(network, FaceTexture(skin, torch.ones(64, 64), F.normalize(normals, dim=0)))
+    models: Any = SimpleNamespace(networks=SHIPPED_NETWORKS)
+    texture = FaceTexture(skin, torch.ones(64, 64), F.normalize(normals, dim=0))
+    found = explain_by_diffuse_sh(models, None, texture)  # type: ignore[arg-type]
     own = found.reflectance.relit(found.light.directions, found.light.weights[None])[0]
     assert ((own - skin).abs() / skin).mean() < 0.15
     assert 0.15 < found.reflectance.albedo.mean() < 0.5

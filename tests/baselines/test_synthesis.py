@@ -9,11 +9,10 @@ from facerf_cli.baselines.synthesis import (
     LightPrior,
     LogGaussian,
     Scene,
-    SolveSettings,
-    light_given,
     scene_of,
     shrunk,
     solve,
+    solve_light,
     with_detail,
 )
 from facerf_cli.face.head import FaceTexture
@@ -60,19 +59,16 @@ def error_of(found: synthesis.Solution, parts: tuple, given: tuple[Tensor, Tenso
 def test_what_the_priors_made_comes_back_in_spite_of_hair_trust_and_brightness() -> None:
     parts, given, radiance = drawn()
     scene = Scene(radiance, torch.ones(T * T), *given)
-    assert (
-        error_of(solve(scene, *parts, SolveSettings(evidence=1e6, steps=25)), parts, given, radiance) < 0.01
-    )
+    assert error_of(solve(scene, *parts, evidence=1e6, steps=25), parts, given, radiance) < 0.01
     covered = radiance.clone()
     covered[:, : T * T // 8] = 0.01
-    settings = SolveSettings(evidence=1e6, steps=25)
-    found = solve(Scene(covered, torch.ones(T * T), *given), *parts, settings)
+    found = solve(Scene(covered, torch.ones(T * T), *given), *parts, evidence=1e6, steps=25)
     assert error_of(found, parts, given, radiance) < 0.03
     trust = torch.ones(T * T)
     trust[:20] = 0
     spoilt = radiance.clone()
     spoilt[:, :20] = torch.nan
-    found = solve(Scene(spoilt, trust, *given), *parts, SolveSettings(evidence=1e6, steps=25))
+    found = solve(Scene(spoilt, trust, *given), *parts, evidence=1e6, steps=25)
     assert error_of(found, parts, given, radiance) < 0.01
     once = solve(Scene(radiance, torch.ones(T * T), *given), *parts)
     twice = solve(Scene(2 * radiance, torch.ones(T * T), *given), *parts)
@@ -87,7 +83,7 @@ def test_the_light_of_a_known_face() -> None:
     albedo, gloss = parts[0].at(torch.randn(4), T), parts[1].at(torch.randn(2), T)
     light = 2 * (parts[2].mean + torch.einsum("r,rkc->kc", torch.randn(6), parts[2].modes))
     radiance = image(given, albedo, gloss, light)
-    found = light_given(Scene(radiance, torch.ones(T * T), *given), albedo, gloss, parts[2])
+    found = solve_light(Scene(radiance, torch.ones(T * T), *given), albedo, gloss, parts[2])
     assert float((found - light).norm() / light.norm()) < 0.02
 
 
@@ -95,7 +91,7 @@ def test_slopes_are_those_of_the_image() -> None:
     parts, given, radiance = drawn()
     scene = Scene(radiance, torch.ones(T * T), *given)
     seen = scene.trust > 0
-    problem = synthesis._problem(scene, seen, 1.0, *parts, SolveSettings())
+    problem = synthesis._problem(scene, seen, 1.0, *parts, evidence=500.0)
     state = 0.3 * torch.randn(1 + 6 + 4 + 2, dtype=torch.float64)
     _, slopes = synthesis._synthesise(problem, state)
     wanted = torch.autograd.functional.jacobian(

@@ -110,7 +110,7 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(tmp_path: Path, capsys: 
     photo_options = PhotoOptions(Settings(device="cpu"))
     made, models = bench_of(EvaluateOptions(tmp_path), photo_options), load_models_once(photo_options)
     whole, half = (next(PhotoFaces(()).faces(Item(x, x, x.stem), made)) for x in (PHOTO, path))
-    seen, part = whole.by(models), half.by(models)
+    seen, part = whole.fit_with(models), half.fit_with(models)
     crop = part.fit.crop
     column = crop.to_photo(np.stack([np.arange(crop.size_px) + 0.5] * 2, -1))[:, 0]
     left, right = column < 215, column > 225
@@ -118,7 +118,7 @@ def test_what_a_photos_alpha_leaves_out_is_not_compared(tmp_path: Path, capsys: 
     np.testing.assert_allclose(part.mask[:, right], seen.mask[:, right], atol=0.01)
     assert part.head.face.visible.sum() < 0.8 * seen.head.face.visible.sum()
     mean = replace(models, face=models.face.pose_only())
-    assert half.by(mean).mask[:, left].max() == 0
+    assert half.fit_with(mean).mask[:, left].max() == 0
     shown[:, 220:], shown[:9, :9] = 0, 255  # alpha that is 0 everywhere is none
     Image.fromarray(np.dstack([photo, shown])).save(path)
     assert run("reconstruction", path, "-o", tmp_path / "out") == 1
@@ -154,9 +154,9 @@ def test_the_papers_numbers_are_measured_as_far_as_there_are_pairs(
     folder: Path, tmp_path: Path, capsys: Said
 ) -> None:
     for protocol, says in (
-        ("olat", "1 maps are measured, all there are; the paper measured 160"),
-        ("reconstruction", "12 sources are measured"),
-        ("geometry", "12 sources are measured"),
+        ("olat", "measuring all 1 maps; the paper measured 160"),
+        ("reconstruction", "measuring all 12 sources"),
+        ("geometry", "measuring all 12 sources"),
     ):
         capsys.readouterr()
         assert run(protocol, folder, "-o", tmp_path / "out", "--preset", "paper", "--dry-run") == 0
@@ -241,5 +241,5 @@ def test_the_papers_estimator_of_light_can_be_chosen(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(people, "estimate_light", estimate)
     monkeypatch.setattr(people, "reflectance_of", lambda *given: None)
-    method.explained(None)  # type: ignore[arg-type]
+    method.explain(None)  # type: ignore[arg-type]
     assert asked == [method.estimator]

@@ -11,7 +11,7 @@ from torch import Tensor
 from facerf_cli.baselines import Kind
 from facerf_cli.baselines.base import Explained
 from facerf_cli.capture.yale_b import HEIGHT_PX, WIDTH_PX
-from facerf_cli.evaluation.people import DatasetPerson, Method, Portrait
+from facerf_cli.evaluation.people import ComparedFace, DatasetPerson, Method
 from facerf_cli.face.fit import Geometry
 from facerf_cli.face.head import FaceTexture, Head
 from facerf_cli.face.morphable import MorphableModel, load_face_model
@@ -67,7 +67,7 @@ class Double(Method):
     gain: float = 1.0
     made: list[Explained] = field(default_factory=list)
 
-    def explained(self, head: Head) -> Explained:
+    def explain(self, head: Head) -> Explained:
         weights = torch.tensor([0.1, 0.2, 1.0])[:, None].expand(3, 3) * (1 + len(self.made))
         self.made.append(Explained(Unlit(head.face, self.gain), RigLight(LIGHTS, weights)))
         return self.made[-1]
@@ -94,11 +94,11 @@ class PersonOfAlbedo(DatasetPerson):
         albedo = np.where(cosine[..., None] > 0.02, lit / np.maximum(cosine, 0.02)[..., None], 0)
         return albedo.astype(np.float32)
 
-    def portrait(self, pair: Any) -> Portrait:
-        portrait = super().portrait(pair)
+    def source_of(self, pair: Any) -> ComparedFace:
+        face = super().source_of(pair)
         lit = self._frontal(pair.source_camera)[1] > 0.02
-        assert portrait.photo.alpha is not None
-        return replace(portrait, photo=replace(portrait.photo, alpha=portrait.photo.alpha * lit))
+        assert face.photo.alpha is not None
+        return replace(face, photo=replace(face.photo, alpha=face.photo.alpha * lit))
 
     def _frontal(self, camera: str) -> tuple[int, np.ndarray]:
         """The light nearest to the camera's axis, and its cosine to each pixel's normal."""

@@ -70,7 +70,7 @@ def test_an_image_is_no_person_and_folders_that_are_none_are_refused(truths: Pat
     (truths.parent / "empty").mkdir()
     for predictions, words in (
         ([ours, truths.parent / "empty"], "no images"),
-        ([truths], "given twice"),
+        ([truths], "passed twice"),
     ):
         refused(UsageError, words, match, predictions, truths)
 

@@ -7,8 +7,8 @@ import pytest
 
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import measure as module
-from facerf_cli.evaluation.measure import METRICS, SOURCE, Case, Comparison, measure, shown
-from facerf_cli.evaluation.metrics import mse, psnr, si_mse, si_mse_channels, si_mse_clipped, ssim
+from facerf_cli.evaluation.measure import METRICS, SOURCE, Case, Comparison, display, measure
+from facerf_cli.evaluation.metrics import mse, si_mse, si_mse_channels, si_mse_clipped, ssim
 from facerf_cli.evaluation.options import Measures
 from facerf_cli.image.colour import auto_exposure_ev, linear_to_srgb
 from tests.refusals import refused
@@ -49,8 +49,9 @@ def test_a_row_a_method_in_their_order(comparison: Comparison) -> None:
     ]
     near, far = (row.values for row in rows)
     truth, mask, prediction = comparison.truth, comparison.mask, comparison.predictions["near"]
-    for metric in (si_mse, si_mse_clipped, si_mse_channels, mse, psnr, ssim):
+    for metric in (si_mse, si_mse_clipped, si_mse_channels, mse, ssim):
         assert near[metric.__name__] == pytest.approx(metric(prediction, truth, mask)), metric
+    assert near["psnr"] == pytest.approx(-10 * np.log10(near["mse"]))
     assert near["dssim"] == pytest.approx((1 - near["ssim"]) / 2)
     assert rows[0].facts == comparison.case.facts and near.keys() == far.keys() <= METRICS.keys()
     for name, value in near.items():
@@ -95,7 +96,7 @@ def test_the_source_has_face_dis_as_its_own_face_is_shown(
     assert (row.method, row.values) == (SOURCE, {"face_distance": pytest.approx(distance)})
 
 
-def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lpips_is_of_what_is_display(comparison: Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
     def metric(ours: np.ndarray, true: np.ndarray) -> float:
@@ -105,8 +106,8 @@ def test_lpips_is_of_what_is_shown(comparison: Comparison, monkeypatch: pytest.M
     monkeypatch.setattr(module, "perceptual_metric", lambda heads, vgg, device: metric)
     rows, truth = measure(comparison, Measures(vgg_weights="imagenet")), comparison.truth
     assert [row.values["lpips"] for row in rows] == [0.25, 0.25]
-    np.testing.assert_array_equal(seen[0][0], shown(comparison.predictions["near"], truth, comparison.mask))
-    np.testing.assert_array_equal(seen[0][1], shown(truth, truth, comparison.mask))
+    np.testing.assert_array_equal(seen[0][0], display(comparison.predictions["near"], truth, comparison.mask))
+    np.testing.assert_array_equal(seen[0][1], display(truth, truth, comparison.mask))
     assert "lpips" not in measure(comparison, Measures())[0].values
 
 
@@ -124,10 +125,10 @@ def test_what_cannot_be_compared_is_refused_in_words(comparison: Comparison) -> 
     far, mask, truth = comparison.predictions["far"], comparison.mask, comparison.truth
     for changed, words in (
         ({"predictions": {"far": far[:, 1:]}}, "far has 25 x 20 pixels, the truth 26 x 20"),
-        ({"truth": np.where(truth > 0.5, np.inf, truth)}, "the truth holds values that are not finite"),
-        ({"predictions": {"far": np.where(far > 0.5, np.nan, far)}}, "far holds values that are not finite"),
+        ({"truth": np.where(truth > 0.5, np.inf, truth)}, "the truth contains non-finite values"),
+        ({"predictions": {"far": np.where(far > 0.5, np.nan, far)}}, "far contains non-finite values"),
         ({"mask": mask[1:]}, "the mask has 26 x 19 pixels"),
-        ({"mask": 0 * mask}, "nothing of the face is left in the mask"),
+        ({"mask": 0 * mask}, "the mask contains no part"),
     ):
         refused(InputError, f"a/b: {words}", measure, replace(comparison, **changed), Measures())
 

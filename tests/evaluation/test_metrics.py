@@ -80,7 +80,6 @@ def test_figures_are_those_of_the_slow_twins_and_of_training(images: Images) -> 
     assert si_mse(*images) == pytest.approx(slow.si_mse(*images), rel=1e-9)
     assert mse(*images) == pytest.approx(slow.mse(*images), rel=1e-9)
     assert ssim(*images) == pytest.approx(slow.ssim(*images), rel=1e-6)
-    assert psnr(*images) == pytest.approx(-10 * np.log10(mse(*images)))
     planes = [torch.from_numpy(image).double().permute(2, 0, 1)[None, None] for image in images[:2]]
     expected = training_si_mse(*planes, torch.from_numpy(images[2])[None, None])
     assert si_mse(*images) == pytest.approx(expected.item(), rel=1e-9)
@@ -100,12 +99,12 @@ def test_scales_are_ignored_and_never_negative(images: Images) -> None:
 def test_pixels_outside_the_mask_do_not_count_and_equal_images_are_equal(images: Images) -> None:
     prediction, truth, mask = images
     wild = np.where(mask[..., None] > 0, prediction, np.float32(50))
-    for metric in (best_scale, si_mse, si_mse_clipped, mse, psnr, ssim):
+    for metric in (best_scale, si_mse, si_mse_clipped, mse, ssim):
         assert metric(wild, truth, mask) == metric(prediction, truth, mask)
     _, truth, mask = images
     assert si_mse(truth, truth, mask) == pytest.approx(0, abs=1e-15)
     assert ssim(truth, truth, mask) == pytest.approx(1)
-    assert psnr(truth, truth, mask) == pytest.approx(PSNR_HIGHEST_DB)
+    assert psnr(mse(truth, truth, mask)) == pytest.approx(PSNR_HIGHEST_DB)
     prediction, truth, mask = images
     refused(ValueError, "empty", si_mse, prediction, truth, 0 * mask)
     refused(ValueError, "(14, 18, 3)", mse, prediction[:, 1:], truth, mask)
@@ -136,7 +135,6 @@ def test_ita_of_known_colours() -> None:
         linear = np.linalg.inv(colour.RGB_COLOURSPACES["ITU-R BT.709"].matrix_RGB_to_XYZ) @ xyz
         expected = np.degrees(np.arctan((lightness - 50) / yellow))
         assert float(ita_deg(linear)) == pytest.approx(expected, abs=0.1)
-    assert [tone_of(x) for x in (55.1, 55, 0, -30, -90)] == ["very light", "light", "brown", "dark", "dark"]
 
 
 def test_tone_drift_uses_only_the_skin_and_no_light_has_no_angle() -> None:
@@ -156,7 +154,7 @@ def test_tone_drift_uses_only_the_skin_and_no_light_has_no_angle() -> None:
 
 @pytest.mark.parametrize(
     ("ita", "tone"),
-    [(70, "very light"), (55, "light"), (41, "intermediate"), (28, "tan"), (10, "brown"), (-30, "dark")],
+    [(55.1, "very light"), (55, "light"), (41, "intermediate"), (28, "tan"), (10, "brown"), (-30, "dark")],
 )
 def test_tones_are_the_published_classes(ita: float, tone: str) -> None:
     assert tone_of(ita) == tone

@@ -86,7 +86,7 @@ def test_items_evaluated_otherwise_are_measured_again(tmp_path: Path, notes: Pat
     out = tmp_path / "out"
     assert evaluate(out) == 0
     for changed in ({"measures": Measures(space="display")}, {"keep_eyes": True}):
-        refused(UsageError, "leave out --overwrite never", evaluate, out, overwrite="never", **changed)
+        refused(UsageError, "remove --overwrite never", evaluate, out, overwrite="never", **changed)
     assert evaluate(out, jobs=1, dry_run=True) == 0 and (out / "summary.json").exists()
     assert evaluate(out, Toy(cases=3, notes=notes), keep_eyes=True) == 0
     assert "options changed" in capsys.readouterr().err and taken(notes) == list(PEOPLE)
@@ -110,7 +110,7 @@ def test_an_item_whose_input_changed_is_measured_again(tmp_path: Path, notes: Pa
 def test_damaged_figures_are_named(tmp_path: Path) -> None:
     assert evaluate(tmp_path) == 0
     (tmp_path / "cases/bea.json").write_text("{}")
-    refused(InputError, "no figures of an evaluation", evaluate, tmp_path)
+    refused(InputError, "bea.json", evaluate, tmp_path)
     assert not (tmp_path / "summary.json").exists()
 
 

@@ -4,6 +4,7 @@ import importlib.util
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from facerf_cli.capture.yale_b import Flash, YaleB, read_shifts, read_yale_b
 from facerf_cli.errors import InputError
 from facerf_cli.evaluation import people, yale_b
 from facerf_cli.evaluation.measure import measure
-from facerf_cli.evaluation.options import Measures
+from facerf_cli.evaluation.options import Measures, YaleOptions
 from facerf_cli.evaluation.people import Bench, Method
 from facerf_cli.evaluation.yale_b import (
     Relighting,
@@ -38,6 +39,7 @@ from tests.evaluation.method_doubles import FaceModelOnly, Lambert, someone
 
 BENCH = SHARED / "bench" / "yale_b"
 SIDES = Sides(256, 512)
+OPTIONS = YaleOptions(Path())
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +105,7 @@ def test_scores_are_the_benchmarks(
         find=lambda image, name: someone(),
         heads=lambda photo, face: [(TooBright(), face)],
     )
-    comparisons = list(compare_subject(databases[0], "yaleB05", bright))
+    comparisons = list(compare_subject(OPTIONS, bright, (databases[0], "yaleB05")))
     assert len(comparisons) == len(databases[1].cases("yaleB05"))
     for comparison in comparisons[::9]:
         subject, _, light = comparison.case.name.split("/")
@@ -134,7 +136,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     monkeypatch.setattr(yale_b, "SOFT_SOURCES", ("dome",))
     monkeypatch.setattr(yale_b, "ENVIRONMENT_SOURCES", ("frontal",))
     monkeypatch.setattr(yale_b, "ENVIRONMENTS", ("env_sky",))
-    monkeypatch.setattr(yale_b, "_CORE", (Flash(0, 0), Flash(-70, 0)))
+    monkeypatch.setattr(yale_b, "_SOFT_TARGETS", (Flash(0, 0), Flash(-70, 0)))
     monkeypatch.setattr(people, "find_faces", lambda *_: [someone()])
     monkeypatch.setattr(Person, "share", property(lambda person: np.ones(person.photo.shape[:2], np.float32)))
     monkeypatch.setattr(people, "head_of", lambda *given: fits.update(["fitted"]) or head_of(*given))
@@ -142,7 +144,8 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     write_pgm(small.folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm", flat)
     models: Any = FaceModelOnly(load_face_model("builtin"))
     methods: Any = [Lambert("a", models=models), Lambert("b", models=models)]
-    comparisons = list(compare_subject(small, "yaleB07", Bench(models, SIDES, "landmarks", methods=methods)))
+    bench = Bench(models, SIDES, "landmarks", methods=methods)
+    comparisons = list(compare_subject(OPTIONS, bench, (small, "yaleB07")))
     columns = Counter(comparison.case.facts["column"] for comparison in comparisons)
     assert columns == {"frontal": 6, "soft": 2, "environment": 1} and fits["fitted"] == 2  # one a source
     for comparison in comparisons:
@@ -157,9 +160,7 @@ def test_every_method_relights_every_case(small: YaleB, monkeypatch: pytest.Monk
     np.testing.assert_allclose(centre, np.cos(np.radians(70)), atol=1e-3)
     one = Relighting("frontal", "frontal", "A-070E+00")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
-    (in_room,) = compare_subject(
-        small, "yaleB07", Bench(models, SIDES, "landmarks", methods=methods[:1]), room=0.5
-    )
+    (in_room,) = compare_subject(replace(OPTIONS, room=0.5), bench, (small, "yaleB07"))
     lighter = in_room.predictions["a"][110, 84]
     np.testing.assert_allclose(lighter - centre, 0.5, atol=0.02)  # 48 lights stand for all around
 
@@ -168,7 +169,8 @@ def test_a_subject_without_its_frontal_image(tmp_path: Path) -> None:
     folder = write_yale_b(tmp_path / "yale")
     (folder / "yaleB07" / "yaleB07_P00A+000E+00.pgm").unlink()
     with pytest.raises(InputError, match=r"yaleB07: no undamaged image under A\+000E\+00"):
-        list(compare_subject(read_yale_b(folder), "yaleB07", Bench(load_models(), SIDES, "landmarks")))
+        bench = Bench(load_models(), SIDES, "landmarks")
+        list(compare_subject(OPTIONS, bench, (read_yale_b(folder), "yaleB07")))
 
 
 def test_environments_come_from_their_side(small: YaleB) -> None:
@@ -192,7 +194,8 @@ def test_images_are_those_of_relight(small: YaleB, monkeypatch: pytest.MonkeyPat
     one = Relighting("environment", "win_left", "env_two_side")
     monkeypatch.setattr(YaleSubject, "relightings", lambda self: iter([one]))
     method = Method("a", "diffuse-sh", models, network_alone=False)
-    (comparison,) = compare_subject(small, "yaleB07", Bench(models, SIDES, "landmarks", methods=[method]))
+    bench = Bench(models, SIDES, "landmarks", methods=[method])
+    (comparison,) = compare_subject(OPTIONS, bench, (small, "yaleB07"))
     weights = torch.from_numpy(subject.weights(one.light)).float()[:, None].expand(-1, 3)
     expected = person.image(RigLight(directions, weights)).mean(-1).clip(0)
     np.testing.assert_allclose(comparison.predictions["a"][..., 1], expected, rtol=1e-4, atol=1e-5)

@@ -91,7 +91,7 @@ def test_the_crop_follows_the_face_and_that_of_a_box_is_larger():
     crop = from_box((100.0, 40.0, 200.0, 140.0), 64)
     assert crop == Crop(150 - 74, 90 - 2 - 74, 148, 64)
     for bad in ((5.0, 0.0, 5.0, 0.0), (0.0, 0.0, np.inf, 9.0), (0.0, 0.0, np.nan, 9.0)):
-        refused(InputError, "not a box", from_box, bad, 64)
+        refused(InputError, "not a face box", from_box, bad, 64)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import skimage.data
 from facerf_cli.errors import FacerfError
 from facerf_cli.face import descriptor as module
 from facerf_cli.face.descriptor import face_descriptor
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.files.read import read_image
+from facerf_cli.image.colour import to_display
 from facerf_cli.portrait.find import find_faces
 from facerf_cli.raster.camera import PIXEL_CENTRE
 from facerf_cli.relighting.models import SHIPPED_NETWORKS

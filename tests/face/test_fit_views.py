@@ -202,7 +202,7 @@ def test_a_crop_needs_the_front_of_the_face(model: MorphableModel) -> None:
     behind = replace(away, rotation=torch.diag(torch.tensor([-1.0, 1.0, -1.0]).double()))
     for camera in (away, behind):
         shift = torch.tensor([0.0, 0.0, 1.0 if camera is away else -1.2]).double()
-        with pytest.raises(InputError, match="from behind"):
+        with pytest.raises(InputError, match="behind the head"):
             fit_in_crop(
                 model, joint, replace(camera, translation_m=shift - camera.rotation @ head), None, 0.01, 256
             )

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.face.landmarks import read_landmarks, to_display
+from facerf_cli.face.landmarks import read_landmarks
+from facerf_cli.image.colour import to_display
 from facerf_cli.portrait import find
 from facerf_cli.portrait.find import Face, choose_face
 from tests.refusals import refused

@@ -11,9 +11,8 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import Delaunay
 
 from facerf_cli.errors import InputError
-from facerf_cli.face.landmarks import to_display
 from facerf_cli.face.topology import LANDMARKS_M, MIRROR_68
-from facerf_cli.image.colour import srgb_to_linear
+from facerf_cli.image.colour import srgb_to_linear, to_display
 from facerf_cli.portrait.confidence import (
     Confidence,
     check_seen,

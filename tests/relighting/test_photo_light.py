@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 
 from facerf_cli.face.head import FaceTexture
-from facerf_cli.face.landmarks import to_display
+from facerf_cli.image.colour import to_display
 from facerf_cli.light.sphere import RigLight, azel_to_direction, rig_directions
 from facerf_cli.portrait.parse import Square, look
 from facerf_cli.relighting.field import Field, shrunk

@@ -1,4 +1,4 @@
-"""ICT Face Model Light (Li et al., 'Learning Formation of Physically-Based Face Attributes', CVPR 2020)."""
+"""Importer of ICT-FaceKit (Li et al., 'Learning Formation of Physically-Based Face Attributes', 2020)."""
 
 import re
 import tarfile
@@ -20,9 +20,9 @@ _IDS = (
 )
 LANDMARK_IDS = np.array(_IDS.split(), dtype=np.int64)  # from its README
 VERTICES, _NEUTRAL = 26719, "generic_neutral_mesh"
-_SKIN = np.r_[0:11248, 21451:24591]  # face, head and neck; eyeballs
+_OUTER_SURFACE = np.r_[0:11248, 21451:24591]  # vertices of face, head and neck, and of the eyeballs
 _LICENCE = "MIT, Copyright (c) 2020 USC Institute for Creative Technologies"
-_MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj, of all
+_MAX_OBJ_BYTES, _MAX_BYTES = 64 << 20, 2 << 30  # of one .obj and of all
 
 
 def read_ict_facekit(path: Path) -> SourceModel:
@@ -32,7 +32,7 @@ def read_ict_facekit(path: Path) -> SourceModel:
 
 
 def ict_source(raw: dict[str, bytes]) -> SourceModel:
-    """The model of the .obj files' contents by stem; their centimetres become metres."""
+    """Build the model from the contents of the .obj files by stem, and convert centimetres to metres."""
     identities = sorted(stem for stem in raw if re.fullmatch(r"identity\d+", stem))
     expressions = sorted(raw.keys() - {*identities, _NEUTRAL})
     if _NEUTRAL not in raw or not identities or not expressions:
@@ -50,13 +50,13 @@ def ict_source(raw: dict[str, bytes]) -> SourceModel:
         identity=offsets(identities),
         expression=offsets(expressions) * EXPRESSION_STD,
         expression_names=tuple(expressions),
-        triangles=triangles[np.isin(triangles, _SKIN).all(1)],
+        triangles=triangles[np.isin(triangles, _OUTER_SURFACE).all(1)],
         known=dict(enumerate(mean[LANDMARK_IDS])),
     )
 
 
 def _vertices(stem: str, text: bytes) -> np.ndarray:
-    """The vertices [N, 3] of an .obj in metres."""
+    """Parse the vertices [N, 3] of an .obj, in metres."""
     lines = [line[2:] for line in text.splitlines() if line.startswith(b"v ")]
     vertices_cm = np.array(b" ".join(lines).split(), dtype=np.float64).reshape(len(lines), -1)[:, :3]
     if vertices_cm.shape != (VERTICES, 3) or not np.isfinite(vertices_cm).all():
@@ -65,7 +65,7 @@ def _vertices(stem: str, text: bytes) -> np.ndarray:
 
 
 def _triangles(text: bytes) -> np.ndarray:
-    """The triangles [F, 3] of the neutral mesh's polygons."""
+    """Parse the polygons of an .obj as triangles [F, 3]."""
     triangles = []
     for line in text.splitlines():
         if line.startswith(b"f "):
@@ -75,19 +75,19 @@ def _triangles(text: bytes) -> np.ndarray:
 
 
 def _objs(path: Path) -> Iterator[tuple[str, bytes]]:
-    """Iterate over the stems and contents of the .obj files; raises ValueError for too large ones."""
+    """Yield the stem and the content of each .obj file; raises ValueError for too large files."""
     total = 0
     for name, read in _members(path):
-        if found := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
+        if match := re.search(r"FaceXModel/([A-Za-z0-9_]+)\.obj$", name):
             text = read(_MAX_OBJ_BYTES + 1)
             total += len(text)
             if len(text) > _MAX_OBJ_BYTES or total > _MAX_BYTES:
                 raise ValueError(f"{name} is too large")
-            yield found[1], text
+            yield match[1], text
 
 
 def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
-    """Iterate over the files of a folder or archive: the name, and a function that reads up to n bytes."""
+    """Yield the name of each file of a folder or archive, and a function that reads up to n bytes."""
     if path.is_dir():
         for file in sorted(path.rglob("*.obj")):
             with file.open("rb") as stream:
@@ -99,9 +99,9 @@ def _members(path: Path) -> Iterator[tuple[str, Callable[[int], bytes]]]:
                     yield name, member.read
     else:
         require_regular(
-            path, "give ICT-FaceKit's folder, .zip or .tar, FLAME's .pkl or .npz, or Basel's .mat or .h5"
+            path, "use ICT-FaceKit's folder, .zip or .tar, FLAME's .pkl or .npz, or Basel's .mat or .h5"
         )
-        # One pass: seeking in a compressed tar decompresses it again for each of its 150 files.
+        # One pass, because seeking would decompress the tar for each of its 150 files.
         with tarfile.open(path, "r|*") as tar:
             for entry in tar:
                 if entry.isfile() and (content := tar.extractfile(entry)):

@@ -1,6 +1,6 @@
-"""Import of a published face model: from its publisher's topology to the canonical grid.
+"""Import a published face model: resample it from its publisher's topology to the canonical grid.
 
-The model's landmarks warp the grid in UV space, and rays through the warped grid find its surface.
+The model's landmarks warp the grid in UV space; rays through the warped grid locate its surface.
 """
 
 from pathlib import Path
@@ -31,12 +31,12 @@ from facerf_cli.face.topology import (
     landmark_weights,
 )
 
-_HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # a length outside these ranges is in another unit
-_SLIP_M = 0.006  # a ray this far behind its neighbours slipped between the lips or lids
-_CANDIDATES = 12  # the nearest point is searched in this many triangles, those with the nearest centres
-_PULL_M = 0.005  # radius around a landmark in which the grid is pulled onto it
-_FEWEST_LANDMARKS = 12  # that place the grid
-_LEAST_COVERED = 0.75  # share of the grid that a model's surface must cover
+_HEAD_M, _EYES_M = (0.12, 1.0), (0.06, 0.13)  # lengths outside these ranges are in another unit
+_SLIP_M = 0.006  # a ray that ends this far behind its neighbours slipped between the lips or lids
+_CANDIDATES = 12  # triangles, those with the nearest centres, in which the nearest point is searched
+_PULL_M = 0.005  # radius around a landmark within which the grid is pulled onto it
+_FEWEST_LANDMARKS = 12
+_LEAST_COVERED = 0.75  # fraction of the grid that the model's surface must cover
 
 
 def import_face_model(path: Path, landmarks: Path | None = None) -> MorphableModel:
@@ -56,24 +56,22 @@ def _read(path: Path, landmarks: Path | None) -> SourceModel:
     if suffix in (".pkl", ".npz"):
         return read_flame(path, landmarks)
     if landmarks is not None:
-        raise InputError(f"{landmarks}: --landmarks is for FLAME, and {path} is not; remove it")
+        raise InputError(f"{landmarks}: --landmarks is for FLAME, but {path} is not; remove it")
     return read_basel(path) if suffix in (".mat", ".h5") else read_ict_facekit(path)
 
 
 def resample_model(source: SourceModel) -> MorphableModel:
     """Resample a model to the canonical topology.
 
-    A model without expressions gets those of the built-in model, which has the same vertices. A surface that
-    ends inside the grid, such as Basel's face12, continues as the built-in face and moves like its border.
+    A model without expressions uses the built-in model's, which have the same vertices. A surface that ends
+    inside the grid, such as Basel's face12, is continued by the built-in face, which follows its border.
     Raises InputError for a mean in another unit, and for a model that names too few landmarks.
     """
     side_m = float(np.ptp(source.mean[np.unique(source.triangles)], 0).max())
     _require_size("its mean's largest side", side_m, _HEAD_M)
     known = source.known
     if len(known) < _FEWEST_LANDMARKS or not known.keys() >= set(OUTER_EYE_CORNERS):
-        raise InputError(
-            f"it names {len(known)} of the landmarks, too few; give the file as it was published"
-        )
+        raise InputError(f"it names only {len(known)} of the landmarks; use the file as published")
     eyes_m = float(np.linalg.norm(known[OUTER_EYE_CORNERS[0]] - known[OUTER_EYE_CORNERS[1]]))
     _require_size("the distance of its eyes' outer corners", eyes_m, _EYES_M)
     numbers = sorted(known)
@@ -106,15 +104,14 @@ def resample_model(source: SourceModel) -> MorphableModel:
 
 
 def _require_size(what: str, length_m: float, between_m: tuple[float, float]) -> None:
-    """Raise InputError for a length outside a range."""
     if not between_m[0] < length_m < between_m[1]:
-        raise InputError(f"{what} is {1000 * length_m:.4g} mm; give the model in the unit of its publication")
+        raise InputError(f"{what} is {1000 * length_m:.4g} mm; use the model in its published unit")
 
 
 def _beyond(covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The border [V] of the covered vertices [V], and weights [M, B] from its vertices to the uncovered ones.
+    """Return the border [V] of the covered vertices [V], and its weights [M, B] at the uncovered ones.
 
-    Inverse distance weights: exact at the border, smooth beyond.
+    The weights are inverse distances: exact at the border, smooth beyond.
     """
     border = covered & binary_dilation(~covered.reshape(GRID, GRID)).ravel()
     grid = grid_uv().double().numpy()
@@ -125,10 +122,10 @@ def _beyond(covered: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def register(
     mean: np.ndarray, triangles: np.ndarray, landmarks: np.ndarray, numbers: list[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Place the canonical vertices on a mesh: vertex ids and barycentric weights [V, 3], and a mask [V].
+    """Locate the canonical vertices on a mesh; return vertex ids and weights [V, 3], and coverage [V].
 
     A thin-plate spline of the displacements of the landmarks [K, 3] of these numbers [K] from their canonical
-    (u, v) warps the grid. The mask is true where the mesh covers a vertex.
+    (u, v) warps the grid. Coverage is true where the mesh covers a vertex.
     """
     canonical = LANDMARK_UV[numbers]
     warp = RBFInterpolator(canonical, cylinder_uv(landmarks) - canonical, kernel="thin_plate_spline")
@@ -144,7 +141,7 @@ def register(
 def _cast(
     mesh: trimesh.Trimesh, origins: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points [V, 3] where the grid's rays meet the mesh, and a mask [V] of the rays that do.
+    """Intersect the grid's rays with the mesh; return the points [V, 3] and a mask [V] of the hits.
 
     A ray that slips into a slit ends at the distance of its neighbours.
     """
@@ -152,14 +149,14 @@ def _cast(
     if len(rays) < len(origins) * _LEAST_COVERED:
         raise InputError(
             f"its surface covers {100 * len(rays) / len(origins):.0f} % of the face, from the forehead to "
-            f"below the chin; {100 * _LEAST_COVERED:.0f} % are needed, so give the model's larger mesh"
+            f"below the chin; {100 * _LEAST_COVERED:.0f} % are needed; use the model's larger mesh"
         )
-    travelled = np.full(len(origins), np.inf)
-    travelled[rays] = np.linalg.norm(points - origins[rays], axis=-1)
-    filled = np.where(np.isfinite(travelled), travelled, travelled[rays].max())
-    usual = median_filter(filled.reshape(GRID, GRID), 5).ravel()
-    ends = origins + directions * np.where(travelled < usual + _SLIP_M, travelled, usual)[:, None]
-    return ends, np.isfinite(travelled)
+    distance_m = np.full(len(origins), np.inf)
+    distance_m[rays] = np.linalg.norm(points - origins[rays], axis=-1)
+    filled = np.where(np.isfinite(distance_m), distance_m, distance_m[rays].max())
+    median_m = median_filter(filled.reshape(GRID, GRID), 5).ravel()
+    ends = origins + directions * np.where(distance_m < median_m + _SLIP_M, distance_m, median_m)[:, None]
+    return ends, np.isfinite(distance_m)
 
 
 def _pulled(points: np.ndarray, landmarks: np.ndarray, numbers: list[int]) -> np.ndarray:
@@ -175,7 +172,7 @@ def _pulled(points: np.ndarray, landmarks: np.ndarray, numbers: list[int]) -> np
 
 
 def nearest_on_mesh(mesh: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The points [N, 3] of a mesh nearest to `points` [N, 3], and their faces [N]."""
+    """Return the points [N, 3] of a mesh nearest to `points` [N, 3], and their faces [N]."""
     _, nearby = cKDTree(mesh.triangles_center).query(points, _CANDIDATES)
     closest = np.stack(
         [trimesh.triangles.closest_point(mesh.triangles[faces], points) for faces in nearby.T]
@@ -186,7 +183,7 @@ def nearest_on_mesh(mesh: trimesh.Trimesh, points: np.ndarray) -> tuple[np.ndarr
 
 
 def rigid_alignment(points: np.ndarray, onto: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and translation [3] that bring points [N, 3] nearest to `onto` [N, 3] (Kabsch)."""
+    """Return the rotation [3, 3] and translation [3] that align points [N, 3] with `onto` [N, 3] (Kabsch)."""
     centre, target = points.mean(0), onto.mean(0)
     u, _, vt = np.linalg.svd((points - centre).T @ (onto - target))
     flip = np.diag([1, 1, np.sign(np.linalg.det(vt.T @ u.T))])

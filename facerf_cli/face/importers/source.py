@@ -1,4 +1,4 @@
-"""A face model in its publisher's topology, and checks of the arrays in its file."""
+"""Face model in its publisher's topology, and checks of the arrays in its file."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,21 +15,19 @@ _MAX_VERTICES, _MAX_TRIANGLES, _MAX_SHAPES = 120_000, 240_000, 500
 
 @dataclass(frozen=True)
 class SourceModel:
-    """A morphable model in its own topology: metres, y up, z out of the face; bases in standard deviations.
+    """Morphable model in its published topology: metres, y up, z out of the face.
 
-    mean [N, 3], identity [Ki, N, 3], expression [Ke, N, 3], triangles [F, 3] of the outer surface; known: the
-    points on the mean of those of the 68 landmarks that the publisher names, by number. Raises ValueError for
-    arrays that do not fit each other or are too large.
+    Raises ValueError for arrays that do not fit each other or are too large.
     """
 
     name: str
     licence: str
-    mean: np.ndarray
-    identity: np.ndarray
-    expression: np.ndarray
+    mean: np.ndarray  # [N, 3]
+    identity: np.ndarray  # [Ki, N, 3] per standard deviation
+    expression: np.ndarray  # [Ke, N, 3] per standard deviation
     expression_names: tuple[str, ...]
-    triangles: np.ndarray
-    known: dict[int, np.ndarray] = field(default_factory=dict)
+    triangles: np.ndarray  # [F, 3] of the outer surface
+    known: dict[int, np.ndarray] = field(default_factory=dict)  # points on the mean by number of the landmark
 
     def __post_init__(self) -> None:
         sizes = len(self.mean), len(self.triangles), len(self.identity), len(self.expression)
@@ -37,25 +35,25 @@ class SourceModel:
         if min(sizes[:3]) < 1 or any(size > limit for size, limit in zip(sizes, limits, strict=True)):
             raise ValueError("it has {} vertices, {} triangles and {} + {} shapes".format(*sizes))
         if not self.identity.shape[1:] == self.expression.shape[1:] == self.mean.shape:
-            raise ValueError(f"its shapes are not of the {len(self.mean)} vertices of its mean")
+            raise ValueError(f"its shapes do not have the {len(self.mean)} vertices of its mean")
         if self.triangles.min() < 0 or self.triangles.max() >= len(self.mean):
-            raise ValueError("its triangles name vertices that it does not have")
+            raise ValueError("its triangles use vertices that it does not have")
 
 
 @contextmanager
 def refusal(path: Path, published: str) -> Iterator[None]:
-    """Turn what a damaged file raises into an InputError in one line; `published` names the right file."""
+    """Convert errors of a damaged file to a one-line InputError; `published` describes the right file."""
     try:
         yield
     except FacerfError:
         raise
-    except Exception as error:  # whatever damage makes readers of archives and arrays raise
+    except Exception as error:  # damaged archives and arrays raise many kinds
         reason = one_line(str(error) or type(error).__name__)[:160]
         raise InputError(f"{path}: not {published} ({reason}); download it again") from None
 
 
 def numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None, ...]) -> np.ndarray:
-    """An array of a file by name; raises ValueError where it is missing, of another shape, or not finite."""
+    """Return an array of a file; raises ValueError if it is missing, has another shape or is not finite."""
     if name not in arrays:
         raise ValueError(f"it lacks {name}")
     array = np.asarray(arrays[name])
@@ -64,5 +62,5 @@ def numbers(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int | None
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise ValueError(f"{name} is {array.dtype} of shape {list(array.shape)}, not numbers [{wanted}]")
     if not np.isfinite(array).all():
-        raise ValueError(f"{name} holds values that are not finite")
+        raise ValueError(f"{name} contains non-finite values")
     return array

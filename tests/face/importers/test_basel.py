@@ -128,7 +128,7 @@ def test_basel_2009_is_read_and_becomes_a_model_with_the_built_in_expressions(
     assert source.triangles.min() == 0 and source.triangles.max() == len(face.mean) - 1
     assert source.known == {}  # its vertices are numbered otherwise than the published ones
     path = tmp_path / "01_MorphableModel.mat"
-    refused(InputError, f"{path}: it names 0 of the landmarks, too few", import_face_model, path)
+    refused(InputError, f"{path}: it names only 0 of the landmarks", import_face_model, path)
     known = {number: face.landmarks[number] for number in basel._LANDMARKS_2009}
     model = resample_model(replace(source, identity=source.identity[:5], known=known))
     builtin = load_face_model()
@@ -232,8 +232,8 @@ WRONG_MAT: dict[str, tuple[Callable[[dict[str, Any]], dict[str, Any]], str]] = {
     ),
     "a structure": (lambda m: {**m, "shapeEV": {"a": 1}}, "not a Basel"),
     "triangles beyond": (lambda m: {**m, "tl": m["tl"] + 1}, "does not have"),
-    "not finite": (lambda m: {**m, "shapeMU": m["shapeMU"] * np.nan}, "not finite"),
-    "millimetres": (lambda m: {**m, "shapeMU": m["shapeMU"] / 1000}, "the unit of its"),
+    "not finite": (lambda m: {**m, "shapeMU": m["shapeMU"] * np.nan}, "non-finite"),
+    "millimetres": (lambda m: {**m, "shapeMU": m["shapeMU"] / 1000}, "published unit"),
 }
 
 
@@ -266,14 +266,14 @@ WRONG_H5: dict[str, tuple[dict[str, Any], str]] = {
         {"shape/model/pcaBasis": np.zeros((9, 199))},
         "pcaBasis is float64 of shape",
     ),
-    "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "not of unit length"),
+    "scaled already": ({"shape/model/pcaBasis": 7 * np.ones((10800, 199), "f4")}, "unit length"),
     "variance below zero": ({"shape/model/pcaVariance": -np.ones(199)}, "pcaVariance is negative"),
     "triangles beyond": ({"shape/representer/cells": np.full((3, 9), 99999)}, "does not have"),
-    "not finite": ({"shape/model/mean": np.full(10800, np.nan)}, "not finite"),
+    "not finite": ({"shape/model/mean": np.full(10800, np.nan)}, "non-finite"),
     "a link to another file": ({"shape/model/mean": h5py.ExternalLink("b.h5", "/a")}, "2017"),
     "a link in circles": ({"shape/model/mean": h5py.SoftLink("/shape/model/mean")}, "2017"),
     "names of another kind": ({"metadata/landmarks/json": "[1, 2]"}, "not a Basel Face Model 2017"),
-    "metres": ({"shape/model/mean": np.zeros(10800)}, "the unit of its"),
+    "metres": ({"shape/model/mean": np.zeros(10800)}, "published unit"),
 }
 
 

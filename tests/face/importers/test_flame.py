@@ -226,12 +226,12 @@ BROKEN: dict[str, tuple[Callable[[Head], Any], str]] = {
     "shapes of another mesh": (lambda face: changed(face, shapedirs=np.zeros((9, 3, 2))), "shape [9, 3"),
     "too many": (lambda face: changed(face, shapedirs=np.zeros((5023, 3, 801), "f2")), "300 + 50"),
     "text for numbers": (lambda face: changed(face, shapedirs="many"), "shapedirs is float64 of shape [0]"),
-    "not finite": (lambda face: changed(face, v_template=face.mean * np.nan), "not finite"),
+    "not finite": (lambda face: changed(face, v_template=face.mean * np.nan), "non-finite"),
     "triangles beyond": (lambda face: changed(face, f=np.array([[0, 1, 9999]])), "does not have"),
     "another skeleton": (lambda face: changed(face, weights=np.zeros((5023, 9))), "shape [5023, 9]"),
     "a list": (lambda face: [1, 2], "holds a list"),
     "a hostile file": (lambda face: changed(face, f=Calls()), "names posix.system, which is not part"),
-    "millimetres": (lambda face: changed(face, v_template=face.mean * 1000), "the unit of its"),
+    "millimetres": (lambda face: changed(face, v_template=face.mean * 1000), "published unit"),
 }
 
 
@@ -247,8 +247,8 @@ def test_what_is_not_flame_is_refused_in_one_line(face: Head, tmp_path: Path, ca
 
 def test_a_model_without_its_embedding_says_what_to_give(face: Head, tmp_path: Path) -> None:
     np.savez(tmp_path / "flame.npz", **{key: changed(face)[key] for key in ("v_template", "f", "shapedirs")})
-    refused(InputError, "give FLAME's landmark embedding as --landmarks", read_flame, tmp_path / "flame.npz")
-    refused(InputError, "no such file; give FLAME's .pkl", read_flame, tmp_path / "a.pkl")
+    refused(InputError, "--landmarks", read_flame, tmp_path / "flame.npz")
+    refused(InputError, "no such file; use FLAME's .pkl", read_flame, tmp_path / "a.pkl")
 
 
 def points(count: int, face: int, weight: float) -> dict[str, np.ndarray]:

@@ -132,7 +132,7 @@ def cut(path: Path) -> Path:
 
 
 HOSTILE = {
-    "not there": (lambda t: t / "none.zip", "give ICT-FaceKit's folder"),
+    "not there": (lambda t: t / "none.zip", "use ICT-FaceKit's folder"),
     "an empty folder": (lambda t: t, "it lacks files of FaceXModel"),
     "no neutral mesh": (lambda t: zipped(t / "a.zip", jawOpen=obj()), "it lacks files of FaceXModel"),
     "a short mesh": (
