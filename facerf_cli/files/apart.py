@@ -1,7 +1,7 @@
-"""Readers in a process of their own, for libraries that a damaged file can crash: HEIC, .mat, HDF5, pickles.
+"""Readers in a separate process, for libraries that a damaged file can crash: HEIC, .mat, HDF5, pickles.
 
-The child sends arrays as an .npz without pickles, so that even a child that a file has taken over can only
-send numbers. Its memory, its time and what it sends are limited; its death is an error in one line.
+The child sends arrays as an .npz without pickles, so that even a child under a file's control can send only
+numbers. Its memory, run time and output are limited; its death is reported as an error.
 """
 
 import importlib
@@ -20,10 +20,9 @@ import numpy as np
 
 from facerf_cli.run.logs import printable_line
 
-_MEMORY_BYTES, _SENT_BYTES = 6 << 30, 2 << 30
-_TIME_S = 300
-_REFUSED = 3  # exit code of a child that says why on stderr
-# -P, for the working directory may hold a json.py; the search path is then that of the parent.
+_MEMORY_BYTES, _OUTPUT_BYTES, _TIME_S = 6 << 30, 2 << 30, 300
+_READER_FAILED = 3  # exit code of a child that prints the reason to stderr
+# -P because the working directory may contain a json.py; the search path is then the parent's.
 _CHILD = "import json, sys; sys.path[:] = json.loads(sys.argv[1])\n"
 _CHILD += "from facerf_cli.files.apart import serve; serve()"
 
@@ -31,26 +30,26 @@ _CHILD += "from facerf_cli.files.apart import serve; serve()"
 def arrays_apart(
     reader: Callable[..., dict[str, np.ndarray]], path: Path, *limits: int, time_s: float = _TIME_S
 ) -> dict[str, np.ndarray]:
-    """Call `reader(path, *limits)`, a function of a module, in a process of its own.
+    """Call `reader(path, *limits)`, a module-level function, in a separate process.
 
-    Raises ValueError with what the reader raised there, or how its process ended.
+    Raises ValueError with the reader's error, or with how its process ended.
     """
     command = [sys.executable, "-P", "-c", _CHILD, json.dumps(sys.path), reader.__module__, reader.__name__]
     command += [os.fspath(path), *map(str, limits)]
     with tempfile.TemporaryFile() as file:
         try:
-            ended = subprocess.run(
+            child = subprocess.run(
                 command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.PIPE, timeout=time_s
             )
         except subprocess.TimeoutExpired:
             raise ValueError(f"reading it takes longer than {time_s:.0f} s") from None
-        if ended.returncode == _REFUSED:
-            raise ValueError(printable_line(ended.stderr.decode(errors="replace")))
-        if code := ended.returncode:
-            death = f"signal {-code}" if code < 0 else f"exit code {code}"
-            with suppress(ValueError):  # no name
-                death = signal.Signals(-code).name
-            raise ValueError(f"it makes its reader fail ({death})")
+        if child.returncode == _READER_FAILED:
+            raise ValueError(printable_line(child.stderr.decode(errors="replace")))
+        if code := child.returncode:
+            cause = f"signal {-code}" if code < 0 else f"exit code {code}"
+            with suppress(ValueError):  # a signal without a name
+                cause = signal.Signals(-code).name
+            raise ValueError(f"its reader crashed ({cause})")
         file.seek(0)
         try:
             with np.load(file, allow_pickle=False) as arrays:
@@ -60,22 +59,21 @@ def arrays_apart(
 
 
 def serve() -> None:
-    """The child: read and send."""
+    """Run the reader in the child process and write its arrays to stdout."""
     _, _, module, reader, path, *limits = sys.argv
     if sys.platform != "win32":
         import resource
 
-        own = {
-            resource.RLIMIT_AS: _MEMORY_BYTES,
-            resource.RLIMIT_FSIZE: _SENT_BYTES,
-            resource.RLIMIT_CORE: 0,
-        }
-        for limit, value in own.items():
-            most = resource.getrlimit(limit)[1]
-            resource.setrlimit(limit, (value if most < 0 else min(value, most), most))
+        for limit, value in (
+            (resource.RLIMIT_AS, _MEMORY_BYTES),
+            (resource.RLIMIT_FSIZE, _OUTPUT_BYTES),
+            (resource.RLIMIT_CORE, 0),
+        ):
+            hard = resource.getrlimit(limit)[1]
+            resource.setrlimit(limit, (value if hard < 0 else min(value, hard), hard))
     try:
         arrays = getattr(importlib.import_module(module), reader)(Path(path), *map(int, limits))
         np.savez(sys.stdout.buffer, **arrays)
-    except Exception as error:  # whatever a damaged file makes its library raise
+    except Exception as error:  # any exception that a damaged file causes in its library
         print(str(error) or type(error).__name__, file=sys.stderr)
-        sys.exit(_REFUSED)
+        sys.exit(_READER_FAILED)

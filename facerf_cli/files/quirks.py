@@ -1,8 +1,4 @@
-"""What OpenImageIO leaves to its caller: refusing rare kinds of files, finding damage, parts of headers.
-
-A header of Radiance's .hdr, lines `NAME=value`, ends with an empty line and the resolution, `-Y 512 +X 1024`.
-HEIC and AVIF are in `isobmff.py`.
-"""
+"""What OpenImageIO leaves to its caller: refusal of rare formats, detection of damage, parts of headers."""
 
 import logging
 import math
@@ -26,23 +22,20 @@ _RAW = (
     " .rwl .sr2 .srf .srw .x3f"
 )
 RAW_SUFFIXES = frozenset(_RAW.split())
-UNDEVELOPED = (  # OpenImageIO reads its thumbnail
-    "a raw file of a camera, or a thumbnail first, is not read; develop it to EXR, TIFF or JPEG, as with"
-    " darktable or RawTherapee"
+UNDEVELOPED = (  # OpenImageIO would read the thumbnail
+    "camera raw, or an image that starts with a thumbnail, is not supported; develop it to EXR, TIFF or JPEG,"
+    " for example in darktable"
 )
-_NO_COMPOSITE = (
-    "a PSD without a composite of its layers is not read; save it with Maximize Compatibility, or as PNG"
-)
-ASSOCIATED = 1  # kind of a TIFF's extra channel: alpha that the colour is multiplied by
-_EXTRA_SAMPLES = 338  # the tag of these kinds
-# A TIFF's photometric interpretations.
+ASSOCIATED = 1  # in a TIFF's ExtraSamples: alpha, with premultiplied colour
+_EXTRA_SAMPLES = 338
+# Photometric interpretations of a TIFF.
 _WHITE_IS_ZERO, _SEPARATED, _CIELAB, _RAW_COLOURS = 0, 5, 8, (32803, 34892)
 _THUMBNAIL = 1  # bit of a TIFF's NewSubfileType
-_FILM_CURVES = ("Logarithmic", "Printing density")  # of a DPX
+_FILM_CURVES = ("Logarithmic", "Printing density")  # in a DPX header
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PSD_VERSION, _HAS_COMPOSITE = 1057, 4  # a PSD's resource, and the place of a byte in it
+_PSD_VERSION, _HAS_COMPOSITE = 1057, 4  # a PSD's resource, and the offset of a byte in it
 _HEADER_BYTES = 1 << 16  # of a Radiance file
-_NOISE, _MOST_ABOVE = 0.01, 0.02  # of multiplied colours: how far, and how many pixels, exceed alpha
+_NOISE, _MOST_ABOVE = 0.01, 0.02  # premultiplied colour may exceed alpha by this, in this fraction of pixels
 _UNSUPPORTED = re.compile(
     r"unsupported|not (supported|configured|implemented|available)|unknown compression", re.I
 )
@@ -51,35 +44,38 @@ log = logging.getLogger(LOGGER_NAME)
 
 
 def refuse_rare(path: Path, form: str, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) -> None:
-    """Raise InputError for kinds of files that few people have; the error names the conversion.
+    """Raise InputError for rare kinds of files; the error names the conversion.
 
-    `form` is OpenImageIO's name of the format, `spec` the header of the image that would be read, and
-    `following` the header of a TIFF's second page.
+    `form` is OpenImageIO's format name, `spec` the header of the image to read, and `following` the header
+    of a TIFF's second page.
     """
     meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
     is_log = form == "cineon" or spec.get_string_attribute("dpx:Transfer") in _FILM_CURVES
     is_turned = form == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5
-    for is_found, message in (
-        (spec.deep, "a deep image is not read; flatten it, as with oiiotool --flatten"),
+    for is_rare, message in (
+        (spec.deep, "deep data is not supported; flatten it with oiiotool --flatten"),
         (form == "tiff" and _is_raw(path, spec, following), UNDEVELOPED),
-        (meaning == _WHITE_IS_ZERO, "a TIFF whose zero is white is not read; save it as PNG"),
-        (meaning == _CIELAB, "a TIFF in CIELAB is not read; convert it to RGB"),
-        (form == "psd" and _lacks_composite(path), _NO_COMPOSITE),
-        (is_log, "a film scan in Cineon log is not read; convert it to linear values, as EXR"),
-        (is_turned, "a DPX file that lies on its side is not read; save it upright"),
+        (meaning == _WHITE_IS_ZERO, "TIFF with white as zero is not supported; save it as PNG"),
+        (meaning == _CIELAB, "TIFF in CIELAB is not supported; convert it to RGB"),
+        (
+            form == "psd" and _lacks_composite(path),
+            "PSD without a composite is not supported; save it with Maximize Compatibility, or as PNG",
+        ),
+        (is_log, "Cineon log film scans are not supported; convert it to linear values, as EXR"),
+        (is_turned, "DPX with rotated pixels is not supported; save it upright"),
     ):
-        if is_found:
+        if is_rare:
             raise InputError(f"{path}: {message}")
 
 
 def has_inks(spec: oiio.ImageSpec) -> bool:
-    """Return whether a JPEG or TIFF holds inks (CMYK)."""
+    """Return whether a JPEG or TIFF is CMYK."""
     is_separated = spec.get_int_attribute("tiff:PhotometricInterpretation", -1) == _SEPARATED
     return is_separated or spec.get_string_attribute("jpeg:ColorSpace") in ("CMYK", "YCbCrK")
 
 
 def _is_raw(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) -> bool:
-    """Return whether a TIFF has a thumbnail first, before its next image, or the values of a sensor."""
+    """Return whether a TIFF contains sensor values, or a thumbnail in front of its image."""
     is_thumbnail = bool(spec.get_int_attribute("tiff:subfiletype", 0) & _THUMBNAIL)
     is_smaller = following is not None and 2 * spec.width <= following.width
     colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
@@ -87,19 +83,19 @@ def _is_raw(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) 
 
 
 def _lacks_composite(path: Path) -> bool:
-    """Return whether a PSD says that it has white in place of its layers."""
+    """Return whether a PSD states that it stores white instead of the composite of its layers."""
     resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
     return bool(resources.get(_PSD_VERSION, b"")[_HAS_COMPOSITE:][:1] == b"\0")
 
 
-def starts_with(path: Path, start: bytes, at: int = 0) -> bool:
-    """Return whether a file has these bytes at its start, or at a place near it."""
+def starts_with(path: Path, start: bytes, offset: int = 0) -> bool:
+    """Return whether a file has these bytes at an offset near its start."""
     with path.open("rb") as stream:
-        return stream.read(at + len(start))[at:] == start
+        return stream.read(offset + len(start))[offset:] == start
 
 
 def by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
-    """Read what OpenImageIO leaves out of a header from the file as opened by Pillow; None if it cannot."""
+    """Return `read(image)` for the file opened by Pillow; None if that fails."""
     from PIL import Image  # few files need it
 
     try:
@@ -107,12 +103,12 @@ def by_pillow(path: Path, read: Callable[[Any], Any]) -> Any:
             warnings.simplefilter("ignore")  # about large images, whose pixels are not decoded here
             with Image.open(path, formats=["JPEG", "PNG", "PSD", "TIFF", "WEBP"]) as image:
                 return read(image)
-    except Exception:  # whatever damage makes Pillow raise
+    except Exception:  # any exception that damage causes in Pillow
         return None
 
 
 def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Yield the kind and the content of each chunk of a PNG file; nothing for a file of another kind.
+    """Yield the kind and content of each chunk of a PNG file; nothing for other files.
 
     Raises InputError for missing bytes and wrong checksums, which OpenImageIO does not report reliably.
     """
@@ -131,9 +127,9 @@ def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
 
 
 def extra_channel(path: Path) -> int:
-    """Return the kind of a TIFF's first channel after its colours, such as `ASSOCIATED`; 0 if none is stated.
+    """Return the kind of a TIFF's first extra channel, such as `ASSOCIATED`; 0 if none is stated.
 
-    Pillow opens few of the files with such a channel, but reads their directory.
+    Pillow opens few files with such a channel, but reads their directory.
     """
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
@@ -146,63 +142,66 @@ def extra_channel(path: Path) -> int:
 
 
 def radiance_exposure(path: Path, spec: oiio.ImageSpec) -> float:
-    """Return what the values of a Radiance file were multiplied by, and set the primaries that it states.
+    """Return the factor of a Radiance file's values, and set `chromaticities` from its PRIMARIES.
 
-    Raises InputError for a damaged header, and for a file that OpenImageIO reads otherwise than meant.
+    The header, lines `NAME=value`, ends with an empty line and the resolution, `-Y 512 +X 1024`. Raises
+    InputError for damage, and for files that OpenImageIO misreads.
     """
     with path.open("rb") as stream:
         start = stream.read(_HEADER_BYTES)
     header, _, rest = start.partition(b"\n\n")
     resolution, _, values = rest.partition(b"\n")
-    exposure, primaries = 1.0, list[float]()
+    exposure, primaries, is_corrected = 1.0, list[float](), False
     try:
         for name, text in re.findall(r"^\s*(\w+)\s*=(.*)$", header.decode("latin-1"), re.MULTILINE):
             if name == "EXPOSURE":
                 exposure *= float(text)
             elif name == "PRIMARIES":
                 primaries = [float(word) for word in text.split()]
-            elif name in ("COLORCORR", "PIXASPECT") and any(float(word) != 1 for word in text.split()):
-                raise ValueError(f"{name} is not read; save it as EXR without it")
-        if not 0 < exposure < math.inf or (any(primaries) and len(primaries) != 8):
-            raise ValueError("a number in it is out of range")
-        if re.match(rb"\+X +\d+ +\+Y|-X +\d+ +-Y", resolution):  # which OpenImageIO turns wrong
-            raise ValueError("columns of this order are not read; turn it with Radiance's protate")
-    except ValueError as error:
-        raise InputError(f"{path}: the header of a Radiance file is wrong: {error}") from None
-    if any(primaries):  # not all 0, as in the maps of Poly Haven
-        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(primaries))
+            elif name in ("COLORCORR", "PIXASPECT"):
+                is_corrected |= any(float(word) != 1 for word in text.split())
+    except ValueError:
+        exposure = math.nan
     stored = path.stat().st_size - (len(start) - len(values))
     has_runs = values.startswith(b"\2\2" + (spec.width & 0xFFFF).to_bytes(2, "big"))
-    if stored < 4 * spec.width * spec.height and not has_runs:
-        kind = "a Radiance file in old-style runs, or cut short,"
-        raise InputError(f"{path}: {kind} is not read; save it as EXR with an image editor")
+    for is_rare, message in (
+        (not 0 < exposure < math.inf or (any(primaries) and len(primaries) != 8), "damaged Radiance header"),
+        (is_corrected, "COLORCORR and PIXASPECT of Radiance files are not supported"),
+        # OpenImageIO rotates these incorrectly.
+        (re.match(rb"\+X +\d+ +\+Y|-X +\d+ +-Y", resolution), "this column order is not supported"),
+        (
+            stored < 4 * spec.width * spec.height and not has_runs,
+            "a Radiance file in old-style runs, or cut short, is not supported",
+        ),
+    ):
+        if is_rare:
+            raise InputError(f"{path}: {message}; save it as EXR in an image editor")
+    if any(primaries):  # Poly Haven's maps have zeros
+        spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), tuple(primaries))
     return exposure
 
 
 def read_in_one_thread() -> None:
-    """Let images be read by the thread that asks, also in processes that are forked from now on.
+    """Make OpenImageIO read images in the calling thread, also in processes forked later.
 
-    A forked process has none of the threads that OpenImageIO has begun; on a machine of many cores it would
-    wait for them without end.
+    A forked process lacks the threads that OpenImageIO has started, and would wait for them forever.
     """
     oiio.attribute("threads", 1)
 
 
 def utf8_path(path: Path) -> str:
-    """Return the path for OpenImageIO, which takes only UTF-8; raise an InputError for any other name."""
+    """Return the path for OpenImageIO, which takes only UTF-8; raise InputError for other names."""
     try:
         path.as_posix().encode()
     except UnicodeEncodeError:
-        raise InputError(
-            f"{str(path)!a}: the name is not UTF-8; rename the file, or the folder that it is in"
-        ) from None
+        raise InputError(f"{str(path)!a}: the name is not UTF-8; rename the file or its folder") from None
     return str(path)
 
 
 def oiio_error(stream: Any = oiio) -> str:
-    """Take the pending error of OpenImageIO, or of one of its streams, which need not be UTF-8.
+    """Return and clear the pending error of OpenImageIO or one of its streams, which may not be UTF-8.
 
-    OpenImageIO prints an error that nobody took when the program ends.
+    OpenImageIO prints pending errors when the program ends.
     """
     try:
         return str(stream.geterror())
@@ -217,20 +216,20 @@ def reason(path: Path, message: str) -> str:
     return one_line(re.sub(r"\bEXR_ERR_\w+ |: magic 0x.*| Is it a file format .*", "", line))
 
 
-def require_whole(path: Path, values: np.ndarray | None, said: str) -> None:
-    """Raise InputError unless values were decoded; `said` is what OpenImageIO reported as it did."""
-    message = reason(path, said)
+def require_whole(path: Path, values: np.ndarray | None, report: str) -> None:
+    """Raise InputError unless values were decoded; `report` is OpenImageIO's error text."""
+    message = reason(path, report)
     if values is None and _UNSUPPORTED.search(message):
         raise InputError(f"{path}: its compression is not supported; save it with another ({message})")
-    if values is None or "premature end" in said.lower():  # a JPEG cut short decodes to grey
+    if values is None or "premature end" in report.lower():  # a truncated JPEG decodes to grey
         raise InputError(f"{path}: damaged or cut short; copy it again ({message or 'no pixels in it'})")
     if message:
         log.warning("%s: %s", path, message)
 
 
 def looks_multiplied(values: np.ndarray, colour: list[int], alpha: int) -> bool:
-    """Return whether the colour of [H, W, C] hardly exceeds alpha where that is neither 0 nor 1."""
-    cover = unit_floats(values[..., alpha])
-    soft = (cover > 0) & (cover < 1)
-    above = unit_floats(values[soft][:, colour].max(-1)) > cover[soft] + _NOISE
-    return bool(soft.any()) and float(above.mean()) < _MOST_ABOVE
+    """Return whether the colour of [H, W, C] rarely exceeds alpha where alpha is neither 0 nor 1."""
+    coverage = unit_floats(values[..., alpha])
+    soft = (coverage > 0) & (coverage < 1)
+    is_above = unit_floats(values[soft][:, colour].max(-1)) > coverage[soft] + _NOISE
+    return bool(soft.any()) and float(is_above.mean()) < _MOST_ABOVE

@@ -119,7 +119,7 @@ def test_a_grey_profile_of_an_image_with_colours_is_left_out(
     np.testing.assert_allclose(255 * colour.linear_to_srgb(image.pixels), levels, atol=1.5)
     assert image.colourspace_name == "sRGB"
     if suffix != "png":  # libpng leaves it out itself
-        assert "profile 'Dot Gain' is for grey images; taken for sRGB" in caplog.text
+        assert "profile 'Dot Gain' is for grey images; assuming sRGB" in caplog.text
 
 
 def test_broken_profiles_are_no_space() -> None:
@@ -148,7 +148,7 @@ def test_tables_are_applied_to_eight_bits_and_refused_for_more(tmp_path: Path, c
         assert np.abs(shown - COLOURS).max() > 40
         assert caplog.records[-1].getMessage().endswith("converted to sRGB by its profile 'Scanner 9'")
     tifffile.imwrite(path := tmp_path / "b.tif", 257 * COLOURS.astype(np.uint16), iccprofile=scanner)
-    refused(InputError, "'Scanner 9' has tables ... convert the image to sRGB", read_image, path)
+    refused(InputError, "'Scanner 9' has tables ... convert it to sRGB", read_image, path)
     assert read_image(path, "Display P3").colourspace_name == "Display P3"
 
 
@@ -159,7 +159,7 @@ def test_a_broken_profile_is_one_line_that_says_what_is_assumed(tmp_path: Path, 
     Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=tables)
     assert read_image(tmp_path / "a.png").colourspace_name == "sRGB"
     (line,) = [record.getMessage() for record in caplog.records]
-    assert line.endswith("a.png: the embedded profile 'Scanner 77' is not understood; taken for sRGB")
+    assert line.endswith("a.png: embedded profile 'Scanner 77' is not supported; assuming sRGB")
 
 
 @pytest.mark.parametrize("space", [colour.LINEAR, colour.ACESCG, colour.ACES], ids=lambda space: space.name)

@@ -229,7 +229,7 @@ BROKEN: dict[str, tuple[Callable[[Head], Any], str]] = {
     "not finite": (lambda face: changed(face, v_template=face.mean * np.nan), "not finite"),
     "triangles beyond": (lambda face: changed(face, f=np.array([[0, 1, 9999]])), "does not have"),
     "another skeleton": (lambda face: changed(face, weights=np.zeros((5023, 9))), "shape [5023, 9]"),
-    "a list": (lambda face: [1, 2], "holds a list"),
+    "a list": (lambda face: [1, 2], "a list"),
     "a hostile file": (lambda face: changed(face, f=Calls()), "names posix.system, which is not part"),
     "millimetres": (lambda face: changed(face, v_template=face.mean * 1000), "the unit of its"),
 }
