@@ -83,7 +83,6 @@ class Film:
 
     Attributes:
         timing: Times of the frames, their mean rate, the timecode, and the file itself if it has sound.
-        lost_sounds: Number of sound tracks with unknown codecs.
     """
 
     def __init__(self, path: Path) -> None:
@@ -96,10 +95,9 @@ class Film:
             self._aspect = Fraction(stream.sample_aspect_ratio or 1)
             coded = stream.codec_context
             self._codes = int(coded.color_primaries), int(coded.color_trc)
-            sounds = [track.codec_context for track in container.streams.audio]
-            self.lost_sounds = sounds.count(None)
+            has_sound = any(track.codec_context for track in container.streams.audio)
             self._pts = self._presented(container, stream)
-            self.timing = self._timed(container, stream, any(sounds))
+            self.timing = self._timed(container, stream, has_sound)
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[Any, Any]]:

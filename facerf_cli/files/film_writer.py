@@ -1,6 +1,5 @@
 """Videos written by PyAV from images, with another video's sound: H.264 in .mp4, ProRes in .mov."""
 
-import io
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.film import BT709, Film, Timing, exact, reason, require_av, start_s
+from facerf_cli.files.film import BT709, Timing, exact, reason, require_av, start_s
 from facerf_cli.files.read import PHOTO_LIMIT_PX, decode
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, unit_floats
 from facerf_cli.run.logs import LOGGER_NAME
@@ -54,35 +53,18 @@ _ALPHA_FORM = replace(
 )
 
 
-def check_writable(path: Path, source: Path) -> None:
-    """Raise InputError if a video cannot have the sound of another; log what it loses.
-
-    Called before frames are rendered, which may take hours.
-    """
-    av, film = require_av(path), Film(source)
-    height, width, channels = film.read(0).shape
-    if film.lost_sounds:
-        log.warning("%s: %d sound tracks have unknown codecs and are omitted", source, film.lost_sounds)
-    if channels == 4 and path.suffix.lower() == ".mp4":
-        log.warning("%s: has no alpha, and shows %s over black; use FILE.mov for alpha", path, source)
-    try:
-        with av.open(io.BytesIO(), "w", format=path.suffix[1:].lower()) as container:
-            _begin(av, container, _FORMS[path.suffix.lower()], (height, width), film.timing)
-            container.start_encoding()
-    except (av.error.FFmpegError, ValueError) as error:
-        raise InputError(
-            f"{source}: its sound cannot be written to {path} ({reason(error)}); convert it to AAC"
-        ) from None
-
-
 def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
     """Write PNG images as a video atomically; `comment` goes into its metadata.
 
-    .mov keeps alpha in ProRes 4444, .mp4 shows the images over black.
+    .mov keeps alpha in ProRes 4444, .mp4 shows the images over black. Raises InputError if FFmpeg cannot
+    write the sound.
     """
     av, form = require_av(path), _FORMS[path.suffix.lower()]
-    if path.suffix.lower() == ".mov" and decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
-        form = _ALPHA_FORM
+    if decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
+        if path.suffix.lower() == ".mov":
+            form = _ALPHA_FORM
+        else:
+            log.warning("%s: has no alpha, and shows the images over black; use FILE.mov for alpha", path)
     clock = _clock(timing)
     starts = [round(time_s * clock) for time_s in timing.times_s]
     ends = [*starts[1:], starts[-1] + round(clock / timing.rate)]
@@ -97,11 +79,16 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
         yield inf, stream.encode(None)
 
     options = {"movflags": "+faststart"}
-    with atomic_path(path) as temporary, av.open(str(temporary), "w", options=options) as container:
-        container.metadata["comment"] = comment
-        stream, sound = _begin(av, container, form, _pixels(images[0], form).shape[:2], timing)
-        for _, packets in merge(encoded(stream), sound, key=itemgetter(0)):
-            container.mux(packets)
+    try:
+        with atomic_path(path) as temporary, av.open(str(temporary), "w", options=options) as container:
+            container.metadata["comment"] = comment
+            stream, sound = _begin(av, container, form, _pixels(images[0], form).shape[:2], timing)
+            for _, packets in merge(encoded(stream), sound, key=itemgetter(0)):
+                container.mux(packets)
+    except av.error.FFmpegError as error:
+        raise InputError(
+            f"{path}: cannot be written ({reason(error)}); convert the sound of the video to AAC"
+        ) from None
 
 
 def _begin(
@@ -135,6 +122,8 @@ def _begin(
                 sound.layout = coded.layout.name.replace(" channels", "c")  # the usual layout of that count
             sound.metadata.update({"language": track.language} if track.language else {})
             tracks[track.index] = sound, is_copied
+        else:
+            log.warning("%s: a sound track has an unknown codec and is omitted", timing.sound)
     return stream, _sound(av, source, tracks)
 
 

@@ -8,7 +8,7 @@ head's rotation and the fit, so that a stack can be relit without its photo.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
 from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
-from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, writing
+from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, write_parts
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.run import memory
 from facerf_cli.run.logs import one_line
@@ -70,29 +70,31 @@ def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -
     memory of the prediction is freed first, since fresh memory costs nothing until it is touched.
     """
     clamped, threads = 0, oiio.get_int_attribute("exr_threads")
+
+    def images() -> Iterator[np.ndarray]:
+        count = 0
+        for batch in olats:
+            count += len(batch)
+            memory.give_back()
+            yield from batch.permute(0, 2, 3, 1).cpu().numpy()
+        if count != len(header.directions):
+            raise ValueError(f"{count} lights, not {len(header.directions)}")
+        # last, because it may be summed as the lights arrive
+        yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
+
+    def parts() -> Iterator[Callable[[slice], np.ndarray]]:
+        nonlocal clamped
+        for image in images():
+            data, count = half_floats(path, image)
+            clamped += count
+            yield data.__getitem__
+
     oiio.attribute("exr_threads", -1)
     try:
-        with writing(path, _specs(header)) as file:
-            for part in _parts(header, olats):
-                data, count = half_floats(path, part)
-                clamped += count
-                for rows in file.next_part():
-                    file.write(rows, data[rows])
+        write_parts(path, _specs(header), parts())
     finally:
         oiio.attribute("exr_threads", threads)
     warn_of_clamped(path, clamped)
-
-
-def _parts(header: StackHeader, olats: Iterable[Tensor]) -> Iterator[np.ndarray]:
-    """Yield the lights [H, W, 3], then the source, which may be summed as the lights arrive."""
-    count = 0
-    for batch in olats:
-        count += len(batch)
-        memory.give_back()
-        yield from batch.permute(0, 2, 3, 1).cpu().numpy()
-    if count != len(header.directions):
-        raise ValueError(f"{count} lights, not {len(header.directions)}")
-    yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:

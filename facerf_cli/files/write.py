@@ -5,9 +5,9 @@ tools that expect four channels find four.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -100,22 +100,25 @@ def write_exr(
         joined.erase_attribute("name")
         specs = [joined]
     clamped = 0
-    with writing(path, specs, metadata) as file:
-        for together in [parts] if single else [[part] for part in parts]:
-            for rows in file.next_part():
-                written = []
-                for part in together:
-                    values = part.rows(rows, space)
-                    if part is parts[0] and alpha is not None:
-                        values[..., :3] *= values[..., 3:]
-                    if part.kind == "float":
-                        _require_finite(path, values)
-                        written.append(values.astype(np.float32, copy=False))
-                    else:
-                        data, count = half_floats(path, values)
-                        written.append(data)
-                        clamped += count
-                file.write(rows, np.concatenate(written, -1))
+
+    def joined_rows(group: Sequence[_ExrPart], rows: slice) -> np.ndarray:
+        nonlocal clamped
+        written = []
+        for part in group:
+            values = part.rows(rows, space)
+            if part is parts[0] and alpha is not None:
+                values[..., :3] *= values[..., 3:]
+            if part.kind == "float":
+                _require_finite(path, values)
+                written.append(values.astype(np.float32, copy=False))
+            else:
+                data, count = half_floats(path, values)
+                written.append(data)
+                clamped += count
+        return np.concatenate(written, -1)
+
+    groups = [parts] if single else [[part] for part in parts]
+    write_parts(path, specs, [partial(joined_rows, group) for group in groups], metadata)
     warn_of_clamped(path, clamped)
     return clamped
 
@@ -203,13 +206,15 @@ def write_tiff(
     if space.is_linear:
         profile = np.frombuffer(linear_profile(space), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
-    with writing(path, [spec], metadata) as file:
-        for rows in file.next_part():
-            values = from_linear_rec709(rows_of(pixels, rows), space)
-            _require_finite(path, values)
-            if alpha is not None:
-                values = np.dstack([values, rows_of(alpha, rows)])
-            file.write(rows, values.astype(np.float32, copy=False))
+
+    def float_rows(rows: slice) -> np.ndarray:
+        values = from_linear_rec709(rows_of(pixels, rows), space)
+        _require_finite(path, values)
+        if alpha is not None:
+            values = np.dstack([values, rows_of(alpha, rows)])
+        return values.astype(np.float32, copy=False)
+
+    write_parts(path, [spec], [float_rows], metadata)
 
 
 def write_display(
@@ -241,18 +246,20 @@ def write_display(
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
     spec.attribute("png:filter", _PNG_FILTER)
     gain = np.float32(2.0**chosen_ev)
-    with writing(path, [spec], {"facerf:exposure_ev": chosen_ev, **(metadata or {})}) as file:
-        for rows in file.next_part():
-            colour, coverage = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
-            _require_finite(path, colour)
-            if coverage is not None and jpeg:
-                colour = colour * coverage[..., None]
-            more = None if added is None else added[rows] * gain
-            soft = None if share is None else rows_of(share, rows)
-            data = encode_display(np.nan_to_num(colour * gain), view, soft, more)
-            if coverage is not None and not jpeg:
-                data = np.dstack([data, coverage.astype(np.float32)])
-            file.write(rows, data)
+
+    def encoded_rows(rows: slice) -> np.ndarray:
+        colour, coverage = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
+        _require_finite(path, colour)
+        if coverage is not None and jpeg:
+            colour = colour * coverage[..., None]
+        more = None if added is None else added[rows] * gain
+        soft = None if share is None else rows_of(share, rows)
+        data = encode_display(np.nan_to_num(colour * gain), view, soft, more)
+        if coverage is not None and not jpeg:
+            data = np.dstack([data, coverage.astype(np.float32)])
+        return data
+
+    write_parts(path, [spec], [encoded_rows], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
     return chosen_ev
 
 
@@ -263,51 +270,34 @@ def new_spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
     return spec
 
 
-class PartsFile:
-    """Image file whose parts are written one after another, in strips of rows."""
+def write_parts(
+    path: Path,
+    specs: Sequence[oiio.ImageSpec],
+    parts: Iterable[Callable[[slice], np.ndarray]],
+    metadata: Attributes | None = None,
+) -> None:
+    """Write an image file atomically from one function per part, which returns rows [h, W, C].
 
-    def __init__(self, path: Path, temporary: Path, specs: Sequence[oiio.ImageSpec]) -> None:
+    The metadata goes into the first part's header and is written as XMP. Parts are written as they arrive.
+    """
+    for name, value in (metadata or {}).items():
+        set_attribute(specs[0], name, value)
+    with atomic_path(path) as temporary:
         stream = oiio.ImageOutput.create(utf8_path(temporary))
         if stream is None:
             oiio_error()
             raise UsageError(f"{path}: unknown image format; use .exr, .png or .jpg")
-        self._path, self._name, self._specs, self._stream = path, str(temporary), specs, stream
-        self._begun = 0
-        self._check(self._stream.open(self._name, tuple(specs) if len(specs) > 1 else specs[0]))
 
-    def next_part(self) -> Iterator[slice]:
-        """Begin the next part, and return the rows of its strips."""
-        spec = self._specs[self._begun]
-        if self._begun:
-            self._check(self._stream.open(self._name, spec, "AppendSubimage"))
-        self._begun += 1
-        return strips((spec.height, spec.width))
+        def check(good: bool) -> None:
+            if not good:
+                message = oiio_error(stream)
+                stream.close()
+                raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
 
-    def write(self, rows: slice, values: np.ndarray) -> None:
-        contiguous = np.ascontiguousarray(values)
-        self._check(self._stream.write_scanlines(rows.start, rows.stop, 0, contiguous))
-
-    def close(self) -> None:
-        assert self._begun == len(self._specs)
-        self._check(self._stream.close())
-
-    def _check(self, good: bool) -> None:
-        if not good:
-            message = oiio_error(self._stream)
-            self._stream.close()
-            message = message or oiio_error(self._stream)
-            raise FacerfError(f"{self._path}: cannot write: {one_line(message)}")
-
-
-@contextmanager
-def writing(
-    path: Path, specs: Sequence[oiio.ImageSpec], metadata: Attributes | None = None
-) -> Iterator[PartsFile]:
-    """Open an image file for atomic writing, with metadata in the first part's header and as XMP."""
-    for name, value in (metadata or {}).items():
-        set_attribute(specs[0], name, value)
-    with atomic_path(path) as temporary:
-        file = PartsFile(path, temporary, specs)
-        yield file
-        file.close()
+        check(stream.open(str(temporary), tuple(specs) if len(specs) > 1 else specs[0]))
+        for number, (part, spec) in enumerate(zip(parts, specs, strict=True)):
+            check(not number or stream.open(str(temporary), spec, "AppendSubimage"))
+            for rows in strips((spec.height, spec.width)):
+                check(stream.write_scanlines(rows.start, rows.stop, 0, np.ascontiguousarray(part(rows))))
+        check(stream.close())
         embed_xmp(temporary, metadata or {})

@@ -85,7 +85,7 @@ def test_a_description(tmp_path: Path, changes: dict[str, Any], said: str) -> No
 def test_a_description_without_a_key(tmp_path: Path, missing: str) -> None:
     path = write_flat_stage(tmp_path) / "stage.json"
     path.write_text(path.read_text().replace(f'"{missing}"', '"other"'))
-    refused(InputError, f"stage.json ... '{missing}'", read_capture, tmp_path)
+    refused(InputError, f"stage.json: {missing}: is missing", read_capture, tmp_path)
 
 
 def test_a_frame(tmp_path: Path) -> None:
