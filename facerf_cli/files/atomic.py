@@ -20,14 +20,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by, end_again
-
-if TYPE_CHECKING:
-    from filelock import FileLock
 
 _ABANDONED_S = 24 * 3600  # age of another machine's temporary folder that counts as abandoned
 _MARK = ".part-"
@@ -151,24 +147,16 @@ def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
     owner = rest.partition("-")[0]
     if len(machine) != len(machine_id()) or not owner.isdecimal():
         return False
-    if machine == machine_id():
-        return not _runs(int(owner))
     try:
-        return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
-    except OSError:  # just renamed or removed by its process
-        return False
-
-
-def _runs(process: int) -> bool:
-    if os.name == "nt":  # where os.kill would end the process
-        return True
-    try:
-        os.kill(process, 0)
+        if machine != machine_id():
+            return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
+        if os.name != "nt":  # where os.kill would end the process
+            os.kill(int(owner), 0)
     except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
+        return True
+    except OSError:  # another user's process, or a folder that its process has just renamed or removed
         pass
-    return True
+    return False
 
 
 def _remove(path: Path) -> None:
@@ -214,13 +202,24 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
     On file systems without locks, warn and continue. New folders are removed if they are still empty at the
     end. Raises OSError if the folder is not writable.
     """
-    from filelock import FileLock  # not needed for --help
+    from filelock import FileLock, Timeout  # not needed for --help
 
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / name
     lock = FileLock(path, fallback_to_soft=False)  # a soft lock would outlive a killed process
+    waits = False
     try:
-        _acquire(lock, path)
+        while not lock.is_locked:
+            folder.mkdir(parents=True, exist_ok=True)  # the last owner may have removed it
+            try:
+                lock.acquire(blocking=waits)
+            except FileNotFoundError:
+                pass
+            except Timeout:
+                owner, waits = "unknown", True
+                with suppress(OSError):  # just ended
+                    owner = printable_line(path.read_text(errors="replace")[:20])
+                log.warning("%s: waiting for another facerf (process %s)", folder, owner)
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
@@ -238,21 +237,3 @@ def alone_in(folder: Path, name: str) -> Iterator[None]:
         with suppress(OSError):
             for empty in created:
                 empty.rmdir()
-
-
-def _acquire(lock: "FileLock", path: Path) -> None:
-    """Wait for a lock; recreate its folder if the last owner has removed it."""
-    from filelock import Timeout
-
-    waits = False
-    while not lock.is_locked:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire(blocking=waits)
-        except FileNotFoundError:
-            pass
-        except Timeout:
-            owner, waits = "unknown", True
-            with suppress(OSError):  # just ended
-                owner = printable_line(path.read_text(errors="replace")[:20])
-            log.warning("%s: waiting for another facerf (process %s)", path.parent, owner)

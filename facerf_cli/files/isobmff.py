@@ -11,7 +11,7 @@ import logging
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
@@ -33,13 +33,7 @@ _FULL = 1  # the range to which pi-heif and Pillow decode
 _MOST = np.iinfo(np.uint16).max
 
 log = logging.getLogger(LOGGER_NAME)
-
-
-class Boxed(NamedTuple):
-    """Open image: its header, and a function that decodes its pixels [H, W, C]."""
-
-    spec: oiio.ImageSpec
-    decode: Callable[[], np.ndarray]
+OpenImage = tuple[oiio.ImageSpec, Callable[[], np.ndarray]]  # header, and a function that decodes [H, W, C]
 
 
 def kind_of(path: Path) -> str:
@@ -89,7 +83,7 @@ def heif_arrays(path: Path, most_px: int) -> dict[str, np.ndarray]:
     return arrays
 
 
-def open_heif(path: Path, most_px: int) -> Boxed:
+def open_heif(path: Path, most_px: int) -> OpenImage:
     """Open the upright main image; above `most_px` pixels it cannot be decoded."""
     if importlib.util.find_spec("pi_heif") is None:
         raise InputError(
@@ -102,10 +96,10 @@ def open_heif(path: Path, most_px: int) -> Boxed:
     height, width, channels = arrays["shape"].tolist()
     spec = oiio.ImageSpec(width, height, channels, f"uint{arrays['bits']}")
     _set_colour(spec, bool(arrays["is_associated"]), arrays.get("profile"), arrays.get("codes"))
-    return Boxed(spec, lambda: arrays["pixels"])
+    return spec, lambda: arrays["pixels"]
 
 
-def open_avif(path: Path) -> Boxed:
+def open_avif(path: Path) -> OpenImage:
     """Open the main image, as stored, with Pillow."""
     from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
 
@@ -135,7 +129,7 @@ def open_avif(path: Path) -> Boxed:
             log.warning("%s: has %d bits, read as 8 bits%s", path, bits, advice)
         return values
 
-    return Boxed(spec, decode)
+    return spec, decode
 
 
 def _damaged(path: Path, error: Exception) -> InputError:

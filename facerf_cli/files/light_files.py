@@ -120,13 +120,12 @@ def read_light(path: Path) -> LightRecord:
         torch.from_numpy(light.weights),
         light.rig,
         torch.from_numpy(light.sh.coefficients) if light.sh else None,
-        {name: value for name, value in light.provenance.items() if _is_attribute(value)},
+        {  # values that an image's header can store
+            name: value
+            for name, value in light.provenance.items()
+            if isinstance(value, str) or (isinstance(value, int | float) and abs(value) < 1 << 31)
+        },
     )
-
-
-def _is_attribute(value: Any) -> bool:
-    """Return whether an image's header can store the value."""
-    return isinstance(value, str) or (isinstance(value, int | float) and abs(value) < 1 << 31)
 
 
 def read_map_file(path: Path | str) -> Tensor:

@@ -52,13 +52,16 @@ def refuse_rare(path: Path, form: str, spec: oiio.ImageSpec, following: oiio.Ima
     meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
     is_log = form == "cineon" or spec.get_string_attribute("dpx:Transfer") in _FILM_CURVES
     is_turned = form == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5
+    resources = {}
+    if form == "psd":
+        resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
     for is_rare, message in (
         (spec.deep, "deep data is not supported; flatten it with oiiotool --flatten"),
         (form == "tiff" and _is_raw(path, spec, following), UNDEVELOPED),
         (meaning == _WHITE_IS_ZERO, "TIFF with white as zero is not supported; save it as PNG"),
         (meaning == _CIELAB, "TIFF in CIELAB is not supported; convert it to RGB"),
         (
-            form == "psd" and _lacks_composite(path),
+            resources.get(_PSD_VERSION, b"")[_HAS_COMPOSITE:][:1] == b"\0",
             "PSD without a composite is not supported; save it with Maximize Compatibility, or as PNG",
         ),
         (is_log, "Cineon log film scans are not supported; convert it to linear values, as EXR"),
@@ -80,12 +83,6 @@ def _is_raw(path: Path, spec: oiio.ImageSpec, following: oiio.ImageSpec | None) 
     is_smaller = following is not None and 2 * spec.width <= following.width
     colours = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
     return starts_with(path, b"CR", 8) or is_thumbnail or is_smaller or colours in _RAW_COLOURS
-
-
-def _lacks_composite(path: Path) -> bool:
-    """Return whether a PSD states that it stores white instead of the composite of its layers."""
-    resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
-    return bool(resources.get(_PSD_VERSION, b"")[_HAS_COMPOSITE:][:1] == b"\0")
 
 
 def starts_with(path: Path, start: bytes, offset: int = 0) -> bool:

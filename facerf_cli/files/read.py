@@ -179,7 +179,14 @@ def decode(
         used = image.colour if alpha is None else [*image.colour, alpha]
         first, past = min(used), max(used) + 1
         kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
-        _require_room(path, spec, limit_px, _DECODED_BYTES.get(form, (past - first) * kind.size()), kept_px)
+        height, width = shown_size(spec)
+        pixels = max(spec.width * spec.height, height * width)
+        size = f"{path}: {spec.width} x {spec.height} pixels"
+        if pixels > limit_px:
+            raise InputError(f"{size}; the limit is {limit_px / 1e6:.0f} megapixels, so make it smaller")
+        linear_bytes = LINEAR_BYTES + _ALPHA_BYTES * (spec.alpha_channel >= 0)
+        decoded_bytes = _DECODED_BYTES.get(form, (past - first) * kind.size())
+        memory.require(size, pixels * (linear_bytes + max(decoded_bytes, kept_px)), "make it smaller")
         if quirks.has_inks(spec):
             rgb = srgb_of_inks(path, profile_of(spec))
             spec.erase_attribute("ICCProfile.*")
@@ -208,9 +215,9 @@ def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px:
         raise InputError(f"{path}: {quirks.UNDEVELOPED}")
     if form := isobmff.kind_of(path):
         room_px = memory.left_bytes() // (LINEAR_BYTES + max(isobmff.HEIF_BYTES, kept_px))
-        boxed = isobmff.open_avif(path) if form == "avif" else isobmff.open_heif(path, min(limit_px, room_px))
-        colour, alpha = first_channels(boxed.spec)
-        yield Opened(form, boxed.spec, colour, alpha, lambda first, past: boxed.decode()[..., first:past])
+        is_avif, most_px = form == "avif", min(limit_px, room_px)
+        spec, decode_all = isobmff.open_avif(path) if is_avif else isobmff.open_heif(path, most_px)
+        yield Opened(form, spec, *first_channels(spec), lambda first, past: decode_all()[..., first:past])
         return
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
@@ -249,17 +256,6 @@ def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px:
         yield Opened(form, spec, chosen.colour, chosen.alpha, read, choice)
     finally:
         stream.close()
-
-
-def _require_room(path: Path, spec: oiio.ImageSpec, limit_px: int, decoded_px: int, kept_px: int) -> None:
-    """Raise InputError if the image exceeds `limit_px` or, at `decoded_px` bytes per pixel, the memory."""
-    height, width = shown_size(spec)
-    pixels = max(spec.width * spec.height, height * width)
-    image = f"{path}: {spec.width} x {spec.height} pixels"
-    if pixels > limit_px:
-        raise InputError(f"{image}; the limit is {limit_px / 1e6:.0f} megapixels, so make it smaller")
-    alpha = _ALPHA_BYTES * (spec.alpha_channel >= 0)
-    memory.require(image, pixels * (LINEAR_BYTES + alpha + max(decoded_px, kept_px)), "make it smaller")
 
 
 def _full_frame(values: np.ndarray, spec: oiio.ImageSpec) -> np.ndarray:

@@ -87,16 +87,14 @@ def power_curve(gamma: float) -> Callable[[np.ndarray], np.ndarray]:
     return decode
 
 
-def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Invert the transfer function of ITU-R BT.2020 with its 12-bit constants."""
-    decoded = colour_science().models.oetf_inverse_BT2020(np.abs(encoded), is_12_bits_system=True)
-    return np.copysign(decoded, encoded).astype(np.float32)
+def _published_curve(function: str, **constants: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a decoding curve of colour-science by its function's name; negative values are mirrored."""
 
+    def decode(encoded: np.ndarray) -> np.ndarray:
+        decoded = getattr(colour_science().models, function)(np.abs(encoded), **constants)
+        return np.copysign(decoded, encoded).astype(np.float32)
 
-def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Invert the transfer function of ROMM RGB (ISO 22028-2), also called ProPhoto RGB."""
-    decoded = colour_science().models.cctf_decoding_ROMMRGB(np.abs(encoded))
-    return np.copysign(decoded, encoded).astype(np.float32)
+    return decode
 
 
 @dataclass(frozen=True)
@@ -119,11 +117,12 @@ SRGB = ColourSpace("sRGB", REC709_CHROMATICITIES, srgb_to_linear)
 DISPLAY_P3 = ColourSpace("Display P3", _P3_CHROMATICITIES, srgb_to_linear)
 ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, power_curve(563 / 256))
 ACESCG = ColourSpace("ACEScg", _AP1_CHROMATICITIES)
-REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
+_BT2020_CURVE = _published_curve("oetf_inverse_BT2020", is_12_bits_system=True)
+REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _BT2020_CURVE)
 LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
 LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
 ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
-PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _romm_to_linear)
+PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _published_curve("cctf_decoding_ROMMRGB"))
 
 # Without case, spaces and punctuation; includes OpenImageIO's interchange names.
 _ALIASES = {
