@@ -146,7 +146,7 @@ def test_tables_are_applied_to_eight_bits_and_refused_for_more(tmp_path: Path, c
         shown = 255 * colour.linear_to_srgb(image.pixels)
         assert np.abs(shown - by_littlecms(COLOURS, scanner)).max() < 12
         assert np.abs(shown - COLOURS).max() > 40
-        assert caplog.records[-1].getMessage().endswith("converted to sRGB by its profile 'Scanner 9'")
+        assert "'Scanner 9'" in caplog.records[-1].getMessage()
     tifffile.imwrite(path := tmp_path / "b.tif", 257 * COLOURS.astype(np.uint16), iccprofile=scanner)
     refused(InputError, "'Scanner 9' has tables ... convert it to sRGB", read_image, path)
     assert read_image(path, "Display P3").colourspace_name == "Display P3"
@@ -159,7 +159,7 @@ def test_a_broken_profile_is_one_line_that_says_what_is_assumed(tmp_path: Path, 
     Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=tables)
     assert read_image(tmp_path / "a.png").colourspace_name == "sRGB"
     (line,) = [record.getMessage() for record in caplog.records]
-    assert line.endswith("a.png: embedded profile 'Scanner 77' is not supported; assuming sRGB")
+    assert "a.png" in line and "'Scanner 77'" in line and line.endswith("assuming sRGB")
 
 
 @pytest.mark.parametrize("space", [colour.LINEAR, colour.ACESCG, colour.ACES], ids=lambda space: space.name)

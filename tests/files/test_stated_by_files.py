@@ -168,19 +168,19 @@ def test_the_image_of_an_exr_is_chosen_by_its_name(tmp_path: Path, caplog: pytes
     caplog.set_level(logging.INFO, "facerf")
     other, depth = 1 - LINEAR, LINEAR[..., :1]
     in_layers = [f"V.{layer}.{letter}" for layer in ("AO", "Combined") for letter in "RGB"]
-    for name, parts, said in [
-        ("depth_first", [("depth", depth, ("Z",)), ("rgba", LINEAR, COLOURS)], "rgba is read, not depth"),
-        ("albedo_first", [("albedo", other, COLOURS), ("main", LINEAR, COLOURS)], "main is read, not albedo"),
-        ("beauty", [("diffuse", other, COLOURS), ("beauty", LINEAR, COLOURS)], "beauty is read, not diffuse"),
-        ("blender", [("", np.dstack([other, LINEAR]), tuple(in_layers))], "V.Combined is read, not V.AO"),
-        ("nuke", [("", LINEAR, ("fill.red", "fill.green", "fill.blue"))], "fill is read"),
-        ("plain", [("rgba", LINEAR, COLOURS), ("albedo", other, COLOURS)], ""),
+    for name, parts, layers in [
+        ("depth_first", [("depth", depth, ("Z",)), ("rgba", LINEAR, COLOURS)], ["rgba", "depth"]),
+        ("albedo_first", [("albedo", other, COLOURS), ("main", LINEAR, COLOURS)], ["main", "albedo"]),
+        ("beauty", [("diffuse", other, COLOURS), ("beauty", LINEAR, COLOURS)], ["beauty", "diffuse"]),
+        ("blender", [("", np.dstack([other, LINEAR]), tuple(in_layers))], ["V.Combined", "V.AO"]),
+        ("nuke", [("", LINEAR, ("fill.red", "fill.green", "fill.blue"))], ["fill"]),
+        ("plain", [("rgba", LINEAR, COLOURS), ("albedo", other, COLOURS)], []),
     ]:
         caplog.clear()
         path = write_parts(tmp_path / f"{name}.exr", parts, "float", oiio__ColorSpace="lin_rec709_scene")
         np.testing.assert_array_equal(read_image(path).pixels, LINEAR, err_msg=name)
         lines = [record.getMessage() for record in caplog.records]
-        assert lines == ([f"{path}: layer {said}"] if said else [])
+        assert len(lines) == bool(layers) and all(layer in line for line in lines for layer in layers)
     assert read_header(path).width_px == W
 
 
