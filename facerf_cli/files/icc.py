@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.quirks import by_pillow
+from facerf_cli.files.workarounds import by_pillow
 from facerf_cli.image.colour import (
     ACES,
     ACESCG,

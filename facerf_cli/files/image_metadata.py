@@ -19,9 +19,9 @@ from xml.sax.saxutils import quoteattr
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.quirks import utf8_path
 from facerf_cli.files.read import metadata_of, open_image, shown_size
 from facerf_cli.files.spaces import default_space, is_floating, stated_space
+from facerf_cli.files.workarounds import utf8_path
 from facerf_cli.image.colour import ColourSpace
 
 Attributes = Mapping[str, str | int | float]

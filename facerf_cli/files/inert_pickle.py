@@ -1,6 +1,6 @@
 """Arrays in pickles such as FLAME's, read through an allow-list of names.
 
-Damage can still crash the unpickler: use a separate process for a user's file (`files/apart.py`).
+Damage can still crash the unpickler: use a separate process for a user's file (`files/sandbox.py`).
 """
 
 import pickle

@@ -1,7 +1,7 @@
 """HEIC and AVIF: images in ISO boxes (ISO 14496-12), which OpenImageIO does not read.
 
 HEIC and HEIF, the formats of phones, are decoded by pi-heif, an extra (`facerf[heic]`), in a separate process
-(`apart.py`), because some damaged files crash it. AVIF is decoded by Pillow in 8 bits; with PyAV, an extra
+(`sandbox.py`), because some damaged files crash it. AVIF is decoded by Pillow in 8 bits; with PyAV, an extra
 (`facerf[video]`), 10 and 12 bits keep their depth. Values are integers [H, W, C] as stored.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.sandbox import read_in_subprocess
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 # Bytes per pixel during decoding: 16 bits in both processes; 16 bits in planes, in one array, and scaled.
@@ -90,7 +90,7 @@ def open_heif(path: Path, most_px: int) -> OpenImage:
             f"{path}: HEIC and HEIF need the package pi-heif; pip install 'facerf[heic]', or save it as JPEG"
         )
     try:
-        arrays = arrays_apart(heif_arrays, path, most_px)
+        arrays = read_in_subprocess(heif_arrays, path, most_px)
     except ValueError as error:
         raise InputError(f"{path}: not a readable image; save it as JPEG ({error})") from None
     height, width, channels = arrays["shape"].tolist()

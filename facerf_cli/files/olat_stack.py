@@ -22,8 +22,8 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
-from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
+from facerf_cli.files.workarounds import oiio_error, utf8_path
 from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, write_parts
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.run import memory

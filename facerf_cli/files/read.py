@@ -2,7 +2,7 @@
 
     read_image ─ decode ─ open_image (chooses a layer) ─ upright ─ spaces.stated_space ─ to_linear_rec709
 
-OpenImageIO reads all formats except HEIC and AVIF (`isobmff.py`); `quirks.py` handles what it leaves open.
+OpenImageIO reads all formats except HEIC and AVIF (`isobmff.py`); `workarounds.py` fills its gaps.
 Data and display windows apply only to EXR: in other formats an offset positions a page or a stamp.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files import isobmff, quirks
+from facerf_cli.files import isobmff, workarounds
 from facerf_cli.files.icc import srgb_of_inks, srgb_of_tables
 from facerf_cli.files.layers import chosen_layer, first_channels
 from facerf_cli.files.spaces import (
@@ -41,9 +41,6 @@ _DECODED_BYTES = {"heif": isobmff.HEIF_BYTES, "avif": isobmff.AVIF_BYTES}  # per
 _HAVE_WINDOWS = ("openexr", "rla")
 # Formats whose resolutions are meant for print and often differ by mistake; viewers show square pixels.
 _PRINTED = ("jpeg", "png", "tiff")
-# Formats whose colour is multiplied by alpha, unless the header states otherwise.
-_ASSOCIATED = ("openexr", "tiff", "targa", "rla", "iff", "dpx", "softimage", "heif", "avif")
-_TGA_ALPHA = 4
 _INTEGERS = (oiio.TypeDesc(oiio.UINT8), oiio.TypeDesc(oiio.UINT16))
 _SAME_ASPECT, _MOST_ASPECT = 0.03, 8.0
 
@@ -166,16 +163,14 @@ def decode(
     require_regular(path, "specify an image file")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; specify an image file")
-    for _ in quirks.png_chunks(path):  # checks all of them
+    for _ in workarounds.png_chunks(path):  # checks all of them
         pass
     with open_image(path, layer, limit_px, kept_px) as image:
         form, spec = image.form, image.spec
         if image.choice:
             log.info("%s: %s", path, image.choice)
         alpha = image.alpha if with_alpha and not is_ultra_hdr(path, spec) else None
-        if form == "targa" and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
-            # its fourth channel is not necessarily alpha
-            alpha = alpha if spec.get_int_attribute("targa:alpha_type", 0) == _TGA_ALPHA else None
+        alpha = None if workarounds.lacks_alpha(form, spec) else alpha
         used = image.colour if alpha is None else [*image.colour, alpha]
         first, past = min(used), max(used) + 1
         kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
@@ -187,7 +182,7 @@ def decode(
         linear_bytes = LINEAR_BYTES + _ALPHA_BYTES * (spec.alpha_channel >= 0)
         decoded_bytes = _DECODED_BYTES.get(form, (past - first) * kind.size())
         memory.require(size, pixels * (linear_bytes + max(decoded_bytes, kept_px)), "make it smaller")
-        if quirks.has_inks(spec):
+        if workarounds.has_inks(spec):
             rgb = srgb_of_inks(path, profile_of(spec))
             spec.erase_attribute("ICCProfile.*")
             return Decoded(rgb, spec, [0, 1, 2], None)
@@ -196,12 +191,9 @@ def decode(
     alpha = None if alpha is None else alpha - first
     if alpha is None or (form == "bmp" and not values[..., alpha].any()):  # which need not be alpha
         return Decoded(values, spec, colour, None)
-    is_associated = form in _ASSOCIATED and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
-    if is_associated and form == "tiff":  # OpenImageIO also reports this if the tag is missing
-        is_associated = quirks.extra_channel(path) == quirks.ASSOCIATED
-    if form == "jpegxl" and quirks.looks_multiplied(values, colour, alpha):
+    if form == "jpegxl" and workarounds.looks_multiplied(values, colour, alpha):
         raise InputError(f"{path}: JPEG XL with premultiplied alpha is not supported; save it as PNG")
-    return Decoded(values, spec, colour, alpha, is_associated)
+    return Decoded(values, spec, colour, alpha, workarounds.is_associated(path, form, spec))
 
 
 @contextmanager
@@ -211,8 +203,8 @@ def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px:
     A HEIF is decoded when it is opened, if it has at most `limit_px` pixels and fits the memory budget.
     Raises InputError for unknown and rare formats, camera raw files and missing layers.
     """
-    if path.suffix.lower() in quirks.RAW_SUFFIXES:
-        raise InputError(f"{path}: {quirks.UNDEVELOPED}")
+    if path.suffix.lower() in workarounds.RAW_SUFFIXES:
+        raise InputError(f"{path}: {workarounds.UNDEVELOPED}")
     if form := isobmff.kind_of(path):
         room_px = memory.left_bytes() // (LINEAR_BYTES + max(isobmff.HEIF_BYTES, kept_px))
         is_avif, most_px = form == "avif", min(limit_px, room_px)
@@ -221,23 +213,23 @@ def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px:
         return
     settings = oiio.ImageSpec()
     settings.attribute("oiio:UnassociatedAlpha", 1)
-    stream = oiio.ImageInput.open(quirks.utf8_path(path), settings)
+    stream = oiio.ImageInput.open(workarounds.utf8_path(path), settings)
     if stream is None:
-        cause = quirks.reason(path, quirks.oiio_error())
+        cause = workarounds.reason(path, workarounds.oiio_error())
         raise InputError(f"{path}: not a readable image; save it as EXR, PNG or JPEG ({cause})")
     try:
-        form, warnings = stream.format_name(), quirks.oiio_error(stream)
+        form, warnings = stream.format_name(), workarounds.oiio_error(stream)
         specs = [stream.spec()]
         while form == "openexr" or (form == "tiff" and len(specs) == 1):
             if not stream.seek_subimage(len(specs), 0):
                 break
             specs.append(stream.spec())
-        quirks.oiio_error(stream)  # clears the error about the missing part
+        workarounds.oiio_error(stream)  # clears the error about the missing part
         chosen, choice = chosen_layer(path, specs if form == "openexr" else specs[:1], layer)
         spec = oiio.ImageSpec(specs[chosen.part])
-        quirks.refuse_rare(path, form, spec, specs[1] if form == "tiff" and len(specs) > 1 else None)
+        workarounds.refuse_rare(path, form, spec, specs[1] if form == "tiff" and len(specs) > 1 else None)
         stream.seek_subimage(chosen.part, 0)
-        exposure = quirks.radiance_exposure(path, spec) if form == "hdr" else 1.0
+        exposure = workarounds.radiance_exposure(path, spec) if form == "hdr" else 1.0
         if form not in _HAVE_WINDOWS:
             spec.x = spec.y = spec.full_x = spec.full_y = 0
             spec.full_width, spec.full_height = spec.width, spec.height
@@ -249,7 +241,7 @@ def open_image(path: Path, layer: str | None = None, limit_px: int = 0, kept_px:
         def read(first: int, past: int) -> np.ndarray:
             kind = spec.format if spec.format in _INTEGERS else oiio.TypeDesc(oiio.FLOAT)
             values = stream.read_image(chosen.part, 0, first, past, kind)
-            quirks.require_whole(path, values, f"{warnings}\n{quirks.oiio_error(stream)}")
+            workarounds.require_whole(path, values, f"{warnings}\n{workarounds.oiio_error(stream)}")
             values = np.asarray(values).reshape(spec.height, spec.width, past - first)
             return values if exposure == 1 else values / np.float32(exposure)
 

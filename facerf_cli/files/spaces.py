@@ -16,7 +16,7 @@ import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.icc import GREY, Curve, has_tables, space_of_profile
-from facerf_cli.files.quirks import by_pillow, png_chunks, starts_with
+from facerf_cli.files.workarounds import by_pillow, png_chunks, starts_with
 from facerf_cli.image.colour import (
     ADOBE_RGB,
     DISPLAY_P3,

@@ -19,8 +19,8 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import Attributes, embed_xmp, set_attribute
-from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.spaces import OCIO_SPACE
+from facerf_cli.files.workarounds import oiio_error, utf8_path
 from facerf_cli.image.colour import (
     ACES,
     ACESCG,

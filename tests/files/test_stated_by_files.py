@@ -123,7 +123,7 @@ def test_alpha_and_codes_of_a_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     values = np.dstack([QUADS // 2, np.full((H, W), 128, np.uint8)])
     stated = {"shape": np.array([H, W, 4]), "bits": np.array(8), "is_associated": np.array(True)}
     found = {**stated, "pixels": values, "codes": np.array([1, 13])}
-    monkeypatch.setattr(isobmff, "arrays_apart", lambda *_: found)
+    monkeypatch.setattr(isobmff, "read_in_subprocess", lambda *_: found)
     np.testing.assert_allclose(levels_of(path), QUADS, atol=2)
     found["codes"] = np.array([9, 18])
     refused(InputError, "a.heic: HDR (HLG)", read_image, path)

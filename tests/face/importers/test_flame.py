@@ -83,7 +83,7 @@ def source(pkl: Path) -> SourceModel:
 @pytest.fixture
 def here(source: SourceModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Read in this process: starting another takes a second."""
-    monkeypatch.setattr(flame, "arrays_apart", arrays_here)
+    monkeypatch.setattr(flame, "read_in_subprocess", arrays_here)
 
 
 def embedding(face: Head, first: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What OpenImageIO leaves to its caller: refusal of rare formats, detection of damage, parts of headers."""
+"""Gaps of OpenImageIO: refusal of rare formats, detection of damage, alpha, parts of headers."""
 
 import logging
 import math
@@ -26,8 +26,10 @@ UNDEVELOPED = (  # OpenImageIO would read the thumbnail
     "camera raw, or an image that starts with a thumbnail, is not supported; develop it to EXR, TIFF or JPEG,"
     " for example in darktable"
 )
-ASSOCIATED = 1  # in a TIFF's ExtraSamples: alpha, with premultiplied colour
-_EXTRA_SAMPLES = 338
+# Formats whose colour is multiplied by alpha, unless the header states otherwise.
+_ASSOCIATED = ("openexr", "tiff", "targa", "rla", "iff", "dpx", "softimage", "heif", "avif")
+_EXTRA_SAMPLES, _ASSOCIATED_ALPHA = 338, 1  # tag of a TIFF, and one of its values
+_TGA_ALPHA = 4
 # Photometric interpretations of a TIFF.
 _WHITE_IS_ZERO, _SEPARATED, _CIELAB, _RAW_COLOURS = 0, 5, 8, (32803, 34892)
 _THUMBNAIL = 1  # bit of a TIFF's NewSubfileType
@@ -123,11 +125,19 @@ def png_chunks(path: Path) -> Iterator[tuple[bytes, bytes]]:
             yield kind, body
 
 
-def extra_channel(path: Path) -> int:
-    """Return the kind of a TIFF's first extra channel, such as `ASSOCIATED`; 0 if none is stated.
+def lacks_alpha(form: str, spec: oiio.ImageSpec) -> bool:
+    """Return whether the fourth channel of a TGA is not alpha."""
+    is_open = form == "targa" and not spec.get_int_attribute("oiio:UnassociatedAlpha", 0)
+    return is_open and spec.get_int_attribute("targa:alpha_type", 0) != _TGA_ALPHA
 
-    Pillow opens few files with such a channel, but reads their directory.
-    """
+
+def is_associated(path: Path, form: str, spec: oiio.ImageSpec) -> bool:
+    """Return whether the colour is multiplied by alpha."""
+    if form not in _ASSOCIATED or spec.get_int_attribute("oiio:UnassociatedAlpha", 0):
+        return False
+    if form != "tiff":
+        return True
+    # OpenImageIO assumes it without the tag. Pillow opens few files with alpha, but reads their directory.
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     with path.open("rb") as stream:
@@ -135,7 +145,7 @@ def extra_channel(path: Path) -> int:
         directory = ImageFileDirectory_v2(start if 43 in start[2:4] else start[:8])  # 43: BigTIFF
         stream.seek(directory.next)
         directory.load(stream)
-        return int(directory.get(_EXTRA_SAMPLES, (0,))[0])
+        return bool(directory.get(_EXTRA_SAMPLES, (0,))[0] == _ASSOCIATED_ALPHA)
 
 
 def radiance_exposure(path: Path, spec: oiio.ImageSpec) -> float:

@@ -24,10 +24,10 @@ _MEMORY_BYTES, _OUTPUT_BYTES, _TIME_S = 6 << 30, 2 << 30, 300
 _READER_FAILED = 3  # exit code of a child that prints the reason to stderr
 # -P because the working directory may contain a json.py; the search path is then the parent's.
 _CHILD = "import json, sys; sys.path[:] = json.loads(sys.argv[1])\n"
-_CHILD += "from facerf_cli.files.apart import serve; serve()"
+_CHILD += "from facerf_cli.files.sandbox import serve; serve()"
 
 
-def arrays_apart(
+def read_in_subprocess(
     reader: Callable[..., dict[str, np.ndarray]], path: Path, *limits: int, time_s: float = _TIME_S
 ) -> dict[str, np.ndarray]:
     """Call `reader(path, *limits)`, a module-level function, in a separate process.
