@@ -27,7 +27,6 @@ _REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.32
 _AP0_CHROMATICITIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 _AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
-_ROMM_CHROMATICITIES = (0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001, 0.3457, 0.3585)
 
 # XYZ to cone responses of the Bradford transform (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -87,14 +86,10 @@ def power_curve(gamma: float) -> Callable[[np.ndarray], np.ndarray]:
     return decode
 
 
-def _published_curve(function: str, **constants: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a decoding curve of colour-science by its function's name; negative values are mirrored."""
-
-    def decode(encoded: np.ndarray) -> np.ndarray:
-        decoded = getattr(colour_science().models, function)(np.abs(encoded), **constants)
-        return np.copysign(decoded, encoded).astype(np.float32)
-
-    return decode
+def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
+    """Invert the transfer function of ITU-R BT.2020 with its 12-bit constants."""
+    decoded = colour_science().models.oetf_inverse_BT2020(np.abs(encoded), is_12_bits_system=True)
+    return np.copysign(decoded, encoded).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -117,12 +112,10 @@ SRGB = ColourSpace("sRGB", REC709_CHROMATICITIES, srgb_to_linear)
 DISPLAY_P3 = ColourSpace("Display P3", _P3_CHROMATICITIES, srgb_to_linear)
 ADOBE_RGB = ColourSpace("Adobe RGB", _ADOBE_CHROMATICITIES, power_curve(563 / 256))
 ACESCG = ColourSpace("ACEScg", _AP1_CHROMATICITIES)
-_BT2020_CURVE = _published_curve("oetf_inverse_BT2020", is_12_bits_system=True)
-REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _BT2020_CURVE)
+REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
 LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
 LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
 ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
-PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _published_curve("cctf_decoding_ROMMRGB"))
 
 # Without case, spaces and punctuation; includes OpenImageIO's interchange names.
 _ALIASES = {
@@ -135,7 +128,6 @@ _ALIASES = {
     LINEAR_REC2020: "linrec2020 linearrec2020 linrec2020scene",
     LINEAR_P3: "linearp3 linp3d65 linp3d65scene linearp3d65",
     ACES: "aces20651 linap0 linap0scene",
-    PROPHOTO: "prophoto prophotorgb romm rommrgb",
 }
 _BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
 
