@@ -54,7 +54,7 @@ def refuse_rare(path: Path, form: str, spec: oiio.ImageSpec, following: oiio.Ima
     meaning = spec.get_int_attribute("tiff:PhotometricInterpretation", -1)
     is_log = form == "cineon" or spec.get_string_attribute("dpx:Transfer") in _FILM_CURVES
     is_turned = form == "dpx" and spec.get_int_attribute("Orientation", 1) >= 5
-    resources = {}
+    resources: dict[int, bytes] = {}
     if form == "psd":
         resources = by_pillow(path, lambda image: {number: data for number, _, data in image.resources}) or {}
     for is_rare, message in (
