@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.sandbox import read_in_subprocess
 from tests.kinds import Folders, Patch
 
 STRANGERS = ("json", "numpy", "torch", "multiprocessing", "signal")
@@ -46,7 +46,7 @@ def send_pi(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_a_reader_in_its_own_process_imports_none(folder: Path) -> None:
-    assert arrays_apart(send_pi, folder / "a.png")["pi"] == 3.14
+    assert read_in_subprocess(send_pi, folder / "a.png")["pi"] == 3.14
     assert not imported(folder)
 
 
@@ -76,5 +76,5 @@ def test_processes_start_in_known_files() -> None:
     package = Path(__file__).parents[1] / "facerf_cli"
     starts = re.compile(r"\bsubprocess\.|get_context|Popen|num_workers=|os\.(system|fork|exec)")
     files = {file for file in package.rglob("*.py") if starts.search(file.read_text())}
-    known = {"files/apart.py", "run/workers.py", "training/loop.py"}
+    known = {"files/sandbox.py", "run/workers.py", "training/loop.py"}
     assert {file.relative_to(package).as_posix() for file in files} == known

@@ -1,12 +1,11 @@
-"""Atomic writes, and one run at a time in an output folder.
+"""Atomic writes, and locks of output folders.
 
-An output is written into a hidden folder next to it, made durable, and renamed. The hidden folder belongs to
-this process alone, and no link that another user has put there is followed. A power cut leaves the old output
-or the new one: the data is on the disk before the rename, and the rename before the next step (Pillai et al.,
+An output is written into a hidden folder next to it, synced to the disk, and renamed. Only this process uses
+the hidden folder, and links that another user has put there are not followed. A power cut leaves the old or
+the new output: data is on the disk before the rename, and the rename before the next step (Pillai et al.,
 'All File Systems Are Not Created Equal', OSDI 2014).
 
-A run holds the lock of its output folder; the next one waits, and then finds what the first has made. The
-lock ends with its process, however that ends.
+A run holds the lock of its output folder; the next run waits for it. The lock ends with its process.
 """
 
 import atexit
@@ -21,25 +20,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by, end_again
 
-if TYPE_CHECKING:
-    from filelock import FileLock
-
-_ABANDONED_S = 24 * 3600  # without a write: then another machine's temporary folder counts as abandoned
+_ABANDONED_S = 24 * 3600  # age of another machine's temporary folder that counts as abandoned
 _MARK = ".part-"
-_LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, that its temporary folder repeats
-# Errors of one output's name or folder, which cost its item; others, as of a full disk, end the run.
+_LONGEST_STEM = 40  # characters of a name, of up to 4 bytes, in the name of its temporary folder
+# Errors of one output's path, which fail its item; others, such as a full disk, end the run.
 _OF_ONE_PATH = {errno.ENAMETOOLONG, errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EILSEQ}
 _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS}  # NFS, SMB and Lustre without them
-_UNLOCKED = "%s: the file system has no locks (%s), so run only one facerf there at a time"
 _open: set[Path] = set()  # temporary folders of this process
-_watched: list[list[Path]] = []  # what was written since each `all_or_none` began
-_asked: list[Callable[[Path, Path], bool]] = []  # before a file is replaced; see `asking`
+_watched: list[list[Path]] = []  # files written since each `all_or_none` began
+_asked: list[Callable[[Path, Path], bool]] = []  # called before a file is replaced; see `asking`
 _swept: set[Path] = set()  # folders whose leftovers this process has removed
 log = logging.getLogger(LOGGER_NAME)
 
@@ -48,17 +42,17 @@ log = logging.getLogger(LOGGER_NAME)
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path for a file or a folder; it replaces `path` when the block succeeds.
 
-    The temporary path keeps the name (writers choose their format by its suffix), in a hidden folder, so that
-    a search does not take it for an input. Missing parent folders are created. What a killed process left in
-    the folder is removed. Several machines may write the same output at once.
+    The temporary path has the same name (writers choose their format by its suffix) in a hidden folder, which
+    searches for inputs skip. Missing parent folders are created, and leftovers of killed processes removed.
+    Several machines may write the same output at once.
     """
     try:
         with hidden_folder(path) as room:
             temporary = room / path.name
             with suppress(FileNotFoundError):
-                temporary.lstat()  # says that a name is too long, which libraries do not
+                temporary.lstat()  # reports a name that is too long, which libraries do not
             yield temporary
-            end_again()  # what was written may lack what a library left out
+            end_again()  # a library may have caught the exit and written a part
             if not temporary.exists():
                 raise FacerfError(f"{path}: could not be written")
             _sync_all(temporary)
@@ -77,15 +71,15 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def hidden_folder(path: Path) -> Iterator[Path]:
-    """Yield a hidden folder next to an output, of this process alone, which goes with the block."""
+    """Yield a hidden folder of this process next to an output; it is removed after the block."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # for each file it would be quadratic
+    if (absolute := Path(os.path.abspath(path.parent))) not in _swept:  # once per folder, not per file
         _swept.add(absolute)
         sweep_leftovers(path.parent)
     name = f".{path.stem[:_LONGEST_STEM]}{_MARK}{machine_id()}-{os.getpid()}-{secrets.token_hex(4)}"
     room = path.parent / name
     _open.add(room)
-    try:  # before it is there: an interrupt may come at any time
+    try:  # before it is created: an interrupt may come at any time
         room.mkdir(mode=0o700)
         yield room
     finally:
@@ -97,7 +91,7 @@ def hidden_folder(path: Path) -> Iterator[Path]:
 def asking(ask: Callable[[Path, Path], bool]) -> Iterator[None]:
     """Call `ask(path, temporary)` before each output of the block is renamed, in any thread.
 
-    If it returns False, the file at `path` stays as it is. It may raise.
+    If it returns False, the file at `path` is not replaced. It may raise.
     """
     _asked.append(ask)
     try:
@@ -108,7 +102,7 @@ def asking(ask: Callable[[Path, Path], bool]) -> Iterator[None]:
 
 @contextmanager
 def all_or_none() -> Iterator[None]:
-    """Remove what was written in the block, in any thread, where the block fails; an interrupt keeps it."""
+    """Remove files written in the block, in any thread, if it fails; an interrupt keeps them."""
     written: list[Path] = []
     _watched.append(written)
     try:
@@ -122,7 +116,7 @@ def all_or_none() -> Iterator[None]:
 
 
 def sweep_leftovers(folder: Path) -> None:
-    """Remove temporary folders of processes that have ended from a folder."""
+    """Remove temporary folders of ended processes from a folder."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if entry.name.startswith(".") and _MARK in entry.name and _is_abandoned(entry):
@@ -130,22 +124,21 @@ def sweep_leftovers(folder: Path) -> None:
 
 
 def _remove_own() -> None:
-    """Remove what this process is writing."""
     for room in list(_open):
         shutil.rmtree(room, ignore_errors=True)
 
 
 def is_temporary(path: Path) -> bool:
-    """Tell whether a path is in a temporary folder of `atomic_path`."""
+    """Return whether a path is in a temporary folder of `atomic_path`."""
     return any(part.startswith(".") and _MARK in part for part in path.parts)
 
 
 clean_by(_remove_own)
-atexit.register(_remove_own)  # what a Ctrl-C in the midst of removing it has left
+atexit.register(_remove_own)  # again, after a Ctrl-C during the removal
 
 
 def machine_id() -> str:
-    """An id of this machine, since machines that share a folder may use the same process ids."""
+    """Return an id of this machine, since machines that share a folder may use the same process ids."""
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
@@ -154,24 +147,16 @@ def _is_abandoned(leftover: os.DirEntry[str]) -> bool:
     owner = rest.partition("-")[0]
     if len(machine) != len(machine_id()) or not owner.isdecimal():
         return False
-    if machine == machine_id():
-        return not _runs(int(owner))
     try:
-        return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
-    except OSError:  # its process has just renamed or removed it
-        return False
-
-
-def _runs(process: int) -> bool:
-    if os.name == "nt":  # os.kill would end the process there; leftovers stay
-        return True
-    try:
-        os.kill(process, 0)
+        if machine != machine_id():
+            return time.time() - leftover.stat(follow_symlinks=False).st_mtime > _ABANDONED_S
+        if os.name != "nt":  # where os.kill would end the process
+            os.kill(int(owner), 0)
     except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
+        return True
+    except OSError:  # another user's process, or a folder that its process has just renamed or removed
         pass
-    return True
+    return False
 
 
 def _remove(path: Path) -> None:
@@ -182,7 +167,7 @@ def _remove(path: Path) -> None:
 
 
 def _sync_all(path: Path) -> None:
-    """Bring a file, or all of a folder, from memory to the disk."""
+    """Sync a file, or everything in a folder, to the disk."""
     if not path.is_dir():
         _sync(path)
         return
@@ -193,7 +178,7 @@ def _sync_all(path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    follow = 0 if path.is_dir() else getattr(os, "O_NOFOLLOW", 0)  # a folder may be a link of the user's
+    follow = 0 if path.is_dir() else getattr(os, "O_NOFOLLOW", 0)  # folders may be links
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | follow)
     try:
         os.fsync(descriptor)
@@ -202,7 +187,7 @@ def _sync(path: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring a folder's names to the disk, where its file system can."""
+    """Sync a folder's names to the disk if its file system supports that."""
     try:
         _sync(folder)
     except OSError as error:
@@ -212,50 +197,43 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def alone_in(folder: Path, name: str) -> Iterator[None]:
-    """Hold the lock `name` of a folder, which is created; wait for a process that holds it, and say so.
+    """Hold the lock `name` of a folder, which is created; wait for a process that holds it, and log that.
 
-    Where the file system has no locks, warn and go on.
-    Folders that were created and are empty in the end are removed. Raises OSError where the folder cannot be
-    written to.
+    On file systems without locks, warn and continue. New folders are removed if they are still empty at the
+    end. Raises OSError if the folder is not writable.
     """
-    from filelock import FileLock  # --help does without it
+    from filelock import FileLock, Timeout  # not needed for --help
 
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     path = folder / name
-    lock = FileLock(path, fallback_to_soft=False)  # which would outlive a killed process
+    lock = FileLock(path, fallback_to_soft=False)  # a soft lock would outlive a killed process
+    waits = False
     try:
-        _acquire(lock, path)
+        while not lock.is_locked:
+            folder.mkdir(parents=True, exist_ok=True)  # the last owner may have removed it
+            try:
+                lock.acquire(blocking=waits)
+            except FileNotFoundError:
+                pass
+            except Timeout:
+                owner, waits = "unknown", True
+                with suppress(OSError):  # just ended
+                    owner = printable_line(path.read_text(errors="replace")[:20])
+                log.warning("%s: waiting for another facerf (process %s)", folder, owner)
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
-        log.warning(_UNLOCKED, folder, error.strerror)
+        log.warning(
+            "%s: the file system has no locks (%s); run only one facerf there", folder, error.strerror
+        )
     try:
-        with suppress(PermissionError):  # Windows keeps a locked file shut
+        with suppress(PermissionError):  # on Windows, for a locked file
             path.write_text(str(os.getpid()))
         yield
     finally:
         with suppress(PermissionError):
-            path.unlink(missing_ok=True)  # first: who waits for it sees that it is another file
+            path.unlink(missing_ok=True)  # before the release, so that waiting processes see a new file
         lock.release()
         with suppress(OSError):
             for empty in created:
                 empty.rmdir()
-
-
-def _acquire(lock: "FileLock", path: Path) -> None:
-    """Wait for a lock; its folder is made again where the last owner has removed it."""
-    from filelock import Timeout
-
-    wait = "%s: another facerf (process %s) writes there; waiting for it"
-    waits = False
-    while not lock.is_locked:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            lock.acquire(blocking=waits)
-        except FileNotFoundError:
-            pass
-        except Timeout:
-            owner, waits = "unknown", True
-            with suppress(OSError):  # it has just ended
-                owner = printable_line(path.read_text(errors="replace")[:20])
-            log.warning(wait, path.parent, owner)

@@ -1,6 +1,6 @@
 """Videos read by PyAV, an extra (`facerf[video]`): frames by number, decoded in order, and their times.
 
-The wheel of PyAV holds FFmpeg with x264 and x265, which are under the GPL; facerf does not bundle it.
+PyAV's wheel contains FFmpeg with x264 and x265 under the GPL; facerf does not bundle it.
 """
 
 import logging
@@ -24,19 +24,17 @@ log = logging.getLogger(LOGGER_NAME)
 _LARGEST_PX = 8192 * 4320
 _MOST_FRAMES = 1_000_000
 _BT601, BT709, _UNKNOWN = 5, 1, 2
-_HD_LINES = 720  # videos without a stated matrix have BT.709 from here on
-_MICROSECONDS = 1_000_000  # a second, in which FFmpeg counts for whole files
-_READERS = (
-    3  # one goes from key frame to key frame, one to the middle of each take, and one through all frames
-)
-_KEPT, _BEFORE = 12, 5  # decoded frames that are kept; of those that a reader passes over, the last ones
+_HD_LINES = 720  # from this height, videos without a stated matrix are assumed to be BT.709
+_MICROSECONDS = 1_000_000  # per second, FFmpeg's unit for whole files
+_READERS = 3  # for the key frames, the middle of each take, and all frames
+_KEPT, _BEFORE = 12, 5  # decoded frames that are kept, and how many of those that a reader skips
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of a film's frames in seconds, the film whose sound it has, and its first frame's timecode.
+    """Times of a video's frames in seconds, the video with its sound, and its first frame's timecode.
 
-    The timecode is 01:02:03:04, or 01:02:03;04 for drop-frame; empty for none.
+    The timecode is 01:02:03:04, or 01:02:03;04 for drop-frame; empty without one.
     """
 
     times_s: tuple[Fraction, ...]
@@ -51,85 +49,80 @@ class Timing:
 
 
 def require_av(path: Path) -> Any:
-    """Import PyAV; raise UsageError where it is not installed."""
+    """Import PyAV; raise UsageError if it is not installed."""
     try:
         import av
     except ImportError:
         raise UsageError(
-            f"{path}: films need the package av (it holds GPL codecs); pip install 'facerf[video]', or give "
-            "the frames as images with --sequence"
+            f"{path}: videos need the package av (with GPL codecs); pip install 'facerf[video]', or pass the "
+            "frames as images with --sequence"
         ) from None
     return av
 
 
 def exact(av: Any) -> int:
-    """The way to convert colours that rounds to the nearest; by default values come out a step too dark."""
-    way = av.video.reformatter.Interpolation
-    return int(way.BICUBIC | way.ACCURATE_RND | way.FULL_CHR_H_INT | way.FULL_CHR_H_INP)
+    """Return the flags of a colour conversion that rounds to nearest; the default is a step too dark."""
+    flags = av.video.reformatter.Interpolation
+    return int(flags.BICUBIC | flags.ACCURATE_RND | flags.FULL_CHR_H_INT | flags.FULL_CHR_H_INP)
 
 
 @dataclass(eq=False)
 class _Reader:
-    """A pass through a video: the frames that it has yet to decode, and the number of the next one."""
+    """Pass through a video: its remaining frames, and the number of the next one."""
 
     frames: Iterator[Any]
     next: int = 0
 
 
 class Film:
-    """The frames of a video, by number; decoded in order, without seeking.
+    """Frames of a video by number, decoded in order, without seeking.
 
-    A frame is decoded by the nearest of up to three readers before it, each of which only goes forward. So a
-    pass over the frames of each take after its key frames decodes the video at most three times. Few frames
-    are held at a time. Raises InputError for a file that cannot be decoded.
+    Each of up to three readers only moves forward, and the nearest one decodes a frame. So reading the key
+    frames and then all frames of each take decodes the video at most three times. Few frames are kept in
+    memory. Raises InputError for a file that cannot be decoded.
 
     Attributes:
         timing: Times of the frames, their mean rate, the timecode, and the file itself if it has sound.
-        lost_sounds: Number of sound tracks of unknown codecs.
     """
 
     def __init__(self, path: Path) -> None:
         self._path, self._av = path, require_av(path)
         self._matrix: bytes | None = None
         self._kept: dict[int, np.ndarray] = {}
-        self._readers: list[_Reader] = []  # the last used one last
+        self._readers: list[_Reader] = []  # least recently used first
         with self._opened() as (container, stream):
-            self._is_counted = container.format.name == "avi"  # it has no times of presentation
+            self._is_counted = container.format.name == "avi"  # without presentation times
             self._aspect = Fraction(stream.sample_aspect_ratio or 1)
             coded = stream.codec_context
             self._codes = int(coded.color_primaries), int(coded.color_trc)
-            sounds = [track.codec_context for track in container.streams.audio]
-            self.lost_sounds = sounds.count(None)
+            has_sound = any(track.codec_context for track in container.streams.audio)
             self._pts = self._presented(container, stream)
-            self.timing = self._timed(container, stream, any(sounds))
+            self.timing = self._timed(container, stream, has_sound)
 
     @contextmanager
     def _opened(self) -> Iterator[tuple[Any, Any]]:
-        """Open the file and its video stream; raise InputError for what FFmpeg cannot read in the block."""
+        """Open the file and its video stream; FFmpeg's errors in the block become InputErrors."""
         try:
             with self._av.open(str(self._path), metadata_errors="replace") as container:
                 stream = container.streams.best("video")
                 if stream is None or stream.codec_context is None:
-                    raise InputError(
-                        f"{self._path}: holds no pictures that FFmpeg decodes; give a film, or convert it"
-                    )
+                    raise InputError(f"{self._path}: has no video that FFmpeg decodes; convert it")
                 stream.thread_type = "AUTO"
                 yield container, stream
         except (self._av.error.FFmpegError, OSError) as error:
             raise InputError(
-                f"{self._path}: not a readable film, or a damaged one; convert it, or copy it again "
-                f"({reason(error)})"
+                f"{self._path}: damaged, or not a readable video; convert or copy it again ({reason(error)})"
             ) from None
 
     def _presented(self, container: Any, stream: Any) -> list[int]:
-        """Time stamps of all frames in the order of presentation; packets are read, and hardly decoded."""
+        """Return the sorted presentation time stamps of all frames; few videos are decoded for this."""
         coder = stream.codec_context
-        packets = (one for one in container.demux(stream) if one.size and not one.is_discard)
+        packets = (part for part in container.demux(stream) if part.size and not part.is_discard)
         if coder.name == "h264" and coder.field_order > 1 and not self._is_counted:
-            packets = container.decode(stream)  # since packets may be single fields
-        pts = {one.dts if self._is_counted else one.pts for one in packets} - {None}
+            packets = container.decode(stream)  # packets may be single fields
+        pts = {part.dts if self._is_counted else part.pts for part in packets} - {None}
         if not 0 < len(pts) <= _MOST_FRAMES:
-            raise InputError(f"{self._path}: has {len(pts)} frames; give a film of 1 to {_MOST_FRAMES}")
+            raise InputError(f"{self._path}: has {len(pts)} frames; use a video of 1 to {_MOST_FRAMES}")
         return sorted(pts)
 
     def _timed(self, container: Any, stream: Any, has_sound: bool) -> Timing:
@@ -140,26 +133,26 @@ class Film:
             length_s = times_s[-1] - times_s[0]
             rate = (len(times_s) - 1) / length_s if length_s else Fraction(24)
         parts = (container, *container.streams, stream)
-        said = {key.lower(): value for part in parts for key, value in part.metadata.items()}
-        return Timing(times_s, rate, self._path if has_sound else None, said.get("timecode", ""))
+        metadata = {key.lower(): value for part in parts for key, value in part.metadata.items()}
+        return Timing(times_s, rate, self._path if has_sound else None, metadata.get("timecode", ""))
 
     @property
     def space(self) -> ColourSpace:
-        """The colour space that the film's codes state; sRGB where they say nothing that is known."""
-        found = space_of_codes(*self._codes)
-        if found is None:
-            log.warning("%s: colour codes %d and %d are not known; taken for sRGB", self._path, *self._codes)
-        return found or SRGB
+        """Colour space that the video's codes state; sRGB for unknown codes."""
+        space = space_of_codes(*self._codes)
+        if space is None:
+            log.warning("%s: unknown colour codes %d and %d; assuming sRGB", self._path, *self._codes)
+        return space or SRGB
 
     def read(self, number: int) -> np.ndarray:
-        """Frame `number` [H, W, 3 or, with alpha, 4], square pixels, upright, in `space`.
+        """Return frame `number` [H, W, 3 or, with alpha, 4], upright, with square pixels, in `space`.
 
-        It is uint8, or uint16 of deeper films; its colour is not multiplied by alpha.
+        It is uint8, or uint16 for deeper videos; the colour is not multiplied by alpha.
         """
         if number not in self._kept:
             before = [reader for reader in self._readers if reader.next <= number]
-            reader = max(before, key=lambda one: one.next) if before else _Reader(self._decoded())
-            self._readers = [*(one for one in self._readers if one is not reader), reader][-_READERS:]
+            reader = max(before, key=lambda reader: reader.next) if before else _Reader(self._decoded())
+            self._readers = [*(other for other in self._readers if other is not reader), reader][-_READERS:]
             while reader.next <= number:
                 if (frame := next(reader.frames, None)) is None:
                     raise InputError(f"{self._path}: ends before frame {number}; copy it again")
@@ -171,14 +164,14 @@ class Film:
         return self._kept[number]
 
     def _decoded(self) -> Iterator[Any]:
-        """Decode the frames from the first to the last, progressive, one for each time."""
+        """Decode all frames as progressive, one per time stamp."""
         with self._opened() as (container, stream):
-            frames = self._one_for_each_time(container.decode(stream))
-            for _, alike in groupby(frames, lambda one: (one.width, one.height, one.format.name)):
+            frames = self._one_per_time(container.decode(stream))
+            for _, alike in groupby(frames, lambda frame: (frame.width, frame.height, frame.format.name)):
                 yield from _progressive(self._av, alike)
 
-    def _one_for_each_time(self, frames: Iterator[Any]) -> Iterator[Any]:
-        """The frame of each time stamp; a later one in place of one that was not decoded."""
+    def _one_per_time(self, frames: Iterator[Any]) -> Iterator[Any]:
+        """Yield the frame of each time stamp; a later frame replaces one that was not decoded."""
         count = 0
         for frame in frames:
             if self._is_counted:
@@ -192,12 +185,10 @@ class Film:
         width = round(frame.width * max(self._aspect, 1))
         height = round(frame.height / min(self._aspect, 1))
         if width * height > _LARGEST_PX:
-            raise InputError(f"{self._path}: {width} x {height} are too many pixels; scale it")
+            raise InputError(f"{self._path}: {width} x {height} pixels are too many; scale it down")
         if name := HDR_CURVES.get(int(frame.color_trc)):
-            raise InputError(
-                f"{self._path}: is an HDR film ({name}); convert it to Rec.709 (SDR), or give its frames as "
-                "EXR with --sequence"
-            )
+            advice = "convert it to SDR, or use --sequence with EXR frames"
+            raise InputError(f"{self._path}: HDR ({name}) is not supported; {advice}")
         parts, is_rgb = frame.format.components, frame.format.is_rgb
         deep, alpha = max(part.bits for part in parts) > 8, parts[-1].is_alpha
         matrix = int(frame.colorspace)
@@ -206,18 +197,18 @@ class Film:
         form = ("rgb24", "rgb48le", "rgba", "rgba64le")[2 * alpha + deep]
         colours = {} if is_rgb else {"src_colorspace": matrix, "interpolation": exact(self._av)}
         values = frame.to_ndarray(format=form, width=width, height=height, **colours)
-        if alpha and not is_rgb:  # 10 or 12 bits, whose white is to be white
+        if alpha and not is_rgb:  # extends 10 or 12 bits to the white of 16
             values[..., 3] |= values[..., 3] >> parts[-1].bits
-        if self._matrix is None:  # once, since side data keep their frame until garbage is collected
+        if self._matrix is None:  # once, because side data keep their frame in memory
             matrix = frame.side_data.get("DISPLAYMATRIX")
             self._matrix = b"" if matrix is None else bytes(matrix)
         return _upright(values, self._matrix)
 
 
 def _upright(values: np.ndarray, matrix: bytes) -> np.ndarray:
-    """Turn and mirror a frame [H, W, C] by a film's display matrix, to quarters; it may have none.
+    """Rotate by quarter turns and mirror a frame [H, W, C] by the display matrix, which may be empty.
 
-    Its first two columns are a, b, of x, and c, d, of y: (x, y) is shown at (a x + c y, b x + d y).
+    Its first two columns are a, b, for x, and c, d, for y: (x, y) is shown at (a x + c y, b x + d y).
     """
     if not matrix:
         return np.ascontiguousarray(values)
@@ -230,10 +221,10 @@ def _upright(values: np.ndarray, matrix: bytes) -> np.ndarray:
 
 
 def _progressive(av: Any, frames: Iterator[Any]) -> Iterator[Any]:
-    """Frames of one size, of which interlaced ones are made progressive by FFmpeg's bwdif.
+    """Yield frames of one size, with interlaced ones deinterlaced by FFmpeg's bwdif.
 
-    They then show the time of their first field. From the first interlaced frame on, all pass the filter,
-    which looks at the frames around each, and leaves progressive ones as they are.
+    These then show the time of their first field. From the first interlaced frame on, all frames pass the
+    filter, which uses neighbouring frames and leaves progressive ones unchanged.
     """
     graph: Any = None
     for frame in frames:
@@ -252,7 +243,7 @@ def _progressive(av: Any, frames: Iterator[Any]) -> Iterator[Any]:
 
 
 def _filtered(graph: Any, frame: Any) -> Iterator[Any]:
-    """Give a graph a frame, or None at the end; yield the frames that it has ready."""
+    """Push a frame, or None at the end, to a graph; yield the frames that are ready."""
     graph.vpush(frame)
     with suppress(BlockingIOError, EOFError):
         while True:
@@ -260,17 +251,17 @@ def _filtered(graph: Any, frame: Any) -> Iterator[Any]:
 
 
 def start_s(container: Any) -> Fraction:
-    """The time at which pictures or sound begin, which is late in streams that were cut out of others."""
+    """Return the time at which video or sound starts; streams cut from others start late."""
     return max(Fraction(0), Fraction(container.start_time or 0, _MICROSECONDS))
 
 
 def film_timing(path: Path) -> Timing:
-    """Read the timing of a film; its first frame is decoded, so that an HDR film is refused here."""
+    """Read the timing of a video; decoding its first frame also rejects HDR."""
     film = Film(path)
     film.read(0)
     return film.timing
 
 
 def reason(error: Exception) -> str:
-    """The cause of an error of FFmpeg."""
+    """Return the cause of FFmpeg's error."""
     return str(getattr(error, "strerror", None) or error)

@@ -1,6 +1,5 @@
-"""Videos written by PyAV from numbered images, with another one's sound: H.264 in .mp4, ProRes in .mov."""
+"""Videos written by PyAV from images, with another video's sound: H.264 in .mp4, ProRes in .mov."""
 
-import io
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,26 +15,26 @@ import numpy as np
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.film import BT709, Film, Timing, exact, reason, require_av, start_s
+from facerf_cli.files.film import BT709, Timing, exact, reason, require_av, start_s
 from facerf_cli.files.read import PHOTO_LIMIT_PX, decode
 from facerf_cli.image.colour import linear_to_srgb, srgb_to_linear, unit_floats
 from facerf_cli.run.logs import LOGGER_NAME
 
 log = logging.getLogger(LOGGER_NAME)
 _LIMITED = 1  # range (ITU-T H.273)
-_CLOCK = 90_000  # ticks per second, at least, in which the times of frames are written
-_COPIED = "aac mp3 ac3 alac"  # sound that stays as it is in both kinds of files
-_Packets = tuple[Fraction | float, list[Any]]  # what is written, and the time in seconds at which it begins
+_CLOCK = 90_000  # fewest ticks per second for the times of frames
+_COPIED = "aac mp3 ac3 alac"  # sound codecs that both kinds of files accept
+_Packets = tuple[Fraction | float, list[Any]]  # start time in seconds, and packets to write
 
 
 @dataclass(frozen=True)
 class _Form:
-    """A way to write a film; sound of the codecs `copied` stays as it is, other is encoded again, as AAC."""
+    """Encoding of a video; sound in the codecs `copied` is copied, other sound is re-encoded as AAC."""
 
     codec: str
     pixels: str
     options: dict[str, str]
-    source: str  # of numpy's frames
+    source: str  # pixel format of the NumPy frames
     copied: str
 
 
@@ -54,38 +53,24 @@ _ALPHA_FORM = replace(
 )
 
 
-def check_writable(path: Path, source: Path) -> None:
-    """Raise InputError where a film cannot have the sound of another; say what it loses of it."""
-    av, film = require_av(path), Film(source)
-    height, width, channels = film.read(0).shape
-    if film.lost_sounds:
-        log.warning("%s: %d of its sounds are of unknown codecs and left out", source, film.lost_sounds)
-    if channels == 4 and path.suffix.lower() == ".mp4":
-        log.warning("%s: has no alpha, and shows %s over black; give FILE.mov for alpha", path, source)
-    try:
-        with av.open(io.BytesIO(), "w", format=path.suffix[1:].lower()) as container:
-            _begin(av, container, _FORMS[path.suffix.lower()], (height, width), film.timing)
-            container.start_encoding()
-    except (av.error.FFmpegError, ValueError) as error:
-        raise InputError(
-            f"{source}: its sound cannot be written to {path} ({reason(error)}); convert it to AAC"
-        ) from None
-
-
 def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str) -> None:
-    """Write PNG images as a film; it has its name when it is whole. `comment` goes into its metadata.
+    """Write PNG images as a video atomically; `comment` goes into its metadata.
 
-    Alpha is kept in ProRes 4444 in .mov, and .mp4 shows the images over black.
+    .mov keeps alpha in ProRes 4444, .mp4 shows the images over black. Raises InputError if FFmpeg cannot
+    write the sound.
     """
     av, form = require_av(path), _FORMS[path.suffix.lower()]
-    if path.suffix.lower() == ".mov" and decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
-        form = _ALPHA_FORM
+    if decode(images[0], PHOTO_LIMIT_PX).alpha is not None:
+        if path.suffix.lower() == ".mov":
+            form = _ALPHA_FORM
+        else:
+            log.warning("%s: has no alpha, and shows the images over black; use FILE.mov for alpha", path)
     clock = _clock(timing)
     starts = [round(time_s * clock) for time_s in timing.times_s]
     ends = [*starts[1:], starts[-1] + round(clock / timing.rate)]
     assert all(first < last for first, last in pairwise([*starts, ends[-1]]))
 
-    def pictures(stream: Any) -> Iterator[_Packets]:
+    def encoded(stream: Any) -> Iterator[_Packets]:
         for image, start, end in zip(images, starts, ends, strict=True):
             frame = av.VideoFrame.from_ndarray(_pixels(image, form), format=form.source)
             frame = frame.reformat(format=form.pixels, dst_colorspace=BT709, interpolation=exact(av))
@@ -94,60 +79,75 @@ def write_film(path: Path, images: Sequence[Path], timing: Timing, comment: str)
         yield inf, stream.encode(None)
 
     options = {"movflags": "+faststart"}
-    with atomic_path(path) as temporary, av.open(str(temporary), "w", options=options) as container:
-        container.metadata["comment"] = comment
-        stream, sound = _begin(av, container, form, _pixels(images[0], form).shape[:2], timing)
-        for _, packets in merge(pictures(stream), sound, key=itemgetter(0)):
-            container.mux(packets)
+    try:
+        with atomic_path(path) as temporary, av.open(str(temporary), "w", options=options) as container:
+            container.metadata["comment"] = comment
+            stream, sound = _begin(av, container, form, _pixels(images[0], form).shape[:2], timing)
+            for _, packets in merge(encoded(stream), sound, key=itemgetter(0)):
+                container.mux(packets)
+    except av.error.FFmpegError as error:
+        raise InputError(
+            f"{path}: cannot be written ({reason(error)}); convert the sound of the video to AAC"
+        ) from None
 
 
 def _begin(
     av: Any, container: Any, form: _Form, size_px: tuple[int, ...], timing: Timing
 ) -> tuple[Any, Iterator[_Packets]]:
-    """Add the streams of a film to write: return that of its pictures, and what is written to its sound."""
+    """Add the streams of a video; return the video stream, and the packets of its sound."""
     stream = container.add_stream(form.codec, rate=timing.rate)
     stream.options = dict(form.options)
     stream.pix_fmt = form.pixels
     stream.time_base = stream.codec_context.time_base = Fraction(1, _clock(timing))
-    coded = stream.codec_context
-    coded.colorspace = coded.color_primaries = coded.color_trc = BT709
-    coded.color_range = _LIMITED
+    context = stream.codec_context
+    context.colorspace = context.color_primaries = context.color_trc = BT709
+    context.color_range = _LIMITED
     stream.height, stream.width = (side + side % 2 for side in size_px)
-    if timing.timecode:  # FFmpeg leaves out drop-frame ones at other rates than multiples of 30
+    if timing.timecode:  # FFmpeg omits drop-frame at rates that are not multiples of 30
         drops = round(timing.rate) % 30 == 0
         stream.metadata["timecode"] = timing.timecode if drops else timing.timecode.replace(";", ":")
     if timing.sound is None:
         return stream, iter(())
     source = av.open(str(timing.sound), metadata_errors="replace")
-    tracks = {
-        track.index: _begin_sound(av, container, track, track.codec_context.name in form.copied.split())
-        for track in source.streams.audio
-        if track.codec_context
-    }
+    tracks: dict[int, tuple[Any, bool]] = {}
+    for track in source.streams.audio:
+        if coded := track.codec_context:
+            is_copied = coded.name in form.copied.split()
+            if is_copied:
+                sound = container.add_stream_from_template(track)
+            else:
+                rates = av.Codec("aac", "w").audio_rates
+                rate = max((rate for rate in rates if rate <= coded.sample_rate), default=min(rates))
+                sound = container.add_stream("aac", rate=rate)
+                sound.layout = coded.layout.name.replace(" channels", "c")  # the usual layout of that count
+            sound.metadata.update({"language": track.language} if track.language else {})
+            tracks[track.index] = sound, is_copied
+        else:
+            log.warning("%s: a sound track has an unknown codec and is omitted", timing.sound)
     return stream, _sound(av, source, tracks)
 
 
 def _clock(timing: Timing) -> int:
-    """Return the ticks per second; a frame at a usual rate lasts a whole number of them."""
+    """Return the ticks per second, a multiple of the usual frame rates."""
     per_second = timing.rate.numerator
     return per_second * -(-_CLOCK // per_second) if per_second < 2 * _CLOCK else _CLOCK
 
 
 def _pixels(path: Path, form: _Form) -> np.ndarray:
-    """An image's colour [H, W, 3], and alpha [H, W, 4] where the form has it, uint8 or uint16.
+    """Return an image's colour [H, W, 3], or [H, W, 4] if the form has alpha, uint8 or uint16.
 
-    An odd last row or column stands twice, since codecs halve colours.
+    An odd last row or column is repeated, since codecs halve colours.
     """
-    found = decode(path, PHOTO_LIMIT_PX)
-    if len(found.colour) < 3:
-        raise InputError(f"{path}: is not an image of a film; remove it and make it again")
-    values = unit_floats(found.values[..., found.colour])
+    image = decode(path, PHOTO_LIMIT_PX)
+    if len(image.colour) < 3:
+        raise InputError(f"{path}: not a frame of a video; remove it and render it again")
+    values = unit_floats(image.values[..., image.colour])
     alpha = np.ones_like(values[..., :1])
-    if found.alpha is not None:
-        alpha = unit_floats(found.values[..., found.alpha])[..., None]
+    if image.alpha is not None:
+        alpha = unit_floats(image.values[..., image.alpha])[..., None]
     if form is _ALPHA_FORM:
         values = np.concatenate([values, alpha], -1)
-    elif found.alpha is not None:
+    elif image.alpha is not None:
         values = linear_to_srgb(srgb_to_linear(values) * alpha)
     kind = np.uint16 if form.source.endswith("le") else np.uint8
     pixels = np.round(values * np.iinfo(kind).max).astype(kind)
@@ -155,21 +155,8 @@ def _pixels(path: Path, form: _Form) -> np.ndarray:
     return np.ascontiguousarray(np.pad(pixels, ((0, height % 2), (0, width % 2), (0, 0)), "edge"))
 
 
-def _begin_sound(av: Any, container: Any, track: Any, copied: bool) -> tuple[Any, bool]:
-    """Add the stream of a sound track; return it, and whether packets are copied into it."""
-    if copied:
-        stream = container.add_stream_from_template(track)
-    else:
-        coded, rates = track.codec_context, av.Codec("aac", "w").audio_rates
-        rate = max((rate for rate in rates if rate <= coded.sample_rate), default=min(rates))
-        stream = container.add_stream("aac", rate=rate)
-        stream.layout = coded.layout.name.replace(" channels", "c")  # the usual layout of as many
-    stream.metadata.update({"language": track.language} if track.language else {})
-    return stream, copied
-
-
 def _sound(av: Any, source: Any, tracks: dict[int, tuple[Any, bool]]) -> Iterator[_Packets]:
-    """All sound of an open film, by the streams into which its tracks are copied or encoded."""
+    """Yield the sound of an open video, copied or encoded into the streams of its tracks."""
     begins_s, time_s, damaged = start_s(source), Fraction(0), 0
     with source:
         for packet in source.demux([source.streams[index] for index in tracks]):
@@ -194,4 +181,4 @@ def _sound(av: Any, source: Any, tracks: dict[int, tuple[Any, bool]]) -> Iterato
             if not copied:
                 yield inf, stream.encode(None)
         if damaged:
-            log.warning("%s: %d parts of its sound are damaged and left out", source.name, damaged)
+            log.warning("%s: %d sound packets are damaged and omitted", source.name, damaged)

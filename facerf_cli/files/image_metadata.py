@@ -1,4 +1,4 @@
-"""Image files without their pixels: size, number format and colour space in the header; XMP provenance.
+"""Metadata of image files: headers without pixels, and XMP provenance.
 
 Provenance is written as an XMP packet into PNG, JPEG and TIFF files, where viewers look for IPTC's digital
 source type.
@@ -19,22 +19,22 @@ from xml.sax.saxutils import quoteattr
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.quirks import utf8_path
 from facerf_cli.files.read import metadata_of, open_image, shown_size
 from facerf_cli.files.spaces import default_space, is_floating, stated_space
+from facerf_cli.files.workarounds import utf8_path
 from facerf_cli.image.colour import ColourSpace
 
 Attributes = Mapping[str, str | int | float]
 
 _PNG_SIGNATURE, _JPEG_START = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 _TIFF_START, _TIFF_XMP_TAG = b"II*\0", 700
-_JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # begins the APP1 segment that holds XMP
+_JPEG_XMP_SIGNATURE = b"http://ns.adobe.com/xap/1.0/\0"  # starts the APP1 segment that contains XMP
 _XMP_NAMESPACES = {
     "Iptc4xmpExt": "http://iptc.org/std/Iptc4xmpExt/2008-02-29/",
     "xmp": "http://ns.adobe.com/xap/1.0/",
     "facerf": "urn:facerf:1",
 }
-# Attributes that XMP calls by another name.
+# Attributes with another name in XMP.
 _XMP_PROPERTIES = {"IPTC:DigitalSourceType": "Iptc4xmpExt:DigitalSourceType", "Software": "xmp:CreatorTool"}
 
 _OF_PLATE = re.compile(
@@ -48,56 +48,56 @@ _TUPLES = {"smpte:TimeCode": "timecode", "smpte:KeyCode": "keycode"}
 
 @dataclass(frozen=True)
 class Header:
-    """An image's upright size and the kind of its values."""
+    """Upright size, number format, colour space and metadata."""
 
     width_px: int
     height_px: int
     is_floating: bool
-    bits: int  # of a value
-    space: ColourSpace  # as the file states; without a statement linear for floats, sRGB for integers
+    bits: int  # per value
+    space: ColourSpace  # stated, or linear Rec.709 for floats and sRGB for integers
     metadata: dict[str, Any]
 
 
 def read_header(path: Path) -> Header | None:
-    """Read the header of the layer that is read; return None if the file is not a readable image."""
+    """Read the header of the layer that `read_image` reads; return None if it cannot be opened."""
     utf8_path(path)
     if not path.is_file():
         return None
     try:
         with open_image(path) as opened:
             spec = opened.spec
-    except InputError:  # no image, damaged, or pi-heif is not there
+    except InputError:  # not an image, damaged, or pi-heif is missing
         return None
     space = default_space(spec)
-    with suppress(InputError):  # an HDR image, whose pixels are not read
+    with suppress(InputError):  # an HDR image, whose pixels are not supported
         space = stated_space(path, spec) or space
     height, width = shown_size(spec)
     return Header(width, height, is_floating(spec), 8 * spec.format.size(), space, metadata_of(spec))
 
 
 def plate_metadata(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Select metadata of a photo that its results keep: how it was made, not where or by whom."""
+    """Return the metadata that results keep: how a photo was taken, not where or by whom."""
     return {name: value for name, value in metadata.items() if _OF_PLATE.fullmatch(name)}
 
 
 def set_attribute(spec: oiio.ImageSpec, name: str, value: Any) -> None:
-    """Set an attribute of an image; a tuple has the type of its name, or of its numbers."""
+    """Set an attribute of an image; the type of a tuple depends on its name, or on its numbers."""
     if isinstance(value, tuple):
-        of_numbers = f"float[{len(value)}]" if any(isinstance(one, float) for one in value) else "rational"
+        of_numbers = f"float[{len(value)}]" if any(isinstance(x, float) for x in value) else "rational"
         spec.attribute(name, oiio.TypeDesc(_TUPLES.get(name, of_numbers)), value)
     else:
         spec.attribute(name, value)
 
 
 def embed_xmp(path: Path, metadata: Attributes) -> None:
-    """Insert an XMP packet into a finished PNG, JPEG or TIFF; a file of another kind stays as it is."""
+    """Insert an XMP packet into a finished PNG, JPEG or TIFF; other files are unchanged."""
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         return
     packet = xmp_packet(metadata)
     with path.open("r+b") as stream:
         start = stream.read(len(_PNG_SIGNATURE))
         if start.startswith(_TIFF_START):
-            _add_to_tiff(stream, packet)
+            _append_to_tiff(stream, packet)
     if start.startswith(_JPEG_START):
         body = _JPEG_XMP_SIGNATURE + packet
         segment = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
@@ -112,7 +112,7 @@ def embed_xmp(path: Path, metadata: Attributes) -> None:
 
 
 def _insert(path: Path, at: int, segment: bytes) -> None:
-    """Insert bytes into a file, of which little is in memory at a time."""
+    """Insert bytes into a file without loading it into memory."""
     longer = path.with_name(f"{path.name}.xmp")
     with path.open("rb") as before, longer.open("xb") as after:
         after.write(before.read(at) + segment)
@@ -120,8 +120,8 @@ def _insert(path: Path, at: int, segment: bytes) -> None:
     longer.replace(path)
 
 
-def _add_to_tiff(stream: BinaryIO, packet: bytes) -> None:
-    """Append an XMP packet to a little-endian TIFF, and its directory with the tag that points to it."""
+def _append_to_tiff(stream: BinaryIO, packet: bytes) -> None:
+    """Append an XMP packet and a directory that points to it to a little-endian TIFF."""
     stream.seek(len(_TIFF_START))
     stream.seek(int.from_bytes(stream.read(4), "little"))
     (count,) = struct.unpack("<H", stream.read(2))
@@ -140,7 +140,7 @@ def _add_to_tiff(stream: BinaryIO, packet: bytes) -> None:
 
 
 def xmp_packet(metadata: Attributes) -> bytes:
-    """Return an XMP packet with the attributes that have an XMP name; the others are left out."""
+    """Return an XMP packet with the attributes that have an XMP name."""
     named = {_XMP_PROPERTIES.get(name, name): value for name, value in metadata.items()}
     properties = [
         f"{name}={quoteattr(str(value))}"

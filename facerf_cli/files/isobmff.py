@@ -1,8 +1,8 @@
-"""Images in ISO boxes (ISO 14496-12), which OpenImageIO does not read: HEIC and AVIF.
+"""HEIC and AVIF: images in ISO boxes (ISO 14496-12), which OpenImageIO does not read.
 
-HEIC and HEIF, as phones store them, are decoded by pi-heif, an extra (`facerf[heic]`); some damaged files
-crash it, so it runs in a process of its own (`apart.py`). AVIF is decoded by Pillow in 8 bits; 10 and 12 bits
-keep their depth by PyAV, an extra (`facerf[video]`). Values are integers [H, W, C] as they are stored.
+HEIC and HEIF, the formats of phones, are decoded by pi-heif, an extra (`facerf[heic]`), in a separate process
+(`sandbox.py`), because some damaged files crash it. AVIF is decoded by Pillow in 8 bits; with PyAV, an extra
+(`facerf[video]`), 10 and 12 bits keep their depth. Values are integers [H, W, C] as stored.
 """
 
 import importlib.util
@@ -11,39 +11,33 @@ import logging
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
-from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.sandbox import read_in_subprocess
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
-HEIF_BYTES = 12  # of a pixel that is decoded in another process: 16 bits, there and here
-AVIF_BYTES = 24  # of a pixel while it is decoded: 16 bits in planes, in one array, and scaled
+# Bytes per pixel during decoding: 16 bits in both processes; 16 bits in planes, in one array, and scaled.
+HEIF_BYTES, AVIF_BYTES = 12, 24
 _HEIF_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 _AVIF_BRANDS = (b"avif", b"avis")
-_START_BYTES = 64  # in which a file names its brands
+_START_BYTES = 64  # of a file, with its brands
 _DEEP, _TWELVE = 0x40, 0x20  # bits of an av1C box
-_ORIENTATION = 0x0112  # of Exif
-_UNKNOWN, _BT601 = 2, 5  # matrices (ITU-T H.273), and
-_MATRICES = (1, 4, _BT601, 6, 7, 9)  # those that FFmpeg converts
-_FULL = 1  # range, to which pi-heif and Pillow decode
+_ORIENTATION = 0x0112  # in Exif
+_UNKNOWN, _BT601 = 2, 5  # matrices (ITU-T H.273)
+_MATRICES = (1, 4, _BT601, 6, 7, 9)  # supported by FFmpeg
+_FULL = 1  # the range to which pi-heif and Pillow decode
 _MOST = np.iinfo(np.uint16).max
 
 log = logging.getLogger(LOGGER_NAME)
-
-
-class Boxed(NamedTuple):
-    """An open image: its header, and what decodes its pixels [H, W, C] once there is room for them."""
-
-    spec: oiio.ImageSpec
-    decode: Callable[[], np.ndarray]
+OpenImage = tuple[oiio.ImageSpec, Callable[[], np.ndarray]]  # header, and a function that decodes [H, W, C]
 
 
 def kind_of(path: Path) -> str:
-    """Return "avif" or "heif" for a file that begins as one, whatever its suffix; else an empty text."""
+    """Return "avif" or "heif" by a file's first bytes, whatever its suffix; "" for other files."""
     with path.open("rb") as stream:
         start = stream.read(_START_BYTES)
     brands = start[8 : int.from_bytes(start[:4], "big")]
@@ -54,8 +48,8 @@ def kind_of(path: Path) -> str:
     return "heif" if start[8:12] in _HEIF_BRANDS else ""
 
 
-def _state(spec: oiio.ImageSpec, is_associated: bool, profile: Any, codes: Any) -> None:
-    """Set what OpenImageIO would: alpha, and a profile, or without one the codes of primaries and curve."""
+def _set_colour(spec: oiio.ImageSpec, is_associated: bool, profile: Any, codes: Any) -> None:
+    """Set the attributes that OpenImageIO would: alpha, and a profile, or else codes of the space."""
     spec.attribute("oiio:UnassociatedAlpha", int(not is_associated))
     if profile is not None:
         spec.attribute(
@@ -66,9 +60,9 @@ def _state(spec: oiio.ImageSpec, is_associated: bool, profile: Any, codes: Any) 
 
 
 def heif_arrays(path: Path, most_px: int) -> dict[str, np.ndarray]:
-    """The main image, upright: its `shape` [H, W, C], `bits`, and ICC `profile`, or `codes` of its space.
+    """Read the upright main image: `shape` [H, W, C], `bits`, and ICC `profile` or `codes` of its space.
 
-    Its `pixels` [H, W, C] only if there are at most `most_px`.
+    `pixels` [H, W, C] are included only up to `most_px` pixels.
     """
     import pi_heif
 
@@ -85,62 +79,57 @@ def heif_arrays(path: Path, most_px: int) -> dict[str, np.ndarray]:
     elif code := image.info.get("nclx_profile"):
         arrays["codes"] = np.array([code["color_primaries"], code["transfer_characteristics"]])
     if width * height <= most_px:
-        arrays["pixels"] = np.array(image).reshape(height, width, -1)  # a copy: its memory is pi-heif's
+        arrays["pixels"] = np.array(image).reshape(height, width, -1)  # a copy: pi-heif owns its memory
     return arrays
 
 
-def open_heif(path: Path, most_px: int) -> Boxed:
-    """Open the main image, upright; one of more than `most_px` pixels cannot be decoded."""
+def open_heif(path: Path, most_px: int) -> OpenImage:
+    """Open the upright main image; above `most_px` pixels it cannot be decoded."""
     if importlib.util.find_spec("pi_heif") is None:
         raise InputError(
             f"{path}: HEIC and HEIF need the package pi-heif; pip install 'facerf[heic]', or save it as JPEG"
         )
     try:
-        arrays = arrays_apart(heif_arrays, path, most_px)
+        arrays = read_in_subprocess(heif_arrays, path, most_px)
     except ValueError as error:
-        raise InputError(f"{path}: not a readable image; save it again as JPEG ({error})") from None
+        raise InputError(f"{path}: not a readable image; save it as JPEG ({error})") from None
     height, width, channels = arrays["shape"].tolist()
     spec = oiio.ImageSpec(width, height, channels, f"uint{arrays['bits']}")
-    _state(spec, bool(arrays["is_associated"]), arrays.get("profile"), arrays.get("codes"))
-    return Boxed(spec, lambda: arrays["pixels"])
+    _set_colour(spec, bool(arrays["is_associated"]), arrays.get("profile"), arrays.get("codes"))
+    return spec, lambda: arrays["pixels"]
 
 
-def open_avif(path: Path) -> Boxed:
-    """Open the main image, which need not be upright, by Pillow."""
-    try:
-        from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
-    except ImportError:
-        SUPPORTED = False
+def open_avif(path: Path) -> OpenImage:
+    """Open the main image, as stored, with Pillow."""
+    from PIL.AvifImagePlugin import SUPPORTED, AvifImageFile
+
     if not SUPPORTED:
-        raise InputError(f"{path}: AVIF needs Pillow 11.3 or later; pip install -U pillow, or save it as PNG")
+        raise InputError(f"{path}: this Pillow lacks AVIF; pip install -U pillow, or save it as PNG")
     content = path.read_bytes()
     try:
         image = AvifImageFile(io.BytesIO(content))  # Image.open limits the size
         orientation = image.getexif().get(_ORIENTATION, 1)
-    except Exception as error:  # whatever damage makes Pillow raise
+    except Exception as error:  # any exception that damage causes in Pillow
         raise _damaged(path, error) from None
     bits, codes, is_associated = _stated(content)
     spec = oiio.ImageSpec(*image.size, len(image.mode), "uint8" if bits == 8 else "uint16")
-    _state(spec, is_associated, image.info.get("icc_profile") or None, codes)
-    spec.attribute("oiio:BitsPerSample", bits)
+    _set_colour(spec, is_associated, image.info.get("icc_profile") or None, codes)
     spec.attribute("Orientation", orientation if orientation in range(1, 9) else 1)
-    return Boxed(spec, lambda: _decode_avif(path, image, spec))
 
+    def decode() -> np.ndarray:
+        if bits > 8 and (values := _deep_values(image)) is not None:
+            return values
+        try:
+            values = np.asarray(image).reshape(spec.height, spec.width, -1)
+        except Exception as error:  # as above
+            raise _damaged(path, error) from None
+        spec.attribute("oiio:UnassociatedAlpha", 1)  # Pillow divides by alpha
+        if bits > 8:
+            advice = "" if importlib.util.find_spec("av") else "; pip install 'facerf[video]' to keep them"
+            log.warning("%s: has %d bits, read as 8 bits%s", path, bits, advice)
+        return values
 
-def _decode_avif(path: Path, image: Any, spec: oiio.ImageSpec) -> np.ndarray:
-    """Decode an opened image, in 16 bits where it is deeper than 8."""
-    shape, bits = (spec.height, spec.width, -1), spec.get_int_attribute("oiio:BitsPerSample")
-    if bits > 8 and (values := _deep_values(image)) is not None:
-        return values.reshape(shape)
-    try:
-        values = np.asarray(image)
-    except Exception as error:
-        raise _damaged(path, error) from None
-    spec.attribute("oiio:UnassociatedAlpha", 1)  # Pillow divides by alpha
-    if bits > 8:
-        advice = "" if importlib.util.find_spec("av") else "; pip install 'facerf[video]' to keep them"
-        log.warning("%s: has %d bits, read as 8 bits%s", path, bits, advice)
-    return values.reshape(shape)
+    return spec, decode
 
 
 def _damaged(path: Path, error: Exception) -> InputError:
@@ -148,7 +137,7 @@ def _damaged(path: Path, error: Exception) -> InputError:
 
 
 def _deep_values(image: Any) -> np.ndarray | None:
-    """Colour and alpha [H, W, C] uint16; None without PyAV, and for what it does not read whole."""
+    """Decode colour and alpha [H, W, C] uint16; None without PyAV, and for files that PyAV reads in part."""
     try:
         import av
     except ImportError:
@@ -169,7 +158,7 @@ def _deep_values(image: Any) -> np.ndarray | None:
             values, white = frame.to_ndarray(format="rgb48le"), _MOST
         elif matrix in _MATRICES and not (name.startswith("gray") and is_limited):
             values = frame.to_ndarray(format="rgb48le", src_colorspace=matrix)
-            white = 255 << 8 if is_limited else ((1 << bits) - 1) << (16 - bits)  # as it comes from FFmpeg
+            white = 255 << 8 if is_limited else ((1 << bits) - 1) << (16 - bits)  # FFmpeg's white
         else:
             return None
         values = (values * np.float32(_MOST / white)).round().clip(max=_MOST).astype(np.uint16)
@@ -195,9 +184,9 @@ def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _stated(content: bytes) -> tuple[int, tuple[int, int] | None, bool]:
-    """Bits of a value, codes of primaries and curve, and if alpha is multiplied in, by ISO 23008-12.
+    """Return bits per value, codes of primaries and curve, and True for premultiplied alpha (ISO 23008-12).
 
-    The properties of the main image come before those of its alpha and thumbnails.
+    The main image's properties precede those of its alpha and thumbnails.
     """
     try:
         meta = dict(_boxes(dict(_boxes(content))[b"meta"][4:]))

@@ -1,4 +1,4 @@
-"""Layers of an image file: by name, or the one that a renderer calls its image.
+"""Choice of an image file's layer: by name, or the layer that renderers use for the image itself.
 
 An EXR has parts, and each part has layers: channels whose names end in R, G and B after a dot.
 """
@@ -14,7 +14,7 @@ from facerf_cli.errors import InputError
 from facerf_cli.run.logs import one_line
 
 _LETTERS = {"red": "r", "green": "g", "blue": "b", "alpha": "a"}
-# Words in a layer's name: of the image itself, and of what else is rendered.
+# Words in the names of layers: the image itself, and other rendered quantities.
 _IMAGE = "combined beauty rgba rgb image color colour composite final"
 _OTHER = (
     "ao ambient occlusion ambientocclusion albedo depth z normal normals n p position uv motion vector"
@@ -26,7 +26,7 @@ _MOST_NAMED = 8
 
 
 class ImageLayer(NamedTuple):
-    """A layer's name, its part of the file, and the indices of its colour (one or three) and its alpha."""
+    """Layer: its name, its part of the file, and the indices of its colour (one or three) and alpha."""
 
     name: str
     part: int
@@ -35,14 +35,14 @@ class ImageLayer(NamedTuple):
 
 
 def chosen_layer(path: Path, specs: Sequence[oiio.ImageSpec], wanted: str | None) -> tuple[ImageLayer, str]:
-    """Choose a layer by its name, else the image; and say which that is among others.
+    """Choose a layer by name, by default the image; return it and a log message.
 
-    Nothing is said of the R, G and B of the first part.
+    The message is empty for R, G and B of the first part.
     """
     layers = list(_layers(specs))
     if wanted is not None:
-        asked = wanted.casefold()
-        named = (a for a in layers if asked in (a.name.casefold(), a.name.rpartition(".")[2].casefold()))
+        name = wanted.casefold()
+        named = (a for a in layers if name in (a.name.casefold(), a.name.rpartition(".")[2].casefold()))
         chosen = next(named, None)
         if chosen is None:
             known = ", ".join(layer.name for layer in layers if layer.name)
@@ -56,21 +56,21 @@ def chosen_layer(path: Path, specs: Sequence[oiio.ImageSpec], wanted: str | None
     others = dict.fromkeys([*parts, *(layer.name for layer in layers)])
     others.pop(chosen.name, None)
     rest = ", ".join(filter(None, list(others)[:_MOST_NAMED]))
-    return chosen, f"the layer {one_line(chosen.name)} is read" + (f", not {one_line(rest)}" if rest else "")
+    return chosen, f"layer {one_line(chosen.name)} is read" + (f", not {one_line(rest)}" if rest else "")
 
 
 def _layers(specs: Sequence[oiio.ImageSpec]) -> Iterator[ImageLayer]:
-    """Yield the layers with R, G and B of flat parts, in the file's order.
+    """Yield the layers with R, G and B of flat parts in the file's order.
 
-    A part's name is the name of its channels that have none.
+    Channels without a layer name take their part's name.
     """
     for part, spec in enumerate(specs):
         names = () if spec.deep else spec.channelnames
         for layer in dict.fromkeys(name.rpartition(".")[0] for name in names):
             at = {}
             for index, name in enumerate(names):
-                before, _, letter = name.rpartition(".")
-                if before == layer:
+                prefix, _, letter = name.rpartition(".")
+                if prefix == layer:
                     at[_LETTERS.get(letter.lower(), letter.lower())] = index
             if all(letter in at for letter in "rgb"):
                 name = layer or spec.get_string_attribute("oiio:subimagename")
@@ -78,7 +78,7 @@ def _layers(specs: Sequence[oiio.ImageSpec]) -> Iterator[ImageLayer]:
 
 
 def _rank(layer: ImageLayer) -> int:
-    """Rank a layer: 0 for the image, 1 for a name that says nothing, 2 for another quantity."""
+    """Return 0 for the image, 1 for a name without a known word, 2 for another quantity."""
     words = {word.lower() for word in _WORD.findall(layer.name)}
     if words & _OTHER_WORDS:
         return 2
@@ -86,7 +86,7 @@ def _rank(layer: ImageLayer) -> int:
 
 
 def first_channels(spec: oiio.ImageSpec) -> tuple[list[int], int | None]:
-    """Choose the first channels as colour, one for grey or three, and alpha."""
+    """Return the first colour channels (one for grey, or three) and the alpha channel."""
     alpha = spec.alpha_channel
     rest = [index for index in range(spec.nchannels) if index != alpha]
     colour = rest[:3] if len(rest) >= 3 else rest[:1] or [0]

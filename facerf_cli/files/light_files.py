@@ -1,6 +1,6 @@
-"""Lights on disk: JSON of a rig's weights and spherical harmonics, and environment maps.
+"""Lights on disk: environment maps, and JSON with a rig's weights or spherical harmonics.
 
-`facerf estimate-light` writes a JSON light; any image can be an environment map.
+`facerf estimate-light` writes the JSON; any image can be an environment map.
 """
 
 import math
@@ -24,14 +24,14 @@ from facerf_cli.light.sphere import RigLight
 
 Format = Literal["facerf-light-1"]
 FORMAT: Format = "facerf-light-1"
-AXES = "camera: x to the picture's right, y up, z toward the camera; directions point to the light"
+AXES = "camera: x to the image's right, y up, z toward the camera; directions point to the light"
 UNITS = "a light of weight 1 gives a white Lambertian surface that faces it radiance 1; linear Rec.709"
 _MOST_LIGHTS, _MOST_COEFFICIENTS = 4096, 441  # 441: spherical harmonics of order 20
 _JSON_ROWS = 256  # of the map that a JSON light is converted to
 _LARGEST = 1e30  # magnitude of a number; its square still fits double precision
-_LENGTH_TOLERANCE = 1e-2  # a direction's length may differ from 1 by this, since other programs round
+_LENGTH_TOLERANCE = 1e-2  # of a direction's length, since other programs round
 _GPANO, _SIDES = ("CroppedAreaImage", "FullPano"), ("Width", "Height")
-_ADVICE = "give a .json that estimate-light wrote"
+_ADVICE = "use a .json that estimate-light wrote"
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class LightRecord:
 
 
 def write_light(path: Path, record: LightRecord) -> None:
-    """Write a light as JSON atomically; a number that is not finite is a ValueError."""
+    """Write a light as JSON atomically; raises ValueError for NaN and infinity."""
     fields: dict[str, Any] = {"format": FORMAT, "axes": AXES, "units": UNITS}
     fields["rig"] = record.rig
     fields |= {"directions": _numbers(record.directions), "weights": _numbers(record.weights)}
@@ -67,15 +67,15 @@ def _numbers(rows: Tensor) -> list[list[float]]:
 
 
 def _rows(most: int, value: Any) -> np.ndarray:
-    """Finite numbers [N, 3], N of 1 to `most`."""
+    """Return finite numbers [N, 3], N from 1 to `most`."""
     try:
         rows = np.array(value)
     except ValueError:  # rows of different lengths
         rows = np.zeros(())
     if rows.ndim != 2 or rows.shape[1] != 3 or rows.dtype.kind not in "if" or not 1 <= len(rows) <= most:
-        raise ValueError(f"1 to {most} rows of 3 finite numbers are needed")
+        raise ValueError(f"use 1 to {most} rows of 3 finite numbers")
     if not (np.abs(rows) < _LARGEST).all():
-        raise ValueError(f"numbers below {_LARGEST:g} are needed")
+        raise ValueError(f"use numbers below {_LARGEST:g}")
     return rows.astype(np.float32)
 
 
@@ -100,7 +100,7 @@ class _LightDocument(Document):
         if len(self.directions) != len(self.weights):
             raise ValueError(f"{len(self.directions)} directions but {len(self.weights)} weights")
         if np.abs(np.linalg.norm(self.directions, axis=1) - 1).max() > _LENGTH_TOLERANCE:
-            raise ValueError("directions that are unit vectors are needed")
+            raise ValueError("use directions that are unit vectors")
         if self.sh and self.sh.convention != CONVENTION:
             raise ValueError(f"sh has another convention; convert the coefficients to: {CONVENTION}")
         if self.sh and math.isqrt(count := len(self.sh.coefficients)) ** 2 != count:
@@ -109,33 +109,32 @@ class _LightDocument(Document):
 
 
 def read_light(path: Path) -> LightRecord:
-    """Read and check a JSON light; directions are normalized to unit length."""
-    if path.suffix.lower() != ".json":
-        raise InputError(f"{path}: not a .json file; {_ADVICE}")
+    """Read and validate a JSON light; directions are normalized to unit length."""
     light = read_document(path, _LightDocument, _ADVICE)
     return LightRecord(
         torch.from_numpy(light.directions / np.linalg.norm(light.directions, axis=1, keepdims=True)),
         torch.from_numpy(light.weights),
         light.rig,
         torch.from_numpy(light.sh.coefficients) if light.sh else None,
-        {name: value for name, value in light.provenance.items() if _is_attribute(value)},
+        {  # values that an image's header can store
+            name: value
+            for name, value in light.provenance.items()
+            if isinstance(value, str) or (isinstance(value, int | float) and abs(value) < 1 << 31)
+        },
     )
 
 
-def _is_attribute(value: Any) -> bool:
-    """Return whether an image's header can store the value."""
-    return isinstance(value, str) or (isinstance(value, int | float) and abs(value) < 1 << 31)
-
-
 def read_map_file(path: Path | str) -> Tensor:
-    """Read a lat-long map [H, W, 3], linear Rec.709; a JSON light is converted to one."""
+    """Read an environment map [H, W, 3], linear Rec.709; a JSON light is converted to one."""
     if Path(path).suffix.lower() == ".json":
         return _latlong(Path(path))
     image = read_image(path, limit_px=ENVMAP_LIMIT_PX, with_alpha=False)
     sizes = [[image.metadata.get(f"GPano:{name}{side}Pixels") for name in _GPANO] for side in _SIDES]
-    if any(part != whole for part, whole in sizes):
-        advice = "extend it to 360 x 180 degrees, as with Hugin, and save it without these metadata"
-        raise InputError(f"{path}: a part of a sphere by its GPano metadata; {advice}")
+    if any(part != full for part, full in sizes):
+        raise InputError(
+            f"{path}: covers only a part of the sphere (GPano metadata); extend it to 360 x 180 degrees, for"
+            " example in Hugin, and save it without these metadata"
+        )
     envmap = torch.from_numpy(image.pixels)
     try:
         check_envmap(envmap)

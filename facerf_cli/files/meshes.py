@@ -15,7 +15,7 @@ from facerf_cli.files.atomic import atomic_path
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh:
-    """A triangle mesh with normals and a texture."""
+    """Triangle mesh with normals and a texture."""
 
     vertices_m: np.ndarray  # [V, 3]
     normals: np.ndarray  # [V, 3]
@@ -26,9 +26,9 @@ class TexturedMesh:
 
 
 def write_glb(path: Path, mesh: TexturedMesh, camera: tuple[float, np.ndarray] | None = None) -> None:
-    """Write one file that contains the texture, as a rough dielectric.
+    """Write a binary glTF with the texture on a rough dielectric.
 
-    The camera, if any, is square: its angle of view in degrees, and camera_to_mesh [4, 4]; it looks along -z.
+    `camera` is square: its angle of view in degrees, and camera_to_mesh [4, 4]; it looks along -z.
     """
     image = Image.fromarray(mesh.texture_srgb)
     material = PBRMaterial("face", baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
@@ -42,7 +42,7 @@ def write_glb(path: Path, mesh: TexturedMesh, camera: tuple[float, np.ndarray] |
 
 
 def write_obj(path: Path, mesh: TexturedMesh, texture_name: str) -> None:
-    """Write `path` and an .mtl in its folder that names the texture's image (not written here)."""
+    """Write `path`, and an .mtl that names the texture's image, which the caller writes."""
     material = SimpleMaterial(image=Image.new("RGB", (1, 1)), name="face")  # needed to export UVs
     mtl_path = path.with_suffix(".mtl")
     header = "; ".join(f"{name}: {value}" for name, value in mesh.metadata.items())
@@ -56,7 +56,7 @@ def write_obj(path: Path, mesh: TexturedMesh, texture_name: str) -> None:
 
 
 def _with_material(mesh: TexturedMesh, material: PBRMaterial | SimpleMaterial) -> trimesh.Trimesh:
-    up = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1)  # trimesh counts v upward, as OBJ does
+    up = np.stack([mesh.uv[:, 0], 1 - mesh.uv[:, 1]], -1)  # trimesh and OBJ count v upward
     return trimesh.Trimesh(
         mesh.vertices_m,
         mesh.triangles,

@@ -1,14 +1,14 @@
-"""OLAT stacks: a multi-part OpenEXR of half floats with one part for each light; any EXR reader opens it.
+"""OLAT stacks: a multi-part OpenEXR of half floats with one part per light, which any EXR reader opens.
 
-The parts are named `light000` and so on, and hold their light's direction in `facerf:direction` (a unit
-vector toward the light in camera space). A light that is missing from a stage's rig leaves a gap in the
-numbers. The last part, `source`, holds the input of the prediction: the photo's texture (or its render), the
-visibility of each pixel, and normals in camera space. The first part's `facerf:olat` is JSON with the kind of
-stack, the head's rotation and the fit, so that a stack can be relit without its photo.
+Parts are named `light000` and so on, and store the light's direction in `facerf:direction` (a unit vector
+toward the light in camera space). A light that is missing from a stage's rig leaves a gap in the numbers. The
+last part, `source`, contains the input of the prediction: the photo's texture (or its render), the visibility
+of each pixel, and normals in camera space. The first part's `facerf:olat` is JSON with the kind of stack, the
+head's rotation and the fit, so that a stack can be relit without its photo.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,9 +22,9 @@ from torch import Tensor
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.documents import Document, Matrix3, checked
-from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.texts import is_regular, parse_json, require_regular
-from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, writing
+from facerf_cli.files.workarounds import oiio_error, utf8_path
+from facerf_cli.files.write import half_floats, new_spec, warn_of_clamped, write_parts
 from facerf_cli.image.colour import REC709_CHROMATICITIES
 from facerf_cli.run import memory
 from facerf_cli.run.logs import one_line
@@ -32,24 +32,23 @@ from facerf_cli.run.logs import one_line
 Format = Literal["facerf-olat-1"]
 FORMAT: Format = "facerf-olat-1"
 COMPRESSION = "zip"  # the smallest lossless compression, and the fastest
-_LIGHT_BYTES = 6  # of a pixel: half floats
-_SUM_BYTES = 30  # of a pixel of a light that is summed: half floats, floats, and a copy of them
-_AT_ONCE = 16  # lights that are summed
-_SOURCE_BYTES = 100  # of a pixel: a part of 16 half floats as it is decoded, the source's floats, a float sum
+# Bytes per pixel of a light that is read (half floats), of a light that is summed (half floats, floats and a
+# copy), and of the source (16 half floats, floats and a sum).
+_LIGHT_BYTES, _SUM_BYTES, _SOURCE_BYTES = 6, 30, 100
+_AT_ONCE = 16  # most lights per batch of a sum
 _MOST_LIGHTS = 4096
-_MOST_CHANNELS = 16  # of a part; other programs may add some
-_LENGTH_TOLERANCE = 0.01  # a direction's length may differ from 1 by this
+_MOST_CHANNELS = 16  # per part; other programs may add some
+_LENGTH_TOLERANCE = 0.01  # of a direction's length
 _SOURCE_CHANNELS = ("R", "G", "B", "seen", "normal.X", "normal.Y", "normal.Z")
-_HEADER, _DIRECTION = "facerf:olat", "facerf:direction"
-_OF_STACK = (_HEADER, _DIRECTION, "facerf:light")
+_HEADER, _DIRECTION, _LIGHT = "facerf:olat", "facerf:direction", "facerf:light"
 
 
 @dataclass(frozen=True, eq=False)
 class StackHeader:
-    """A stack without its OLATs.
+    """Stack without its OLATs.
 
-    The kinds: 'photo', the photo's person over black, in the photo's frame; 'image', the face in the frame of
-    its crop; 'texture', where H = W = T, the texture's side.
+    Kinds: 'photo', the photo's person over black in the photo's frame; 'image', the face in its crop;
+    'texture', where H = W = T, the texture's side.
     """
 
     kind: Literal["photo", "texture", "image"]
@@ -61,44 +60,44 @@ class StackHeader:
     layout_version: int  # of the UV map
     fit: dict[str, np.ndarray]  # `face.fit.fit_to_arrays`
     metadata: dict[str, Any] = field(default_factory=dict)  # provenance
-    rig_lights: tuple[int, ...] = ()  # numbers of the parts to write, in their rig; () counts from 0
+    rig_lights: tuple[int, ...] = ()  # rig numbers of the parts to write; () counts from 0
 
 
 def write_olat_stack(path: Path, header: StackHeader, olats: Iterable[Tensor]) -> None:
     """Write OLATs from batches [l, 3, H, W] in the order of the header's directions, as they arrive.
 
-    OpenEXR keeps 1.8 MB for each of its threads and each part until it closes a file, and touches little of
-    it. So this thread alone compresses; and what a prediction has filled is given back first, since fresh
-    memory costs nothing until it is touched.
+    OpenEXR keeps 1.8 MB per thread and part until it closes a file. So only this thread compresses, and
+    memory of the prediction is freed first, since fresh memory costs nothing until it is touched.
     """
-    beyond, threads = 0, oiio.get_int_attribute("exr_threads")
+    clamped, threads = 0, oiio.get_int_attribute("exr_threads")
+
+    def images() -> Iterator[np.ndarray]:
+        count = 0
+        for batch in olats:
+            count += len(batch)
+            memory.give_back()
+            yield from batch.permute(0, 2, 3, 1).cpu().numpy()
+        if count != len(header.directions):
+            raise ValueError(f"{count} lights, not {len(header.directions)}")
+        # last, because it may be summed as the lights arrive
+        yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
+
+    def parts() -> Iterator[Callable[[slice], np.ndarray]]:
+        nonlocal clamped
+        for image in images():
+            data, count = half_floats(path, image)
+            clamped += count
+            yield data.__getitem__
+
     oiio.attribute("exr_threads", -1)
     try:
-        with writing(path, _specs(header)) as file:
-            for part in _parts(header, olats):
-                data, count = half_floats(path, part)
-                beyond += count
-                for rows in file.next_part():
-                    file.write(rows, data[rows])
+        write_parts(path, _specs(header), parts())
     finally:
         oiio.attribute("exr_threads", threads)
-    warn_of_clamped(path, beyond)
-
-
-def _parts(header: StackHeader, olats: Iterable[Tensor]) -> Iterator[np.ndarray]:
-    """The lights [H, W, 3], and the source, last, since it may be summed as the lights arrive."""
-    count = 0
-    for batch in olats:
-        count += len(batch)
-        memory.give_back()
-        yield from batch.permute(0, 2, 3, 1).cpu().numpy()
-    if count != len(header.directions):
-        raise ValueError(f"{count} lights, not {len(header.directions)}")
-    yield np.concatenate([header.source, header.seen[..., None], header.normals], -1)
+    warn_of_clamped(path, clamped)
 
 
 def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
-    """Return the image specification of every part."""
     height, width = header.seen.shape
 
     def part(name: str, channels: tuple[str, ...]) -> oiio.ImageSpec:
@@ -117,7 +116,7 @@ def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
     for number, direction in zip(numbers, header.directions.tolist(), strict=True):
         spec = part(f"light{number:03d}", ("R", "G", "B"))
         spec.attribute(_DIRECTION, oiio.TypeDesc("vector"), tuple(direction))
-        spec.attribute("facerf:light", number)
+        spec.attribute(_LIGHT, number)
         specs.append(spec)
     content = {
         "format": FORMAT,
@@ -132,19 +131,19 @@ def _specs(header: StackHeader) -> list[oiio.ImageSpec]:
 
 
 def is_olat_stack(path: Path) -> bool:
-    """Return whether a file is an OLAT stack that facerf wrote; False if it cannot be opened as an image."""
+    """Return whether a file is an OLAT stack; False if it cannot be opened as an image."""
     is_exr = path.suffix.lower() == ".exr" and is_regular(path)
     stream = oiio.ImageInput.open(utf8_path(path)) if is_exr else None
     if stream is None:
         oiio_error()
         return False
-    found = bool(_text_of(stream.spec()))
+    is_stack = bool(_text_of(stream.spec()))
     stream.close()
-    return found
+    return is_stack
 
 
 def _text_of(spec: oiio.ImageSpec) -> str:
-    """The first part's JSON; empty for any other part, and for a text that is not UTF-8."""
+    """Return the first part's JSON; empty for any other part, and for text that is not UTF-8."""
     try:
         return spec.get_string_attribute(_HEADER)
     except UnicodeDecodeError:
@@ -152,21 +151,21 @@ def _text_of(spec: oiio.ImageSpec) -> str:
 
 
 def read_olat_header(path: Path) -> StackHeader:
-    """Read a stack without its OLATs, for which memory is not asked."""
+    """Read a stack without its OLATs."""
     with _opened(path) as stack:
-        _ask_for(stack, 0)
+        stack.require_memory(0)
         document, directions, metadata = stack.document, [], {}
         for entry in stack.stream.spec().extra_attribs:
-            is_ours = entry.name.startswith("facerf:") and entry.name not in _OF_STACK
+            is_ours = entry.name.startswith("facerf:") and entry.name not in (_HEADER, _DIRECTION, _LIGHT)
             if is_ours or entry.name in ("Software", "IPTC:DigitalSourceType"):
                 metadata[entry.name] = entry.value
         for number in range(document.lights):
-            value = _part_at(stack, number).getattribute(_DIRECTION)
+            value = stack.spec(number).getattribute(_DIRECTION)
             direction = np.array(value if isinstance(value, tuple) else (), np.float64)
             if direction.shape != (3,) or not abs(np.linalg.norm(direction) - 1) < _LENGTH_TOLERANCE:
                 raise InputError(f"{path}: a part of the OLAT stack has no direction; write the stack again")
             directions.append(direction / np.linalg.norm(direction))
-        source = _pixels(stack, document.lights, _SOURCE_CHANNELS).astype(np.float32)
+        source = stack.pixels(document.lights, _SOURCE_CHANNELS).astype(np.float32)
     return StackHeader(
         kind=document.kind,
         directions=np.array(directions),
@@ -181,19 +180,22 @@ def read_olat_header(path: Path) -> StackHeader:
 
 
 def read_olats(path: Path, lights: slice | Sequence[int] = slice(None), rows: slice = slice(None)) -> Tensor:
-    """Read some lights' OLATs [l, 3, h, W] float16, or some of their rows, from a stack of any size."""
+    """Read OLATs [l, 3, h, W] float16 of some lights and rows from a stack of any size."""
     with _opened(path) as stack:
-        height = stack.shape[0]
-        share = len(range(height)[rows]) / max(1, height)
+        height, width = stack.shape
         numbers = range(stack.document.lights)[lights] if isinstance(lights, slice) else lights
-        _ask_for(stack, len(numbers), share)
-        return _read_lights(stack, numbers, rows)
+        read_px = len(range(height)[rows])
+        stack.require_memory(len(numbers), read_px / max(1, height))
+        olats = np.empty((len(numbers), read_px, width, 3), np.float16)
+        for index, number in enumerate(numbers):
+            olats[index] = stack.pixels(number, ("R", "G", "B"), rows)
+    return torch.from_numpy(olats).permute(0, 3, 1, 2)
 
 
 def stream_olats(path: Path) -> Iterator[Tensor]:
     """Yield the OLATs of a stack of any length in batches [l, 3, H, W] float32, to be summed.
 
-    A batch has as many lights as fit half of the budget of memory, which is asked for one and the source.
+    A batch takes at most half of the memory budget, which must fit one light and the source.
     """
     with _opened(path) as stack:
         (height, width), lights = stack.shape, stack.document.lights
@@ -201,13 +203,13 @@ def stream_olats(path: Path) -> Iterator[Tensor]:
         memory.require(what, height * width * (_SUM_BYTES + _SOURCE_BYTES), "a stack of fewer pixels")
         fit = (memory.left_bytes() // 2 // (height * width) - _SOURCE_BYTES) // _SUM_BYTES
         at_once = max(1, min(_AT_ONCE, fit))
-    for first in range(0, lights, at_once):  # OpenEXR holds some memory for each part that an open file read
+    for first in range(0, lights, at_once):  # reopened because OpenEXR keeps memory per part that was read
         yield read_olats(path, range(first, min(first + at_once, lights))).float()
 
 
 def _arrays(value: Any) -> dict[str, np.ndarray]:
     if not isinstance(value, dict):
-        raise ValueError("an object of arrays is needed")
+        raise ValueError("use an object of arrays")
     return {name: np.array(entry) for name, entry in value.items()}
 
 
@@ -222,76 +224,64 @@ class _StackDocument(Document):
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """An open file, its first part's JSON, and the shape (H, W) that all parts must have."""
+    """Open file, its first part's JSON, and the shape (H, W) that all parts must have."""
 
     path: Path
     stream: oiio.ImageInput
     document: _StackDocument
     shape: tuple[int, int]
 
+    def require_memory(self, lights: int, fraction: float = 1.0) -> None:
+        """Check the memory for some lights, or a fraction of their rows, and for the source."""
+        height, width = self.shape
+        what = f"{self.path}: {lights} lights of {width} x {height} pixels"
+        needed = height * width * (fraction * lights * _LIGHT_BYTES + _SOURCE_BYTES)
+        memory.require(what, int(needed), "a stack of fewer lights or pixels")
+
+    def spec(self, number: int) -> oiio.ImageSpec:
+        if not self.stream.seek_subimage(number, 0):
+            raise InputError(f"{self.path}: damaged OLAT stack: part {number} is missing; write it again")
+        return self.stream.spec()
+
+    def pixels(self, number: int, channels: tuple[str, ...], rows: slice = slice(None)) -> np.ndarray:
+        """Read the named channels [h, W, C] of a part, or of some of its rows."""
+        spec = self.spec(number)
+        names = list(spec.channelnames)
+        is_sound = (spec.height, spec.width) == self.shape and set(channels) <= set(names)
+        if not is_sound or len(names) > _MOST_CHANNELS or spec.deep or spec.tile_width:
+            raise InputError(
+                f"{self.path}: damaged OLAT stack: part {number} has another size or layout; write it again"
+            )
+        first, past, _ = rows.indices(spec.height)
+        window = (spec.y + first, spec.y + past, 0)
+        values = self.stream.read_scanlines(number, 0, *window, 0, spec.nchannels, oiio.HALF)
+        if values is None:
+            raise InputError(f"{self.path}: damaged or cut short: {one_line(oiio_error(self.stream))}")
+        values = values.reshape(past - first, spec.width, spec.nchannels)
+        values = values[..., [names.index(name) for name in channels]]
+        if not np.isfinite(values).all():
+            raise InputError(f"{self.path}: part {number} of the OLAT stack contains NaN or infinite values")
+        return values
+
 
 @contextmanager
 def _opened(path: Path) -> Iterator[_Stack]:
-    require_regular(path, "give a stack that `facerf predict-olat` wrote")
+    advice = "use a stack that `facerf predict-olat` wrote"
+    require_regular(path, advice)
     stream = oiio.ImageInput.open(utf8_path(path))
     if stream is None:
-        raise InputError(f"{path}: not an OLAT stack: {one_line(oiio_error())}")
+        raise InputError(f"{path}: not an OLAT stack ({one_line(oiio_error())}); {advice}")
     try:
         spec = stream.spec()
         text = _text_of(spec)
         if not text:
-            raise InputError(f"{path}: not an OLAT stack; give one that `facerf predict-olat` wrote")
+            raise InputError(f"{path}: not an OLAT stack; {advice}")
         try:
             document = checked(_StackDocument, parse_json(text), _HEADER)
         except (ValueError, InputError) as error:
-            kind = "damaged OLAT stack, or written by another version of facerf"
-            raise InputError(f"{path}: {kind} ({error})") from None
+            kind = "damaged OLAT stack, or of another version"
+            raise InputError(f"{path}: {kind} ({error}); {advice}") from None
         yield _Stack(path, stream, document, (spec.height, spec.width))
     finally:
         oiio_error(stream)
         stream.close()
-
-
-def _ask_for(stack: _Stack, lights: int, share: float = 1.0) -> None:
-    """Ask the budget for some lights, or a share of their rows, and for the source, decoded and as floats."""
-    height, width = stack.shape
-    what = f"{stack.path}: {lights} lights of {width} x {height} pixels"
-    needed = height * width * (share * lights * _LIGHT_BYTES + _SOURCE_BYTES)
-    memory.require(what, int(needed), "a stack of fewer lights or pixels")
-
-
-def _read_lights(stack: _Stack, numbers: Sequence[int], rows: slice = slice(None)) -> Tensor:
-    height, width = stack.shape
-    olats = np.empty((len(numbers), len(range(height)[rows]), width, 3), np.float16)
-    for place, number in enumerate(numbers):
-        olats[place] = _pixels(stack, number, ("R", "G", "B"), rows)
-    return torch.from_numpy(olats).permute(0, 3, 1, 2)
-
-
-def _part_at(stack: _Stack, number: int) -> oiio.ImageSpec:
-    if not stack.stream.seek_subimage(number, 0):
-        raise InputError(f"{stack.path}: damaged OLAT stack: part {number} is missing; write the stack again")
-    return stack.stream.spec()
-
-
-def _pixels(stack: _Stack, number: int, channels: tuple[str, ...], rows: slice = slice(None)) -> np.ndarray:
-    """Read the named channels [h, W, C] of a part, or of some of its rows."""
-    path, stream, spec = stack.path, stack.stream, _part_at(stack, number)
-    names = list(spec.channelnames)
-    fits = (spec.height, spec.width) == stack.shape and set(channels) <= set(names)
-    if not fits or len(names) > _MOST_CHANNELS or spec.deep:
-        raise InputError(f"{path}: damaged OLAT stack: part {number} has another size or other channels")
-    first, past, _ = rows.indices(spec.height)
-    if spec.tile_width:  # another program has rewritten the file in tiles
-        values = stream.read_image(number, 0, 0, spec.nchannels, oiio.HALF)
-        values = None if values is None else values[first:past]
-    else:
-        window = (spec.y + first, spec.y + past, 0)
-        values = stream.read_scanlines(number, 0, *window, 0, spec.nchannels, oiio.HALF)
-    if values is None:
-        raise InputError(f"{path}: damaged or cut short: {one_line(oiio_error(stream))}")
-    values = values.reshape(past - first, spec.width, spec.nchannels)
-    values = values[..., [names.index(name) for name in channels]]
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}: part {number} of the OLAT stack holds NaN or infinite values")
-    return values

@@ -1,4 +1,4 @@
-"""Overviews for people: contact sheets of images, labels, and HTML pages."""
+"""Contact sheets, labels and HTML pages."""
 
 import math
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ _MARK_SIDE, _SMALLEST_MARK_PX = 0.2, 9  # side of a light's mark, in heights of 
 
 
 def contact_sheet(tiles: np.ndarray, columns: int | None = None) -> np.ndarray:
-    """Arrange tiles [N, h, w, 3] row by row on black [H, W, 3]; `columns` None gives about 3 : 2."""
+    """Arrange tiles [N, h, w, 3] row by row on black [H, W, 3]; without `columns` at about 3 : 2."""
     count, height, width, _ = tiles.shape
     columns = min(count, columns or math.ceil(math.sqrt(1.5 * count * height / width)))
     rows = math.ceil(count / columns)
@@ -25,7 +25,7 @@ def contact_sheet(tiles: np.ndarray, columns: int | None = None) -> np.ndarray:
 
 
 def labels(words: Sequence[str], tile_px: int, height_px: int) -> np.ndarray:
-    """A black strip [height, N * tile, 3], linear, with a word in grey for each of N tiles in a row."""
+    """Return a black strip [height, N * tile, 3], linear, with one grey word per tile."""
     strip = Image.new("L", (tile_px * len(words), height_px))
     draw = ImageDraw.Draw(strip)
     for column, word in enumerate(words):
@@ -37,8 +37,8 @@ def labels(words: Sequence[str], tile_px: int, height_px: int) -> np.ndarray:
 def mark_light(tile: np.ndarray, direction: np.ndarray, brightness: float) -> None:
     """Draw a light's direction into the lower left corner of a tile [h, w, 3]: a dot in a disc.
 
-    The disc is the sphere of directions as the camera sees it. The dot is full for a light in front of the
-    face, hollow for one behind it.
+    The disc shows the sphere of directions from the camera. The dot is filled for a light in front of the
+    face and hollow for a light behind it.
     """
     side = max(_SMALLEST_MARK_PX, round(_MARK_SIDE * tile.shape[0]))
     corner = tile[-side:, :side]
@@ -50,7 +50,7 @@ def mark_light(tile: np.ndarray, direction: np.ndarray, brightness: float) -> No
 
 
 def filled_page(template: Path, **values: Any) -> str:
-    """Fill a template, which may include its neighbours; a value that is missing is an error."""
+    """Fill a Jinja template, which may include files of its folder; a missing value is an error."""
     environment = Environment(
         loader=FileSystemLoader(template.parent),
         autoescape=True,

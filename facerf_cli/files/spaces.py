@@ -1,10 +1,9 @@
-"""The colour space that a file states: by codes (cICP), a profile (ICC), Exif, or numbers in its header.
+"""Colour space that an image file states.
 
-They count in this order; gAMA and cHRM of a PNG come last, as its specification says.
-
-Codes are those of ITU-T H.273. Films, and the images that ffmpeg takes from them, hold display values
-whatever camera curve they state: codes of BT.709 and BT.601 are read by the sRGB curve, alike in both.
-BT.2020 is read by its own curve.
+In order of precedence: codes (cICP), an ICC profile, Exif, numbers in the header (gAMA and cHRM of a PNG).
+Codes are those of ITU-T H.273. Videos, and images that ffmpeg extracts from them, contain display values
+whatever camera curve they state: BT.709 and BT.601 are therefore decoded by the sRGB curve, BT.2020 by its
+own.
 """
 
 import logging
@@ -17,7 +16,7 @@ import OpenImageIO as oiio
 
 from facerf_cli.errors import InputError
 from facerf_cli.files.icc import GREY, Curve, has_tables, space_of_profile
-from facerf_cli.files.quirks import by_pillow, png_chunks, starts_with
+from facerf_cli.files.workarounds import by_pillow, png_chunks, starts_with
 from facerf_cli.image.colour import (
     ADOBE_RGB,
     DISPLAY_P3,
@@ -33,12 +32,12 @@ from facerf_cli.image.colour import (
 )
 from facerf_cli.run.logs import LOGGER_NAME, one_line
 
-OCIO_SPACE = "facerf:colourspace"  # the name of a space that only an OpenColorIO configuration defines
-_SAYS_NOTHING = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file, whatever wrote it
-_EXIF_SRGB, _EXIF_ADOBE = 1, 2  # ColorSpace; 2 is used, if not standard
-_INTEROPERABILITY, _INDEX = 0xA005, 1  # of DCF: R98 is sRGB, R03 Adobe RGB
+OCIO_SPACE = "facerf:colourspace"  # name of a space that only an OpenColorIO configuration defines
+_UNSTATED = ("", "Rec709")  # OpenImageIO reports Rec709 for every PNM file
+_EXIF_SRGB, _EXIF_ADOBE = 1, 2  # ColorSpace; 2 is common but not in the standard
+_INTEROPERABILITY, _INDEX = 0xA005, 1  # DCF: R98 is sRGB, R03 Adobe RGB
 
-HDR_CURVES = {16: "PQ", 18: "HLG"}  # which are not read
+HDR_CURVES = {16: "PQ", 18: "HLG"}  # not supported
 _UNSPECIFIED = 2
 _CURVES: dict[int, Curve | None] = {
     **dict.fromkeys((1, _UNSPECIFIED, 6, 13), SRGB.decode),
@@ -55,10 +54,9 @@ _PRIMARIES = {
     6: _NTSC,
     7: _NTSC,
     9: REC2020.chromaticities,
-    11: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.314, 0.351),  # P3 of cinemas
+    11: (0.68, 0.32, 0.265, 0.69, 0.15, 0.06, 0.314, 0.351),  # DCI-P3
     12: DISPLAY_P3.chromaticities,
 }
-_BLACK, _RANGE = 16 / 255, 219 / 255  # of the narrow range
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -69,32 +67,32 @@ def is_floating(spec: oiio.ImageSpec) -> bool:
 
 
 def default_space(spec: oiio.ImageSpec) -> ColourSpace:
-    """Return the colour space of a file that states none: linear Rec.709 for floats, sRGB for integers."""
+    """Return the space assumed for a file that states none: linear Rec.709 for floats, sRGB for integers."""
     return LINEAR if is_floating(spec) else SRGB
 
 
 def is_ultra_hdr(path: Path, spec: oiio.ImageSpec) -> bool:
-    """Return whether a file is a JPEG with a gain map, which OpenImageIO applies: linear, with alpha of 1."""
+    """Return whether a file is a JPEG with a gain map; OpenImageIO applies it (linear, alpha 1)."""
     return is_floating(spec) and starts_with(path, b"\xff\xd8")
 
 
 def profile_of(spec: oiio.ImageSpec) -> bytes:
-    """Return the embedded ICC profile, empty if there is none."""
+    """Return the embedded ICC profile; empty without one."""
     stored = spec.getattribute("ICCProfile")
     return b"" if stored is None else bytes(stored)
 
 
 def profile_of_tables(path: Path, spec: oiio.ImageSpec) -> bytes:
-    """Return the profile of tables that states the colour space, which littleCMS applies; else nothing."""
+    """Return the ICC profile if it applies and converts by tables, which needs littleCMS; else nothing."""
     profile = profile_of(spec)
-    counts = has_tables(profile) and not spec.getattribute("CICP") and not is_ultra_hdr(path, spec)
-    return profile if counts else b""
+    applies = has_tables(profile) and not spec.getattribute("CICP") and not is_ultra_hdr(path, spec)
+    return profile if applies else b""
 
 
 def stated_space(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
-    """Return the colour space that the file states; None where it says nothing, and for a profile of tables.
+    """Return the colour space that the file states; None without a statement, and for profiles of tables.
 
-    Raises InputError for HDR images.
+    Raises InputError for HDR images and narrow range.
     """
     default, profile = default_space(spec), profile_of(spec)
     if is_ultra_hdr(path, spec):
@@ -102,33 +100,34 @@ def stated_space(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
     if codes := spec.getattribute("CICP"):
         primaries, transfer, _, full_range = codes
         if name := HDR_CURVES.get(transfer):
-            raise InputError(
-                f"{path}: is an HDR image ({name}); convert it to SDR, or to linear values as EXR"
+            raise InputError(f"{path}: HDR ({name}) is not supported; convert it to SDR, or to linear EXR")
+        if not full_range:
+            raise InputError(f"{path}: narrow-range values are not supported; convert it to full range")
+        space = space_of_codes(primaries, transfer)
+        if space is None:
+            log.warning(
+                "%s: unknown colour codes %d and %d; assuming %s", path, primaries, transfer, default.name
             )
-        found = space_of_codes(primaries, transfer, bool(full_range))
-        if found is None:
-            kind = f"colour codes {primaries} and {transfer} are not understood"
-            log.warning("%s: %s; taken for %s", path, kind, default.name)
-        return found or default
+        return space or default
     if profile_of_tables(path, spec):
         return None
     if profile:
         description = spec.get_string_attribute("ICCProfile:profile_description")
-        if profile[16:20] == GREY and spec.nchannels - (spec.alpha_channel >= 0) >= 3:
-            found, kind = None, "is for grey images"
-        else:
-            found, kind = space_of_profile(profile, description), "is not understood"
-        if found is None:
-            kind = f"embedded profile '{one_line(description)}' {kind}"
-            log.warning("%s: the %s; taken for %s", path, kind, default.name)
-        return found or default
+        is_for_grey = profile[16:20] == GREY and spec.nchannels - (spec.alpha_channel >= 0) >= 3
+        space = None if is_for_grey else space_of_profile(profile, description)
+        if space is None:
+            cause = "is for grey images" if is_for_grey else "is not supported"
+            log.warning(
+                "%s: embedded profile '%s' %s; assuming %s", path, one_line(description), cause, default.name
+            )
+        return space or default
     return _space_of_exif(path, spec) or _space_of_png(path) or _space_of_header(path, spec, default)
 
 
 def _space_of_ultra_hdr(path: Path, profile: bytes) -> ColourSpace:
-    """Return the linear space of a JPEG with a gain map, with the primaries of the map, else of the image.
+    """Return the linear space with the primaries of the gain map (ISO 21496-1), else of the base image.
 
-    The gain map (ISO 21496-1) is the file's second image.
+    The gain map is the file's second image.
     """
 
     def of_second(image: Any) -> bytes:
@@ -140,7 +139,7 @@ def _space_of_ultra_hdr(path: Path, profile: bytes) -> ColourSpace:
 
 
 def _space_of_exif(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
-    """Return Adobe RGB for a camera's photo whose Exif says so; other photos are sRGB."""
+    """Return Adobe RGB if Exif states it."""
     stated = spec.get_int_attribute("Exif:ColorSpace", _EXIF_SRGB)
     if stated == _EXIF_SRGB:
         return None
@@ -149,7 +148,7 @@ def _space_of_exif(path: Path, spec: oiio.ImageSpec) -> ColourSpace | None:
 
 
 def _space_of_png(path: Path) -> ColourSpace | None:
-    """Return the space of a PNG's gAMA and cHRM; None without them, and where it says sRGB."""
+    """Return the space of a PNG's gAMA and cHRM; None without them, and if an sRGB chunk overrides them."""
     chunks = dict(takewhile(lambda chunk: chunk[0] != b"IDAT", png_chunks(path)))
     if b"sRGB" in chunks or chunks.keys().isdisjoint((b"gAMA", b"cHRM")):
         return None
@@ -164,7 +163,7 @@ def _space_of_png(path: Path) -> ColourSpace | None:
         return None
     linear = linear_space(primaries)
     if linear is None:
-        log.warning("%s: impossible primaries in the header; sRGB is used", path)
+        log.warning("%s: impossible primaries in the header; assuming sRGB", path)
     if linear is None or gamma == 1:
         return linear
     curve = power_curve(1 / gamma) if gamma else SRGB.decode
@@ -172,32 +171,26 @@ def _space_of_png(path: Path) -> ColourSpace | None:
 
 
 def _space_of_header(path: Path, spec: oiio.ImageSpec, default: ColourSpace) -> ColourSpace | None:
-    """Return the space by the name and the chromaticities that OpenImageIO reports."""
+    """Return the space from the name and the chromaticities that OpenImageIO reports."""
     name = spec.get_string_attribute("oiio:ColorSpace") or spec.get_string_attribute(OCIO_SPACE)
     chromaticities = spec.getattribute("chromaticities", oiio.TypeDesc("float[8]"))
-    if name in _SAYS_NOTHING and not chromaticities:
+    if name in _UNSTATED and not chromaticities:
         return None
-    named = default if name in _SAYS_NOTHING else find_space(name)
+    named = default if name in _UNSTATED else find_space(name)
     if named is None:
-        log.warning("%s: unknown colour space '%s', taken for %s", path, name, default.name)
+        log.warning("%s: unknown colour space '%s'; assuming %s", path, name, default.name)
         named = default
     if not chromaticities or not named.is_linear:
         return named
     by_primaries = linear_space(chromaticities)
     if by_primaries is None:
-        log.warning("%s: impossible primaries in the header; those of %s are used", path, named.name)
+        log.warning("%s: impossible primaries in the header; assuming the primaries of %s", path, named.name)
     return named if by_primaries in (None, LINEAR) else by_primaries
 
 
-def space_of_codes(primaries: int, transfer: int, full_range: bool = True) -> ColourSpace | None:
-    """Return the colour space of two code points, with its usual name if it has one; None if unknown."""
+def space_of_codes(primaries: int, transfer: int) -> ColourSpace | None:
+    """Return the colour space of two code points, by its usual name if it has one; None if unknown."""
     chromaticities = _PRIMARIES.get(primaries)
     if chromaticities is None or transfer not in _CURVES:
         return None
-    decode, name = _CURVES[transfer], f"CICP {primaries}-{transfer}"
-    if full_range:
-        return known_space(ColourSpace(name, chromaticities, decode))
-    curve = decode or (lambda values: values)
-    return ColourSpace(
-        f"{name}, narrow range", chromaticities, lambda encoded: curve((encoded - _BLACK) / _RANGE)
-    )
+    return known_space(ColourSpace(f"CICP {primaries}-{transfer}", chromaticities, _CURVES[transfer]))

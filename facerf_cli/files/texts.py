@@ -1,7 +1,7 @@
-"""Files that other people wrote, read within limits: text, JSON, TOML, and lists of lights.
+"""User-supplied text files, read within limits: text, JSON, TOML and lists of lights.
 
-Only regular files are opened: a pipe or a device could be waited for without end. The module imports nothing
-heavy, since the index of a finished folder is read with it.
+Only regular files are opened, because a pipe or a device could block forever. The module imports nothing
+heavy: the journal of a finished folder is read with it.
 """
 
 import codecs
@@ -17,7 +17,7 @@ from typing import Any
 
 from facerf_cli.errors import InputError
 
-LIMIT_BYTES = 64 << 20  # of any text
+LIMIT_BYTES = 64 << 20
 _ENDS_IN_NUMBER = re.compile(r"(.*\s)?[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE)
 
 Vector = list[float]
@@ -25,12 +25,12 @@ ListedLight = tuple[str, Vector]  # name of an image, empty in a list without na
 
 
 def is_regular(path: Path) -> bool:
-    """Return whether a path leads to a regular file; False for names that the system refuses."""
+    """Return whether a path leads to a regular file; False for names that the system rejects."""
     return regular_size(path) is not None
 
 
 def regular_size(path: Path) -> int | None:
-    """The bytes of a regular file; None for anything else, and for names that the system refuses."""
+    """Return the bytes of a regular file; None for anything else, and for names that the system rejects."""
     try:
         state = os.stat(path)
     except (OSError, ValueError):
@@ -47,15 +47,14 @@ def require_regular(path: Path, advice: str = "check the path") -> None:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); {advice}") from None
     except ValueError:  # a null character
-        raise InputError(f"{str(path)!a}: no file can have this name; {advice}") from None
-    if stat.S_ISDIR(mode):
-        raise InputError(f"{path}: is a folder, not a file; {advice}")
+        raise InputError(f"{str(path)!a}: invalid file name; {advice}") from None
     if not stat.S_ISREG(mode):
-        raise InputError(f"{path}: is a pipe or a device, not a regular file; {advice}")
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe or a device"
+        raise InputError(f"{path}: is {kind}, not a regular file; {advice}")
 
 
 def read_bytes(path: Path, advice: str) -> bytes:
-    """Read a regular file of at most `LIMIT_BYTES`; an InputError for any other gives the advice."""
+    """Read a regular file of at most `LIMIT_BYTES`; errors are InputErrors with the advice."""
     require_regular(path, advice)
     try:
         with path.open("rb") as stream:
@@ -68,13 +67,13 @@ def read_bytes(path: Path, advice: str) -> bytes:
 
 
 def text_of(content: bytes, errors: str = "strict") -> str:
-    """Decode a text in UTF-8, or in UTF-16 with a byte order mark; the mark is no part of it."""
+    """Decode text in UTF-8, or in UTF-16 with a byte order mark, and remove the mark."""
     is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return content.decode("utf-16" if is_utf16 else "utf-8-sig", errors)
 
 
 def read_text(path: Path, advice: str) -> str:
-    """Read a text file; bytes that are no text are replaced."""
+    """Read a text file; invalid bytes are replaced."""
     return text_of(read_bytes(path, advice), "replace")
 
 
@@ -96,17 +95,17 @@ def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is not a finite number")
 
 
-def read_json(path: Path, missing: str) -> Any:
-    """Read a JSON file; `missing` says what to do if the file does not exist, or is none of ours."""
-    content = read_bytes(path, missing)
+def read_json(path: Path, advice: str) -> Any:
+    """Read a JSON file; errors are InputErrors with the advice."""
+    content = read_bytes(path, advice)
     try:
         return parse_json(content)
     except ValueError as error:
-        raise InputError(f"{path}: not JSON ({error}); {missing}") from None
+        raise InputError(f"{path}: not JSON ({error}); {advice}") from None
 
 
 def read_toml(path: Path, advice: str) -> dict[str, Any]:
-    """Read the tables of a TOML file; an InputError for any other gives the advice."""
+    """Read the tables of a TOML file; errors are InputErrors with the advice."""
     content = read_bytes(path, advice)
     try:
         return tomllib.loads(text_of(content))
@@ -115,34 +114,32 @@ def read_toml(path: Path, advice: str) -> dict[str, Any]:
 
 
 def read_light_list(path: Path) -> list[ListedLight]:
-    """Read a list of lights; raise an InputError that names the first wrong line or entry.
+    """Read a list of lights; raises InputError with the first invalid line or entry.
 
-    A text has lines `name x y z` or `x y z`, like LP files of reflectance transformation imaging, which begin
-    with the number of lights. A JSON file holds a list of [x, y, z], or {name: [x, y, z]}, either of them
-    maybe under "light_positions".
+    A text file has lines `name x y z` or `x y z`, like LP files of reflectance transformation imaging, which
+    start with the number of lights. A JSON file contains [[x, y, z], ...] or {name: [x, y, z]}, optionally
+    under "light_positions".
     """
     text = read_text(path, "write lines `name x y z`")
     try:
         rows = _rows_of_json(text) if path.suffix.lower() == ".json" else _rows_of_text(text)
     except ValueError as error:
-        raise InputError(
-            f"{path}: is no list of lights ({error}); correct it, or write [[x, y, z], ...]"
-        ) from None
+        raise InputError(f"{path}: not a list of lights ({error}); write [[x, y, z], ...]") from None
     lights: list[ListedLight] = []
-    for place, name, values in rows:
+    for where, name, values in rows:
         try:
             x, y, z = values
             vector = [float(x), float(y), float(z)]
         except (ValueError, TypeError):
-            raise InputError(f"{path}: {place} is wrong; give `name x y z`") from None
+            raise InputError(f"{path}: {where} is invalid; use `name x y z`") from None
         if not 0 < math.hypot(*vector) < math.inf:
-            raise InputError(f"{path}: {place} has no direction; give a finite vector other than 0")
+            raise InputError(f"{path}: {where} has no direction; use a finite vector other than 0")
         lights.append((name, vector))
     return lights
 
 
 def _rows_of_text(text: str) -> list[tuple[str, str, Any]]:
-    """The place of each light, its name and its values."""
+    """Return the line number, name and values of each light."""
     rows: list[tuple[str, str, Any]] = []
     count = None
     for number, line in enumerate(text.splitlines(), 1):
@@ -151,8 +148,8 @@ def _rows_of_text(text: str) -> list[tuple[str, str, Any]]:
             count = int(fields[0])
         elif fields:
             name = "".join(fields[:-3]).strip()
-            too_many = _ENDS_IN_NUMBER.fullmatch(name) and not name.isdecimal()
-            rows.append((f"line {number}", name, [] if too_many else fields[-3:]))
+            has_too_many = _ENDS_IN_NUMBER.fullmatch(name) and not name.isdecimal()
+            rows.append((f"line {number}", name, [] if has_too_many else fields[-3:]))
     if count not in (None, len(rows)):
         raise ValueError(f"it states {count} lights and has {len(rows)}")
     return rows

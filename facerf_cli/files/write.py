@@ -1,13 +1,13 @@
-"""Image files written from scene-linear Rec.709: EXR, TIFF, PNG and JPEG, whole or not at all.
+"""Image files written atomically from scene-linear Rec.709: EXR, TIFF, PNG and JPEG.
 
-An EXR with layers has several parts: the image, which any program opens, and then a part for each layer, so
-that tools which want four channels find four.
+An EXR with layers has several parts: the image, which any program opens, and one part per layer, so that
+tools that expect four channels find four.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -19,8 +19,8 @@ from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.icc import linear_profile
 from facerf_cli.files.image_metadata import Attributes, embed_xmp, set_attribute
-from facerf_cli.files.quirks import oiio_error, utf8_path
 from facerf_cli.files.spaces import OCIO_SPACE
+from facerf_cli.files.workarounds import oiio_error, utf8_path
 from facerf_cli.image.colour import (
     ACES,
     ACESCG,
@@ -39,11 +39,10 @@ from facerf_cli.run.logs import LOGGER_NAME, one_line
 
 log = logging.getLogger(LOGGER_NAME)
 
-
 HALF_MAX = 65504.0  # the largest finite half float
 JPEG_QUALITY = 95
-_PNG_LEVEL = 4  # of zlib: half the time of 6 for two hundredths more bytes
-_PNG_FILTER = 32  # libpng's PNG_FILTER_UP: half the time of a choice for each row, and no more bytes
+_PNG_LEVEL = 4  # zlib level: half the time of 6 for 2 % more bytes
+_PNG_FILTER = 32  # libpng's PNG_FILTER_UP: half the time of a choice per row, and no more bytes
 _OIIO_NAMES = {
     LINEAR: "lin_rec709_scene",
     LINEAR_REC2020: "lin_rec2020_scene",
@@ -51,8 +50,8 @@ _OIIO_NAMES = {
     ACESCG: "lin_ap1_scene",
     ACES: "lin_ap0_scene",
 }
-# Channel letters and number format of special layers. Positions and UVs are single precision, since a half
-# float has steps of half a millimetre at a metre.
+# Channel letters and number format of data layers. Positions and UVs are single precision: at a distance of a
+# metre, half floats have steps of half a millimetre.
 _LAYER_CHANNELS = {
     "normal": ("XYZ", "half"),
     "position": ("XYZ", "float"),
@@ -71,12 +70,12 @@ def write_exr(
     compression: str = "zip",
     single: bool = False,
 ) -> int:
-    """Write linear Rec.709 [H, W, 3] in half floats in a colour space; return how many were out of range.
+    """Write linear Rec.709 [H, W, 3] as half floats in a colour space; return the number of clamped values.
 
-    The colour must not be premultiplied; it is written multiplied by alpha [H, W], as EXR requires. `layers`
-    are [H, W] or [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z, depth.Z and uv.U/V in float, others as R,
-    G, B in half. Each name before the dot is a part, or with `single` all are channels of one. Values beyond
-    the range of half floats (65504) are clamped with a warning.
+    The colour must not be premultiplied; it is multiplied by alpha [H, W], as EXR requires. `layers` are
+    [H, W] or [H, W, C]: normal.X/Y/Z in half, position.X/Y/Z, depth.Z and uv.U/V in float, others as R, G, B
+    in half. Each name in front of the dot is a part; with `single`, all are channels of one part. Values
+    beyond the range of half floats (65504) are clamped with a warning.
     """
     parts, specs = _exr_parts(pixels, alpha, layers or {}), []
     for part in parts:
@@ -87,65 +86,68 @@ def write_exr(
             spec.attribute("name", part.name)
         spec.attribute("compression", compression)
         spec.attribute("oiio:ColorSpace", "data" if part.is_data else _OIIO_NAMES.get(space, space.name))
-        if space.chromaticities is None:  # its name may be unknown to OpenImageIO, which then leaves it out
+        if space.chromaticities is None:  # OpenImageIO omits unknown names
             if not part.is_data:
                 spec.attribute(OCIO_SPACE, space.name)
-        else:  # the same in all parts, as OpenEXR requires
+        else:  # OpenEXR requires the same in all parts
             spec.attribute("chromaticities", oiio.TypeDesc("float[8]"), space.chromaticities)
         specs.append(spec)
     if single:
-        one = oiio.ImageSpec(specs[0])
-        one.nchannels = sum(spec.nchannels for spec in specs)
-        one.channelnames = tuple(name for spec in specs for name in spec.channelnames)
-        one.channelformats = tuple(spec.format for spec in specs for _ in range(spec.nchannels))
-        one.erase_attribute("name")
-        specs = [one]
-    beyond = 0
-    with writing(path, specs, metadata) as file:
-        for together in [parts] if single else [[part] for part in parts]:
-            for rows in file.next_part():
-                written = []
-                for part in together:
-                    values = part.rows(rows, space)
-                    if part is parts[0] and alpha is not None:
-                        values[..., :3] *= values[..., 3:]
-                    if part.kind == "float":
-                        _require_finite(path, values)
-                        written.append(values.astype(np.float32, copy=False))
-                    else:
-                        data, count = half_floats(path, values)
-                        written.append(data)
-                        beyond += count
-                file.write(rows, np.concatenate(written, -1))
-    warn_of_clamped(path, beyond)
-    return beyond
+        joined = oiio.ImageSpec(specs[0])
+        joined.nchannels = sum(spec.nchannels for spec in specs)
+        joined.channelnames = tuple(name for spec in specs for name in spec.channelnames)
+        joined.channelformats = tuple(spec.format for spec in specs for _ in range(spec.nchannels))
+        joined.erase_attribute("name")
+        specs = [joined]
+    clamped = 0
+
+    def joined_rows(group: Sequence[_ExrPart], rows: slice) -> np.ndarray:
+        nonlocal clamped
+        written = []
+        for part in group:
+            values = part.rows(rows, space)
+            if part is parts[0] and alpha is not None:
+                values[..., :3] *= values[..., 3:]
+            if part.kind == "float":
+                _require_finite(path, values)
+                written.append(values.astype(np.float32, copy=False))
+            else:
+                data, count = half_floats(path, values)
+                written.append(data)
+                clamped += count
+        return np.concatenate(written, -1)
+
+    groups = [parts] if single else [[part] for part in parts]
+    write_parts(path, specs, [partial(joined_rows, group) for group in groups], metadata)
+    warn_of_clamped(path, clamped)
+    return clamped
 
 
 @dataclass(frozen=True, eq=False)
 class _ExrPart:
-    """A part of an EXR: channels of one number format, which images [H, W] or [H, W, C] have together."""
+    """Part of an EXR: channels of one number format from images [H, W] or [H, W, C]."""
 
     name: str
     kind: str
-    is_data: bool  # no colours: it has no colour space
+    is_data: bool  # not colour
     channels: list[str]
-    images: list[tuple[np.ndarray, bool]]  # and whether they are colours, to convert
+    images: list[tuple[np.ndarray, bool]]  # with True for colours, which are converted
 
     def rows(self, rows: slice, space: ColourSpace) -> np.ndarray:
-        """Some rows [h, W, C] of all channels, colours in a space."""
-        found = []
+        """Return rows [h, W, C] of all channels, with colours in a space."""
+        parts = []
         for image, is_colour in self.images:
             values = rows_of(image, rows)
             if is_colour:
                 values = from_linear_rec709(values.astype(np.float32, copy=False), space)
-            found.append(values)
-        return np.dstack(found)
+            parts.append(values)
+        return np.dstack(parts)
 
 
 def _exr_parts(
     pixels: np.ndarray, alpha: np.ndarray | None, layers: Mapping[str, np.ndarray]
 ) -> list[_ExrPart]:
-    """Return the image itself, and a part for the layers of each name before the dot."""
+    """Return the image, and one part for the layers of each name in front of the dot."""
     rgba = _ExrPart("rgba", "half", False, list("RGB"), [(pixels, True)])
     if alpha is not None:
         rgba.channels.append("A")
@@ -163,7 +165,7 @@ def _exr_parts(
 
 
 def half_floats(path: Path, values: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return finite values as half floats, and how many were beyond their range."""
+    """Return finite values as half floats, and the number of values that were clamped to their range."""
     data = _half(values)
     if np.isfinite(data).all():
         return data, 0
@@ -172,14 +174,14 @@ def half_floats(path: Path, values: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _half(values: np.ndarray) -> np.ndarray:
-    """Values as half floats; numpy alone takes several times as long."""
+    """Convert to half floats; numpy takes several times as long."""
     return np.asarray(torch.tensor(np.ascontiguousarray(values)).half().numpy())
 
 
 def warn_of_clamped(path: Path, count: int) -> None:
-    """Say that values were beyond the range of half floats, if some were."""
+    """Log the number of values that were clamped to the range of half floats."""
     if count:
-        log.warning("%s: %d values beyond the range of half floats are set to %g", path, count, HALF_MAX)
+        log.warning("%s: %d values beyond the range of half floats are clamped to %g", path, count, HALF_MAX)
 
 
 def _require_finite(path: Path, values: np.ndarray) -> None:
@@ -194,9 +196,9 @@ def write_tiff(
     metadata: Attributes | None = None,
     space: ColourSpace = LINEAR,
 ) -> None:
-    """Write linear Rec.709 [H, W, 3] as a 32-bit TIFF in a colour space, with the profile of a linear one.
+    """Write linear Rec.709 [H, W, 3] as a 32-bit TIFF in a colour space, with a profile if it is linear.
 
-    The colour must not be premultiplied, and is not in the file.
+    The colour must not be premultiplied; the file is not either.
     """
     spec = new_spec((*pixels.shape[:2], 3 if alpha is None else 4), "float")
     spec.attribute("compression", "zip")
@@ -204,13 +206,15 @@ def write_tiff(
     if space.is_linear:
         profile = np.frombuffer(linear_profile(space), np.uint8)
         spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(profile)}]"), profile)
-    with writing(path, [spec], metadata) as file:
-        for rows in file.next_part():
-            values = from_linear_rec709(rows_of(pixels, rows), space)
-            _require_finite(path, values)
-            if alpha is not None:
-                values = np.dstack([values, rows_of(alpha, rows)])
-            file.write(rows, values.astype(np.float32, copy=False))
+
+    def float_rows(rows: slice) -> np.ndarray:
+        values = from_linear_rec709(rows_of(pixels, rows), space)
+        _require_finite(path, values)
+        if alpha is not None:
+            values = np.dstack([values, rows_of(alpha, rows)])
+        return values.astype(np.float32, copy=False)
+
+    write_parts(path, [spec], [float_rows], metadata)
 
 
 def write_display(
@@ -227,9 +231,9 @@ def write_display(
 ) -> float:
     """Write linear Rec.709 [H, W, 3] as a PNG or JPEG, by the suffix; return the exposure in EV.
 
-    "auto" is `colour.auto_exposure_ev` where alpha [H, W] exceeds one half. PNG keeps alpha, with colour that
-    is not premultiplied; JPEG has no alpha and shows the image over black. `view`, `share` and `added`, not
-    exposed, are those of `colour.encode_display`; `bits` are of a PNG, `quality` (1 to 100) of a JPEG.
+    "auto" is `colour.auto_exposure_ev` where alpha [H, W] exceeds one half. PNG keeps alpha with colour that
+    is not premultiplied; JPEG shows the image over black. For `view`, `share` and `added` (unexposed) see
+    `colour.encode_display`; `bits` applies to PNG, `quality` (1 to 100) to JPEG.
     """
     chosen_ev = auto_exposure_ev(pixels, alpha) if exposure == "auto" else float(exposure)
     jpeg = path.suffix.lower() in (".jpg", ".jpeg")
@@ -242,75 +246,58 @@ def write_display(
     spec.attribute("png:compressionLevel", _PNG_LEVEL)
     spec.attribute("png:filter", _PNG_FILTER)
     gain = np.float32(2.0**chosen_ev)
-    with writing(path, [spec], {"facerf:exposure_ev": chosen_ev, **(metadata or {})}) as file:
-        for rows in file.next_part():
-            seen, opaque = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
-            _require_finite(path, seen)
-            if opaque is not None and jpeg:
-                seen = seen * opaque[..., None]
-            more = None if added is None else added[rows] * gain
-            kept = None if share is None else rows_of(share, rows)
-            data = encode_display(np.nan_to_num(seen * gain), view, kept, more)
-            if opaque is not None and not jpeg:
-                data = np.dstack([data, opaque.astype(np.float32)])
-            file.write(rows, data)
+
+    def encoded_rows(rows: slice) -> np.ndarray:
+        colour, coverage = rows_of(pixels, rows), None if alpha is None else rows_of(alpha, rows)
+        _require_finite(path, colour)
+        if coverage is not None and jpeg:
+            colour = colour * coverage[..., None]
+        more = None if added is None else added[rows] * gain
+        soft = None if share is None else rows_of(share, rows)
+        data = encode_display(np.nan_to_num(colour * gain), view, soft, more)
+        if coverage is not None and not jpeg:
+            data = np.dstack([data, coverage.astype(np.float32)])
+        return data
+
+    write_parts(path, [spec], [encoded_rows], {"facerf:exposure_ev": chosen_ev, **(metadata or {})})
     return chosen_ev
 
 
 def new_spec(shape: tuple[int, ...], kind: str) -> oiio.ImageSpec:
-    """Return the specification of an image [H, W, C] of a kind of values, such as "half"."""
+    """Return the header of an image [H, W, C] in a number format such as "half"."""
     spec = oiio.ImageSpec(shape[1], shape[0], shape[2], kind)
-    spec.attribute("DateTime", "")  # else OpenImageIO writes the time, and two runs give different bytes
+    spec.attribute("DateTime", "")  # otherwise OpenImageIO writes the time, and runs are not reproducible
     return spec
 
 
-class PartsFile:
-    """The parts of an image file, which are written one after the other, in strips of rows."""
+def write_parts(
+    path: Path,
+    specs: Sequence[oiio.ImageSpec],
+    parts: Iterable[Callable[[slice], np.ndarray]],
+    metadata: Attributes | None = None,
+) -> None:
+    """Write an image file atomically from one function per part, which returns rows [h, W, C].
 
-    def __init__(self, path: Path, temporary: Path, specs: Sequence[oiio.ImageSpec]) -> None:
-        stream = oiio.ImageOutput.create(utf8_path(temporary))
-        if stream is None:
-            oiio_error()
-            raise UsageError(f"{path}: not the suffix of an image format; use .exr, .png or .jpg")
-        self._path, self._name, self._specs, self._stream = path, str(temporary), specs, stream
-        self._begun = 0
-        self._check(self._stream.open(self._name, tuple(specs) if len(specs) > 1 else specs[0]))
-
-    def next_part(self) -> Iterator[slice]:
-        """Begin the next part, and yield the rows of each of its strips."""
-        spec = self._specs[self._begun]
-        if self._begun:
-            self._check(self._stream.open(self._name, spec, "AppendSubimage"))
-        self._begun += 1
-        return strips((spec.height, spec.width))
-
-    def write(self, rows: slice, values: np.ndarray) -> None:
-        """Write some rows [h, W, C]."""
-        contiguous = np.ascontiguousarray(values)
-        self._check(self._stream.write_scanlines(rows.start, rows.stop, 0, contiguous))
-
-    def close(self) -> None:
-        """Finish the file, whose parts are all written."""
-        assert self._begun == len(self._specs)
-        self._check(self._stream.close())
-
-    def _check(self, good: bool) -> None:
-        if not good:
-            message = oiio_error(self._stream)
-            self._stream.close()
-            message = message or oiio_error(self._stream)
-            raise FacerfError(f"{self._path}: cannot write: {one_line(message)}")
-
-
-@contextmanager
-def writing(
-    path: Path, specs: Sequence[oiio.ImageSpec], metadata: Attributes | None = None
-) -> Iterator[PartsFile]:
-    """Write the parts of an image atomically, with its metadata in the first one's header and as XMP."""
+    The metadata goes into the first part's header and is written as XMP. Parts are written as they arrive.
+    """
     for name, value in (metadata or {}).items():
         set_attribute(specs[0], name, value)
     with atomic_path(path) as temporary:
-        file = PartsFile(path, temporary, specs)
-        yield file
-        file.close()
+        stream = oiio.ImageOutput.create(utf8_path(temporary))
+        if stream is None:
+            oiio_error()
+            raise UsageError(f"{path}: unknown image format; use .exr, .png or .jpg")
+
+        def check(good: bool) -> None:
+            if not good:
+                message = oiio_error(stream)
+                stream.close()
+                raise FacerfError(f"{path}: cannot write: {one_line(message or oiio_error(stream))}")
+
+        check(stream.open(str(temporary), tuple(specs) if len(specs) > 1 else specs[0]))
+        for number, (part, spec) in enumerate(zip(parts, specs, strict=True)):
+            check(not number or stream.open(str(temporary), spec, "AppendSubimage"))
+            for rows in strips((spec.height, spec.width)):
+                check(stream.write_scanlines(rows.start, rows.stop, 0, np.ascontiguousarray(part(rows))))
+        check(stream.close())
         embed_xmp(temporary, metadata or {})

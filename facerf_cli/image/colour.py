@@ -1,9 +1,8 @@
-"""Colour spaces: from the encodings of files to scene-linear Rec.709, and from there to sRGB for display.
+"""Colour spaces, scene-linear Rec.709, exposure and display views.
 
 Matrices are derived from primaries and white points, with Bradford adaptation to D65 (as OpenColorIO does for
-the ACES spaces). Constants are those of colour-science, which is imported only for what few files need: other
-transfer functions, and colour temperatures. A name that is not defined here is looked up in an OpenColorIO
-configuration (`ocio`). A view turns scene-linear values into values of a display.
+the ACES spaces). Constants agree with colour-science, which is imported only for rare transfer functions and
+colour temperatures. Names that are not defined here are looked up in an OpenColorIO configuration.
 """
 
 import difflib
@@ -12,7 +11,6 @@ import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -29,23 +27,21 @@ _REC2020_CHROMATICITIES = (0.708, 0.292, 0.17, 0.797, 0.131, 0.046, 0.3127, 0.32
 _AP0_CHROMATICITIES = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
 _AP1_CHROMATICITIES = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
 _ADOBE_CHROMATICITIES = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
-_ROMM_CHROMATICITIES = (0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001, 0.3457, 0.3585)
 
-# From XYZ to the cone responses of the Bradford transform (Lam 1985).
+# XYZ to cone responses of the Bradford transform (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-_BLOCK_VALUES = 2**18  # values per block; a block fits the processor's cache
-# Limits of chromaticities: the tolerance of equal ones, the largest coordinate, and the smallest area or
-# coordinate of primaries that span a space.
+_BLOCK_VALUES = 2**18  # values per block, which fits the processor's cache
+# Limits of chromaticities: tolerance of equality, largest coordinate, smallest area or coordinate.
 _SAME_XY, _LARGEST_XY, _LEAST_XY = 5e-4, 4.0, 1e-5
 
 AUTO_EXPOSURE_PERCENTILE = 99.0
-_FIREFLY = 8.0  # times the 99th percentile: brighter than any highlight of skin
+_FIREFLY = 8.0  # times the 99th percentile, brighter than highlights of skin
 ExposureRule = Literal["auto", "face"]
-MOST_OVER_FRONT_EV = 3.0  # that a face which sees little of the light gets more than one that sees it all
+MOST_OVER_FRONT_EV = 3.0  # most extra exposure of a face that the light barely reaches
 _BLACK = 1e-9
 AUTO_EXPOSURE_TARGET_LINEAR = 0.8  # luminance of that percentile after exposure
 SHOULDER_START_LINEAR = AUTO_EXPOSURE_TARGET_LINEAR
-_WHITENING = 0.3  # of colours that the soft view bends, by how much it does
+_WHITENING = 0.3  # desaturation per amount of compression in the soft view
 
 
 def srgb_to_linear(encoded: np.ndarray) -> np.ndarray:
@@ -67,27 +63,18 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
 
 @cache
 def colour_science() -> Any:
-    """Import colour-science without its warnings and side effects; it takes most of a second."""
-    with np.printoptions(), warnings.catch_warnings(), _without("OpenImageIO"):
-        warnings.simplefilter("ignore")  # about its optional dependencies
-        return importlib.import_module("colour")
+    """Import colour-science without its warnings and side effects, which takes most of a second.
 
-
-@contextmanager
-def _without(name: str) -> Iterator[None]:
-    """Hide a module from imports in the block.
-
-    colour-science would keep types of OpenImageIO alive, which OpenImageIO reports as leaks at exit.
+    OpenImageIO is hidden: colour-science would keep its types alive, which it reports as leaks at exit.
     """
     modules: dict[str, Any] = sys.modules
-    hidden = modules.get(name)
-    modules[name] = None  # makes Python raise ImportError for it
+    openimageio, modules["OpenImageIO"] = modules["OpenImageIO"], None
     try:
-        yield
+        with np.printoptions(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about its optional dependencies
+            return importlib.import_module("colour")
     finally:
-        del modules[name]
-        if hidden is not None:
-            modules[name] = hidden
+        modules["OpenImageIO"] = openimageio
 
 
 def power_curve(gamma: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -100,29 +87,23 @@ def power_curve(gamma: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _bt2020_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Invert ITU-R BT.2020's transfer function, with the constants of its 12-bit systems."""
+    """Invert the transfer function of ITU-R BT.2020 with its 12-bit constants."""
     decoded = colour_science().models.oetf_inverse_BT2020(np.abs(encoded), is_12_bits_system=True)
-    return np.copysign(decoded, encoded).astype(np.float32)
-
-
-def _romm_to_linear(encoded: np.ndarray) -> np.ndarray:
-    """Invert the transfer function of ROMM RGB (ISO 22028-2), which is ProPhoto RGB."""
-    decoded = colour_science().models.cctf_decoding_ROMMRGB(np.abs(encoded))
     return np.copysign(decoded, encoded).astype(np.float32)
 
 
 @dataclass(frozen=True)
 class ColourSpace:
-    """A colour space by its primaries and decoding curve; without primaries OpenColorIO converts it."""
+    """Colour space with primaries and a decoding curve; without primaries OpenColorIO converts it."""
 
     name: str
     chromaticities: tuple[float, ...] | None
     decode: Callable[[np.ndarray], np.ndarray] | None = None  # None if linear
-    config: str = ""  # OpenColorIO's, which knows the name
+    config: str = ""  # OpenColorIO configuration that defines the name
 
     @property
     def is_linear(self) -> bool:
-        """True if values are known to be proportional to light."""
+        """True if values are proportional to light; False if that is unknown."""
         return self.chromaticities is not None and self.decode is None
 
 
@@ -135,9 +116,8 @@ REC2020 = ColourSpace("Rec.2020", _REC2020_CHROMATICITIES, _bt2020_to_linear)
 LINEAR_REC2020 = ColourSpace("linear Rec.2020", _REC2020_CHROMATICITIES)
 LINEAR_P3 = ColourSpace("linear P3", _P3_CHROMATICITIES)
 ACES = ColourSpace("ACES2065-1", _AP0_CHROMATICITIES)
-PROPHOTO = ColourSpace("ProPhoto RGB", _ROMM_CHROMATICITIES, _romm_to_linear)
 
-# Compared without case, spaces and punctuation; includes the interchange names that OpenImageIO uses.
+# Without case, spaces and punctuation; includes OpenImageIO's interchange names.
 _ALIASES = {
     LINEAR: "linear linrec709 linearrec709 linrec709scene linsrgb linearrec709srgb",
     SRGB: "srgb srgbrec709scene srgbtexture srgbtx srgbencodedrec709srgb",
@@ -148,13 +128,12 @@ _ALIASES = {
     LINEAR_REC2020: "linrec2020 linearrec2020 linrec2020scene",
     LINEAR_P3: "linearp3 linp3d65 linp3d65scene linearp3d65",
     ACES: "aces20651 linap0 linap0scene",
-    PROPHOTO: "prophoto prophotorgb romm rommrgb",
 }
 _BY_ALIAS = {alias: space for space, aliases in _ALIASES.items() for alias in aliases.split()}
 
 
 def find_space(name: str, config: str = "") -> ColourSpace | None:
-    """Return the space of this name, defined here or by OpenColorIO; None if it is unknown."""
+    """Return the space of this name, defined here or by OpenColorIO; None if unknown."""
     plain = "".join(letter for letter in name.lower() if letter.isalnum())
     if plain in _BY_ALIAS:
         return _BY_ALIAS[plain]
@@ -162,15 +141,15 @@ def find_space(name: str, config: str = "") -> ColourSpace | None:
 
 
 def known_space(space: ColourSpace) -> ColourSpace:
-    """Return the space of a usual name that has the same primaries and curve, else the space itself."""
+    """Return the named space with the same primaries and curve, or the space itself."""
     alike = (known for known in _ALIASES if known.decode is space.decode)
     return next((known for known in alike if known.chromaticities == space.chromaticities), space)
 
 
 def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
-    """Return the linear space of these primaries and white, with its usual name if it has one.
+    """Return the linear space of these primaries and white, by its usual name if it has one.
 
-    None if they are impossible: white must lie inside the triangle of the primaries.
+    None for impossible ones: white must be inside the triangle of the primaries.
     """
     xy = np.array(chromaticities, float).reshape(4, 2)
     if not (np.abs(xy) < _LARGEST_XY).all() or not (np.abs(xy[:, 1]) > _LEAST_XY).all():
@@ -186,13 +165,13 @@ def linear_space(chromaticities: tuple[float, ...]) -> ColourSpace | None:
 
 
 def named_space(name: str, config: str = "") -> ColourSpace:
-    """Return the space that a user names; an unknown name raises a UsageError that lists similar ones."""
+    """Return the space that a user names; raises UsageError with similar names for an unknown one."""
     space = find_space(name, config)
     if space is None:
         ours = [known.name for known in _ALIASES]
         names = {known.casefold(): known for known in ours} | ocio.names(config)
         near = difflib.get_close_matches(name.casefold(), names, len(names), 0.5)
-        similar = dict.fromkeys(known.name for one in near if (known := find_space(names[one], config)))
+        similar = dict.fromkeys(known.name for key in near if (known := find_space(names[key], config)))
         hint = f"similar names: {', '.join([*similar][:3])}" if similar else f"known: {', '.join(ours)}"
         raise UsageError(f"unknown colour space '{name}' ({hint}; and the names of the OCIO configuration)")
     return space
@@ -201,25 +180,25 @@ def named_space(name: str, config: str = "") -> ColourSpace:
 def to_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
     """Convert [H, W, 3] from `space` to scene-linear Rec.709, unclipped: wide gamuts give negative values.
 
-    Integers count in steps from 0 to 1; the curve of a space is then looked up.
+    Unsigned integers are scaled to 0..1 and decoded by a lookup table.
     """
     if pixels.dtype.kind == "u" and space.chromaticities is not None:
         return _by_matrix(_looked_up(pixels, space), matrix_to_rec709(space.chromaticities))
     pixels = unit_floats(pixels)
     if space.chromaticities is None:
         for name, matrix in _ocio_bridges():
-            found = ocio.converted(pixels, space.name, name, space.config)
-            if found is not None:
-                return _by_matrix(found, matrix)
+            converted = ocio.converted(pixels, space.name, name, space.config)
+            if converted is not None:
+                return _by_matrix(converted, matrix)
         raise _cannot_convert(space)
     linear = pixels if space.decode is None else in_blocks(space.decode, pixels)
     return _by_matrix(linear, matrix_to_rec709(space.chromaticities))
 
 
 def _looked_up(integers: np.ndarray, space: ColourSpace) -> np.ndarray:
-    """Decode unsigned integers [H, W, 3] by the curves of a space, each computed once for each value."""
+    """Decode unsigned integers [H, W, 3] by the curves of a space, computed once per value."""
     values = unit_floats(np.arange(np.iinfo(integers.dtype).max + 1, dtype=integers.dtype))
-    grey = np.repeat(values[:, None, None], 3, -1)  # a profile has a curve for each channel
+    grey = np.repeat(values[:, None, None], 3, -1)  # a profile has one curve per channel
     table = (grey if space.decode is None else space.decode(grey))[:, 0]
     linear = np.empty(integers.shape, np.float32)
     for channel in range(3):
@@ -228,20 +207,20 @@ def _looked_up(integers: np.ndarray, space: ColourSpace) -> np.ndarray:
 
 
 def unit_floats(values: np.ndarray) -> np.ndarray:
-    """Values as float32; unsigned integers count in steps from 0 to 1."""
+    """Convert to float32; unsigned integers are scaled to 0..1."""
     if values.dtype.kind != "u":
         return values.astype(np.float32, copy=False)
-    return values.astype(np.float32) * (1 / np.float32(np.iinfo(values.dtype).max))  # as OpenImageIO
+    return values.astype(np.float32) * (1 / np.float32(np.iinfo(values.dtype).max))  # as in OpenImageIO
 
 
 def from_linear_rec709(pixels: np.ndarray, space: ColourSpace) -> np.ndarray:
-    """Convert scene-linear Rec.709 [H, W, 3] to a linear space, or to one of OpenColorIO, unclipped."""
+    """Convert scene-linear Rec.709 [H, W, 3] to a linear or an OpenColorIO space, unclipped."""
     if space.chromaticities is None:
         for name, matrix in _ocio_bridges():
             bridge = _by_matrix(pixels, np.linalg.inv(matrix))
-            found = ocio.converted(bridge, name, space.name, space.config)
-            if found is not None:
-                return found
+            converted = ocio.converted(bridge, name, space.name, space.config)
+            if converted is not None:
+                return converted
         raise _cannot_convert(space)
     if space.decode is not None:
         raise ValueError(f"{space.name} is not linear")
@@ -256,18 +235,19 @@ def _by_matrix(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def _ocio_bridges() -> Iterator[tuple[str, np.ndarray]]:
-    """Yield names of linear spaces that OpenColorIO may know, each with its matrix to linear Rec.709."""
+    """Yield names of linear spaces that configurations may have, with their matrix to linear Rec.709."""
     yield from ((name, np.eye(3)) for name in ocio.REC709_NAMES)
     yield from ((name, matrix_to_rec709(_AP0_CHROMATICITIES)) for name in ocio.ACES_NAMES)
 
 
 def _cannot_convert(space: ColourSpace) -> UsageError:
-    known = "the configuration has neither linear Rec.709 nor ACES2065-1 under a usual name"
-    return UsageError(f"'{space.name}': OpenColorIO cannot convert it; maybe {known}")
+    return UsageError(
+        f"'{space.name}': OpenColorIO cannot convert it; use one with linear Rec.709 or ACES2065-1"
+    )
 
 
 def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> np.ndarray:
-    """Apply a curve to [H, W, C] in blocks of rows, which fit the processor's cache: several times faster."""
+    """Apply a curve to [H, W, C] in blocks of rows that fit the cache, which is several times faster."""
     rows = max(1, _BLOCK_VALUES // max(1, pixels[0].size))
     result = np.empty(pixels.shape, np.float32)
     for start in range(0, len(pixels), rows):
@@ -278,7 +258,7 @@ def in_blocks(curve: Callable[[np.ndarray], np.ndarray], pixels: np.ndarray) -> 
 def rgb_to_xyz(chromaticities: tuple[float, ...]) -> np.ndarray:
     """Return the matrix [3, 3] from linear RGB of these primaries to XYZ, with Y = 1 for white."""
     xy = np.array(chromaticities, float).reshape(4, 2)
-    xyz = np.concatenate([xy, 1 - xy.sum(-1, keepdims=True)], -1) / xy[:, 1:]  # [4, 3], each of Y = 1
+    xyz = np.concatenate([xy, 1 - xy.sum(-1, keepdims=True)], -1) / xy[:, 1:]  # [4, 3], each with Y = 1
     return xyz[:3].T * np.linalg.solve(xyz[:3].T, xyz[3])
 
 
@@ -289,7 +269,7 @@ def matrix_to_rec709(chromaticities: tuple[float, ...]) -> np.ndarray:
 
 
 def adaptation(from_white: np.ndarray, to_white: np.ndarray) -> np.ndarray:
-    """Return the matrix [3, 3] of the Bradford adaptation between two whites, XYZ [3]."""
+    """Return the Bradford adaptation matrix [3, 3] between two whites, XYZ [3]."""
     gain = (_BRADFORD @ to_white) / (_BRADFORD @ from_white)
     return np.linalg.inv(_BRADFORD) @ (gain[:, None] * _BRADFORD)
 
@@ -319,16 +299,16 @@ def ita_deg(linear: np.ndarray) -> np.ndarray:
 
 
 def without_fireflies(linear: np.ndarray) -> np.ndarray:
-    """Limit [H, W, 3] to 8 times its 99th percentile, so that a broken pixel sets no mean; 1 is never cut."""
+    """Limit [H, W, 3] to 8 times its 99th percentile, at least 1, so that means ignore single hot pixels."""
     if linear.max() <= 1:
         return linear
     return np.minimum(linear, max(1.0, _FIREFLY * float(np.percentile(linear, 99))), dtype=linear.dtype)
 
 
 def auto_exposure_ev(linear: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the exposure that maps the 99th percentile of the luminance to 0.8, in EV, to two decimals.
+    """Return the exposure in EV, to two decimals, that maps the 99th percentile of the luminance to 0.8.
 
-    linear is [H, W, 3]. Only pixels where `mask` [H, W] exceeds one half count. A black image gives 0 EV.
+    `linear` is [H, W, 3]; only pixels where `mask` [H, W] exceeds one half count. A black image gives 0 EV.
     """
     whole = np.ones(linear.shape[:2]) if mask is None else mask
     high = _brighter_than(linear, whole, AUTO_EXPOSURE_PERCENTILE)
@@ -355,36 +335,38 @@ def to_display(linear: np.ndarray, exposure_ev: float | None = None) -> np.ndarr
 def anchored_exposure_ev(
     relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray | None = None
 ) -> float:
-    """Return the exposure in EV, to two decimals, that leaves a face as bright in `relit` as in its plate.
+    """Return the exposure in EV, to two decimals, that keeps a face's mean luminance of the plate.
 
-    Images [H, W, 3] and masks [H, W], of which what exceeds one half counts. As bright: of the same mean
-    luminance, so that the person fits a background that stays, and a dark skin stays as dark beside a light
-    one as it was. No more than lets the brightest hundredth of the person exceed white, or the plate's own,
-    by one EV, as in a light from behind. A black face gives 0 EV.
+    Images are [H, W, 3]; masks [H, W] count where they exceed one half. The person then fits an unchanged
+    background, and the contrast between dark and light skin is kept. The exposure is limited so that the
+    brightest hundredth of the person exceeds white, or the plate's, by at most one EV (rear light). A black
+    face gives 0 EV.
     """
-    bright, wanted = (_mean_luminance(image, face) for image in (relit, plate))
-    if min(bright, wanted) <= _BLACK:
+    relit_mean, plate_mean = (_mean_luminance(image, face) for image in (relit, plate))
+    if min(relit_mean, plate_mean) <= _BLACK:
         return 0.0
-    whole = face if person is None else person
-    most, own = (_brighter_than(image, whole, AUTO_EXPOSURE_PERCENTILE) for image in (relit, plate))
-    gain = min(wanted / bright, 2 * max(1.0, own) / max(most, _BLACK))
+    mask = face if person is None else person
+    relit_high, plate_high = (
+        _brighter_than(image, mask, AUTO_EXPOSURE_PERCENTILE) for image in (relit, plate)
+    )
+    gain = min(plate_mean / relit_mean, 2 * max(1.0, plate_high) / max(relit_high, _BLACK))
     return round(float(np.log2(gain)), 2)
 
 
 def chosen_exposure_ev(
     rule: ExposureRule, relit: np.ndarray, plate: np.ndarray, face: np.ndarray, person: np.ndarray
 ) -> float:
-    """The exposure in EV by a rule: `auto`, anchored to the plate, or `face`, which shows the person well."""
+    """Return the exposure in EV by a rule: `auto` keeps the plate's brightness, `face` exposes the person."""
     if rule == "face":
         return auto_exposure_ev(relit, person)
     return anchored_exposure_ev(relit, plate, face, person)
 
 
 def most_exposure_ev(rule: ExposureRule, strength: float) -> float:
-    """The most exposure in EV, by a rule, under light of a total luminance; see `light_weights.strengths`.
+    """Return the largest exposure in EV under light of a total luminance (`light_weights.strengths`).
 
-    A face that looks into a light of strength 1 needs 0 EV to be as bright as in its photo. Under `auto`, a
-    light from behind shows a dark face, not what little reaches it hundreds of times as bright.
+    A face toward a light of strength 1 needs 0 EV for the brightness of its photo. Under `auto`, the limit
+    keeps a face under rear light dark.
     """
     limited = rule == "auto" and strength > _BLACK
     return MOST_OVER_FRONT_EV - math.log2(strength) if limited else math.inf
@@ -402,9 +384,9 @@ def _brighter_than(linear: np.ndarray, mask: np.ndarray, percentile: float) -> f
 
 @dataclass(frozen=True)
 class View:
-    """A display view: "none" is the sRGB curve, clipped at 1; "soft" has `softened` before it.
+    """Display view: "none" is the sRGB curve, clipped at 1; "soft" applies `softened` first.
 
-    Others are views of a display of an OpenColorIO configuration; '' is its default one.
+    Others are views of a display of an OpenColorIO configuration; '' is its default display.
     """
 
     name: str = "none"
@@ -425,9 +407,9 @@ _VIEWS = {"none": PLAIN_VIEW, "soft": SOFT_VIEW, "aces": _ACES_VIEW}
 
 
 def named_view(name: str, config: str = "", display: str = "") -> View:
-    """Return the view that a user names; an unknown name raises a UsageError that lists the known ones.
+    """Return the view that a user names; raises UsageError with the known names for an unknown one.
 
-    With a display the view is one of its own; "soft", which is nobody's choice then, is its default one.
+    With a display, the view is one of its views; "soft", the default of the option, is its default view.
     """
     if not display and name in _VIEWS:
         return _VIEWS[name]
@@ -439,34 +421,34 @@ def named_view(name: str, config: str = "", display: str = "") -> View:
 
 
 def _spelt(name: str, known: Sequence[str], what: str, more: Sequence[str] = ()) -> str:
-    """A name, or the beginning of one alone, as OpenColorIO spells it."""
+    """Return a known name in its spelling, given in full or by an unambiguous start."""
     for alike in (str.__eq__, str.startswith):
-        found = [spelt for spelt in known if alike(spelt.casefold(), name.casefold())]
-        if len(found) == 1:
-            return found[0]
+        matches = [spelt for spelt in known if alike(spelt.casefold(), name.casefold())]
+        if len(matches) == 1:
+            return matches[0]
     raise UsageError(f"unknown {what} '{name}' (known: {', '.join([*more, *known])})")
 
 
 def shoulder(linear: np.ndarray) -> np.ndarray:
-    """Keep values up to s = 0.8, and let higher ones approach 1: 1 - (1 - s) exp(-(x - s) / (1 - s))."""
+    """Keep values up to s = 0.8 and compress higher ones: 1 - (1 - s) exp(-(x - s) / (1 - s))."""
     start = np.float32(SHOULDER_START_LINEAR)
     above = np.maximum(linear - start, 0) / (1 - start)
     return np.where(above > 0, 1 - (1 - start) * np.exp(-above), linear)
 
 
 def softened(linear: np.ndarray) -> np.ndarray:
-    """Bend colours [..., 3] whose brightest channel is above the shoulder's start; their hue stays.
+    """Compress colours [..., 3] whose brightest channel is above the shoulder's start; their hue is kept.
 
-    All channels follow the brightest one, and the more it was bent the more white is mixed in, as in Khronos'
-    PBR Neutral tone mapper (2024). Bent one by one, the channels of bright skin and leaves turn yellow.
+    All channels follow the brightest one, and white is mixed in by the amount of compression, as in Khronos'
+    PBR Neutral tone mapper (2024). With separate channels, bright skin and leaves would turn yellow.
     """
     brightest = np.maximum(np.maximum(linear[..., 0], linear[..., 1]), linear[..., 2])
-    found = brightest > SHOULDER_START_LINEAR
-    brightest = brightest[found][:, None]
-    bent = shoulder(brightest)
-    colour = linear[found] * (bent / brightest)
+    is_bright = brightest > SHOULDER_START_LINEAR
+    brightest = brightest[is_bright][:, None]
+    compressed = shoulder(brightest)
+    colour = linear[is_bright] * (compressed / brightest)
     result = linear.copy()
-    result[found] = bent + (colour - bent) / (1 + _WHITENING * (brightest - bent))
+    result[is_bright] = compressed + (colour - compressed) / (1 + _WHITENING * (brightest - compressed))
     return result
 
 
@@ -475,9 +457,9 @@ def encode_display(
 ) -> np.ndarray:
     """Encode exposed linear Rec.709 [H, W, 3] for a display, 0..1.
 
-    `share` [H, W] in 0..1 is how far the soft shoulder applies to a pixel: what was photographed, and so is
-    encoded already, keeps its look without it. Where light was `added` [H, W, 3] to what was photographed,
-    the shoulder bends that alone.
+    `share` [H, W] in 0..1 is the strength of the soft shoulder; photographed pixels, which have been encoded
+    before, keep their look without it. Where light was `added` [H, W, 3] to the photo, the shoulder applies
+    only to that light.
     """
     if view.name == "none":
         return in_blocks(lambda block: linear_to_srgb(np.clip(block, 0, 1)), linear)
@@ -490,9 +472,8 @@ def encode_display(
             mixed = soft if share is None else linear + share[..., None] * (soft - linear)
         return encode_display(mixed, PLAIN_VIEW)
     for name, matrix in _ocio_bridges():
-        found = ocio.displayed(
-            _by_matrix(linear, np.linalg.inv(matrix)), name, view.name, view.config, view.display
-        )
-        if found is not None:
-            return found.clip(0, 1)
+        bridge = _by_matrix(linear, np.linalg.inv(matrix))
+        displayed = ocio.displayed(bridge, name, view.name, view.config, view.display)
+        if displayed is not None:
+            return displayed.clip(0, 1)
     raise _cannot_convert(ColourSpace(view.name, None))

@@ -1,4 +1,4 @@
-"""The colours that pigments give skin.
+"""Skin colour from pigments.
 
 Skin has two layers in the model of Kubelka and Munk, an epidermis with melanin over an infinitely deep dermis
 with blood (after Cotton and Claridge, *Developing a predictive model of human skin colouring*, 1996).
@@ -6,7 +6,7 @@ Saunderson's correction (1942) accounts for the boundary to the air.
 
 Absorption: melanosomes (6.6e11 nm^-3.33 /cm) and bloodless skin after S. Jacques (*Skin optics summary*,
 1998); pheomelanin (2.9e15 nm^-4.75 /cm) after Donner and Jensen (2006); its fraction of all melanin, the same
-in all skins, after Del Bino et al. (2015); haemoglobin from S. Prahl's table (omlc.org, after Gratzer and
+for all skin, after Del Bino et al. (2015); haemoglobin from S. Prahl's table (omlc.org, after Gratzer and
 Kollias). Scattering: Jacques, *Optical properties of biological tissues: a review* (2013).
 """
 
@@ -33,7 +33,7 @@ _STEPS = 64  # of the table along each axis
 
 
 def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
-    """Diffuse reflectance [..., 33] at `WAVELENGTHS_NM`, without the gloss of the surface.
+    """Return the diffuse reflectance [..., 33] at `WAVELENGTHS_NM`, without surface gloss.
 
     melanin [...]: fraction of the epidermis's volume that is melanosomes; blood [...]: fraction of the
     dermis's volume that is blood.
@@ -59,7 +59,7 @@ def skin_reflectance(melanin: np.ndarray, blood: np.ndarray) -> np.ndarray:
 
 
 def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Kubelka-Munk reflectance and transmittance of one layer."""
+    """Return the Kubelka-Munk reflectance and transmittance of one layer."""
     back = 0.75 * scattering
     a = 1 + 2 * absorption / back
     b = np.sqrt(a * a - 1)
@@ -68,13 +68,13 @@ def _layer(absorption: np.ndarray, scattering: np.ndarray, depth_cm: float) -> t
 
 
 def observer_weights() -> np.ndarray:
-    """Matrix [33, 3] from reflectance at `WAVELENGTHS_NM` to XYZ under D65; white has the colour of D65."""
+    """Return the matrix [33, 3] from reflectance at `WAVELENGTHS_NM` to XYZ under D65."""
     return np.array(_TABLES["observer"], float) / 100
 
 
 @lru_cache(maxsize=1)  # thousands of spectra
 def skin_table() -> Tensor:
-    """Table [1, 3, steps of blood, steps of melanin] of linear Rec.709; steps are even in the square root."""
+    """Return linear Rec.709 [1, 3, blood, melanin] at steps that are uniform in the square root."""
     step = np.linspace(0, 1, _STEPS) ** 2
     blood, melanin = np.meshgrid(step * BLOOD_MOST, step * MELANIN_MOST, indexing="ij")
     xyz = skin_reflectance(melanin, blood) @ observer_weights()
@@ -83,7 +83,7 @@ def skin_table() -> Tensor:
 
 
 def skin_albedo(melanin: Tensor, blood: Tensor) -> Tensor:
-    """Colour [B, 3, H, W] of skin, linear Rec.709, from melanin and blood fractions [B, 1, H, W]."""
+    """Return skin colour [B, 3, H, W], linear Rec.709, from melanin and blood fractions [B, 1, H, W]."""
     at = torch.stack([melanin[:, 0] / MELANIN_MOST, blood[:, 0] / BLOOD_MOST], -1)
     at = 2 * at.clamp(0, 1).sqrt() - 1
     return F.grid_sample(skin_table().expand(len(at), -1, -1, -1), at, align_corners=True)

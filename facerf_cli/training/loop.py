@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader, Dataset
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.quirks import read_in_one_thread
+from facerf_cli.files.workarounds import read_in_one_thread
 from facerf_cli.network.checkpoint import load_networks, save_networks
 from facerf_cli.network.inputs import Batch
 from facerf_cli.run.logs import LOGGER_NAME

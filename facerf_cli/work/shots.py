@@ -259,11 +259,7 @@ class FilmOutput:
         if batch.dry_run:
             print(named(f"{items[0].input_path} -> {self.path}"))
             return ""
-        if shots and shots[0].film:
-            from facerf_cli.files.film_writer import check_writable
-
-            check_writable(self.path, shots[0].film)
-        elif len({_stated(item, self.rate)[0] for item in items}) > 1:
+        if not (shots and shots[0].film) and len({_stated(item, self.rate)[0] for item in items}) > 1:
             log.warning("%s: its frames state several rates; the first one's is used (--fps)", self.path)
         return recipe
 

@@ -59,7 +59,7 @@ def test_a_draft_is_refused_until_it_is_filled_in(tmp_path: Path) -> None:
     stage = draft_stage(stage_at(tmp_path), SUFFIXES, FOLDERS)
     assert json.loads(as_text(stage)) == stage and as_text(stage).count('"direction"') == 4
     (tmp_path / "stage.json").write_text(as_text(stage))
-    refused(InputError, "colour_space is null; fill it in (and 8 more)", read_capture, tmp_path)
+    refused(InputError, "colour_space: is null; fill it in (and 8 more)", read_capture, tmp_path)
     for light in stage["lights"]:
         light["direction"] = [0, 0, 1]
     for camera in stage["cameras"]:
@@ -204,17 +204,17 @@ def test_lists_are_read_by_the_images_names_or_by_order(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("1\nL1 0 0", "line 2 is wrong"),
-        ("L1 0 0 1\nL2 a b c", "line 2 is wrong"),
+        ("1\nL1 0 0", "line 2 is invalid"),
+        ("L1 0 0 1\nL2 a b c", "line 2 is invalid"),
         ("3\nL1 0 0 1\nL2 0 1 0", "states 3 lights and has 2"),
         ("1\nL1 0 0 1\nL2 0 1 0", "states 1 lights and has 2"),
-        ("a.jpg 0.1 0.2 0.9 1.0", "line 1 is wrong"),
-        ("0.1 0.2 0.9 1.0", "line 1 is wrong"),
-        ("0,5 0,3 0,8", "line 1 is wrong"),
+        ("a.jpg 0.1 0.2 0.9 1.0", "line 1 is invalid"),
+        ("0.1 0.2 0.9 1.0", "line 1 is invalid"),
+        ("0,5 0,3 0,8", "line 1 is invalid"),
         ("L1 0 0 0", "line 1 has no direction"),
         ("L1 nan 0 0", "no direction"),
         ("L1 inf 0 0", "no direction"),
-        ("\0\1\2", "line 1 is wrong"),
+        ("\0\1\2", "line 1 is invalid"),
     ],
 )
 def test_a_wrong_list_is_refused(tmp_path: Path, text: str, said: str) -> None:

@@ -37,7 +37,7 @@ def camera(**changes: Any) -> dict[str, Any]:
         ({"axes": "opengl"}, "opencv"),
         ({"unit": "mm"}, "'m'"),
         ({"colour_space": "mauve"}, "'mauve'"),
-        ({"colour_space": None}, "colour_space is null; fill it in"),
+        ({"colour_space": None}, "colour_space: is null; fill it in"),
         ({"lights": []}, "at least 1"),
         (light(direction=[0, 0, 2]), "length 1"),
         (light(direction=[0, 1]), "finite"),
@@ -55,7 +55,7 @@ def camera(**changes: Any) -> dict[str, Any]:
         (camera(world_to_camera=[*CAMERA["world_to_camera"], [0, 0, 1, 1]]), "last row"),
         (camera(world_to_camera="eye"), "3 x 4"),
         ({"cameras": [CAMERA, {k: CAMERA[k] for k in ("width", "height", "K")} | {"id": "C1"}]}, "camera C1"),
-        (light(direction=None) | camera(K=[None, 3]), "direction is null; fill it in (and 1 more"),
+        (light(direction=None) | camera(K=[None, 3]), "direction: is null; fill it in (and 1 more"),
         (camera(distortion=[0.1]), "k1, k2, p1, p2, k3 of OpenCV"),
         (camera(distortion=[0.1, 0, 0, "x"]), "k1, k2, p1, p2, k3 of OpenCV"),
         (camera(distortion=[0.1] * 8), "undistort"),
@@ -85,7 +85,7 @@ def test_a_description(tmp_path: Path, changes: dict[str, Any], said: str) -> No
 def test_a_description_without_a_key(tmp_path: Path, missing: str) -> None:
     path = write_flat_stage(tmp_path) / "stage.json"
     path.write_text(path.read_text().replace(f'"{missing}"', '"other"'))
-    refused(InputError, f"stage.json ... '{missing}'", read_capture, tmp_path)
+    refused(InputError, f"stage.json: {missing}: is missing", read_capture, tmp_path)
 
 
 def test_a_frame(tmp_path: Path) -> None:

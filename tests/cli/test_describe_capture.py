@@ -43,7 +43,7 @@ def test_a_draft_filled_in_is_the_true_description(given: Path, bare: Path, caps
             assert key == "intensity" or left_open or value == known[key]
     line = ["prepare-dataset", str(bare), "-o", str(bare.parent / "dataset"), "--dry-run"]
     assert main(line) == 2
-    assert "colour_space is null; fill it in (and 10 more)" in capsys.readouterr().err
+    assert "colour_space: is null; fill it in (and 10 more)" in capsys.readouterr().err
     (bare / "stage.json").write_text(
         json.dumps(draft | {key: true[key] for key in ("lights", "cameras", "colour_space")})
     )

@@ -162,7 +162,7 @@ def test_files_that_hold_no_image(truths: Path, ours: Path) -> None:
     path = ours / "anna/one.npy"
     for content, words in (
         (np.zeros(SHAPE, int), "values of type int64"),
-        (np.zeros((2, *SHAPE), np.float32), "an array of shape"),
+        (np.zeros((2, *SHAPE), np.float32), "array of shape"),
         (np.full(SHAPE, np.nan, np.float32), "NaN"),
         (np.array([Path("x")], object), "not an array"),
     ):

@@ -59,9 +59,8 @@ def test_without_pyav_a_line_says_that_bits_are_lost(caplog: Log, monkeypatch: P
     image = read_image(MULTIPLIED)
     np.testing.assert_allclose(255 * image.alpha, 102, atol=1e-3)
     (record,) = caplog.records
-    assert record.getMessage().endswith(
-        "multiplied.avif: has 12 bits, read as 8 bits; pip install 'facerf[video]' to keep them"
-    )
+    said = record.getMessage()
+    assert "multiplied.avif" in said and "12 bits" in said and "pip install 'facerf[video]'" in said
     np.testing.assert_allclose(stored(MULTIPLIED)[INSIDE], QUADS[INSIDE], atol=4)  # of 8 bits, divided by .4
 
 
@@ -69,7 +68,7 @@ def test_without_pyav_a_line_says_that_bits_are_lost(caplog: Log, monkeypatch: P
 def test_alpha_of_eight_bits(tmp_path: Path, multiplied: bool) -> None:
     alpha = np.full((H, W, 1), 102, np.uint8)
     path = save(tmp_path / "a.avif", np.dstack([QUADS, alpha]), alpha_premultiplied=multiplied)
-    assert open_avif(path).spec.get_int_attribute("oiio:UnassociatedAlpha") == (not multiplied)
+    assert open_avif(path)[0].get_int_attribute("oiio:UnassociatedAlpha") == (not multiplied)
     np.testing.assert_allclose(read_image(path).alpha, 0.4, atol=1e-6)
     np.testing.assert_allclose(stored(path)[INSIDE], QUADS[INSIDE], atol=4 if multiplied else 1.5)
 

@@ -118,7 +118,7 @@ def test_an_error_of_the_server_is_one_line_that_says_what_to_do(server: Server,
         fetch(server.published(), OPTION, tmp_path)
     assert str(caught.value) == (
         f"{server.url}/models/a%20file.pth: cannot be fetched to {tmp_path / 'a file.pth'} (HTTP Error 404: "
-        "Not Found); run again with a network, put the file there, or give --weights PATH"
+        "Not Found); run again with a network, put the file there, or use --weights PATH"
     )
     assert server.asked == 1
 
@@ -127,7 +127,7 @@ def test_offline_is_one_line_that_says_what_to_do(tmp_path: Path) -> None:
     with socket.socket() as taken:  # bound, but nobody listens
         taken.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{taken.getsockname()[1]}/a.pth"
-        words = "Connection refused ... run again with a network, put the file there, or give --weights"
+        words = "Connection refused ... run again with a network, put the file there, or use --weights"
         refused(FacerfError, words, fetch, PublishedFile(url, DIGEST, 10**6), OPTION, tmp_path)
 
 

@@ -183,7 +183,7 @@ def test_display_auto_exposure_is_returned_and_alpha_is_not_premultiplied(tmp_pa
 def test_what_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refused(FacerfError, "cannot write", write_display, tmp_path / "file" / "a.png", VALUES[..., :3])
-    refused(UsageError, "suffix", write_display, tmp_path / "a.xyz", VALUES[..., :3])
+    refused(UsageError, "use .exr, .png or .jpg", write_display, tmp_path / "a.xyz", VALUES[..., :3])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from facerf_cli.files.apart import arrays_apart
 from facerf_cli.files.inert_pickle import pickled_arrays
+from facerf_cli.files.sandbox import read_in_subprocess
 from tests.face.importers.heads import arrays_here
 from tests.files.pickled import chumpy, python_2, saved_object
 from tests.refusals import refused
@@ -162,7 +162,7 @@ def test_damage_is_an_error(tmp_path: Path, case: str) -> None:
 )
 def test_what_exhausts_the_unpickler_costs_its_process_alone(tmp_path: Path, data: bytes) -> None:
     with pytest.raises(ValueError, match=r"\w"):
-        arrays_apart(pickled_arrays, written(tmp_path / "a.pkl", data))
+        read_in_subprocess(pickled_arrays, written(tmp_path / "a.pkl", data))
 
 
 def test_values_without_numbers_are_empty_and_operations_not_computed(tmp_path: Path) -> None:

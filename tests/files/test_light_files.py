@@ -44,21 +44,21 @@ def test_a_light_comes_back_from_plain_json(tmp_path: Path) -> None:
     assert fields["format"] == FORMAT and "white" in fields["units"] and "camera" in fields["axes"]
     assert [len(row) for row in fields["weights"]] == [3] * 7 and fields["sh"]["order"] == 2
     (tmp_path / "a.json").write_text("[1]")
-    refused(InputError, "a.json is [1]; an object", read_light, tmp_path / "a.json")
+    refused(InputError, "a.json: use an object", read_light, tmp_path / "a.json")
 
 
 BAD: dict[str, dict[str, Any]] = {
-    "format is ... facerf-light-1": {"format": "other"},
-    "no 'directions'; add it": {"directions": None},
+    "format: ... facerf-light-1": {"format": "other"},
+    "directions: is missing; add it": {"directions": None},
     "2 directions but 1 weights": {"weights": [[1, 1, 1]]},
     "directions that are unit vectors": {"directions": [[1, 0, 0], [0, 2, 0]]},
-    "weights is ... rows of 3": {"weights": [[1, 1, 1], [1, 1]]},
+    "weights: ... rows of 3": {"weights": [[1, 1, 1], [1, 1]]},
     "NaN is not a finite": {"weights": [[1, 1, 1], [1, 1, float("nan")]]},
     "3 finite numbers": {"weights": [[1, 1, 1], [1, 1, "2"]]},
-    "directions is ... 1 to 4096 rows": {"directions": []},
+    "directions: ... 1 to 4096 rows": {"directions": []},
     "rows, not 8": {"sh": {"coefficients": [[0, 0, 0]] * 8, "convention": CONVENTION}},
     "sh has another convention": {"sh": {"coefficients": [[1, 1, 1]], "convention": "x"}},
-    "sh is 5; an object": {"sh": 5},
+    "sh: use an object": {"sh": 5},
 }
 
 
@@ -73,7 +73,7 @@ def test_an_error_is_one_line_that_names_the_fault(complaint: str, tmp_path: Pat
 @pytest.mark.parametrize("text", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b" " * (5 << 20)])
 def test_damaged_files_are_refused(text: bytes, tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(text)
-    refused(InputError, "a.json: ... give a .json", read_light, tmp_path / "a.json")
+    refused(InputError, "a.json: ... use a .json", read_light, tmp_path / "a.json")
     refused(InputError, "no such file", read_light, tmp_path / "b.json")
 
 
@@ -99,5 +99,5 @@ def test_a_part_of_a_sphere_is_refused(tmp_path: Path) -> None:
     levels = np.full((16, 32, 3), 200, np.uint8)
     assert read_map_file(pano(tmp_path / "a.jpg", levels, (16, 32), (0, 0))).shape == (16, 32, 3)
     part = pano(tmp_path / "a.jpg", levels, (32, 64), (4, 10))
-    refused(InputError, "a.jpg: a part of a sphere ... extend it to 360 x 180 degrees", read_map_file, part)
+    refused(InputError, "a.jpg: ... extend it to 360 x 180 degrees", read_map_file, part)
     assert read_image(part).pixels.shape == (16, 32, 3)  # a photo is what it shows

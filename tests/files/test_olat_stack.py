@@ -137,7 +137,7 @@ def rewritten(path: Path, **changes: object) -> Path:
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({}, "part 1 is missing"), ({"lights": 10**9}, "lights is 1000000000"), ({"lights": 0}, "lights is 0"),
+    ({}, "part 1 is missing"), ({"lights": 10**9}, "lights: "), ({"lights": 0}, "lights: "),
     ({"lights": "many"}, "damaged"), ({"kind": "sound"}, "damaged"), ({"format": "x-9"}, "damaged"),
     ({"rotation": [1, 2]}, "damaged"), ({"rotation": [[float("nan")] * 3] * 3}, "damaged"),
     ({"fit": 7}, "damaged"), ({"layout_version": None}, "damaged"),

@@ -55,7 +55,8 @@ def test_known_grey_and_sampled_profiles_are_recognised(tmp_path: Path) -> None:
     assert space_of_profile(SRGB.tobytes(), "x") is colour.SRGB
     prophoto = space_of_profile(icc_profiles.PROPHOTO, "My camera")
     assert prophoto is not None and prophoto.name == "My camera" and prophoto.chromaticities is not None
-    ours = colour.matrix_to_rec709(colour.PROPHOTO.chromaticities or ())
+    romm = (0.7347, 0.2653, 0.1596, 0.8404, 0.0366, 0.0001, 0.3457, 0.3585)
+    ours = colour.matrix_to_rec709(romm)
     np.testing.assert_allclose(colour.matrix_to_rec709(prophoto.chromaticities), ours, atol=2e-3)
     tags = {b"rTRC": icc_profiles.sampled(0, 16384, 65535), b"gTRC": icc_profiles.sampled(), b"bTRC": b""}
     tags[b"bTRC"] = icc_profiles.sampled(512)  # a power of 2
@@ -119,7 +120,7 @@ def test_a_grey_profile_of_an_image_with_colours_is_left_out(
     np.testing.assert_allclose(255 * colour.linear_to_srgb(image.pixels), levels, atol=1.5)
     assert image.colourspace_name == "sRGB"
     if suffix != "png":  # libpng leaves it out itself
-        assert "profile 'Dot Gain' is for grey images; taken for sRGB" in caplog.text
+        assert "profile 'Dot Gain' is for grey images; assuming sRGB" in caplog.text
 
 
 def test_broken_profiles_are_no_space() -> None:
@@ -146,9 +147,9 @@ def test_tables_are_applied_to_eight_bits_and_refused_for_more(tmp_path: Path, c
         shown = 255 * colour.linear_to_srgb(image.pixels)
         assert np.abs(shown - by_littlecms(COLOURS, scanner)).max() < 12
         assert np.abs(shown - COLOURS).max() > 40
-        assert caplog.records[-1].getMessage().endswith("converted to sRGB by its profile 'Scanner 9'")
+        assert "'Scanner 9'" in caplog.records[-1].getMessage()
     tifffile.imwrite(path := tmp_path / "b.tif", 257 * COLOURS.astype(np.uint16), iccprofile=scanner)
-    refused(InputError, "'Scanner 9' has tables ... convert the image to sRGB", read_image, path)
+    refused(InputError, "'Scanner 9' has tables ... convert it to sRGB", read_image, path)
     assert read_image(path, "Display P3").colourspace_name == "Display P3"
 
 
@@ -159,7 +160,7 @@ def test_a_broken_profile_is_one_line_that_says_what_is_assumed(tmp_path: Path, 
     Image.fromarray(COLOURS).save(tmp_path / "a.png", icc_profile=tables)
     assert read_image(tmp_path / "a.png").colourspace_name == "sRGB"
     (line,) = [record.getMessage() for record in caplog.records]
-    assert line.endswith("a.png: the embedded profile 'Scanner 77' is not understood; taken for sRGB")
+    assert "a.png" in line and "'Scanner 77'" in line and line.endswith("assuming sRGB")
 
 
 @pytest.mark.parametrize("space", [colour.LINEAR, colour.ACESCG, colour.ACES], ids=lambda space: space.name)

@@ -123,10 +123,10 @@ def test_alpha_and_codes_of_a_heif(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     values = np.dstack([QUADS // 2, np.full((H, W), 128, np.uint8)])
     stated = {"shape": np.array([H, W, 4]), "bits": np.array(8), "is_associated": np.array(True)}
     found = {**stated, "pixels": values, "codes": np.array([1, 13])}
-    monkeypatch.setattr(isobmff, "arrays_apart", lambda *_: found)
+    monkeypatch.setattr(isobmff, "read_in_subprocess", lambda *_: found)
     np.testing.assert_allclose(levels_of(path), QUADS, atol=2)
     found["codes"] = np.array([9, 18])
-    refused(InputError, "a.heic: is an HDR image (HLG)", read_image, path)
+    refused(InputError, "a.heic: HDR (HLG)", read_image, path)
 
 
 @pytest.mark.parametrize(("suffix", "is_alpha"), [("bmp", False), ("png", True), ("webp", True)])
@@ -168,19 +168,19 @@ def test_the_image_of_an_exr_is_chosen_by_its_name(tmp_path: Path, caplog: pytes
     caplog.set_level(logging.INFO, "facerf")
     other, depth = 1 - LINEAR, LINEAR[..., :1]
     in_layers = [f"V.{layer}.{letter}" for layer in ("AO", "Combined") for letter in "RGB"]
-    for name, parts, said in [
-        ("depth_first", [("depth", depth, ("Z",)), ("rgba", LINEAR, COLOURS)], "rgba is read, not depth"),
-        ("albedo_first", [("albedo", other, COLOURS), ("main", LINEAR, COLOURS)], "main is read, not albedo"),
-        ("beauty", [("diffuse", other, COLOURS), ("beauty", LINEAR, COLOURS)], "beauty is read, not diffuse"),
-        ("blender", [("", np.dstack([other, LINEAR]), tuple(in_layers))], "V.Combined is read, not V.AO"),
-        ("nuke", [("", LINEAR, ("fill.red", "fill.green", "fill.blue"))], "fill is read"),
-        ("plain", [("rgba", LINEAR, COLOURS), ("albedo", other, COLOURS)], ""),
+    for name, parts, layers in [
+        ("depth_first", [("depth", depth, ("Z",)), ("rgba", LINEAR, COLOURS)], ["rgba", "depth"]),
+        ("albedo_first", [("albedo", other, COLOURS), ("main", LINEAR, COLOURS)], ["main", "albedo"]),
+        ("beauty", [("diffuse", other, COLOURS), ("beauty", LINEAR, COLOURS)], ["beauty", "diffuse"]),
+        ("blender", [("", np.dstack([other, LINEAR]), tuple(in_layers))], ["V.Combined", "V.AO"]),
+        ("nuke", [("", LINEAR, ("fill.red", "fill.green", "fill.blue"))], ["fill"]),
+        ("plain", [("rgba", LINEAR, COLOURS), ("albedo", other, COLOURS)], []),
     ]:
         caplog.clear()
         path = write_parts(tmp_path / f"{name}.exr", parts, "float", oiio__ColorSpace="lin_rec709_scene")
         np.testing.assert_array_equal(read_image(path).pixels, LINEAR, err_msg=name)
         lines = [record.getMessage() for record in caplog.records]
-        assert lines == ([f"{path}: the layer {said}"] if said else [])
+        assert len(lines) == bool(layers) and all(layer in line for line in lines for layer in layers)
     assert read_header(path).width_px == W
 
 
@@ -199,12 +199,11 @@ def test_exif_of_dcf_says_adobe_rgb(tmp_path: Path, suffix: str) -> None:
 
 
 def test_codes_of_bt2020(tmp_path: Path) -> None:
-    stored = bt2020_of(LINEAR)
-    for full_range in (1, 0):
-        levels = stored * 255 if full_range else 16 + 219 * stored
-        chunk = (b"cICP", bytes([9, 14, 0, full_range]))
-        path = write_png(tmp_path / "a.png", np.round(levels).astype(np.uint8), chunk)
-        np.testing.assert_allclose(levels_of(path), QUADS, atol=4)
+    levels = np.round(255 * bt2020_of(LINEAR)).astype(np.uint8)
+    path = write_png(tmp_path / "a.png", levels, (b"cICP", bytes([9, 14, 0, 1])))
+    np.testing.assert_allclose(levels_of(path), QUADS, atol=4)
+    narrow = write_png(tmp_path / "b.png", levels, (b"cICP", bytes([9, 14, 0, 0])))
+    refused(InputError, "b.png: narrow-range ... convert it to full range", read_image, narrow)
 
 
 def test_primaries_and_gamma_of_a_png(tmp_path: Path) -> None:
@@ -234,4 +233,4 @@ def test_inks_with_a_profile(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(linear[:, W // 2 + 1 :], ((50 + 16) / 116) ** 3, atol=0.006)
     for profile in (None, b"broken" * 50):
         Image.fromarray(inks, "CMYK").save(path, icc_profile=profile, **more)
-        refused(InputError, "inks (CMYK) without a profile ... convert the image to RGB", read_image, path)
+        refused(InputError, "CMYK without a valid profile ... convert it to RGB", read_image, path)

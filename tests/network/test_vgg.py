@@ -104,5 +104,5 @@ def test_offline_names_the_option(tmp_path: Path, monkeypatch: Patch) -> None:
     nowhere = PublishedFile("http://127.0.0.1:9/vgg16-397923af.pth", VGG16.sha256, VGG16.size_limit)
     monkeypatch.setattr(feature_networks, "VGG16", nowhere)
     monkeypatch.setattr("facerf_cli.files.downloads.cache_folder", lambda: tmp_path)
-    with pytest.raises(FacerfError, match=r"cannot be fetched .*, or give --vgg-weights PATH$"):
+    with pytest.raises(FacerfError, match=r"cannot be fetched .*, or use --vgg-weights PATH$"):
         load_vgg("imagenet")

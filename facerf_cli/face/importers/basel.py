@@ -19,7 +19,7 @@ import numpy as np
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.face.importers.source import SourceModel, numbers, refusal
-from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.sandbox import read_in_subprocess
 from facerf_cli.files.texts import parse_json, require_regular
 
 _LICENCE = "Basel Face Model {year}, (c) University of Basel; non-commercial use, by its licence agreement"
@@ -49,7 +49,7 @@ def read_basel(path: Path) -> SourceModel:
     if year != "2009" and importlib.util.find_spec("h5py") is None:
         raise FacerfError("Basel Face Model: h5py is missing; run pip install 'facerf[face-models]'")
     with refusal(path, f"a Basel Face Model {year}"):
-        raw = arrays_apart(arrays_2009 if year == "2009" else arrays_2017, path)
+        raw = read_in_subprocess(arrays_2009 if year == "2009" else arrays_2017, path)
         mean, identity = _linear_model(raw, "shape")
         names: tuple[str, ...] = ()
         known: dict[int, np.ndarray] = {}

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from facerf_cli.face.importers.source import SourceModel, numbers, refusal
 from facerf_cli.face.morphable import read_npz
-from facerf_cli.files.apart import arrays_apart
 from facerf_cli.files.inert_pickle import pickled_arrays
+from facerf_cli.files.sandbox import read_in_subprocess
 from facerf_cli.files.texts import require_regular
 
 IDENTITIES = 300  # number of identity shapes, which precede the expressions
@@ -66,7 +66,7 @@ def read_flame(path: Path, landmarks: Path | None = None) -> SourceModel:
 
 
 def _table(path: Path) -> dict[str, np.ndarray]:
-    return read_npz(path) if path.suffix == ".npz" else arrays_apart(pickled_arrays, path)
+    return read_npz(path) if path.suffix == ".npz" else read_in_subprocess(pickled_arrays, path)
 
 
 def _jaw_shapes(mean: np.ndarray, raw: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

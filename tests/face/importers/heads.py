@@ -73,7 +73,7 @@ def off_mm(model: MorphableModel, head: Head) -> np.ndarray:
 
 
 def arrays_here(reader: Callable[[Path], dict[str, np.ndarray]], path: Path) -> dict[str, np.ndarray]:
-    """`arrays_apart` without its process."""
+    """`read_in_subprocess` without its process."""
     try:
         return reader(path)
     except Exception as error:

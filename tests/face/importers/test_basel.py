@@ -36,7 +36,7 @@ def face() -> Head:
 @pytest.fixture
 def here(monkeypatch: Patch) -> None:
     """Read in this process: starting another takes a second."""
-    monkeypatch.setattr(basel, "arrays_apart", arrays_here)
+    monkeypatch.setattr(basel, "read_in_subprocess", arrays_here)
 
 
 def orthonormal(shapes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +151,7 @@ def test_the_published_mesh_of_2009_has_its_landmarks(monkeypatch: Patch, tmp_pa
     mean_mm, cells = 1e3 * np.arange(53490 * 3, dtype=np.float64), np.array([[0], [1], [2]])
     model = mean_mm, np.eye(len(mean_mm), 1), np.ones(1)
     arrays = {f"shape/model/{name}": array for name, array in zip(basel._MODEL, model, strict=True)}
-    monkeypatch.setattr(basel, "arrays_apart", lambda *_: {**arrays, "shape/representer/cells": cells})
+    monkeypatch.setattr(basel, "read_in_subprocess", lambda *_: {**arrays, "shape/representer/cells": cells})
     (tmp_path / "a.mat").touch()
     known = read_basel(tmp_path / "a.mat").known
     assert len(known) == 18 and set(known) <= set(range(17, 68))

@@ -83,7 +83,7 @@ def source(pkl: Path) -> SourceModel:
 @pytest.fixture
 def here(source: SourceModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Read in this process: starting another takes a second."""
-    monkeypatch.setattr(flame, "arrays_apart", arrays_here)
+    monkeypatch.setattr(flame, "read_in_subprocess", arrays_here)
 
 
 def embedding(face: Head, first: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -229,7 +229,7 @@ BROKEN: dict[str, tuple[Callable[[Head], Any], str]] = {
     "not finite": (lambda face: changed(face, v_template=face.mean * np.nan), "non-finite"),
     "triangles beyond": (lambda face: changed(face, f=np.array([[0, 1, 9999]])), "does not have"),
     "another skeleton": (lambda face: changed(face, weights=np.zeros((5023, 9))), "shape [5023, 9]"),
-    "a list": (lambda face: [1, 2], "holds a list"),
+    "a list": (lambda face: [1, 2], "a list"),
     "a hostile file": (lambda face: changed(face, f=Calls()), "names posix.system, which is not part"),
     "millimetres": (lambda face: changed(face, v_template=face.mean * 1000), "published unit"),
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from facerf_cli.files.apart import arrays_apart
+from facerf_cli.files.sandbox import read_in_subprocess
 
 
 def numbers(path: Path) -> dict[str, np.ndarray]:
@@ -44,7 +44,7 @@ def pickled(path: Path) -> dict[str, np.ndarray]:
 
 def test_arrays_come_back_by_name(tmp_path: Path) -> None:
     path = tmp_path / os.fsdecode(b"a \xff b")
-    arrays = arrays_apart(numbers, path)
+    arrays = read_in_subprocess(numbers, path)
     assert arrays["a/b"].tolist() == [0, 1, 2] and bytes(arrays["name"]) == os.fsencode(path)
 
 
@@ -61,5 +61,5 @@ def test_arrays_come_back_by_name(tmp_path: Path) -> None:
 )
 def test_what_goes_wrong_there_is_an_error_here(reader: str, says: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=says) as raised:
-        arrays_apart(globals()[reader], tmp_path, time_s=2 if reader == "endless" else 60)
+        read_in_subprocess(globals()[reader], tmp_path, time_s=2 if reader == "endless" else 60)
     assert str(raised.value).isprintable()
