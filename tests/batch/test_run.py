@@ -15,8 +15,8 @@ import pytest
 from facerf_cli.batch import journal
 from facerf_cli.batch.inputs import Item, _ignores_case, collect_items
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of, require_same
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items
-from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
+from facerf_cli.batch.run import Outcome, run_items
+from facerf_cli.batch.settings import NOT_IN_RECIPE, BatchOptions, Settings, Shard
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256
@@ -44,7 +44,7 @@ def test_nothing_to_work_on_and_an_output_folder_that_cannot_be(tmp_path: Path, 
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "out"):
-        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; give another"):
+        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; use another"):
             run([photos], folder)
 
 
@@ -184,7 +184,7 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
     assert run([two], tmp_path / "out") == 0
     said = capsys.readouterr()
     assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
-    assert "1 to make again: input changed" in said.err
+    assert "1 item out of date: input changed" in said.err
     assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
     run([two], tmp_path / "out")
     two.rename(tmp_path / "moved")
@@ -214,9 +214,9 @@ def test_other_options_make_all_again(two: Path, tmp_path: Path, capsys: Said) -
     assert [Path(line).name for line in said.out.splitlines()] == ["a_copy.bin"]
     assert "1 of 2 results are finished" in said.err and "1 result would be made" in said.err
     run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
-    assert "2 to make again: options changed" in capsys.readouterr().err
+    assert "2 items out of date: options changed" in capsys.readouterr().err
     run([two], tmp_path / "out", recipe={"lights": 300})
-    assert "2 to make again: options changed" in capsys.readouterr().err
+    assert "2 items out of date: options changed" in capsys.readouterr().err
 
 
 def test_results_of_a_relative_folder_are_recognised(two: Path, monkeypatch: Patch, capsys: Said) -> None:
@@ -246,7 +246,7 @@ def test_outputs_that_the_user_changed_are_kept_and_empty_ones_made_again(
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
     (out / "a_copy.bin").write_bytes(b"")
     run([two], out)
-    assert "1 to make again: missing or empty" in capsys.readouterr().err
+    assert "1 item out of date: missing or empty" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("edited", [True, False])
@@ -453,11 +453,11 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
     assert call() == 0
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
-    assert "make again" not in said.err
+    assert "out of date" not in said.err
     assert (out / "a_a.bin").read_bytes() == b"retouched"
     (out / "b_a.bin").unlink()
     assert call() == 0
-    assert "1 to make again: missing or empty" in capsys.readouterr().err
+    assert "1 item out of date: missing or empty" in capsys.readouterr().err
 
 
 def test_a_finished_folder_is_read_without_writing_or_reading_much(

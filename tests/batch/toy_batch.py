@@ -11,8 +11,8 @@ from pathlib import Path
 
 from facerf_cli.batch.inputs import Item, collect_items
 from facerf_cli.batch.recipe import DigestOf, Recipe
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
-from facerf_cli.batch.settings import Settings, Shard
+from facerf_cli.batch.run import Job, Outcome, run_items
+from facerf_cli.batch.settings import BatchOptions, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging

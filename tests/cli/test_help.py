@@ -12,7 +12,7 @@ import typer.main
 
 from facerf_cli.cli import manual
 from facerf_cli.cli.examples import examples_of
-from facerf_cli.main import FLAGS, VALUED, app, main
+from facerf_cli.main import app, main
 from tests.kinds import Patch, Said
 
 # Options whose value is a small language, which their help explains.
@@ -151,11 +151,11 @@ def test_each_verb_has_one_or_two_examples_of_options_that_it_has(path: tuple[st
         command = command.commands[name]
     if hasattr(command, "commands"):
         return
-    known = {name for option in command.params for name in (*option.opts, *option.secondary_opts)}
+    known = {name for option in (*command.params, *ROOT.params) for name in option.opts}
     lines = examples_of(" ".join(path))
     assert len(lines) in (1, 2) and command.epilog.endswith(f"  {lines[-1]}")
     for line in lines:
         words = shlex.split(line)[1 + len(path) :]
-        assert not {word for word in words if word[0] == "-"} - known - FLAGS - VALUED
+        assert not {word for word in words if word[0] == "-"} - known
     page = manual.pages()[f"facerf-{'-'.join(path)}.1"]
     assert ".SH EXAMPLES" in page and ".SH EXIT STATUS" in page
