@@ -156,7 +156,7 @@ def _print_version(wanted: bool) -> None:
 def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     """Take defaults from a configuration file, also for options in front of `--config`."""
     root = context.find_root()
-    if path is None or path == root.params.get("config"):  # FACERF_CONFIG was read before
+    if path is None or path == root.params.get("config_file"):  # FACERF_CONFIG was read before
         return path
     root.default_map = read_config(path, root.command)
     if context is not root:
@@ -204,9 +204,10 @@ def _defaults(table: Mapping[str, Any], command: Any, where: str, typed: str) ->
 def _global_options(
     context: typer.Context,
     settings: Settings,
-    config: Annotated[
+    config_file: Annotated[
         Path | None,
         typer.Option(
+            "--config",
             envvar="FACERF_CONFIG",
             callback=_take_defaults,
             is_eager=True,

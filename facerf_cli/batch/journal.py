@@ -129,7 +129,7 @@ class Journal:
             return {path: "" for path in outputs if not is_occupied(path)}
         stale = {}
         for path, key in _with_keys(outputs, keys):
-            reason = self._why_stale(item, path, key)
+            reason = self.why(item, path, key)
             if reason is None:
                 continue
             if refusal := self.refusal(path):
@@ -137,7 +137,7 @@ class Journal:
             stale[path] = reason
         return stale
 
-    def _why_stale(self, item: Item, path: Path, recipe: str) -> str | None:
+    def why(self, item: Item, path: Path, recipe: str) -> str | None:
         """Return why a result must be made: '' if it was never made, None if it is finished."""
         row = self._outputs.get(self._name(path))
         if not (path.is_dir() or regular_size(path)):

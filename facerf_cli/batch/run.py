@@ -10,7 +10,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -261,7 +261,7 @@ def _results(
     owner: Owner | None,
     options: BatchOptions,
     settings: Settings,
-) -> Iterator[ItemResult]:
+) -> Generator[ItemResult]:
     """Process items by workers, with a progress bar; yield their results."""
     items_per_process = job.items_a_process * options.in_a_row
     workers = options.workers(settings, default_job_count(len(todo), items_per_process, settings))

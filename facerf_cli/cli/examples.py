@@ -50,5 +50,5 @@ def examples_of(command: str) -> list[str]:
 
 
 def epilog_of(command: str, notes: str) -> str:
-    """Return the end of a command's help: notes, and its examples; \\b keeps their lines apart."""
+    """Return the end of a command's help: notes, and its examples, whose lines stay apart."""
     return "\n".join([notes, "", "\b", "EXAMPLES", *(f"  {line}" for line in examples_of(command))])

@@ -29,7 +29,7 @@ def settings_of(context: typer.Context) -> Settings:
     return settings
 
 
-def was_given(context: typer.Context, name: str) -> bool:
+def was_given(context: Any, name: str) -> bool:
     """Tell whether the command line contains an option, even with its default value."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"

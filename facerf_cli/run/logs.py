@@ -82,8 +82,8 @@ def json_line(row: Mapping[str, Any]) -> str:
     text = json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
     if text.isprintable():
         return text
-    escapes = {letter: json.dumps(letter)[1:-1] for letter in set(text) if not letter.isprintable()}
-    return text.translate(str.maketrans(escapes | {"\x7f": "\\u007f"}))
+    escapes = {ord(letter): json.dumps(letter)[1:-1] for letter in set(text) if not letter.isprintable()}
+    return text.translate(escapes | {0x7F: "\\u007f"})
 
 
 def _plain(value: Any) -> Any:

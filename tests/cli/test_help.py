@@ -111,6 +111,7 @@ def test_help_all_and_the_man_page_have_every_option(
     command: Any = ROOT
     for name in path:
         command = command.commands[name]
+    assert path == () or not {option.name for option in command.params} & {one.name for one in ROOT.params}
     for option in command.params:
         if option.param_type_name == "option":
             assert option.opts[0] in full and manual._text(option.opts[0]) in page
