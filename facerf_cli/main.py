@@ -270,7 +270,7 @@ def _prepare_streams() -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command line and return its exit code; an error becomes one line on stderr."""
-    configure_logging()
+    configure_logging(as_json="--log-json" in arguments)
     try:
         _check_surroundings()
         spelt = [_AMERICAN.sub(r"\1colourspace", argument) for argument in arguments]

@@ -11,7 +11,6 @@ import os
 import re
 import shutil
 import sys
-import tempfile
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -386,6 +385,8 @@ def _from_stdin(null_separated: bool) -> list[str]:
 
     The first bytes decide. Raises UsageError for other data, such as a video.
     """
+    import tempfile  # --help does without it
+
     stream = sys.stdin.buffer
     content = stream.read(LIMIT_BYTES + 1)
     for suffix, start in _STARTS.items():
