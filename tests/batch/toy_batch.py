@@ -82,10 +82,15 @@ def run(
     **options: object,
 ) -> int:
     """Copy photos to OUTPUT; notes go to the folder above."""
+    job = Copy(output.parent, recipe or {})
+    return run_job(job, inputs, output, shard=shard or Shard(), ray=ray, **options)
+
+
+def run_job(job: Job, inputs: Path | list[Path], output: Path, **options: object) -> int:
+    """Run a job on photos."""
     configure_logging()
-    batch = BatchOptions(output, shard=shard or Shard(), ray=ray, **options)  # type: ignore[arg-type]
     items = collect_items([str(path) for path in ([inputs] if isinstance(inputs, Path) else inputs)], output)
-    return run_items(Copy(output.parent, recipe or {}), items, batch, Settings())
+    return run_items(job, items, BatchOptions(output, **options), Settings())  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":
