@@ -36,7 +36,8 @@ MAN = Path(__file__).parents[2] / "man"
 def test_the_order_is_that_of_a_day(capsys: Said, monkeypatch: Patch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     assert main(["--help"]) == 0
-    lines = [line.strip("│╭─╮ ") for line in capsys.readouterr().out.splitlines()]
+    boxed = (line for line in capsys.readouterr().out.splitlines() if line.startswith(("│", "╭")))
+    lines = [line.strip("│╭─╮ ") for line in boxed]
     first = [line.split()[0] for line in lines if line]
     order = ["Relight", "relight", "Take", "estimate-light", "predict-olat", "segment", "fit-geometry"]
     order += ["Make", "envmap", "Train", "synth-stage", "prepare-dataset"]
