@@ -224,7 +224,6 @@ class Journal:
         self._append([self._output_row(file_row(path), "")])
 
     def _output_row(self, written: Row, key: str) -> Row:
-        """Return the row of a finished output, from the row of its file."""
         name = self._name(Path(written["file"]))
         return {"output": name, "verb": self._verb, "sha256": written["sha256"], "key": key}
 
@@ -380,7 +379,6 @@ def _carries(path: Path, key: str) -> bool:
 
 
 def _in_cache(file: Path) -> Path:
-    """Return the path of the journal of the single file that `-o` names."""
     from facerf_cli.files.downloads import cache_folder  # --help does without it
 
     name = hashlib.sha256(os.fsencode(os.path.abspath(file))).hexdigest()[:16]

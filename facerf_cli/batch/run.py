@@ -170,7 +170,6 @@ def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: 
 
 
 def _unusable(folder: Path, error: BaseException) -> UsageError:
-    """Return the error of an output folder that cannot be written to."""
     reason = error.strerror if isinstance(error, OSError) else error
     if folder.is_symlink() and not folder.exists():
         reason = "a link that leads nowhere"
@@ -222,7 +221,6 @@ def _make(job: Job, plan: Plan, journal: Journal, options: BatchOptions, setting
             keep_newer(kept, files_read((item, job), [item]))
 
     def done(result: ItemResult) -> int:
-        """Note and print the result of an item; return 1 for a failure."""
         outputs = job.outputs_of(result.item) if result.made else ()  # may depend on what was made
         journal.add(result.item, result.row(job.verb, options.output), result.made, outputs, plan.keys)
         return _print_result(result, options)
@@ -354,7 +352,6 @@ def _rows_of(job: Job, plan: Plan, journal: Journal) -> Iterator[Row]:
 
 
 def _log_plan(plan: Plan) -> None:
-    """Log how many results are finished, and why others are out of date."""
     stale = sum(map(len, plan.stale.values()))
     if kept := sum(len(plan.outputs[item]) for item in plan.stale) - stale:
         log.info("%d of %d results are finished and kept", kept, kept + stale)

@@ -119,8 +119,8 @@ SLOW_VERB = """
 import sys, time
 from pathlib import Path
 from facerf_cli.batch.inputs import collect_items
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.run import Job, Outcome, run_items
+from facerf_cli.batch.settings import BatchOptions, Settings
 from facerf_cli.files.atomic import atomic_path
 
 class Slow(Job):
