@@ -156,8 +156,8 @@ def _print_version(wanted: bool) -> None:
 def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
     """Take defaults from a configuration file, also for options in front of `--config`."""
     root = context.find_root()
-    if path is None or path == root.params.get("config_file"):  # FACERF_CONFIG was read before
-        return path
+    if path is None:
+        return None
     root.default_map = read_config(path, root.command)
     if context is not root:
         assert context.parent is not None and context.info_name is not None

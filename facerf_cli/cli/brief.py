@@ -62,7 +62,7 @@ class _Brief(Any if TYPE_CHECKING else object):  # type: ignore[misc]
 
 def _hidden(option: Any) -> Any:
     hidden = copy(option)
-    hidden.hidden = True
+    hidden.hidden, hidden.envvar = True, None  # which the root has read
     return hidden
 
 
