@@ -19,6 +19,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.cli.brief import Verb
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
+from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Patch, Said
 
 ROOT = Path(main.__file__).parents[1]
@@ -78,7 +79,11 @@ def test_the_traceback_is_there_for_who_asks_and_logs_may_be_json(run_line: RunL
     ["--seed", "7", "probe", "-q", "--device=cpu", "--checkpoint=a.st"],
     ["--seed", "1", "--device", "auto", "probe", "--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q"],
 ])  # fmt: skip
-def test_global_options_stand_anywhere(run_line: RunLine, line: list[str]) -> None:
+def test_global_options_stand_anywhere(
+    run_line: RunLine, line: list[str], tmp_path: Path, monkeypatch: Patch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_toy_checkpoint(Path("a.st"))
     assert run_line(*line) == 0
     assert seen[-1] == Settings(quiet=True, device="cpu", checkpoints=(Path("a.st"),), seed=7)
 
