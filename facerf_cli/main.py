@@ -26,8 +26,6 @@ from facerf_cli.cli.brief import Verb, Verbs
 from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.texts import read_toml
-from facerf_cli.network.files import checkpoint_file, read_metadata
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals, leave
@@ -173,6 +171,8 @@ def read_config(path: Path, group: Any) -> dict[str, Any]:
 
     Raises UsageError for a file that is not TOML, and for a command or an option that does not exist.
     """
+    from facerf_cli.files.texts import read_toml  # --help does without it
+
     try:
         tables = read_toml(path, "correct it")
     except InputError as error:
@@ -229,12 +229,13 @@ def _global_options(
     if settings.verbose and settings.quiet:
         raise UsageError("-v and -q: contradict each other; remove one")
     configure_logging(settings.verbosity, settings.log_json)
-    files, by_default = (
-        tuple(map(checkpoint_file, settings.checkpoints)),
-        not was_given(context, "checkpoints"),
-    )
-    for file in () if by_default or context.invoked_subcommand == "doctor" else files:
-        read_metadata(file)  # doctor itself reports what is wrong with it
+    files, by_default = settings.checkpoints, not was_given(context, "checkpoints")
+    if files:
+        from facerf_cli.network.files import checkpoint_file, read_metadata  # --help does without it
+
+        files = tuple(map(checkpoint_file, files))
+        for file in () if by_default or context.invoked_subcommand == "doctor" else files:
+            read_metadata(file)  # doctor itself reports what is wrong with it
     context.obj = replace(settings, checkpoints=files, checkpoints_by_default=by_default)
     memory.set_limit(context.obj.job_bytes(1))
 

@@ -22,7 +22,6 @@ from string import Formatter
 from typing import Any
 
 from facerf_cli.errors import InputError, UsageError
-from facerf_cli.files.texts import LIMIT_BYTES
 from facerf_cli.option import flag
 from facerf_cli.run.logs import LOGGER_NAME, printable_line
 from facerf_cli.run.stopping import clean_by
@@ -50,6 +49,7 @@ _MOST_NAMED = 8  # suffixes or folders in a log line
 _LONGEST_PATH = 4096  # characters
 _START_BYTES, _QUOTED_BYTES = 4096, 40  # of standard input: searched for an image, and quoted in a message
 _LEAST_EXISTING = 0.1  # fraction of a list's names; other data may contain the folders . and /
+_MOST_LIST_BYTES = 64 << 20  # on standard input
 _MOST_IMAGE_BYTES = 1 << 30  # on standard input: the most pixels that are read, of four floats
 _STARTS = {  # the first bytes of images, by suffix
     ".exr": rb"\x76\x2f\x31\x01",
@@ -388,7 +388,7 @@ def _from_stdin(null_separated: bool) -> list[str]:
     import tempfile  # --help does without it
 
     stream = sys.stdin.buffer
-    content = stream.read(LIMIT_BYTES + 1)
+    content = stream.read(_MOST_LIST_BYTES + 1)
     for suffix, start in _STARTS.items():
         if re.match(start, content[:_START_BYTES], re.DOTALL):
             folder = tempfile.mkdtemp(prefix="facerf-stdin-")
@@ -402,10 +402,10 @@ def _from_stdin(null_separated: bool) -> list[str]:
                     file.write(content)
                     if file.tell() > _MOST_IMAGE_BYTES:
                         raise UsageError("-: an image of more than 1 GiB; pass the file by its name")
-                    content = stream.read(LIMIT_BYTES)
+                    content = stream.read(_MOST_LIST_BYTES)
             return [str(path)]
     is_utf16 = re.match(rb"\xff\xfe.\0|\xfe\xff\0.", content, re.DOTALL)
-    is_text = len(content) <= LIMIT_BYTES and not is_utf16 and (null_separated or b"\0" not in content)
+    is_text = len(content) <= _MOST_LIST_BYTES and not is_utf16 and (null_separated or b"\0" not in content)
     text = os.fsdecode(content).removeprefix("\ufeff") if is_text else "\0"
     names = text.split("\0") if null_separated else [line.rstrip("\r") for line in text.split("\n")]
     names = list(filter(None, names))

@@ -1,6 +1,5 @@
 """Log lines, JSON rows, and the provenance of outputs."""
 
-import json
 import logging
 import math
 import re
@@ -79,6 +78,8 @@ def json_line(row: Mapping[str, Any]) -> str:
     Characters that are not printable, and bytes of file names that are not UTF-8, are escaped: a terminal
     would obey some, and other programs would take some for the end of the line.
     """
+    import json  # --help does without it
+
     text = json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
     if text.isprintable():
         return text

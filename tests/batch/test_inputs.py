@@ -188,7 +188,7 @@ def test_what_is_neither_an_image_nor_a_list_costs_a_line(
 
 
 def test_what_stdin_may_hold_is_bounded(monkeypatch: Patch) -> None:
-    monkeypatch.setattr(inputs_module, "LIMIT_BYTES", 5000)
+    monkeypatch.setattr(inputs_module, "_MOST_LIST_BYTES", 5000)
     monkeypatch.setattr(inputs_module, "_MOST_IMAGE_BYTES", 12000)
     for content, said in ((b"\x89PNG" + bytes(20000), "more than 1 GiB"), (b"x" * 5001, "neither")):
         pipe(monkeypatch, content)
