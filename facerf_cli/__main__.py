@@ -1,4 +1,4 @@
-"""`python -m facerf_cli` is the same as `facerf`."""
+"""Run `facerf`, as `python -m facerf_cli`."""
 
 from facerf_cli.main import run
 

@@ -1,19 +1,19 @@
-"""The command line: verbs, global options, errors to exit codes.
+"""The command line: commands, global options, errors to exit codes.
 
-A verb is a function in `facerf_cli/cli/`, in the file of its name, and listed with its panel in `_LINES`; its
-file is imported when the verb runs, or its help is shown. To keep help fast, the modules directly
-in `cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a verb is behind a deferred
-import. A test checks it.
+A command is a function in `facerf_cli/cli/`, in the file of its name, and listed with its panel in `_LINES`;
+its file is imported when the command runs, or its help is shown. To keep help fast, the modules directly in
+`cli/` import nothing heavy (torch, numpy, OpenImageIO, scipy): the work of a command is behind a deferred
+import. A test checks this.
 """
 
 import io
 import logging
-import math
 import os
 import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,21 +21,19 @@ from typing import Annotated, Any
 import typer
 
 from facerf_cli._version import __version__
-from facerf_cli.batch.settings import Settings, device_name, torch_device
+from facerf_cli.batch.settings import Settings, torch_device
 from facerf_cli.cli.brief import Verb, Verbs
 from facerf_cli.cli.examples import epilog_of, examples_of
 from facerf_cli.cli.options import EPILOG, unwrapped, was_given, with_groups
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.files.texts import read_toml
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging, unexpected
 from facerf_cli.run.stopping import end_again, end_on_signals, leave
-from facerf_cli.work.photo_options import FITTING, NETWORKS, networks_of
 
-# The help's panels, which say what one wants to do, and a line for each verb, in the order of a user's day.
+# Panels of the help, one per purpose, and a line for each command, in the order of a user's day.
 _LINES = {
     "Relight photos": {
-        "demo": "Relight a photo that facerf brings along.",
+        "demo": "Relight a photo that facerf contains.",
         "relight": "Relight photos by environment maps and single lights.",
         "view": "Make a web page to relight a photo by dragging lights.",
     },
@@ -62,26 +60,7 @@ _LINES = {
 }
 VERBS = {verb: panel for panel, verbs in _LINES.items() for verb in verbs}
 
-# The networks that verbs use; with some options they use fewer.
-_GEOMETRY = frozenset({"geometry"})  # of --geometry network
-_ALL = networks_of(NETWORKS) | {"light_features"} | _GEOMETRY
-USES: dict[str, frozenset[str]] = {
-    "demo": _ALL,
-    "relight": _ALL,
-    "view": networks_of(["portrait"]) | _GEOMETRY,
-    "estimate-light": _ALL - {"portrait"},
-    "predict-olat": networks_of(["portrait"]) | _GEOMETRY,
-    "segment": frozenset({"parsing"}),
-    "fit-geometry": FITTING | _GEOMETRY,
-    "evaluate": _ALL,
-    "prepare-dataset": frozenset({"parsing"}),  # which finds faces
-    "train": frozenset({"parsing"}),
-}
-
-# Global options, which are moved before the verb wherever they stand.
-FLAGS = frozenset({"-v", "--verbose", "-q", "--quiet", "--log-json", "--version", "-0", "--null"})
-VALUED = frozenset({"--device", "--checkpoint", "--memory", "--seed", "--config"})
-# Options that take every following file of these kinds, so that a shell may expand a pattern there.
+# Options that take every following file with these suffixes, so that a shell may expand a pattern there.
 SEVERAL = {"--envmap": (".exr", ".hdr")}
 
 # Options of earlier versions, and what replaces them.
@@ -92,18 +71,15 @@ _REMOVED = {
     "--matte-from": "write mattes with `rembg p photos mattes`, and pass --person mattes",
     "--photo": "relight the photo itself, without its stack",
 }
-_SPINS = (
-    "20000"  # turns of a waiting thread of torch's before it sleeps; with more, other programs wait for it
-)
+_SPINS = "20000"  # OpenMP spin count: idle threads sleep sooner and leave the cores to other programs
 _AMERICAN = re.compile(r"^(--(?:in|out)put-)colorspace(?=$|=)")
 _LONGEST_PATH = 4096  # bytes, of Linux
-_MOST_SEED = 2**63 - 1  # torch's
 _PATIENCE_S = 2.0  # for a run to unwind after SIGTERM
 log = logging.getLogger(LOGGER_NAME)
 
 
 class _Commands(Mapping[str, Any]):
-    """The commands of all verbs, by name; each is made when it is asked for."""
+    """All commands by name; each is made when it is first used."""
 
     def __init__(self, more: Mapping[str, Any]) -> None:
         self._made = dict(more)
@@ -121,20 +97,20 @@ class _Commands(Mapping[str, Any]):
 
 
 def _command(name: str) -> Any:
-    """The command of a verb; the file of a verb with subcommands has an app."""
+    """Make a command; the file of a command with subcommands has an app."""
     file = import_module(f"facerf_cli.cli.{name.replace('-', '_')}")
-    verbs = getattr(file, "app", None)
-    if verbs is None:
-        verbs = typer.Typer(add_completion=False)
-        verbs.command(name)(with_groups(getattr(file, name.replace("-", "_"))))
-    for one in verbs.registered_commands:
-        assert one.callback is not None
-        own = one.name or one.callback.__name__.replace("_", "-")
-        one.cls, one.help = Verb, unwrapped(one.callback.__doc__ or "")
-        one.epilog = epilog_of(own if own == name else f"{name} {own}", EPILOG)
-    found = typer.main.get_command(verbs)
-    found.name, found.rich_help_panel = name, VERBS[name]  # type: ignore[attr-defined]
-    return found
+    commands = getattr(file, "app", None)
+    if commands is None:
+        commands = typer.Typer(add_completion=False)
+        commands.command(name)(with_groups(getattr(file, name.replace("-", "_"))))
+    for entry in commands.registered_commands:
+        assert entry.callback is not None
+        own = entry.name or entry.callback.__name__.replace("_", "-")
+        entry.cls, entry.help = Verb, unwrapped(entry.callback.__doc__ or "")
+        entry.epilog = epilog_of(own if own == name else f"{name} {own}", EPILOG)
+    command = typer.main.get_command(commands)
+    command.name, command.rich_help_panel = name, VERBS[name]  # type: ignore[attr-defined]
+    return command
 
 
 class _Verbs(Verbs):
@@ -143,7 +119,7 @@ class _Verbs(Verbs):
         self.commands = _Commands(self.commands)  # type: ignore[assignment]
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Print the help with a line for each verb, without importing its file."""
+        """Print the help with a line for each command, without importing its file."""
         commands, make = self.commands, typer.core.TyperCommand
         self.commands = {
             name: make(name, help=line, rich_help_panel=panel)
@@ -157,7 +133,7 @@ class _Verbs(Verbs):
 app = typer.Typer(
     cls=_Verbs,
     name="facerf",
-    help="One photo of a face in; the face under any light, from any direction, out.",
+    help="Relight the people in a photo, under any light from any direction.",
     pretty_exceptions_enable=False,
 )
 
@@ -176,16 +152,27 @@ def _print_version(wanted: bool) -> None:
 
 
 def _take_defaults(context: typer.Context, path: Path | None) -> Path | None:
-    if path is not None:
-        context.default_map = read_config(path, context.command)
+    """Take defaults from a configuration file, also for options in front of `--config`."""
+    root = context.find_root()
+    if path is None:
+        return None
+    root.default_map = read_config(path, root.command)
+    if context is not root:
+        assert context.parent is not None and context.info_name is not None
+        context.default_map = (context.parent.default_map or {}).get(context.info_name)
+        for option in root.command.params:
+            if not option.is_eager and not was_given(root, option.name or ""):
+                option.handle_parse_result(root, {}, [])
     return path
 
 
 def read_config(path: Path, group: Any) -> dict[str, Any]:
-    """Read defaults from a TOML file, for typer: a table of options for each command, [global] for all.
+    """Read defaults from a TOML file, for typer: a table of options per command, and [global] for all.
 
     Raises UsageError for a file that is not TOML, and for a command or an option that does not exist.
     """
+    from facerf_cli.files.texts import read_toml  # --help does without it
+
     try:
         tables = read_toml(path, "correct it")
     except InputError as error:
@@ -196,11 +183,11 @@ def read_config(path: Path, group: Any) -> dict[str, Any]:
 
 
 def _defaults(table: Mapping[str, Any], command: Any, where: str, typed: str) -> dict[str, Any]:
-    """The values of a command's options by typer's names, and those of its subcommands."""
+    """Return the values of a command's options by typer's names, and those of its subcommands."""
     from facerf_cli.training.settings import KINDS  # tables of [train], which it reads itself
 
-    options = (one for one in command.params if not one.is_eager)
-    names = {word.lstrip("-"): one.name for one in options for word in one.opts}
+    options = (option for option in command.params if not option.is_eager)
+    names = {word.lstrip("-"): option.name for option in options for word in option.opts}
     names |= {name: name for name in KINDS if typed == "facerf train"}
     commands = getattr(command, "commands", {})
     values = {}
@@ -214,51 +201,18 @@ def _defaults(table: Mapping[str, Any], command: Any, where: str, typed: str) ->
     return values
 
 
-@app.callback()
 def _global_options(
     context: typer.Context,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Log more; show tracebacks of errors.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Log errors only; no progress bar.")] = False,
-    log_json: Annotated[bool, typer.Option("--log-json", help="Log to stderr as JSON lines.")] = False,
-    device: Annotated[
-        str, typer.Option(metavar="auto|cpu|cuda|cuda:N|mps", help="Compute on this device.")
-    ] = Settings.device,
-    checkpoint: Annotated[
-        list[Path],
-        typer.Option(
-            metavar="FILE|RUN",
-            help="Use the networks of a checkpoint (.safetensors), or of the best one in a run's folder. "
-            "Repeatable: each file counts for the networks that it was trained for.",
-            show_default="the shipped ones",
-        ),
-    ] = [],  # noqa: B006 (typer copies it)
-    seed: Annotated[
-        int, typer.Option(min=0, max=_MOST_SEED, help="Seed of everything that is random.")
-    ] = Settings.seed,
-    memory_gb: Annotated[
-        float | None,
-        typer.Option(
-            "--memory",
-            metavar="GB",
-            min=0.1,
-            help="Take no more memory than this for each job, over what it holds at rest; refuse what needs "
-            "more.",
-            show_default="half of all",
-        ),
-    ] = None,
-    null: Annotated[
-        bool, typer.Option("--null", "-0", help="Names on standard input end in NUL, as of find -print0.")
-    ] = Settings.null_separated,
-    config: Annotated[
+    settings: Settings,
+    config_file: Annotated[
         Path | None,
         typer.Option(
+            "--config",
             envvar="FACERF_CONFIG",
             callback=_take_defaults,
             is_eager=True,
             metavar="FILE",
-            help="Take defaults of options from this TOML file (docs/batch.md).",
+            help="TOML file with defaults of options (docs/batch.md).",
             show_default=False,
         ),
     ] = None,
@@ -272,44 +226,23 @@ def _global_options(
         ),
     ] = False,
 ) -> None:
-    if verbose and quiet:
-        raise UsageError("-v and -q: contradict each other; leave one out")
-    verbosity = int(verbose) - int(quiet)
-    configure_logging(verbosity, log_json)
-    if memory_gb is not None and not math.isfinite(memory_gb):
-        raise UsageError(f"--memory {memory_gb}: not a size; give a number of GB")
-    limit_bytes = None if memory_gb is None else int(memory_gb * 2**30)
-    context.obj = Settings(
-        verbosity,
-        log_json,
-        device_name(device),
-        _checkpoints(context, checkpoint),
-        not was_given(context, "checkpoint"),
-        seed,
-        null,
-        memory_bytes=limit_bytes,
-    )
+    if settings.verbose and settings.quiet:
+        raise UsageError("-v and -q: contradict each other; remove one")
+    configure_logging(settings.verbosity, settings.log_json)
+    files, by_default = settings.checkpoints, not was_given(context, "checkpoints")
+    if files:
+        from facerf_cli.network.files import checkpoint_file, read_metadata  # --help does without it
+
+        files = tuple(map(checkpoint_file, files))
+        for file in () if by_default or context.invoked_subcommand == "doctor" else files:
+            read_metadata(file)  # doctor itself reports what is wrong with it
+    context.obj = replace(settings, checkpoints=files, checkpoints_by_default=by_default)
     memory.set_limit(context.obj.job_bytes(1))
 
 
-_global_options.everyday = {"version"}  # type: ignore[attr-defined]  # so that verbs fill the screen
-
-
-def _checkpoints(context: typer.Context, given: Sequence[Path]) -> tuple[Path, ...]:
-    """The files of `--checkpoint`; raises UsageError for one that serves no network of the verb.
-
-    A configuration file is for all verbs, so that what it names may serve others.
-    """
-    if not given:
-        return ()
-    from facerf_cli.network.files import checkpoint_file, serving_files
-
-    files, verb = tuple(map(checkpoint_file, given)), context.invoked_subcommand or ""
-    if was_given(context, "checkpoint"):
-        if verb != "doctor":  # which shows what is wrong
-            serving_files(files, USES.get(verb, ()), f"facerf {verb}")
-        return files
-    return files if verb in USES else ()
+_global_options = with_groups(_global_options)
+_global_options.everyday = {"version"}  # type: ignore[attr-defined]  # so that commands fill the screen
+app.callback()(_global_options)
 
 
 def run() -> None:
@@ -318,21 +251,21 @@ def run() -> None:
     end_on_signals(_PATIENCE_S)
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", _SPINS)
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # small systems, which threads only wait for
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # its systems are too small for threads
     _prepare_streams()
     memory.collect_seldom()
     memory.share_freed()
     try:
         code = main(sys.argv[1:])
-    except SystemExit as stop:  # of a signal; the interpreter's own end would name what libraries hold
+    except SystemExit as stop:  # raised by a signal; the interpreter's own exit would report leaks
         code = stop.code if isinstance(stop.code, int) else 1
     leave(code)
 
 
 def _prepare_streams() -> None:
-    """Open streams that are closed; and let names come and go as the bytes that they are in any encoding."""
+    """Open streams that are closed, and pass names through unchanged in any encoding."""
     for name in ("stdin", "stdout", "stderr"):
-        if getattr(sys, name) is None:  # else the next file would take its number, and what libraries print
+        if getattr(sys, name) is None:  # else the next file would take its number
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
         if isinstance(stream := getattr(sys, name), io.TextIOWrapper):
             stream.reconfigure(encoding=sys.getfilesystemencoding(), errors="surrogateescape")
@@ -340,11 +273,11 @@ def _prepare_streams() -> None:
 
 def main(arguments: Sequence[str]) -> int:
     """Run one command line and return its exit code; an error becomes one line on stderr."""
-    configure_logging()
+    configure_logging(as_json="--log-json" in arguments)
     try:
         _check_surroundings()
         spelt = [_AMERICAN.sub(r"\1colourspace", argument) for argument in arguments]
-        line = repeat_options(global_options_first(spelt or ["--help"]))
+        line = repeat_options(spelt or ["--help"])
         try:
             code = app(args=line, prog_name="facerf", standalone_mode=False)
         finally:
@@ -379,32 +312,15 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _check_surroundings() -> None:
-    """Raise UsageError for a working folder or an environment that libraries fail on when they are loaded."""
+    """Raise UsageError for a working folder or an environment that makes libraries fail on import."""
     if len(os.fsencode(os.getcwd())) >= _LONGEST_PATH:
         raise UsageError(f"working folder: its path is longer than {_LONGEST_PATH} bytes; use another one")
     if not (epoch := os.environ.get("SOURCE_DATE_EPOCH", "0")).isdecimal():
         raise UsageError(f"SOURCE_DATE_EPOCH {epoch!r}: not a number of seconds; unset it")
 
 
-def global_options_first(arguments: Sequence[str]) -> list[str]:
-    """Move global options to the front, so that they may also stand after the verb."""
-    moved: list[str] = []
-    kept: list[str] = []
-    rest = iter(arguments)
-    for argument in rest:
-        if argument == "--":
-            kept += [argument, *rest]
-        elif argument in FLAGS or (argument.split("=")[0] in VALUED and "=" in argument):
-            moved.append(argument)
-        elif argument in VALUED:
-            moved += [argument, *([value] if (value := next(rest, None)) is not None else [])]
-        else:
-            kept.append(argument)
-    return moved + kept
-
-
 def _end_quietly() -> int:
-    """Redirect stdout, whose reader has closed it, so that Python's last flush does not fail."""
+    """Redirect stdout, which its reader has closed, so that Python's last flush does not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())  # type: ignore[union-attr]
     return 128 + signal.SIGPIPE
 
@@ -429,8 +345,8 @@ def repeat_options(arguments: Sequence[str]) -> list[str]:
 def _see_help(error: Any) -> str:
     context = getattr(error, "ctx", None)
     path = context.command_path if context else "facerf"
-    is_no_verb = path == "facerf" and "No such command" in error.format_message()
-    advice = f"a verb comes first, as in {examples_of('relight')[0]}" if is_no_verb else ""
+    is_no_command = path == "facerf" and "No such command" in error.format_message()
+    advice = f"a command comes first, as in {examples_of('relight')[0]}" if is_no_command else ""
     advice = _REMOVED.get(getattr(error, "option_name", ""), advice)
     return f"({advice}{'; ' if advice else ''}see '{path} --help')"
 

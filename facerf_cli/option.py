@@ -1,8 +1,7 @@
 """Options of the command line as fields of frozen dataclasses, in the files of the functions that take them.
 
-A field made by `option` holds its limits; the docstring's section `Attributes` has its help. `cli/options.py`
-turns the fields of the groups that a verb names into the verb's options. Nothing here knows the library of
-the command line.
+A field made by `option` has its limits; the docstring's section `Attributes` has its help. `cli/options.py`
+turns the fields of a command's groups into options. This module does not depend on typer.
 """
 
 import dataclasses
@@ -12,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-# Panels of a verb's options in its help, in this order, after others. What must be given, --output and --help
-# have none: they stand first, under Options.
+# Panels of options in the help, in this order. Required options, --output and --help have none: they come
+# first, under Options.
 LIGHT, IMAGE, FACE, METHOD, BATCH = "Light", "Image", "Face", "Method", "Batch"
 RUN, DATA, LENGTH, LOSSES, SPEED = "The run", "Data", "Length", "Losses and ablations", "Speed"
 METHODS, MEASURES = "Methods", "Measures"
@@ -22,25 +21,25 @@ PANELS = (RUN, DATA, METHODS, MEASURES, LENGTH, LOSSES, SPEED, LIGHT, IMAGE, FAC
 
 @dataclass(frozen=True)
 class Option:
-    """The command line's side of a field; the field's annotation says what values it takes."""
+    """An option of the command line; the annotation of its field defines the possible values."""
 
     help: str
     metavar: str | None = None
-    flags: tuple[str, ...] = ()  # --field-name where there are none
+    flags: tuple[str, ...] = ()  # by default --field-name
     panel: str | None = None  # of the help
-    everyday: bool = False  # in --help, as is what the verb's examples use; others are in --help-all
-    shown_default: bool | str = True  # shown in the help: the default, a text in its place, or nothing
+    everyday: bool = False  # also in --help, like the options of the examples; --help-all has all
+    shown_default: bool | str = True  # the help shows the default, this text instead, or nothing
     least: float | None = None
     most: float | None = None
-    parse: Callable[[Any], Any] | None = None  # makes the field's value of what is typed
-    typed: Any = None  # the type of what is typed, if not the field's; str | None with `parse`
-    default_text: Any = None  # with `parse`: what is typed by default
-    required: bool = False  # on the command line, though the dataclass has a default
+    parse: Callable[[Any], Any] | None = None  # converts the typed value to the field's value
+    typed: Any = None  # type of the typed value, if not the field's; str | None with `parse`
+    default_text: Any = None  # with `parse`: the typed value by default
+    required: bool = False  # on the command line, although the dataclass has a default
 
 
 @dataclass(frozen=True)
 class Only:
-    """The options of a group that a verb has: `Annotated[Group, Only("face")]`; others keep defaults."""
+    """Options of a group that a command has: `Annotated[Group, Only("face")]`; others keep defaults."""
 
     names: frozenset[str]
 
@@ -49,7 +48,7 @@ class Only:
 
 
 class Without(Only):
-    """The options of a group that a verb has not."""
+    """Options of a group that a command does not have."""
 
 
 def option(
@@ -58,11 +57,11 @@ def option(
     """Make a dataclass field that is an option.
 
     Args:
-        default: The value without the option; `...` where the option must be given.
-        help: A sentence: verb, object, unit; by default that of `Attributes` in the dataclass's docstring.
-        metavar: The placeholder of the value in the help.
+        default: Value without the option; `...` if the option is required.
+        help: Help text; by default the one of `Attributes` in the dataclass's docstring.
+        metavar: Placeholder of the value in the help.
         in_recipe: False for a field that shapes no output.
-        more: Further fields of `Option`.
+        more: Other fields of `Option`.
     """
     metadata = {"option": Option(help, metavar, **more), "in_recipe": in_recipe}
     if default is ...:
@@ -71,15 +70,15 @@ def option(
 
 
 def attributes_of(kind: type) -> dict[str, str]:
-    """The sections `Attributes` in the docstrings of a class and its bases: a line of words by name."""
-    found = {}
-    for one in reversed(kind.__mro__):
-        section = inspect.cleandoc(one.__doc__ or "").partition("\nAttributes:\n")[2]
+    """Return the text of each name in the sections `Attributes` of a class and its bases."""
+    texts = {}
+    for base in reversed(kind.__mro__):
+        section = inspect.cleandoc(base.__doc__ or "").partition("\nAttributes:\n")[2]
         for name, text in re.findall(r"^    (\w+): (.+(?:\n {8}.+)*)", section, re.MULTILINE):
-            found[name] = " ".join(text.split())
-    return found
+            texts[name] = " ".join(text.split())
+    return texts
 
 
 def flag(name: str) -> str:
-    """An option as it is typed on the command line: the name of its field, without its unit."""
+    """Return the option of a field as it is typed on the command line, without the unit of the name."""
     return f"--{name.removesuffix('_px').replace('_', '-')}"

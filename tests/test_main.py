@@ -16,11 +16,10 @@ import typer
 
 from facerf_cli import __version__, main
 from facerf_cli.batch.settings import Settings
+from facerf_cli.cli.brief import Verb
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import FacerfError, InputError, UsageError
-from facerf_cli.face.topology import LAYOUT_VERSION
-from facerf_cli.network.checkpoint import save_networks
-from facerf_cli.network.diffuse_sh import DiffuseNetwork
+from tests.cli.toy_checkpoint import save_toy_checkpoint
 from tests.kinds import Patch, Said
 
 ROOT = Path(main.__file__).parents[1]
@@ -33,11 +32,11 @@ ERRORS: dict[str, BaseException] = {
     "system": PermissionError(13, "Permission denied", "/there"),
 }
 seen: list[Settings] = []
-Verb = Callable[..., int]
+RunLine = Callable[..., int]
 
 
 @pytest.fixture
-def verb(monkeypatch: Patch) -> Iterator[Verb]:
+def run_line(monkeypatch: Patch) -> Iterator[RunLine]:
     """Runs a line with one more verb, `probe`, that notes its settings and raises what it is told."""
 
     def probe(context: typer.Context, kind: str = "", pose: str = "") -> None:
@@ -47,7 +46,7 @@ def verb(monkeypatch: Patch) -> Iterator[Verb]:
         print(pose)
 
     registered = list(main.app.registered_commands)
-    main.app.command()(probe)
+    main.app.command(cls=Verb)(probe)
     yield lambda *line: main.main(list(line))
     main.app.registered_commands[:] = registered
 
@@ -57,18 +56,20 @@ def verb(monkeypatch: Patch) -> Iterator[Verb]:
     ("bug", 1, "unexpected ZeroDivisionError: by zero (rerun with -v for the traceback)"),
     ("stop", 130, "interrupted"), ("system", 1, "/there: Permission denied"),
 ])  # fmt: skip
-def test_an_error_is_one_line_and_a_code(verb: Verb, capsys: Said, kind: str, code: int, text: str) -> None:
-    assert verb("probe", "--kind", kind) == code
+def test_an_error_is_one_line_and_a_code(
+    run_line: RunLine, capsys: Said, kind: str, code: int, text: str
+) -> None:
+    assert run_line("probe", "--kind", kind) == code
     assert capsys.readouterr() == ("", f"facerf: error: {text}\n")
 
 
-def test_the_traceback_is_there_for_who_asks_and_logs_may_be_json(verb: Verb, capsys: Said) -> None:
-    assert verb("probe", "--kind", "bug", "-v") == 1
+def test_the_traceback_is_there_for_who_asks_and_logs_may_be_json(run_line: RunLine, capsys: Said) -> None:
+    assert run_line("probe", "--kind", "bug", "-v") == 1
     assert "Traceback (most recent call last)" in capsys.readouterr().err
-    assert verb("--log-json", "probe", "--kind", "input") == 1
+    assert run_line("--log-json", "probe", "--kind", "input") == 1
     row = json.loads(capsys.readouterr().err)
     assert row["level"] == "error" and row["message"] == "a.png: is bad" and "time" in row
-    assert verb("probe", "--pose", "-20,5,0") == 0
+    assert run_line("probe", "--pose", "-20,5,0") == 0
     assert capsys.readouterr().out == "-20,5,0\n"
 
 
@@ -76,24 +77,23 @@ def test_the_traceback_is_there_for_who_asks_and_logs_may_be_json(verb: Verb, ca
     ["--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q", "probe"],
     ["probe", "--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q"],
     ["--seed", "7", "probe", "-q", "--device=cpu", "--checkpoint=a.st"],
+    ["--seed", "1", "--device", "auto", "probe", "--device", "cpu", "--seed=7", "--checkpoint", "a.st", "-q"],
 ])  # fmt: skip
 def test_global_options_stand_anywhere(
-    verb: Verb, line: list[str], tmp_path: Path, monkeypatch: Patch
+    run_line: RunLine, line: list[str], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(main.USES, "probe", frozenset({"diffuse_sh"}))
-    save_networks(Path("a.st"), {"diffuse_sh": DiffuseNetwork()}, {"layout_version": LAYOUT_VERSION})
-    assert verb(*line) == 0
-    assert seen[-1] == Settings(-1, False, "cpu", (Path("a.st"),), seed=7)
+    save_toy_checkpoint(Path("a.st"))
+    assert run_line(*line) == 0
+    assert seen[-1] == Settings(quiet=True, device="cpu", checkpoints=(Path("a.st"),), seed=7)
 
 
-def test_every_global_option_is_known_to_the_mover_and_none_is_moved_from_behind_two_dashes() -> None:
-    line = ["probe", "--seed", "1", "--", "-v", "--seed"]
-    assert main.global_options_first(line) == ["--seed", "1", "probe", "--", "-v", "--seed"]
-    command = typer.main.get_command(main.app)
-    names = {name for option in command.params for name in option.opts} - {"--help", "-h"}
-    completion = {"--install-completion", "--show-completion"}
-    assert names - completion == main.FLAGS | main.VALUED
+def test_global_options_end_at_two_dashes_and_with_the_options_of_a_command(
+    run_line: RunLine, capsys: Said
+) -> None:
+    assert run_line("probe", "--pose", "--seed") == 0 and capsys.readouterr().out == "--seed\n"
+    assert run_line("probe", "--", "--seed") == 2 and "extra argument" in capsys.readouterr().err
+    assert run_line("-v", "probe", "-q") == 2 and "-v and -q" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("package", [version("torch"), "2.13.0"])  # PyPI's CUDA build has no +cu130
@@ -245,14 +245,14 @@ def test_ctrl_c_outside_of_a_verb_is_one_line(monkeypatch: Patch, capsys: Said) 
     ({"folder": "/d" * 2048}, "working folder: its path is longer than 4096 bytes"),
 ])  # fmt: skip
 def test_what_libraries_fail_on_is_one_line(
-    verb: Verb, capsys: Said, monkeypatch: Patch, change: dict[str, str], said: str
+    run_line: RunLine, capsys: Said, monkeypatch: Patch, change: dict[str, str], said: str
 ) -> None:
     if folder := change.pop("folder", None):
         monkeypatch.setattr(main.os, "getcwd", lambda: folder)
     seed = change.pop("argument", "0")
     for name, value in change.items():
         monkeypatch.setenv(name, value)
-    assert verb("probe", "--seed", seed) == 2
+    assert run_line("probe", "--seed", seed) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
 

@@ -1,9 +1,8 @@
 """The journal of an output folder: what was made, from what, and how each item ended.
 
-`.facerf.jsonl` has JSON rows of three kinds; the last row of a thing counts. With `--shard` each process
-appends to a journal of its own (`.facerf-3-of-8.jsonl`) and reads all of them. The journal of the one file
-that `-o` names is in the user's cache, so that nothing lies beside the file, which carries its key in its
-metadata.
+`.facerf.jsonl` has JSON rows of three kinds; the last row of each thing counts. With `--shard` each process
+appends to its own journal (`.facerf-3-of-8.jsonl`) and reads all of them. With `-o FILE` the journal is in
+the user's cache, so that no other file is written beside FILE, whose metadata contains its key.
 
 - `file`: a file that was read or written: size, times, inode and SHA-256. If unchanged, it is not read again.
 - `output`: a result, by its path in the folder, with its SHA-256. It is noted before it gets its name, so
@@ -11,8 +10,8 @@ metadata.
   digests of its recipe (options, files and networks that shape it) and of its input.
 - `item`: how an item ended: its status, outputs, facts and error. `--report` writes these rows.
 
-A result is finished if its row has the key that is wanted. A file is replaced only if facerf wrote it and it
-has not changed since (`Journal.refusal`).
+A result is finished if its row has the expected key. A file is replaced only if facerf wrote it and it has
+not changed since (`Journal.refusal`).
 """
 
 import hashlib
@@ -40,7 +39,7 @@ _INPUT = 16  # digits of an input's digest in a key
 
 
 class Journal:
-    """The rows of an output folder, and what follows from them.
+    """The rows of an output folder.
 
     Attributes:
         path: The file that this process appends to.
@@ -57,40 +56,41 @@ class Journal:
         self._folder, self._verb = folder, verb
         self._prefix = os.path.join(folder, "")
         self.path = _in_cache(file) if file else folder / f".facerf{shard.suffix}.jsonl"
-        # A cache that cannot be written to costs the next run the same work again, not this one.
+        # If the cache cannot be written, the next run repeats the work, but this one succeeds.
         self._lost: tuple[type[Exception], ...] = (FacerfError, OSError) if file else ()
         self._is_single = file is not None
         self.items: dict[tuple[str, str], Row] = {}
-        self._own: dict[str, Row] = {}  # rows of this process's file, by what they are of
+        self._own: dict[str, Row] = {}  # rows of this process's file, by what they describe
         self._new: list[Row] = []  # rows of files that were read since rows were last written
         self._files: dict[str, Row] = {}
         self._outputs: dict[str, Row] = {}  # that have a key
         self._digests: dict[str, set[str]] = {}  # by output: what facerf has written there
         self._of_item: dict[tuple[str, str], set[str]] = {}  # by command and item: its outputs
-        for path in [self.path] if file else sorted(folder.glob(".facerf*.jsonl"), key=_time_of):
+        by_time = sorted(folder.glob(".facerf*.jsonl"), key=lambda path: path.stat().st_mtime_ns)
+        for path in [self.path] if file else by_time:
             for row in json_rows(path):
                 self._take(row, is_own=path == self.path)
 
     def _take(self, row: Row, is_own: bool = True) -> None:
         """Take a row, in place of an earlier one of the same thing."""
         if "output" in row:
-            name = str(row["output"])
+            name, digest = str(row["output"]), str(row.get("sha256"))
             if name.startswith("/") or ".." in name.split("/"):
                 return
-            self._digests.setdefault(name, set()).add(str(row.get("sha256")))
+            self._digests.setdefault(name, set()).add(digest)
             self._of_item.setdefault((str(row.get("verb")), str(row.get("item"))), set()).add(name)
             of = f"output {name}"
             if "key" in row:
                 self._outputs[name] = row
-                for digest in self._digests[name] if is_own else ():  # noted before it got its name
-                    self._own.pop(f"output {name} {digest}", None)
+                for noted in self._digests[name] if is_own else ():  # before it got its name
+                    self._own.pop(f"output {name} {noted}", None)
             else:
-                of += f" {row.get('sha256')}"
+                of += f" {digest}"
         elif "file" in row and "sha256" in row:
             self._files[of := str(row["file"])] = row
-        elif isinstance(row.get("verb"), str) and isinstance(row.get("item"), str):
-            self.items[row["verb"], row["item"]] = row
-            of = f"item {row['verb']} {row['item']}"
+        elif named := item_of(row):
+            self.items[named] = row
+            of = "item {} {}".format(*named)
         else:
             return
         if is_own:
@@ -98,32 +98,30 @@ class Journal:
             self._own[of] = row
 
     def digest_of(self, path: Path) -> str:
-        """SHA-256 of a file; an unchanged one that the journal knows is not read. Raises InputError."""
-        known = self._files.get(os.path.abspath(path))
-        try:
+        """Return the SHA-256 of a file, without reading it if its row is up to date. Raises InputError."""
+        row = self._files.get(os.path.abspath(path))
+        with suppress(OSError):
             state = os.stat(path)
-            is_file = not stat.S_ISDIR(state.st_mode)  # a folder's own state says nothing of its files
-            same = is_file and known is not None and _state(state).items() <= known.items()
-        except OSError:
-            same = False
-        if known is None or not same:
-            known = file_row(path)
-            self._take(known)
-            self._new.append(known)
-        return str(known["sha256"])
+            is_file = not stat.S_ISDIR(state.st_mode)  # a folder's state does not show changes of its files
+            if row is not None and is_file and _state(state).items() <= row.items():
+                return str(row["sha256"])
+        row = file_row(path)
+        self._take(row)
+        self._new.append(row)
+        return str(row["sha256"])
 
     def to_make(
         self, item: Item, outputs: Sequence[Path], keys: Sequence[str], overwrite: Overwrite
     ) -> dict[Path, str]:
-        """Return the outputs of an item that must be made, and why: '' where they never were.
+        """Return the outputs of an item that must be made, and why: '' if they were never made.
 
         Args:
             item: Its input is compared by content.
-            outputs: Its results, with a key each, or one key for all.
+            outputs: Its results, with one key each, or one key for all.
             keys: Digests of recipes (`recipe.key_of`).
-            overwrite: What happens to results that exist.
+            overwrite: Whether to replace existing results.
 
-        Raises InputError for one that would replace a file which facerf did not write, or which has changed.
+        Raises InputError for an output that may not be replaced (`refusal`).
         """
         if overwrite == "always":
             return dict.fromkeys(outputs, "")
@@ -140,7 +138,7 @@ class Journal:
         return stale
 
     def why(self, item: Item, path: Path, recipe: str) -> str | None:
-        """Say why a result must be made: '' if it never was, None if it is finished."""
+        """Return why a result must be made: '' if it was never made, None if it is finished."""
         row = self._outputs.get(self._name(path))
         if not (path.is_dir() or regular_size(path)):
             return "" if row is None else "missing or empty"
@@ -155,12 +153,12 @@ class Journal:
         if read != key.partition(" ")[2]:
             return "input changed"
         others = self._digests[self._name(path)] - {row.get("sha256")}
-        if others and self._digest_or_none(path) in others:  # of other options, by a run that did not end
+        if others and self._digest_or_none(path) in others:  # written by an unfinished run, other options
             return "the last run was interrupted"
         return None
 
     def refusal(self, path: Path) -> str:
-        """Say why an output must not be replaced; '' if facerf wrote what is there, or nothing is there."""
+        """Return why an output must not be replaced; '' if facerf wrote it or it does not exist."""
         if not is_occupied(path):
             return ""
         written = self._digests.get(self._name(path))
@@ -170,7 +168,7 @@ class Journal:
         return f"{path}: {state}; {_ADVICE}"
 
     def key_of(self, item: Item, recipe: str) -> str:
-        """The key of a result: the digests of its recipe and of its input."""
+        """Return the key of a result: the digests of its recipe and of its input."""
         return _key(recipe, "none" if item.is_drawn else self._digest_or_none(item.input_path))
 
     def replaceable(self, item: Item) -> set[Path]:
@@ -180,15 +178,15 @@ class Journal:
         return {path for path in paths if os.path.exists(path) and not self.refusal(path)}
 
     def open(self, todo: Iterable[Item]) -> None:
-        """Write the file anew, without rows that no longer count, before items are made.
+        """Rewrite the file without outdated rows, before items are made.
 
-        Nothing is written where no item is to be made and the rows know all files that were read.
+        Nothing is written if no item is to be made and all files that were read have rows.
         """
-        names = [item.name for item in todo]
-        for name in names:
-            self.items.pop((self._verb, name), None)
-            self._own.pop(f"item {self._verb} {name}", None)
-        if names or self._new:
+        todo = list(todo)
+        for item in todo:
+            self.items.pop((self._verb, item.name), None)
+            self._own.pop(f"item {self._verb} {item.name}", None)
+        if todo or self._new:
             with suppress(*self._lost), atomic_path(self.path) as temporary:
                 temporary.write_text(lines_of(self._own.values()), encoding="utf-8")
         self._new.clear()
@@ -208,30 +206,31 @@ class Journal:
         rows = [row]
         if made:
             recipes = {self._name(path): key for path, key in _with_keys(outputs, keys)}
-            rows += [one for one in (made.read, *made.outputs) if one]
-            for one in made.outputs:
-                name = self._name(Path(one["file"]))
-                key = _key(recipes.get(name, ""), made.read.get("sha256", "none"))
-                rows.append(self._output_row(name, one, key) | {"item": item.name})
-        for one in rows:
-            self._take(one)
+            rows += [file for file in (made.read, *made.outputs) if file]
+            for written in made.outputs:
+                recipe = recipes.get(self._name(Path(written["file"])), "")
+                key = _key(recipe, made.read.get("sha256", "none"))
+                rows.append(self._output_row(written, key) | {"item": item.name})
         self._append(rows)
 
-    def add_file(self, item: Item, output: Path, key: str) -> None:
-        """Add the one output of a run that has no items, with the digest of its recipe."""
+    def add_file(self, item: Item, output: Path, recipe: str) -> None:
+        """Add the single output of a run without items, with the digest of its recipe."""
         read, written = file_row(item.input_path), file_row(output)
-        row = self._output_row(self._name(output), written, _key(key, read["sha256"]))
-        self._append([read, written, row | {"item": item.name}])
+        row = self._output_row(written, _key(recipe, read["sha256"])) | {"item": item.name}
+        self._append([read, written, row])
 
     def own(self, path: Path) -> None:
         """Note a file that belongs to no item, such as the list of all pages, as written by facerf."""
-        self._append([self._output_row(self._name(path), file_row(path), "")])
+        self._append([self._output_row(file_row(path), "")])
 
-    def _output_row(self, name: str, written: Row, key: str) -> Row:
-        """The row of a finished output, from the row of its file."""
+    def _output_row(self, written: Row, key: str) -> Row:
+        name = self._name(Path(written["file"]))
         return {"output": name, "verb": self._verb, "sha256": written["sha256"], "key": key}
 
     def _append(self, rows: Iterable[Row]) -> None:
+        rows = list(rows)
+        for row in rows:
+            self._take(row)
         with suppress(*self._lost):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             append_rows(self.path, [*self._new, *rows])
@@ -241,21 +240,21 @@ class Journal:
         try:
             return self.digest_of(path)
         except InputError:
-            return "none"  # its item says so
+            return "none"  # its item reports that
 
     def _name(self, path: Path) -> str:
         text = os.fspath(path)
-        if text.startswith(self._prefix) and ".." not in text:  # as all of a command's; ten times faster
+        if text.startswith(self._prefix) and ".." not in text:  # the usual case; ten times faster
             return text[len(self._prefix) :].replace(os.sep, "/")
         return Path(os.path.relpath(path, self._folder)).as_posix()
 
 
 class Made(NamedTuple):
-    """The rows of an item's files.
+    """Rows of an item's files.
 
     Attributes:
-        read: Of its input; empty where it has none.
-        outputs: Of what it wrote.
+        read: Row of the input; empty if there is none.
+        outputs: Rows of the files that were written.
     """
 
     read: Row
@@ -276,9 +275,9 @@ class Writes:
         self._row = {"verb": verb, "item": item.name}
 
     def __call__(self, path: Path, temporary: Path) -> bool:
-        """Tell whether a file takes the place of what is at a path; see `atomic.asking`.
+        """Tell whether a file replaces the one at a path; see `atomic.asking`.
 
-        Raises InputError for a file that is not facerf's.
+        Raises InputError for a file that facerf did not write.
         """
         if is_temporary(path) or not path.is_relative_to(self._folder):
             return True
@@ -296,7 +295,7 @@ class Writes:
         return True
 
     def rows(self, outputs: Iterable[Path]) -> tuple[Row, ...]:
-        """Return rows of all that was written, and of outputs that were not written by `atomic_path`."""
+        """Return rows of all files that were written, and of outputs not written by `atomic_path`."""
         rows: list[Row] = []
         for path, (digest, before) in self._written.items():
             with suppress(OSError):  # the user has removed it
@@ -310,7 +309,7 @@ class Writes:
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Append rows in one write, which those of other processes do not divide, and bring them to the disk."""
+    """Append rows in one write, which other processes' writes do not split, and sync them to the disk."""
     descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     try:
         os.write(descriptor, lines_of(rows).encode())
@@ -321,14 +320,16 @@ def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
 
 
 def file_row(path: Path) -> Row:
-    """A row of a file or folder: its state and its digest; InputError if it cannot be read.
+    """Return the row of a file or folder: its state and its digest; InputError if it cannot be read.
 
-    A folder's digest is of the names, sizes and times of the files in it.
+    A folder's digest covers the names, sizes and times of the files in it.
     """
     try:
         state = os.stat(path)
         if stat.S_ISDIR(state.st_mode):
-            digest = _listing_digest(path)
+            files = ((file, file.stat()) for file in sorted(path.rglob("*")) if file.is_file())
+            listing = [[f.relative_to(path).as_posix(), s.st_size, s.st_mtime_ns] for f, s in files]
+            digest = hashlib.sha256(json.dumps(listing).encode("utf-8", "backslashreplace")).hexdigest()
         else:
             require_regular(path)
             digest = _digest(path, *_state(state).values())
@@ -337,51 +338,47 @@ def file_row(path: Path) -> Row:
     return {"file": os.path.abspath(path), **_state(state), "sha256": digest}
 
 
-@lru_cache(maxsize=8)  # every frame of a film has the film as its input
+@lru_cache(maxsize=8)  # every frame of a video has the video as its input
 def _digest(path: Path, *_: int) -> str:
-    """SHA-256 of a file in a state: its size, times and inode."""
+    """Return the SHA-256 of a file in a state: its size, times and inode."""
     return file_sha256(path)
 
 
-def _listing_digest(folder: Path) -> str:
-    facts = []
-    for path in sorted(folder.rglob("*")):
-        if path.is_file():
-            state = path.stat()
-            facts.append([path.relative_to(folder).as_posix(), state.st_size, state.st_mtime_ns])
-    return hashlib.sha256(json.dumps(facts).encode("utf-8", "backslashreplace")).hexdigest()
-
-
 def json_rows(path: Path) -> Iterator[Row]:
-    """The objects of a file of JSON lines; a missing file has none."""
+    """Yield the objects of a file of JSON lines; a missing file has none."""
     if not is_regular(path):
         return
     for line in path.read_text(encoding="utf-8", errors="replace").split("\n"):
-        with suppress(ValueError):  # a run that was killed may leave half a line
+        with suppress(ValueError):  # a killed run may leave half a line
             row = parse_json(line)
             if isinstance(row, dict):
                 yield row
 
 
+def item_of(row: Row) -> tuple[str, str] | None:
+    """Return the command and the item that a row describes; None for a row of another kind."""
+    verb, item = row.get("verb"), row.get("item")
+    return (verb, item) if isinstance(verb, str) and isinstance(item, str) else None
+
+
 def lines_of(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows as JSON lines."""
+    """Format rows as JSON lines."""
     return "".join(json_line(row) + "\n" for row in rows)
 
 
 def is_occupied(path: Path) -> bool:
-    """True where anything but an empty file is: a full disk or a copy may leave empty ones."""
+    """Tell whether a path has anything but an empty file, which a full disk or a copy may leave."""
     return os.path.lexists(path) and regular_size(path) != 0
 
 
 def _carries(path: Path, key: str) -> bool:
-    """Tell whether a file contains a key, as the metadata of the file of `-o FILE` does."""
+    """Tell whether a file contains a key, which `-o FILE` writes into the metadata."""
     with suppress(OSError, ValueError), path.open("rb") as file:  # ValueError: an empty file
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ).find(key.encode()) >= 0
     return False
 
 
 def _in_cache(file: Path) -> Path:
-    """The journal of the one file that `-o` names."""
     from facerf_cli.files.downloads import cache_folder  # --help does without it
 
     name = hashlib.sha256(os.fsencode(os.path.abspath(file))).hexdigest()[:16]
@@ -389,16 +386,12 @@ def _in_cache(file: Path) -> Path:
 
 
 def _with_keys(outputs: Sequence[Path], keys: Sequence[str]) -> Iterator[tuple[Path, str]]:
-    """Pair outputs with their keys; one key may serve all."""
+    """Pair outputs with their keys, or with one key for all."""
     return zip(outputs, keys if len(keys) > 1 else [*keys] * len(outputs), strict=True)
 
 
 def _key(recipe: str, input_sha256: str) -> str:
     return f"{recipe} {input_sha256[:_INPUT]}"
-
-
-def _time_of(path: Path) -> int:
-    return path.stat().st_mtime_ns
 
 
 def _state(state: os.stat_result) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Recipes of outputs: the options, files and networks that shape them, as JSON, and the digest of that."""
+"""Recipes of outputs: the options, files and networks that shape them, as JSON, and their digest."""
 
 import dataclasses
 import hashlib
@@ -10,7 +10,7 @@ from typing import Any
 
 from facerf_cli.errors import UsageError
 
-RESULTS_VERSION = 27  # raised where the same recipe gives other pixels
+RESULTS_VERSION = 27  # increased when the same recipe gives different pixels
 SHIPPED = Path(__file__).parents[1] / "assets"
 
 Recipe = dict[str, Any]  # names and JSON values
@@ -19,9 +19,9 @@ RecipesOf = Callable[[DigestOf], Sequence[Recipe]]  # of each output of an item,
 
 
 def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
-    """List the fields of a dataclass, of dataclasses in it too, that shape outputs.
+    """List the fields of a dataclass, and of dataclasses in it, that shape outputs.
 
-    A file counts by its content. Behind the checkpoints stand the networks that facerf ships.
+    Files count by their content. The user's checkpoints are followed by the networks that facerf ships.
     """
     recipe: Recipe = {"results": RESULTS_VERSION}
     _add_fields(recipe, settings, digest_of)
@@ -29,7 +29,7 @@ def recipe_of(settings: Any, digest_of: DigestOf) -> Recipe:
 
 
 def key_of(recipe: Recipe) -> str:
-    """A short digest of a recipe, by which outputs and cached files name it."""
+    """Return a short digest of a recipe, for the keys of outputs and the names of cached files."""
     text = json.dumps(recipe, sort_keys=True)
     return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:16]
 
@@ -48,7 +48,7 @@ def _add_fields(recipe: Recipe, settings: Any, digest_of: DigestOf) -> None:
 
 
 def _plain(value: Any, digest_of: DigestOf) -> Any:
-    """A value as JSON; files, named by a path or by text, as digests of their content."""
+    """Convert a value to JSON; files, named by a path or by text, become digests of their content."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         inner: Recipe = {}
         _add_fields(inner, value, digest_of)
@@ -63,7 +63,7 @@ def _plain(value: Any, digest_of: DigestOf) -> Any:
 
 
 def _of_folder(path: Path, digest_of: DigestOf) -> str:
-    """The content of a folder; for a pattern (mattes/{stem}.png) of the folder that it begins with."""
+    """Return the digests of a folder's files; for a pattern (mattes/{stem}.png), of its fixed folder."""
     fixed, brace, rest = str(path).partition("{")
     folder = Path(f"{fixed}_").parent if brace else path
     files = (file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else ()
@@ -74,21 +74,21 @@ def _content(files: Iterable[Path], digest_of: DigestOf) -> str:
     return "sha256:" + " ".join(digest_of(path)[:16] for path in files)
 
 
-def require_same(before: Recipe, now: Recipe, said: str, advice: str) -> None:
-    """Raise UsageError, `SAID: other crop, seed; ADVICE`, where two recipes differ."""
+def require_same(before: Recipe, now: Recipe, what: str, advice: str) -> None:
+    """Raise UsageError, `WHAT: other crop, seed; ADVICE`, if two recipes differ."""
     names = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
     if names:
-        raise UsageError(f"{said}: other {', '.join(names).replace('_', ' ')}; {advice}")
+        raise UsageError(f"{what}: other {', '.join(names).replace('_', ' ')}; {advice}")
 
 
 def text_of_state(path: Path) -> str:
-    """Text that changes when a file is written again."""
+    """Return text that changes when a file is rewritten."""
     state = path.stat()
     return f"{state.st_size}-{state.st_mtime_ns}"
 
 
 def is_made_from(path: Path, text: str) -> bool:
-    """Tell whether a safetensors file is there that has the text as its metadata `of`."""
+    """Tell whether a safetensors file exists whose metadata `of` is the text."""
     from safetensors import SafetensorError, safe_open
 
     try:

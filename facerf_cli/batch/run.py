@@ -1,83 +1,76 @@
-"""The contract of every verb that walks folders: what is read, skipped, written and reported.
+"""The contract of every command that processes folders: what is read, skipped, written and reported.
 
-A verb passes a `Job` to `run_items`. It raises `InputError` for a faulty item (the run continues); any
-other `FacerfError` concerns the whole run and ends it.
+A command passes a `Job` to `run_items`. It raises `InputError` for a faulty item, and the run continues; any
+other `FacerfError` ends the run.
 """
 
 import logging
 import os
-import re
 import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self
 
-from facerf_cli.batch.inputs import Item, NamePattern, check_case, file_pattern, files_read, refuse_read
-from facerf_cli.batch.journal import Journal, Made, Row, Writes, file_row, json_rows, lines_of
+from facerf_cli.batch.inputs import Item, check_case, files_read, refuse_read
+from facerf_cli.batch.journal import Journal, Made, Row, Writes, file_row, item_of, json_rows, lines_of
 from facerf_cli.batch.recipe import DigestOf, Recipe, key_of
-from facerf_cli.batch.settings import NOT_IN_RECIPE, Overwrite, Settings, Shard, torch_device
+from facerf_cli.batch.settings import BatchOptions, Overwrite, Settings, default_job_count
 from facerf_cli.errors import FacerfError, InputError, UsageError
 from facerf_cli.files.atomic import all_or_none, alone_in, asking, atomic_path, sweep_leftovers
 from facerf_cli.files.texts import regular_size, require_regular
-from facerf_cli.option import BATCH, option
 from facerf_cli.run import memory
-from facerf_cli.run.logs import (
-    LOGGER_NAME,
-    STDERR,
-    counted,
-    escaped,
-    named,
-    printable_line,
-    unexpected,
-)
+from facerf_cli.run.logs import LOGGER_NAME, counted, escaped, named, printable_line, unexpected
 from facerf_cli.run.machine import processors
 from facerf_cli.run.stopping import end_again
-from facerf_cli.run.workers import Workers, ending, process_died, spread
+from facerf_cli.run.workers import process_died, spread
 
 REPORT_NAME = "report.jsonl"
-T = TypeVar("T")
-R = TypeVar("R")
+Outputs = Mapping[Item, Sequence[Path]]
+Owner = tuple[Path, str, Path, Overwrite]  # output folder, command, its journal, --overwrite
 log = logging.getLogger(LOGGER_NAME)
 
 
 class Job:
-    """The work of a verb on each of its items; a frozen dataclass, which workers get in other processes."""
+    """The work of a command on each of its items; a frozen dataclass that is sent to other processes."""
 
-    items_a_process: ClassVar[int] = 0  # for which it pays to start one that nobody asked for; 0: never
+    items_a_process: ClassVar[int] = 0  # at least, for a process that facerf starts unasked; 0: never
 
     @property
     def verb(self) -> str:
-        """Its name, for the report and the index."""
+        """Name of the command, for the report and the journal."""
         raise NotImplementedError
 
     def outputs_of(self, item: Item) -> Sequence[Path]:
-        """The files of a finished item."""
+        """Return the files of a finished item."""
         raise NotImplementedError
 
     def recipes_of(self, digest_of: DigestOf) -> Sequence[Recipe]:
-        """List what shapes each output besides its input, or all; without recipes what exists is finished."""
+        """Return what shapes each output besides its input; without recipes, existing outputs are finished.
+
+        One recipe may serve all outputs.
+        """
         return ()
 
     def ready(self, dry_run: bool) -> Self:
-        """Load what all items need; not called where all is finished.
+        """Load what all items need; not called if all items are finished.
 
-        Returns the job, or one that lacks the outputs that cannot be made, which are then a failure.
+        Returns the job, or a job without the outputs that cannot be made, which then count as failures.
         """
         return self
 
     def __call__(self, item: Item) -> "Outcome":
-        """Make the outputs of an item, or those that are stale."""
+        """Make the outputs of an item, or its stale ones."""
         raise NotImplementedError
 
     @property
     def process(self) -> Callable[[Item], "Outcome"]:
-        """A function that does that; picklable. Not asked for where all is finished."""
+        """A picklable function that does so; not asked for if all items are finished."""
         return self
 
 
@@ -91,7 +84,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ItemResult:
-    """The end of one item, in a form that can be sent between processes."""
+    """How one item ended, in a form that can be sent between processes."""
 
     item: Item
     seconds: float
@@ -101,184 +94,86 @@ class ItemResult:
     trace: str = ""
     stops_the_run: FacerfError | None = None
 
+    def row(self, verb: str, folder: Path) -> Row:
+        """Return the row of the report; outputs are relative to the folder."""
+        outcome = self.outcome or Outcome([])
+        outputs = (
+            path.relative_to(folder) if path.is_relative_to(folder) else path for path in outcome.outputs
+        )
+        row = {
+            "verb": verb,
+            "item": self.item.name,
+            "input": named(self.item.input_path.as_posix()),
+            "status": "failed" if self.error else "done",
+            "seconds": self.seconds,
+            "error": printable_line(self.error) or None,
+            "outputs": list(outputs),
+        }
+        return {**row, **outcome.facts, **row}
+
 
 def write_report(folder: Path, rows: Iterable[Row]) -> None:
-    """Write the rows of items to report.jsonl, after those of other items that it has."""
-    path = folder / REPORT_NAME
-    table = {(row.get("verb"), row.get("item")): row for row in _earlier_rows(path)}
+    """Write rows of items to report.jsonl, after its rows of other items."""
+    table = _report_rows(folder)
     for row in rows:
         table.pop((row["verb"], row["item"]), None)
         table[row["verb"], row["item"]] = row
-    with atomic_path(path) as temporary:
+    with atomic_path(folder / REPORT_NAME) as temporary:
         temporary.write_text(lines_of(table.values()), encoding="utf-8")
 
 
-def _earlier_rows(path: Path) -> list[Row]:
-    """The rows of a report; raises UsageError for a file of this name that is none."""
-    rows = [
-        row
-        for row in json_rows(path)
-        if isinstance(row.get("verb"), str) and isinstance(row.get("item"), str)
-    ]
-    if not rows and regular_size(path):
+def _report_rows(folder: Path) -> dict[tuple[str, str], Row]:
+    """Read the rows of report.jsonl; UsageError if the file was not written by facerf."""
+    path = folder / REPORT_NAME
+    table = {names: row for row in json_rows(path) if (names := item_of(row))}
+    if not table and regular_size(path):
         raise UsageError(f"{path}: was not written by facerf; move it, or choose another -o")
-    return rows
-
-
-def unusable(folder: Path, error: BaseException) -> UsageError:
-    """The error of an output folder that cannot be written to."""
-    reason = error.strerror if isinstance(error, OSError) else error
-    if folder.is_symlink() and not folder.exists():
-        reason = "a link that leads nowhere"
-    return UsageError(f"-o {folder}: cannot be written to ({reason}); give another folder")
-
-
-def _row(verb: str, result: ItemResult, output_folder: Path) -> Row:
-    outcome = result.outcome or Outcome([])
-    row = {
-        "verb": verb,
-        "item": result.item.name,
-        "input": named(result.item.input_path.as_posix()),
-        "status": "failed" if result.error else "done",
-        "seconds": result.seconds,
-        "error": printable_line(result.error) or None,
-        "outputs": [
-            path.relative_to(output_folder) if path.is_relative_to(output_folder) else path
-            for path in outcome.outputs
-        ],
-    }
-    return row | {name: value for name, value in outcome.facts.items() if name not in row}
-
-
-_JOB_BYTES = 2 << 30  # that a process which is not asked for may have
-_FILE_SUFFIX = re.compile(
-    r"\.(exr|hdr|png|jpe?g|tiff?|webp|gif|bmp|heic|avif|jsonl?|txt|csv|html|pdf|zip|npz|safetensors|glb|obj"
-    r"|mp4|mov|m4v|webm|avi|mkv)",
-    re.IGNORECASE,
-)
-
-
-def folder_not_file(output: Path, other: str = "") -> Path:
-    """The folder that `-o` names; raises UsageError for a file's name, unless such a folder is there.
-
-    `other` names the suffixes of files that may be given.
-    """
-    if _FILE_SUFFIX.fullmatch(output.suffix) and not output.is_dir():
-        kinds = f", or a file as {other}" if other else ""
-        folder = f"give a folder, such as -o {output.with_suffix('')}"
-        raise UsageError(f"-o {output}: is a file's name; {folder}{kinds}")
-    return output
-
-
-@dataclass(frozen=True)
-class BatchOptions:
-    """The options of the contract.
-
-    Attributes:
-        output: Write the results to this folder.
-        overwrite: Make again results that exist: never; those that were made from other inputs, options or
-            networks (changed); or always.
-        dry_run: List what would be read and written; write nothing.
-        jobs: Process so many items at a time.
-        shard: Process every Nth item only, from the Kth on; other machines take the rest.
-        ray: Run as tasks of Ray on a cluster (HOST:PORT of its head, or auto) or on this machine (local).
-        name: Name the outputs by a pattern of {dir}, {parent}, {stem}, {ext} and {frame:04}; what each is
-            follows it.
-        report: Write report.jsonl, too: a row for each item with its outputs, and facts or an error.
-    """
-
-    output: Path = option(
-        Path(),
-        metavar="DIR",
-        in_recipe=False,
-        flags=("--output", "-o"),
-        shown_default=False,
-        required=True,
-        typed=Path,
-        parse=folder_not_file,
-    )
-    overwrite: Overwrite = option("changed", in_recipe=False, panel=BATCH, everyday=True)
-    dry_run: bool = option(False, in_recipe=False, panel=BATCH)
-    jobs: int | None = option(
-        None,
-        in_recipe=False,
-        flags=("--jobs", "-j"),
-        shown_default="auto",
-        least=1,
-        panel=BATCH,
-        everyday=True,
-    )
-    shard: Shard = option(
-        Shard(), metavar="K/N", in_recipe=False, shown_default="all items", parse=Shard.parse, panel=BATCH
-    )
-    ray: str | None = option(None, metavar="ADDRESS", in_recipe=False, shown_default=False, panel=BATCH)
-    name: NamePattern | None = option(
-        None,
-        metavar="PATTERN",
-        in_recipe=False,
-        shown_default="{dir}/{stem}.{frame}",
-        parse=file_pattern,
-        panel=BATCH,
-    )
-    report: bool = option(False, in_recipe=False, panel=BATCH)
-    file: Path | None = field(default=None, metadata=NOT_IN_RECIPE)  # the one that -o names
-    in_a_row: int = field(default=1, metadata=NOT_IN_RECIPE)  # neighbouring items that a process takes
-    print_outputs: bool = field(default=True, metadata=NOT_IN_RECIPE)  # on stdout
-
-    def workers(self, settings: Settings, unasked: int = 1) -> Workers:
-        """The workers that `--jobs`, `--ray` and `--device` ask for; so many jobs where none is named."""
-        jobs = self.jobs or (unasked if self.ray is None else 0)
-        gpus = None if settings.device == "auto" else int(settings.device.startswith("cuda"))
-        return Workers(jobs, self.ray, gpus, self.in_a_row)
-
-
-def jobs_that_pay(items: int, items_a_process: int, settings: Settings) -> int:
-    """Processes for so many items where `--jobs` is not given: a photo keeps two processors half busy.
-
-    One for a GPU, and with `--memory`, which is a ceiling for each.
-    """
-    if items_a_process == 0 or settings.memory_bytes is not None:
-        return 1
-    memory_for = memory.default_limit() // _JOB_BYTES
-    jobs = min(items // items_a_process, processors(), memory_for)
-    return jobs if jobs > 1 and torch_device(settings).type == "cpu" else 1
+    return table
 
 
 def run_items(job: Job, items: Sequence[Item], options: BatchOptions, settings: Settings) -> int:
     """Process this process's share of the items; return the exit code: 0 all done, 1 some failed.
 
-    Raises UsageError where the output folder cannot be used, or an output is a file to be read.
+    Raises UsageError if the output folder cannot be used, or an output is a file to be read.
     """
-    outputs = [path for item in items for path in job.outputs_of(item)]
-    refuse_read(outputs, files_read((items, job), items))
+    outputs = {item: job.outputs_of(item) for item in items}
+    refuse_read((path for paths in outputs.values() for path in paths), files_read((items, job), items))
     items = options.shard.share(items)
     with ExitStack() as stack:
         if not options.dry_run:
             try:
                 stack.enter_context(alone_in(options.output, f".facerf-lock{options.shard.suffix}"))
             except OSError as error:
-                raise unusable(options.output, error) from error
-        check_case(outputs, options.output)
+                raise _unusable(options.output, error) from error
+        check_case([path for paths in outputs.values() for path in paths], options.output)
         if options.report:
-            _earlier_rows(options.output / REPORT_NAME)
+            _report_rows(options.output)
         journal = Journal(options.output, job.verb, options.shard, options.file)
-        plan = _plan(job, items, options, journal)
+        plan = _plan(job, {item: outputs[item] for item in items}, options, journal)
         lacks = False
         if any(plan.stale.values()):
             usable = job.ready(options.dry_run)
             lacks = usable is not job
             if lacks:
-                job, plan = usable, _plan(usable, items, options, journal)
+                job = usable
+                plan = _plan(job, {item: job.outputs_of(item) for item in items}, options, journal)
         _log_plan(plan)
         if options.dry_run:
-            for result in plan.refused:
+            for result in plan.rejected:
                 _print_result(result, options)
-            failures = int(bool(plan.refused)) + _list_what_would_be_done(plan.stale)
+            failures = int(bool(plan.rejected)) + _list_planned(plan.stale)
         else:
             failures = _make(job, plan, journal, options, settings)
             if options.report:
-                write_report(options.output, _rows_of(job, items, journal))
+                write_report(options.output, _rows_of(job, plan, journal))
     return int(lacks or failures > 0)
+
+
+def _unusable(folder: Path, error: BaseException) -> UsageError:
+    reason = error.strerror if isinstance(error, OSError) else error
+    if folder.is_symlink() and not folder.exists():
+        reason = "a link that leads nowhere"
+    return UsageError(f"-o {folder}: cannot be written to ({reason}); use another folder")
 
 
 class Plan(NamedTuple):
@@ -286,97 +181,62 @@ class Plan(NamedTuple):
 
     Attributes:
         keys: Digests of the recipes of an item's outputs.
-        outputs: Of each item.
-        stale: The outputs of each item that must be made, and why: '' where they never were.
-        refused: The items that may not replace a file.
+        outputs: Outputs of each item.
+        stale: Outputs of each item that must be made, and why: '' if they were never made.
+        rejected: Items that may not replace a file.
     """
 
     keys: Sequence[str]
-    outputs: Mapping[Item, Sequence[Path]]
+    outputs: Outputs
     stale: Mapping[Item, Mapping[Path, str]]
-    refused: Sequence[ItemResult]
+    rejected: Sequence[ItemResult]
 
 
-def _plan(job: Job, items: Sequence[Item], options: BatchOptions, journal: Journal) -> Plan:
+def _plan(job: Job, outputs: Outputs, options: BatchOptions, journal: Journal) -> Plan:
     keys = [key_of(recipe) for recipe in job.recipes_of(journal.digest_of)]
-    each = {item: job.outputs_of(item) for item in items}
     stale: dict[Item, dict[Path, str]] = {}
-    refused: list[ItemResult] = []
-    for item, outputs in each.items():
+    rejected: list[ItemResult] = []
+    for item, paths in outputs.items():
         if not keys:
-            done = options.overwrite != "always" and _exist(outputs)
-            stale[item] = {} if done else dict.fromkeys(outputs, "")
+            done = options.overwrite != "always" and _exist(paths)
+            stale[item] = {} if done else dict.fromkeys(paths, "")
             continue
         try:
-            stale[item] = journal.to_make(item, outputs, keys, options.overwrite)
+            stale[item] = journal.to_make(item, paths, keys, options.overwrite)
         except InputError as error:
-            refused.append(ItemResult(item, 0.0, error=str(error)))
-    return Plan(keys, each, stale, refused)
+            rejected.append(ItemResult(item, 0.0, error=str(error)))
+    return Plan(keys, outputs, stale, rejected)
 
 
 def _make(job: Job, plan: Plan, journal: Journal, options: BatchOptions, settings: Settings) -> int:
-    """Make what is stale, note and print the end of each item; return how many failed."""
+    """Make stale outputs, note and print how each item ended; return how many failed."""
     todo = [_to_make(item, plan, journal, options) for item, paths in plan.stale.items() if paths]
     try:
-        journal.open([*todo, *(result.item for result in plan.refused)])
+        journal.open([*todo, *(result.item for result in plan.rejected)])
     except FacerfError as error:
-        raise unusable(options.output, error.__cause__ or error) from error
+        raise _unusable(options.output, error.__cause__ or error) from error
     if plan.keys and options.overwrite == "changed":
         for item, stale in plan.stale.items():
             kept = [path for path in plan.outputs[item] if path not in stale]
             keep_newer(kept, files_read((item, job), [item]))
 
     def done(result: ItemResult) -> int:
-        """Note and print the result of an item; return 1 for a failure."""
-        row = _row(job.verb, result, options.output)
         outputs = job.outputs_of(result.item) if result.made else ()  # may depend on what was made
-        journal.add(result.item, row, result.made, outputs, plan.keys)
+        journal.add(result.item, result.row(job.verb, options.output), result.made, outputs, plan.keys)
         return _print_result(result, options)
 
-    failures = sum(map(done, plan.refused))
+    failures = sum(map(done, plan.rejected))
     if todo:
         owner = (options.output, job.verb, journal.path, options.overwrite) if plan.keys else None
-        with ending(_results(job, todo, owner, options, settings)) as results:
+        with closing(_results(job, todo, plan.outputs, owner, options, settings)) as results:
             failures += sum(map(done, results))
     if failures and len(plan.outputs) > 1:
         log.error("%d of %d failed; %s has a row for each", failures, len(plan.outputs), journal.path)
     return failures
 
 
-def _rows_of(job: Job, items: Sequence[Item], journal: Journal) -> Iterator[Row]:
-    """The journal's rows of items; that of one without a row says that it was skipped."""
-    for item in items:
-        skipped = _row(job.verb, ItemResult(item, 0.0, Outcome(job.outputs_of(item))), Path())
-        yield journal.items.get((job.verb, item.name)) or skipped | {"status": "skipped"}
-
-
-Owner = tuple[Path, str, Path, Overwrite]  # output folder, command, its journal, --overwrite
-
-
-def _results(
-    job: Job, todo: Sequence[Item], owner: Owner | None, options: BatchOptions, settings: Settings
-) -> Iterator[ItemResult]:
-    """Process items by workers, with a progress bar; yield their results."""
-    workers = options.workers(
-        settings, jobs_that_pay(len(todo), job.items_a_process * options.in_a_row, settings)
-    )
-    at_once = min(workers.jobs or processors(), len(todo))
-    work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
-    memory.collect_as_usual()
-    try:
-        with ending(spread_with_bar(work, todo, job.verb, workers, settings, _broken)) as results:
-            for result in results:
-                if result.stops_the_run is not None:
-                    raise result.stops_the_run
-                yield result
-    finally:
-        if workers.jobs > 1:  # a worker that was killed could not remove what it was writing
-            for folder in {path.parent for item in todo for path in job.outputs_of(item)}:
-                sweep_leftovers(folder)
-
-
 def _to_make(item: Item, plan: Plan, journal: Journal, options: BatchOptions) -> Item:
-    """Return an item with the outputs that its work may replace and keeps, and the key of its one file."""
+    """Return an item with the outputs that its work may replace and keeps, and the key of its single file."""
     outputs, stale = plan.outputs[item], plan.stale[item]
     others = journal.replaceable(item).difference(outputs) if plan.keys else set()
     key = journal.key_of(item, plan.keys[0]) if plan.keys and options.file else ""
@@ -384,7 +244,7 @@ def _to_make(item: Item, plan: Plan, journal: Journal, options: BatchOptions) ->
 
 
 def keep_newer(outputs: Sequence[Path], read: Iterable[Path]) -> None:
-    """Set the time of finished outputs that are older than a file they were made from, as Make expects."""
+    """Touch finished outputs that are older than a file they were made from, as Make expects."""
     with suppress(OSError):
         newest_ns = max((path.stat().st_mtime_ns for path in read), default=0) if outputs else 0
         for path in outputs:
@@ -392,33 +252,40 @@ def keep_newer(outputs: Sequence[Path], read: Iterable[Path]) -> None:
                 os.utime(path)
 
 
-def sums_up(
-    items: Sequence[Item], outputs_of: Callable[[Item], Sequence[Path]], options: BatchOptions
-) -> bool:
-    """True if a verb may now write what depends on all items.
+def _results(
+    job: Job,
+    todo: Sequence[Item],
+    outputs: Outputs,
+    owner: Owner | None,
+    options: BatchOptions,
+    settings: Settings,
+) -> Generator[ItemResult]:
+    """Process items by workers, with a progress bar; yield their results."""
+    items_per_process = job.items_a_process * options.in_a_row
+    workers = options.workers(settings, default_job_count(len(todo), items_per_process, settings))
+    at_once = min(workers.jobs or processors(), len(todo))
+    work = partial(_run_one, job.process, owner, settings.job_bytes(at_once))
+    memory.collect_as_usual()
 
-    Without `--shard` always. A shard may when the items of all shards are finished, so the last one does; not
-    with `--overwrite always`, since an earlier run's outputs look the same.
-    """
-    if options.shard.of == 1:
-        return True
-    always = options.overwrite == "always"
-    left = len(items) if always else sum(not _exist(outputs_of(item)) for item in items)
-    if left:
-        state = "may be unfinished" if always else f"({left}) are unfinished"
-        log.info(
-            "items %s, so there is no summary; a run without --shard and --overwrite always writes it", state
-        )
-    return not left
+    def died(item: Item, error: Exception) -> ItemResult:
+        return ItemResult(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
+
+    try:
+        with closing(spread(work, todo, workers, died, job.verb)) as results:
+            for result in results:
+                if result.stops_the_run is not None:
+                    raise result.stops_the_run
+                yield result
+    finally:
+        if workers.jobs > 1:  # a killed worker could not remove what it was writing
+            for folder in {path.parent for item in todo for path in outputs[item]}:
+                sweep_leftovers(folder)
 
 
 def _run_one(
-    process: Callable[[Item], Outcome],
-    owner: Owner | None,
-    memory_bytes: int,
-    item: Item,
+    process: Callable[[Item], Outcome], owner: Owner | None, memory_bytes: int, item: Item
 ) -> ItemResult:
-    """Run `process` on an item and return an `ItemResult`, whatever happens.
+    """Run `process` on an item and return an `ItemResult`, even if it fails.
 
     A job without recipes has no `owner`: it replaces its outputs.
     """
@@ -446,34 +313,56 @@ def _run_one(
         return result(error=str(error), trace=traceback.format_exc())
     except FacerfError as error:
         return result(stops_the_run=error)
-    except Exception as error:  # a bug must not cost the other items
+    except Exception as error:  # a bug must not affect other items
         return result(error=f"{item.input_path}: {unexpected(error)}", trace=traceback.format_exc())
     finally:
         memory.give_back()
         end_again()
 
 
-def _broken(item: Item, error: Exception) -> ItemResult:
-    """The result of an item whose process died."""
-    return ItemResult(item, 0.0, error=f"{item.input_path}: {process_died(error)}")
+def sums_up(
+    items: Sequence[Item], outputs_of: Callable[[Item], Sequence[Path]], options: BatchOptions
+) -> bool:
+    """Tell whether a command may now write what depends on all items.
+
+    Without `--shard` it always may. With shards the last one may, when the items of all are finished; not
+    with `--overwrite always`, since an earlier run's outputs look the same.
+    """
+    if options.shard.of == 1:
+        return True
+    always = options.overwrite == "always"
+    left = len(items) if always else sum(not _exist(outputs_of(item)) for item in items)
+    if left:
+        state = "may be unfinished" if always else f"({left}) are unfinished"
+        log.info(
+            "items %s, so there is no summary; a run without --shard and --overwrite always writes it", state
+        )
+    return not left
 
 
 def _exist(outputs: Sequence[Path]) -> bool:
     return bool(outputs) and all(path.is_dir() or regular_size(path) for path in outputs)
 
 
+def _rows_of(job: Job, plan: Plan, journal: Journal) -> Iterator[Row]:
+    """Yield the journal's rows of items; an item without a row was skipped."""
+    for item, outputs in plan.outputs.items():
+        skipped = ItemResult(item, 0.0, Outcome(outputs)).row(job.verb, Path()) | {"status": "skipped"}
+        yield journal.items.get((job.verb, item.name)) or skipped
+
+
 def _log_plan(plan: Plan) -> None:
-    """Log how many results are finished, and why others are made again."""
     stale = sum(map(len, plan.stale.values()))
     if kept := sum(len(plan.outputs[item]) for item in plan.stale) - stale:
         log.info("%d of %d results are finished and kept", kept, kept + stale)
     reasons = Counter(next(filter(None, paths.values()), "") for paths in plan.stale.values())
     for reason, count in sorted(reasons.items()):
         if reason:
-            log.info("%d to make again: %s", count, reason)
+            log.info("%s out of date: %s", counted(count, "item"), reason)
 
 
-def _list_what_would_be_done(stale: Mapping[Item, Mapping[Path, str]]) -> int:
+def _list_planned(stale: Mapping[Item, Mapping[Path, str]]) -> int:
+    """Print what a run would make; return 1 if an input does not exist."""
     for item, paths in stale.items():
         for path in paths:
             print_path(named(f"{item.input_path} -> {path}"))
@@ -498,23 +387,5 @@ def _print_result(result: ItemResult, options: BatchOptions) -> int:
 
 
 def print_path(text: object) -> None:
-    """Print a name to standard output, for people escaped, for programs as it is."""
+    """Print a name to standard output; a terminal gets it escaped."""
     print(escaped(str(text)) if sys.stdout.isatty() else text, flush=True)
-
-
-def spread_with_bar(
-    work: Callable[[T], R],
-    items: Sequence[T],
-    title: str,
-    workers: Workers,
-    settings: Settings,
-    died: Callable[[T, Exception], R],
-) -> Iterator[R]:
-    """Map items by workers, with a progress bar on stderr if that is a terminal."""
-    from rich.progress import Progress  # --help does without it
-
-    shown = STDERR.is_terminal and settings.verbosity >= 0 and not settings.log_json
-    # rich would send what is printed to stdout to its console, stderr: right only if both are one terminal.
-    bar = Progress(console=STDERR, disable=not shown, redirect_stdout=sys.stdout.isatty())
-    with bar, ending(spread(work, items, workers, died)) as results:
-        yield from bar.track(results, total=len(items), description=title)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import BatchOptions
 from facerf_cli.cli.options import settings_of
 from facerf_cli.errors import UsageError
 from facerf_cli.option import LIGHT, Only, option

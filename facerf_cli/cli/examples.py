@@ -1,4 +1,4 @@
-"""One or two examples of each command, for its help and its man page."""
+"""Examples of each command, one or two, for its help and its man page."""
 
 _LINES = """
 facerf demo
@@ -44,11 +44,11 @@ facerf face-model import flame.pkl --landmarks embedding.npy -o flame.npz
 """
 
 
-def examples_of(verb: str) -> list[str]:
-    """The examples of a verb, such as `evaluate olat`."""
-    return [line for line in _LINES.splitlines() if f"{line} ".startswith(f"facerf {verb} ")]
+def examples_of(command: str) -> list[str]:
+    """Return the examples of a command, such as `evaluate olat`."""
+    return [line for line in _LINES.splitlines() if f"{line} ".startswith(f"facerf {command} ")]
 
 
-def epilog_of(verb: str, notes: str) -> str:
-    """The end of a verb's help: notes, and its examples after the mark that keeps their lines."""
-    return "\n".join([notes, "", "\b", "EXAMPLES", *(f"  {line}" for line in examples_of(verb))])
+def epilog_of(command: str, notes: str) -> str:
+    """Return the end of a command's help: notes, and its examples, whose lines stay apart."""
+    return "\n".join([notes, "", "\b", "EXAMPLES", *(f"  {line}" for line in examples_of(command))])

@@ -1,8 +1,7 @@
-"""Man pages from the app: `python -m facerf_cli.cli.manual DIR` writes facerf.1 and a page for each verb."""
+"""Man pages from the app: `python -m facerf_cli.cli.manual DIR` writes facerf.1 and a page per command."""
 
 import sys
 from collections.abc import Iterable, Iterator
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,15 @@ from facerf_cli.errors import UsageError
 from facerf_cli.main import app
 
 _EXIT_CODES = (
-    ("", "0", "All is done."),
-    ("", "1", "Some input failed; each is named in a line on standard error."),
-    ("", "2", "The command line is wrong, or there is nothing to work on."),
+    ("", "0", "Everything is done."),
+    ("", "1", "Some inputs failed; standard error has a line for each."),
+    ("", "2", "The command line is wrong, or there are no inputs."),
     ("", "130", "Interrupted."),
 )
 
 
 def pages() -> dict[str, str]:
-    """File name to troff source, for facerf and every verb."""
+    """Return the troff source of each page, by file name."""
     root = typer.main.get_command(app)
     context = typer.Context(root, info_name="facerf")
     walk = _walk(context, root, ("facerf",))
@@ -37,8 +36,8 @@ def _walk(context: Any, command: Any, path: tuple[str, ...]) -> Iterator[tuple[t
 
 
 def _lines(path: tuple[str, ...], command: Any) -> Iterator[str]:
-    """The lines of a page."""
-    name, typed, verbs = "-".join(path), " ".join(path), getattr(command, "commands", {})
+    """Yield the lines of a page."""
+    name, typed, commands = "-".join(path), " ".join(path), getattr(command, "commands", {})
     context = typer.Context(command, info_name=typed)
     summary, *paragraphs = (command.help or "").replace("\\[", "[").replace("\b", "").strip().split("\n\n")
     yield f'.TH "{name.upper()}" "1" "" "facerf {__version__}" "facerf manual"'
@@ -47,44 +46,44 @@ def _lines(path: tuple[str, ...], command: Any) -> Iterator[str]:
     yield from (".SH DESCRIPTION", _text(summary))
     for paragraph in paragraphs:
         yield from (".PP", _text(" ".join(paragraph.split())))
-    options = ((one, one.get_help_record(context)) for one in command.get_params(context))
-    yield from _section("OPTIONS", ((_panel_of(one), *record) for one, record in options if record))
-    listed = ((_panel_of(verb), name, verb.get_short_help_str(200)) for name, verb in verbs.items())
-    yield from _section("VERBS", listed)
-    if not verbs:
+    options = ((option, option.get_help_record(context)) for option in command.get_params(context))
+    yield from _section("OPTIONS", ((_panel_of(option), *record) for option, record in options if record))
+    entries = ((_panel_of(entry), name, entry.get_short_help_str(200)) for name, entry in commands.items())
+    yield from _section("COMMANDS", entries)
+    if not commands:
         yield from (".PP", _text(EPILOG), ".SH EXAMPLES", ".nf")
         yield from map(_text, examples_of(" ".join(path[1:])))
         yield ".fi"
     yield from _section("EXIT STATUS", _EXIT_CODES)
-    nearby = [f"{name}-{verb}" for verb in sorted(verbs)] or ["-".join(path[:-1])]
-    yield from (".SH SEE ALSO", ", ".join(f"\\fB{_text(one)}\\fR(1)" for one in nearby))
+    related = [f"{name}-{subcommand}" for subcommand in sorted(commands)] or ["-".join(path[:-1])]
+    yield from (".SH SEE ALSO", ", ".join(f"\\fB{_text(page)}\\fR(1)" for page in related))
 
 
 def _panel_of(part: Any) -> str:
-    """The panel of an option or a verb in the help; empty for the first one."""
+    """Return the panel of an option or a command in the help; empty for the first panel."""
     return getattr(part, "rich_help_panel", None) or ""
 
 
 def _section(title: str, entries: Iterable[tuple[str, str, str]]) -> Iterator[str]:
-    """A section of panels, terms and meanings, with a subsection for each panel; nothing without entries."""
-    found = list(entries)
-    panels = ["", *dict.fromkeys(panel for panel, _, _ in found)]
-    found.sort(key=lambda entry: panels.index(entry[0]))
-    for number, (panel, held) in enumerate(groupby(found, lambda entry: entry[0])):
-        yield from [f".SH {title}"] if number == 0 else []
+    """Yield a section of panels, terms and meanings, with a subsection per panel; empty without entries."""
+    by_panel: dict[str, list[tuple[str, str]]] = {"": []}
+    for panel, term, meaning in entries:
+        by_panel.setdefault(panel, []).append((term, meaning))
+    yield from [f".SH {title}"] if any(by_panel.values()) else []
+    for panel, terms in by_panel.items():
         yield from [f".SS {_text(panel)}"] if panel else []
-        for _, term, meaning in held:
+        for term, meaning in terms:
             yield from (".TP", f"\\fB{_text(term)}\\fR", _text(" ".join(meaning.split())))
 
 
 def _text(text: str) -> str:
-    """Text as troff prints it literally: backslashes, hyphens that are typed, and dots that begin a line."""
+    """Escape what troff would interpret: backslashes, hyphens, and dots that begin a line."""
     text = text.replace("\\", "\\e").replace("-", "\\-")
     return f"\\&{text}" if text.startswith((".", "'")) else text
 
 
 def main(arguments: list[str]) -> None:
-    """Write all pages into the folder named, and remove pages of verbs that are gone."""
+    """Write all pages into a folder, and remove pages of removed commands."""
     if len(arguments) != 1:
         raise UsageError("usage: python -m facerf_cli.cli.manual DIR")
     folder, written = Path(arguments[0]), pages()

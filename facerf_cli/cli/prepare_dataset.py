@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import BatchOptions
 from facerf_cli.capture.settings import CAPTURE, ChartSettings, CheckSettings, ReadSettings
 from facerf_cli.cli.options import refuse_given, settings_of
 from facerf_cli.dataset.settings import DatasetSettings

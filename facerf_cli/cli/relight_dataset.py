@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from facerf_cli.batch.run import BatchOptions
+from facerf_cli.batch.settings import BatchOptions
 from facerf_cli.cli.options import settings_of
 from facerf_cli.dataset.settings import PairSettings
 from facerf_cli.option import Without

@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, sums_up
+from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
+from facerf_cli.batch.settings import BatchOptions
 from facerf_cli.cli.options import settings_of
 from facerf_cli.option import Without
 from facerf_cli.synth.stage_settings import StageSettings

@@ -11,8 +11,8 @@ import numpy as np
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.journal import json_rows
 from facerf_cli.batch.recipe import Recipe, require_same
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, spread_with_bar, sums_up
-from facerf_cli.batch.settings import Settings, torch_device
+from facerf_cli.batch.run import Job, Outcome, run_items, sums_up
+from facerf_cli.batch.settings import BatchOptions, Settings, torch_device
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.chart import read_charts, write_chart_overlays
 from facerf_cli.capture.checks.subject import check_subject
@@ -57,7 +57,7 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.network.files import serving_files
 from facerf_cli.relighting.models import Networks
 from facerf_cli.run.logs import LOGGER_NAME, counted
-from facerf_cli.run.workers import one_thread, process_died
+from facerf_cli.run.workers import one_thread, process_died, spread
 
 log = logging.getLogger(LOGGER_NAME)
 
@@ -109,7 +109,7 @@ def check_all(
     """
     if batch.shard.of > 1:
         raise UsageError("--shard: --checks only checks all subjects; omit it, and give --jobs or --ray")
-    results = spread_with_bar(work, items, "checks", batch.workers(settings), settings, _not_checked)
+    results = spread(work, items, batch.workers(settings), _not_checked, "checks")
     findings = [found for of_subject in results for found in of_subject]
     write_findings(batch.output / FINDINGS_FILE, findings)
     show_findings(findings, strict)

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from facerf_cli.batch.inputs import MAP_SUFFIXES, Item, collect_items
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items, spread_with_bar
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.run import Job, Outcome, run_items
+from facerf_cli.batch.settings import BatchOptions, Settings
 from facerf_cli.dataset.dataset import Dataset, read_dataset
 from facerf_cli.dataset.pairs import (
     draw_pairs,
@@ -25,7 +25,7 @@ from facerf_cli.dataset.weights import envmap_names
 from facerf_cli.errors import UsageError
 from facerf_cli.run import memory
 from facerf_cli.run.logs import LOGGER_NAME
-from facerf_cli.run.workers import process_died
+from facerf_cli.run.workers import process_died, spread
 from facerf_cli.synth.sky.skies import parse_envmaps
 
 T = TypeVar("T")
@@ -125,7 +125,7 @@ def _spread_maps(
         raise UsageError(
             "--shard: the pairs are not drawn yet; run once with --lazy and without --shard first"
         )
-    return spread_with_bar(work, maps, "maps", batch.workers(settings), settings, _map_died)
+    return spread(work, maps, batch.workers(settings), _map_died, "maps")
 
 
 def _map_died(task: Any, error: Exception) -> Any:

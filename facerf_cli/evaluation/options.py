@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from facerf_cli.baselines import RelightKind
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions
-from facerf_cli.batch.settings import NOT_IN_RECIPE
+from facerf_cli.batch.settings import NOT_IN_RECIPE, BatchOptions
 from facerf_cli.errors import UsageError
 from facerf_cli.option import DATA, MEASURES, METHODS, Only, option
 from facerf_cli.work.photo_options import FieldOptions, SolveOptions

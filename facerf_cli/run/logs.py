@@ -1,6 +1,5 @@
 """Log lines, JSON rows, and the provenance of outputs."""
 
-import json
 import logging
 import math
 import re
@@ -34,7 +33,7 @@ _LONGEST_LINE = 2000  # characters of a message; those of damaged files may be o
 
 @dataclass(frozen=True)
 class Provenance:
-    """The origin of a result, for the metadata of every output.
+    """Origin of a result, for the metadata of every output.
 
     `face_model` and its licence are `MorphableModel.stamp`; `source_type` is '' for images that are not
     synthetic, such as a cropped photograph.
@@ -45,10 +44,10 @@ class Provenance:
     face_model: str = ""
     face_model_licence: str = ""
     source_type: str = COMPOSITE_SOURCE_TYPE
-    key: str = ""  # of the file of `-o FILE`, by which a later run recognises it
+    key: str = ""  # of the file of `-o FILE`, so that a later run recognises it
 
     def attributes(self) -> dict[str, str | int]:
-        """Metadata for a file's header; empty fields are left out."""
+        """Return metadata for a file's header, without empty fields."""
         attributes: dict[str, str | int] = {
             "Software": f"facerf {__version__}",
             "facerf:version": __version__,
@@ -64,9 +63,9 @@ class Provenance:
 
 
 def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "", key: str = "") -> dict[str, Any]:
-    """Metadata of weighted sums of a stack's images, from the stack's own metadata.
+    """Return metadata for weighted sums of a stack's images, from the stack's metadata.
 
-    They are marked as synthetic even if the stack holds photographs, since their light did not exist.
+    Sums of photographs are also marked as synthetic, since their light did not exist.
     """
     default = Provenance(stack_name, source_type=_CAPTURES_SOURCE_TYPE)
     of_stack = {name: value for name, value in stack.items() if name != "facerf:key"}
@@ -76,18 +75,16 @@ def attributes_of_sum(stack: Mapping[str, Any], stack_name: str = "", key: str =
 def json_line(row: Mapping[str, Any]) -> str:
     """Format a row as one line of strict JSON: paths as text, numpy as numbers, NaN and infinity as null.
 
-    Bytes of a file's name that are not UTF-8 are escaped, so that the line can be written; and what is not
-    printable, so that a terminal does not obey it and no other program sees two lines.
+    Characters that are not printable, and bytes of file names that are not UTF-8, are escaped: a terminal
+    would obey some, and other programs would take some for the end of the line.
     """
+    import json  # --help does without it
+
     text = json.dumps(_plain(row), allow_nan=False, ensure_ascii=False)
-    return "".join(map(_json_escape, text) if not text.isprintable() else text)
-
-
-def _json_escape(letter: str) -> str:
-    """JSON's escape of a character that is not printable."""
-    if letter.isprintable():
-        return letter
-    return "\\u007f" if letter == "\x7f" else json.dumps(letter)[1:-1]
+    if text.isprintable():
+        return text
+    escapes = {ord(letter): json.dumps(letter)[1:-1] for letter in set(text) if not letter.isprintable()}
+    return text.translate(escapes | {0x7F: "\\u007f"})
 
 
 def _plain(value: Any) -> Any:
@@ -105,7 +102,7 @@ def _plain(value: Any) -> Any:
 
 
 class LineFormatter(logging.Formatter):
-    """Formats `facerf: warning: …`; information has no prefix. A traceback follows if one is attached."""
+    """Formats `facerf: warning: …`, without a prefix for information, and an exception's traceback."""
 
     def format(self, record: logging.LogRecord) -> str:
         prefix = "" if record.levelno <= logging.INFO else f"facerf: {record.levelname.lower()}: "
@@ -132,7 +129,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class _StderrHandler(logging.Handler):
-    """Prints above a running progress bar when stderr is a terminal, plainly when it is not."""
+    """Prints plainly, or above a running progress bar if stderr is a terminal."""
 
     def emit(self, record: logging.LogRecord) -> None:
         text = self.format(record)
@@ -153,7 +150,7 @@ def configure_logging(verbosity: int = 0, as_json: bool = False) -> None:
 
 
 def log_to_queue(queue: Any, level: int) -> None:
-    """Send this process's log, from a level on, to a queue only: any object with `put_nowait`."""
+    """Send this process's log, from a level on, only to a queue: any object with `put_nowait`."""
     from logging.handlers import QueueHandler  # --help does without it
 
     logger = logging.getLogger(LOGGER_NAME)
@@ -164,34 +161,34 @@ def log_to_queue(queue: Any, level: int) -> None:
 
 @contextmanager
 def step(name: str) -> Iterator[None]:
-    """Log the seconds that a step of the work takes (`-v`), and those of all threads on the processors."""
+    """Log how long a step of the work takes (`-v`), and the processor time of all its threads."""
     log = logging.getLogger(LOGGER_NAME)
     if not log.isEnabledFor(logging.DEBUG):
         yield
         return
     start_s, used_s = time.perf_counter(), time.process_time()
     yield
-    taken = {"seconds": time.perf_counter() - start_s, "processor_seconds": time.process_time() - used_s}
-    spent = {"step": name, **{key: round(value, 3) for key, value in taken.items()}}
+    seconds, processor_seconds = time.perf_counter() - start_s, time.process_time() - used_s
+    spent = {"step": name, "seconds": round(seconds, 3), "processor_seconds": round(processor_seconds, 3)}
     log.debug(
         "step %(step)s: %(seconds)g s, %(processor_seconds)g s of processors", spent, extra={"spent": spent}
     )
 
 
 def unexpected(error: Exception) -> str:
-    """The message of an error that is a bug, not the user's fault."""
+    """Return the message of an error that is a bug, not the user's fault."""
     return f"unexpected {type(error).__name__}: {error} (rerun with -v for the traceback)"
 
 
 def one_line(text: str) -> str:
-    """The text with line breaks and runs of spaces replaced by single spaces."""
+    """Replace line breaks and runs of spaces by single spaces."""
     return " ".join(text.split())
 
 
 def escaped(text: str) -> str:
-    r"""The text with characters that are not printable as `\x1b` or `\u2028`.
+    r"""Escape characters that are not printable, as `\x1b` or `\u2028`.
 
-    They come from names and metadata: a terminal would obey some, and others hide or turn what follows.
+    Names and metadata contain them: a terminal would obey some, and others hide or reverse the rest.
     """
     if text.isprintable():
         return text
@@ -199,12 +196,12 @@ def escaped(text: str) -> str:
 
 
 def named(text: str) -> str:
-    """Return the text with `-` in place of the temporary file of an image on standard input."""
+    """Replace the temporary file of an image on standard input by `-`."""
     return _FROM_STDIN.sub("-", text)
 
 
 def printable_line(text: str) -> str:
-    """The text as one printable line of limited length, for a log or a report."""
+    """Return the text as one printable line of limited length, for a log or a report."""
     line = escaped(one_line(named(text[: 4 * _LONGEST_LINE])))
     return line if len(line) <= _LONGEST_LINE else line[: _LONGEST_LINE - 3] + "..."
 

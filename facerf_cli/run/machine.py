@@ -34,7 +34,7 @@ def _cgroup_limits() -> Iterator[int]:
             name, file = _LIMITS.get(kind.split(" ")[0], ("", ""))
             if file and name in paths:
                 top, point = mount.split(" ")[3:5]
-                # In a container, a path outside of it may stand there; then the mount's own limit is met.
+                # In a container the path may lie outside the mount; then the mount's own limit applies.
                 folder = Path(point, os.path.relpath(paths[name], top))
                 for cgroup in (folder, *folder.parents):
                     with suppress(OSError, ValueError):  # none there, or "max"

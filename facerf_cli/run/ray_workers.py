@@ -1,7 +1,7 @@
 """Items as tasks of Ray, for `--ray`: on this machine's processors or a cluster's (docs/clusters.md).
 
-Ray itself would try a task again without asking; here the driver does, because it looks first whether the
-lost worker had finished. All machines must see the same files under the same paths.
+Ray would repeat a task itself; here the driver does, since it first looks whether the lost worker had
+finished. All machines must see the same files under the same paths.
 """
 
 import importlib
@@ -14,24 +14,25 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from contextlib import chdir
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from facerf_cli._version import __version__
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.run.logs import LOGGER_NAME, log_to_queue, one_line
 from facerf_cli.run.machine import processors
 
+if TYPE_CHECKING:
+    from facerf_cli.run.workers import Workers
+
 T = TypeVar("T")
 R = TypeVar("R")
-LOCAL = "local"
 _NO_MODULES = Path(__file__).parents[1] / "assets"
 _ATTEMPTS = 3  # at an item whose workers are lost
 _PATIENCE_S = 10
-_STORE_BYTES = 256 << 20  # of shared memory; what goes through it is settings
-# Before Ray is imported: nothing is sent home or announced, a wrong address is given up in half a minute, and
-# the workers of this machine are as nice as `--jobs`' are (Ray's own 15 starves them beside other programs).
+_STORE_BYTES = 256 << 20  # of shared memory, which only settings go through
+# Set before Ray is imported: no telemetry, a wrong address fails within half a minute, and the workers of
+# this machine have the priority that `--jobs` has (Ray's own niceness of 15 starves them beside others).
 _ENVIRONMENT = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ENABLE_METRICS_COLLECTION": "0",
@@ -40,35 +41,37 @@ _ENVIRONMENT = {
     "RAY_NUM_REDIS_GET_RETRIES": "2",
     "RAY_py_gcs_connect_timeout_s": "5",
 }
-_PASSED_ON = ("OCIO",)  # variables of this process that say what a picture's colours are
+_PASSED_ON = ("OCIO",)  # variables of this process that define an image's colours
 log = logging.getLogger(LOGGER_NAME)
 
 
 def in_ray(
     work: Callable[[T], R],
     items: Sequence[T],
-    address: str,
-    jobs: int,
-    gpus: int | None,
-    broken: Callable[[T, Exception], R],
+    workers: "Workers",
+    died: Callable[[T, Exception], R],
 ) -> Generator[tuple[int, R]]:
-    """Each item's number and result as they come; `jobs` tasks at a time, 0 for as many as there are CPUs.
+    """Yield the number and result of each item as they come.
 
-    A task has one CPU, one thread, and `gpus` GPUs; None: one where the cluster has any. An item whose worker
-    is lost is tried again, twice.
-    Raises `UsageError` where there is no Ray, or none at the address.
+    A task has one processor, one thread and `workers.gpus` GPUs. An item whose worker is lost is tried twice
+    more. Raises UsageError if Ray is not installed, or does not run at the address.
     """
-    ray = connect(address, jobs)
-    if gpus is None:
-        gpus = int(ray.cluster_resources().get("GPU", 0) >= 1)
-    _warn_of_what_lacks(ray, gpus)
+    address = workers.ray or "local"
+    ray = connect(address, workers.jobs)
+    resources = ray.cluster_resources()
+    gpus = int(resources.get("GPU", 0) >= 1) if workers.gpus is None else workers.gpus
+    for name, needed in (("CPU", 1), ("GPU", gpus)):
+        if resources.get(name, 0) < needed:  # a cluster that grows may yet get it
+            log.warning("the Ray cluster has no %s now; tasks wait for one", name)
     task = ray.remote(num_cpus=1, num_gpus=gpus, max_retries=0)(_task)
-    shared, site = ray.put(work), _Site.here()
+    environment = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
+    shared, site = ray.put(work), _Site(os.getcwd(), __version__, log.level, environment)
     waiting = deque((number, 1) for number in range(len(items)))
     running: dict[Any, tuple[int, int]] = {}
     try:
         while waiting or running:
-            at_once = jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))  # a cluster may grow
+            # A cluster may grow.
+            at_once = workers.jobs or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
             while waiting and len(running) < at_once:
                 number, attempt = waiting.popleft()
                 running[task.remote(shared, items[number], site)] = number, attempt
@@ -76,31 +79,36 @@ def in_ray(
                 number, attempt = running.pop(reference)
                 answer = _answer_of(ray, reference)
                 if isinstance(answer, _Answer):
-                    answer.log()
+                    for record in answer.records:
+                        log.handle(record)
                     yield number, answer.result
                 elif attempt < _ATTEMPTS:
                     log.warning("a worker was lost; its item is tried again (%s)", answer)
                     waiting.appendleft((number, attempt + 1))
                 else:
                     error = ChildProcessError(f"{attempt} times; the last: {answer}")
-                    yield number, broken(items[number], error)
+                    yield number, died(items[number], error)
     except ray.exceptions.RayError as error:
         raise FacerfError(
             f"--ray {address}: the cluster was lost ({_first_sentence(error)}); start it again, then run the "
             "same command, which continues"
         ) from error
     finally:
-        _cancel(ray, list(running))
+        if running and ray.is_initialized():  # an interrupted task removes its temporary files
+            for reference in running:
+                ray.cancel(reference)
+            for reference in ray.wait(list(running), num_returns=len(running), timeout=_PATIENCE_S)[1]:
+                ray.cancel(reference, force=True)
 
 
 def connect(address: str, jobs: int = 0) -> Any:
-    """The module `ray`, connected; it stays so until this process ends. Errors as of `in_ray`."""
+    """Return the module `ray`, connected until this process ends. Raises UsageError as `in_ray` does."""
     token = Path.home() / ".ray" / "auth_token"
-    show_token = {"RAY_AUTH_MODE": "token"} if address != LOCAL and token.is_file() else {}
+    show_token = {"RAY_AUTH_MODE": "token"} if address != "local" and token.is_file() else {}
     for name, value in (_ENVIRONMENT | show_token).items():
         os.environ.setdefault(name, value)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Ray's, of its own future
+        warnings.simplefilter("ignore")  # Ray's, about its own future
         try:
             ray = importlib.import_module("ray")
         except ImportError:
@@ -117,10 +125,10 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
         "logging_level": logging.ERROR,
         "runtime_env": {"env_vars": {"PYTHONSAFEPATH": "1"}},
     }
-    if address == LOCAL:
+    if address == "local":
         options |= {"num_cpus": jobs or processors(), "object_store_memory": _STORE_BYTES}
         options["include_dashboard"] = False
-    else:
+    elif address != "auto":
         _require_listener(address)
     ours = signal.getsignal(signal.SIGTERM)
     try:
@@ -133,19 +141,17 @@ def _initialise(ray: Any, address: str, jobs: int) -> None:
             ) from error
         raise UsageError(f"--ray {address}: {_first_sentence(error)}") from error
     finally:
-        signal.signal(signal.SIGTERM, ours)  # Ray sets one of its own
-    # A thread of Ray's tells standard output, which is for results, of workers that died; so do we.
-    innards: Any = importlib.import_module("ray._private.worker")
-    innards.print_to_stdstream = lambda *_, **__: None
+        signal.signal(signal.SIGTERM, ours)  # Ray sets its own
+    # A thread of Ray reports dead workers on standard output, which is for results; facerf logs them.
+    internals: Any = importlib.import_module("ray._private.worker")
+    internals.print_to_stdstream = lambda *_, **__: None
 
 
 def _require_listener(address: str) -> None:
-    """Raise UsageError where nobody answers: Ray alone would take minutes to give up."""
-    if address == "auto":
-        return
+    """Raise UsageError if there is no server at an address: Ray itself would take minutes to give up."""
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or "/" in host:
-        raise UsageError(f"--ray {address}: give HOST:PORT of the head of a cluster, auto, or local")
+        raise UsageError(f"--ray {address}: not an address; use HOST:PORT of a cluster's head, auto or local")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=_PATIENCE_S).close()
     except (OSError, OverflowError) as error:
@@ -153,16 +159,8 @@ def _require_listener(address: str) -> None:
         raise UsageError(f"--ray {address}: cannot be reached ({reason}); is Ray's head there?") from None
 
 
-def _warn_of_what_lacks(ray: Any, gpus: int) -> None:
-    """Say what tasks will wait for; a cluster that grows may yet get it."""
-    have = ray.cluster_resources()
-    for name, wanted in (("CPU", 1), ("GPU", gpus)):
-        if have.get(name, 0) < wanted:
-            log.warning("the Ray cluster has no %s now; tasks wait for one", name)
-
-
 def _answer_of(ray: Any, reference: Any) -> "_Answer | str":
-    """A task's answer, or how its worker was lost; what it raised is raised here."""
+    """Return a task's answer, or how its worker was lost; raise the exception of the work."""
     errors = ray.exceptions
     lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
     try:
@@ -180,60 +178,35 @@ def _answer_of(ray: Any, reference: Any) -> "_Answer | str":
 
 
 def _first_sentence(error: Exception) -> str:
-    """Ray explains its errors at length; this much goes into a line."""
+    """Return the first sentence of one of Ray's long explanations."""
     return one_line(str(error)).split(". ")[0][:200] or type(error).__name__
 
 
-def _cancel(ray: Any, running: list[Any]) -> None:
-    """Interrupt tasks, which lets them take their temporary files away, and end by force those that stay."""
-    if not (running and ray.is_initialized()):
-        return
-    for reference in running:
-        ray.cancel(reference)
-    for reference in ray.wait(running, num_returns=len(running), timeout=_PATIENCE_S)[1]:
-        ray.cancel(reference, force=True)
-
-
-@dataclass(frozen=True)
-class _Site:
-    """Facts of the process that sent a task."""
+class _Site(NamedTuple):
+    """The process that sends tasks: its working folder, facerf's version, log level and variables."""
 
     folder: str
     version: str
     level: int
-    environment: tuple[tuple[str, str], ...]
-
-    @staticmethod
-    def here() -> "_Site":
-        passed = tuple((name, os.environ[name]) for name in _PASSED_ON if name in os.environ)
-        return _Site(os.getcwd(), __version__, log.level, passed)
-
-    def enter(self) -> None:
-        """Make a worker work as if in the sender's place: relative paths lead where they led there."""
-        host = socket.gethostname()
-        if self.version != __version__:
-            raise UsageError(f"--ray: {host} has facerf {__version__}, and this is {self.version}")
-        if not Path(self.folder).is_dir():
-            raise UsageError(f"--ray: {host} has no {self.folder}; all machines must share the files")
-        os.chdir(self.folder)
-        os.environ.update(self.environment)
+    environment: dict[str, str]
 
 
-@dataclass(frozen=True)
-class _Answer:
-    """An item's result, and what was logged on the way."""
+class _Answer(NamedTuple):
+    """The result of an item, and the log records of its work."""
 
     result: Any
     records: list[logging.LogRecord]
 
-    def log(self) -> None:
-        for record in self.records:
-            log.handle(record)
-
 
 def _task(work: Callable[[Any], Any], item: Any, site: _Site) -> _Answer:
-    """Run one item in a worker of Ray."""
-    site.enter()
+    """Process one item in a worker of Ray, with the sender's working folder and variables."""
+    host = socket.gethostname()
+    if site.version != __version__:
+        raise UsageError(f"--ray: {host} has facerf {__version__}, and this is {site.version}")
+    if not Path(site.folder).is_dir():
+        raise UsageError(f"--ray: {host} has no {site.folder}; all machines must share the files")
+    os.chdir(site.folder)  # so that relative paths are the sender's
+    os.environ.update(site.environment)
     records: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
     log_to_queue(records, site.level)
     result = work(item)

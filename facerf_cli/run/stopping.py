@@ -1,7 +1,7 @@
-"""Signals that end a process: it unwinds, so that temporary files go, or is ended where that takes too long.
+"""Signals that end a process: it unwinds, so that temporary files are removed, or is ended if that is slow.
 
 Python runs a handler between two of its instructions, and a library may be minutes away from the next. A
-thread therefore waits for the signal's number too (`signal.set_wakeup_fd`).
+thread therefore also waits for the signal's number (`signal.set_wakeup_fd`).
 
 A library may also catch the exit and continue with half of its work (`except BaseException`, as trimesh's
 writer of OBJ does): `end_again` raises it once more, before an output gets its name and after an item.
@@ -21,20 +21,23 @@ from typing import Any, NoReturn
 _cleaners: list[Callable[[], None]] = []
 _unhurried: list[None] = []  # an entry for each block that ends by itself
 _ended_by: list[int] = []  # the signal whose exit was raised
+_interrupted_s: list[float] = []  # when the first Ctrl-C came
 _AT_ONCE_S = 1.0  # a second Ctrl-C within this time is the first one, which a shell and a terminal both send
 
 
 def end_on_signals(patience_s: float, interrupts: bool = True) -> None:
     """Unwind on SIGTERM and SIGHUP, and on SIGINT if `interrupts`; end after `patience_s` in any case.
 
-    A signal that is ignored (`nohup`) stays so. Call it in the main thread.
+    A signal that is ignored (`nohup`) stays ignored. Call it in the main thread.
     """
-    numbers = [signal.SIGTERM] + ([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])
-    handled = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
-    for number in handled:
-        signal.signal(number, _unwind)
-    if interrupts and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _Interrupt())
+    handlers: dict[int, Any] = {signal.SIGTERM: _unwind}
+    if hasattr(signal, "SIGHUP"):
+        handlers[signal.SIGHUP] = _unwind
+    if interrupts:
+        handlers[signal.SIGINT] = _interrupt
+    for number, handler in handlers.items():
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, handler)
     sys.unraisablehook = _silent_about_exits
     if hasattr(signal, "SIGHUP"):  # elsewhere a pipe cannot be waited for
         ours, theirs = os.pipe()
@@ -65,7 +68,7 @@ def clean_by(cleaner: Callable[[], None]) -> None:
 
 @contextmanager
 def unhurried() -> Iterator[None]:
-    """Let the block take its time after a signal, as a step of training does."""
+    """Let the block finish after a signal, however long it takes, such as a step of training."""
     _unhurried.append(None)
     try:
         yield
@@ -78,6 +81,16 @@ def _unwind(number: int, _: FrameType | None) -> NoReturn:
     _raise_exit(number)
 
 
+def _interrupt(number: int, _: FrameType | None) -> None:
+    """Unwind at the first Ctrl-C; end at a later one, while unwinding takes long."""
+    now_s = time.monotonic()
+    if not _interrupted_s:
+        _interrupted_s.append(now_s)
+        _raise_exit(number)
+    if now_s - _interrupted_s[0] > _AT_ONCE_S:
+        _end(number)
+
+
 def _raise_exit(number: int) -> NoReturn:
     _ended_by[:] = [number]
     if number == signal.SIGINT:
@@ -86,28 +99,13 @@ def _raise_exit(number: int) -> NoReturn:
 
 
 def _silent_about_exits(unraisable: Any) -> None:
-    """Report an exception that Python cannot raise, but not after a signal: an exit, what it left open."""
+    """Report an exception that Python cannot raise, unless a signal caused it."""
     if not _ended_by:
         sys.__unraisablehook__(unraisable)
 
 
-class _Interrupt:
-    """The handler of Ctrl-C: the first unwinds; one that comes later, while that takes long, ends."""
-
-    def __init__(self) -> None:
-        self._first_s: float | None = None
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        now_s = time.monotonic()
-        if self._first_s is None:
-            self._first_s = now_s
-            _raise_exit(number)
-        if now_s - self._first_s > _AT_ONCE_S:
-            _end(number)
-
-
 def _watch(pipe: int, patience_s: float) -> None:
-    """End the process where a signal's own handler does not: its thread is in a library."""
+    """End the process if the thread that should run a signal's handler stays in a library."""
     while number := os.read(pipe, 1):
         if number[0] != signal.SIGINT and not _unhurried:
             time.sleep(patience_s)

@@ -23,7 +23,8 @@ from facerf_cli.batch.inputs import (
 )
 from facerf_cli.batch.journal import Journal
 from facerf_cli.batch.recipe import DigestOf, Recipe, RecipesOf, key_of
-from facerf_cli.batch.run import BatchOptions, folder_not_file, keep_newer
+from facerf_cli.batch.run import keep_newer
+from facerf_cli.batch.settings import BatchOptions, folder_not_file
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import BATCH, option

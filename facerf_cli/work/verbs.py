@@ -12,8 +12,8 @@ from typing import Any, Literal, Self
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, Item, collect_items, only_item
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, folder_not_file, run_items
-from facerf_cli.batch.settings import NOT_IN_RECIPE
+from facerf_cli.batch.run import Job, Outcome, run_items
+from facerf_cli.batch.settings import NOT_IN_RECIPE, BatchOptions, folder_not_file
 from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights

@@ -21,11 +21,9 @@ from facerf_cli.batch.inputs import (
     NamePattern,
     collect_items,
     expand_inputs,
-    file_pattern,
     split_frame,
 )
-from facerf_cli.batch.run import BatchOptions
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.settings import BatchOptions, Settings
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.main import main
 from facerf_cli.work.photo_options import PhotoOptions, check_companion
@@ -190,7 +188,7 @@ def test_what_is_neither_an_image_nor_a_list_costs_a_line(
 
 
 def test_what_stdin_may_hold_is_bounded(monkeypatch: Patch) -> None:
-    monkeypatch.setattr(inputs_module, "LIMIT_BYTES", 5000)
+    monkeypatch.setattr(inputs_module, "_MOST_LIST_BYTES", 5000)
     monkeypatch.setattr(inputs_module, "_MOST_IMAGE_BYTES", 12000)
     for content, said in ((b"\x89PNG" + bytes(20000), "more than 1 GiB"), (b"x" * 5001, "neither")):
         pipe(monkeypatch, content)
@@ -255,7 +253,7 @@ def test_frames(tmp_path: Path) -> None:
     for pattern in ("plate.%04d.exr", "plate.####.exr", "plate.0998-1001.exr"):
         assert list(map(Path, expand_inputs([str(tmp_path / pattern)]))) == frames
     for wrong in ("plate.5-4.exr", "plate.1-900000.exr", str(tmp_path / "other.%04d.exr")):
-        with pytest.raises(UsageError, match=r"give FIRST-LAST|no such files"):
+        with pytest.raises(UsageError, match=r"use FIRST-LAST|no such files"):
             list(expand_inputs([wrong]))
     (tmp_path / "2020-2021.jpg").touch()
     assert list(expand_inputs([str(tmp_path / "2020-2021.jpg")])) == [str(tmp_path / "2020-2021.jpg")]
@@ -334,7 +332,7 @@ def test_images_become_the_frames_of_shots(
     items, shots = collect_frames([str(folder)], ShotOptions(sequence=True), batch, PhotoOptions(Settings()))
     found = {
         shot.base.relative_to(out).as_posix(): [
-            item.pattern_text(file_pattern("n{frame}"))[1:] for item in shot.frames
+            item.pattern_text(NamePattern.parse("n{frame}", "--name"))[1:] for item in shot.frames
         ]
         for shot in shots
     }
@@ -439,9 +437,9 @@ def test_outputs_have_the_given_names(verb: str, plates: Path, capsys: Said) -> 
     for name in ("a/me_jpg", "a/me_png", "plates/shot_png_000007"):
         assert f" -> {plates.parent / 'out' / name}{VERBS[verb]}\n" in said
     assert main([*line, "--name", "{dir}/{stem}"]) == 2
-    assert "--name names them alike; give it more fields" in capsys.readouterr().err
+    assert "--name names them alike; use more fields" in capsys.readouterr().err
     assert main([*line, "--name", "{stem}_{light}"]) == 2
-    assert "{light} is no field" in capsys.readouterr().err
+    assert "unknown field {light}" in capsys.readouterr().err
     assert main([*line, "--name", "../{stem}"]) == 2
 
 

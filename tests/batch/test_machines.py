@@ -12,8 +12,9 @@ import typer
 
 from facerf_cli import main
 from facerf_cli.batch.inputs import Item
-from facerf_cli.batch.run import BatchOptions, jobs_that_pay, sums_up
-from facerf_cli.batch.settings import Settings, Shard, torch_device
+from facerf_cli.batch.run import sums_up
+from facerf_cli.batch.settings import BatchOptions, Settings, Shard, default_job_count, torch_device
+from facerf_cli.cli.brief import Verb
 from facerf_cli.cli.options import with_groups
 from facerf_cli.errors import UsageError
 from facerf_cli.run import ray_workers
@@ -53,7 +54,7 @@ def call() -> Call:
 
     app = typer.Typer()
     app.callback()(main._global_options)
-    app.command()(with_groups(walk))
+    app.command(cls=Verb)(with_groups(walk))
     return lambda *line: (app(args=["walk", "-o", "out", *line], standalone_mode=False), got.pop())[1]
 
 
@@ -87,21 +88,21 @@ def test_processes_start_unasked_where_they_pay(
     settings: Settings,
     jobs: int,
 ) -> None:
-    monkeypatch.setattr("facerf_cli.batch.run.processors", lambda: processors)
+    monkeypatch.setattr("facerf_cli.batch.settings.processors", lambda: processors)
     monkeypatch.setattr("facerf_cli.run.memory.default_limit", lambda jobs=1: gigabytes << 30)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
-    assert jobs_that_pay(items, a_process, settings) == jobs
+    assert default_job_count(items, a_process, settings) == jobs
 
 
 def test_a_folder_gets_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[int] = []
 
-    def counted(work: Any, items: Any, workers: Workers, broken: Any) -> Any:
+    def counted(work: Any, items: Any, workers: Workers, died: Any, title: str) -> Any:
         seen.append(workers.jobs)
-        return map(work, items)
+        return (work(item) for item in items)
 
     monkeypatch.setattr("facerf_cli.batch.run.spread", counted)
-    monkeypatch.setattr("facerf_cli.batch.run.jobs_that_pay", lambda items, *_: 10 * items)
+    monkeypatch.setattr("facerf_cli.batch.run.default_job_count", lambda items, *_: 10 * items)
     (tmp_path / "photos").mkdir()
     for name in "ab":
         (tmp_path / "photos" / f"{name}.png").write_bytes(b"good")
@@ -111,7 +112,7 @@ def test_a_folder_gets_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("text", ["", "1", "0/2", "3/2", "1/0", "a/b", "-1/2", "1/2/3", "1.0/2", "½/2"])
 def test_a_wrong_share(call: Call, text: str) -> None:
-    refused(UsageError, "--shard ... : not a share; give K/N with K from 1 to N", call, f"--shard={text}")
+    refused(UsageError, "--shard ... : not a shard; use K/N with K from 1 to N", call, f"--shard={text}")
 
 
 @pytest.mark.parametrize("of", [1, 2, 3, 7])
@@ -173,7 +174,7 @@ def test_one_of_several_gpus_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     found = [str(torch_device(Settings(device=name))) for name in ("auto", "cuda", "cuda:1", "cpu")]
     assert found == ["cuda", "cuda", "cuda:1", "cpu"]
-    refused(UsageError, "--device cuda:2: ... give ... cuda:1", torch_device, Settings(device="cuda:2"))
+    refused(UsageError, "--device cuda:2: ... use ... cuda:1", torch_device, Settings(device="cuda:2"))
 
 
 @pytest.mark.parametrize(

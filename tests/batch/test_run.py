@@ -13,17 +13,16 @@ from typing import Never
 import pytest
 
 from facerf_cli.batch import journal
-from facerf_cli.batch.inputs import Item, _ignores_case, collect_items
+from facerf_cli.batch.inputs import Item, _ignores_case
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of, require_same
-from facerf_cli.batch.run import BatchOptions, Outcome, run_items
-from facerf_cli.batch.settings import NOT_IN_RECIPE, Settings, Shard
+from facerf_cli.batch.run import Outcome
+from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.texts import file_sha256
-from facerf_cli.run.logs import configure_logging
 from facerf_cli.work.output_options import OutputOptions
 from facerf_cli.work.photo_options import PhotoOptions
-from tests.batch.toy_batch import Copy, run
+from tests.batch.toy_batch import Copy, run, run_job
 from tests.folders import rows
 from tests.kinds import Patch, Said
 from tests.processes import wait_until
@@ -44,7 +43,7 @@ def test_nothing_to_work_on_and_an_output_folder_that_cannot_be(tmp_path: Path, 
     assert not (tmp_path / "out").exists()
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "out"):
-        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; give another"):
+        with pytest.raises(UsageError, match=f"-o {folder}: cannot be written to .*; use another"):
             run([photos], folder)
 
 
@@ -120,8 +119,8 @@ SLOW_VERB = """
 import sys, time
 from pathlib import Path
 from facerf_cli.batch.inputs import collect_items
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.run import Job, Outcome, run_items
+from facerf_cli.batch.settings import BatchOptions, Settings
 from facerf_cli.files.atomic import atomic_path
 
 class Slow(Job):
@@ -184,7 +183,7 @@ def test_another_photo_of_a_name_is_processed_and_the_same_from_elsewhere_is_not
     assert run([two], tmp_path / "out") == 0
     said = capsys.readouterr()
     assert said.out.split() == [str(tmp_path / "out" / "a_copy.bin")]
-    assert "1 to make again: input changed" in said.err
+    assert "1 item out of date: input changed" in said.err
     assert (tmp_path / "out" / "a_copy.bin").read_bytes() == b"z"
     run([two], tmp_path / "out")
     two.rename(tmp_path / "moved")
@@ -214,9 +213,9 @@ def test_other_options_make_all_again(two: Path, tmp_path: Path, capsys: Said) -
     assert [Path(line).name for line in said.out.splitlines()] == ["a_copy.bin"]
     assert "1 of 2 results are finished" in said.err and "1 result would be made" in said.err
     run([two], tmp_path / "out", recipe={"lights": 200}, dry_run=True)
-    assert "2 to make again: options changed" in capsys.readouterr().err
+    assert "2 items out of date: options changed" in capsys.readouterr().err
     run([two], tmp_path / "out", recipe={"lights": 300})
-    assert "2 to make again: options changed" in capsys.readouterr().err
+    assert "2 items out of date: options changed" in capsys.readouterr().err
 
 
 def test_results_of_a_relative_folder_are_recognised(two: Path, monkeypatch: Patch, capsys: Said) -> None:
@@ -246,7 +245,7 @@ def test_outputs_that_the_user_changed_are_kept_and_empty_ones_made_again(
     assert (out / "a_copy.bin").read_bytes() == b"retouched"
     (out / "a_copy.bin").write_bytes(b"")
     run([two], out)
-    assert "1 to make again: missing or empty" in capsys.readouterr().err
+    assert "1 item out of date: missing or empty" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("edited", [True, False])
@@ -299,8 +298,7 @@ def test_a_file_beside_the_outputs_follows_the_same_rule(two: Path, tmp_path: Pa
             return Outcome([item.output("_copy.bin"), item.output("_face1.bin")])
 
     def call(number: int, **options: object) -> int:
-        items = collect_items([str(two / "a.png")], out)
-        return run_items(Several(out, {"lights": number}), items, BatchOptions(out, **options), Settings())
+        return run_job(Several(out, {"lights": number}), two / "a.png", out, **options)
 
     assert call(1) == call(2) == 0 and beside.read_bytes() == b"{'lights': 2}"
     beside.write_bytes(b"mine")
@@ -347,8 +345,7 @@ def test_a_run_with_other_options_that_was_ended_leaves_nothing_finished(two: Pa
             return Outcome([item.output("_copy.bin")])
 
     def call(number: int) -> int:
-        items = collect_items([str(two / "a.png")], out)
-        return run_items(Said(out, {"lights": number}), items, BatchOptions(out), Settings())
+        return run_job(Said(out, {"lights": number}), two / "a.png", out)
 
     assert call(1) == 0
     with pytest.raises(KeyboardInterrupt):
@@ -370,8 +367,7 @@ def test_a_result_that_is_edited_while_its_item_runs_is_the_users(two: Path, tmp
             return Outcome([item.output("_copy.bin")])
 
     def call(number: int) -> int:
-        items = collect_items([str(two / "a.png")], out)
-        return run_items(Slow(out, {"lights": number}), items, BatchOptions(out), Settings())
+        return run_job(Slow(out, {"lights": number}), two / "a.png", out)
 
     assert call(1) == 0 and call(2) == 1
     assert (out / "a_copy.bin").read_bytes() == b"mine"
@@ -442,22 +438,18 @@ def test_only_stale_outputs_are_made(two: Path, tmp_path: Path, capsys: Said) ->
                     temporary.write_bytes(b"made")
             return Outcome(self.outputs_of(item))
 
-    def call() -> int:
-        configure_logging()
-        return run_items(Lit(out), collect_items([str(two)], out), BatchOptions(out), Settings())
-
-    assert call() == 0
+    assert run_job(Lit(out), two, out) == 0
     (out / "a_a.bin").write_bytes(b"retouched")
     lights.append("b")
     capsys.readouterr()
-    assert call() == 0
+    assert run_job(Lit(out), two, out) == 0
     said = capsys.readouterr()
     assert [Path(line).name for line in said.out.split()] == ["a_b.bin", "b_b.bin"]
-    assert "make again" not in said.err
+    assert "out of date" not in said.err
     assert (out / "a_a.bin").read_bytes() == b"retouched"
     (out / "b_a.bin").unlink()
-    assert call() == 0
-    assert "1 to make again: missing or empty" in capsys.readouterr().err
+    assert run_job(Lit(out), two, out) == 0
+    assert "1 item out of date: missing or empty" in capsys.readouterr().err
 
 
 def test_a_finished_folder_is_read_without_writing_or_reading_much(
@@ -488,16 +480,6 @@ def test_damaged_rows_are_passed_over(two: Path, tmp_path: Path, capsys: Said) -
     assert made(capsys) == []
 
 
-def test_shards_know_what_the_others_made(two: Path, tmp_path: Path, capsys: Said) -> None:
-    for number in (1, 2):
-        run(two, tmp_path / "out", Shard(number, 2))
-    assert made(capsys) == ["a", "b"]
-    run([two], tmp_path / "out")
-    assert made(capsys) == []
-    run([two], tmp_path / "out", report=True)
-    assert [row["status"] for row in rows(tmp_path / "out", "report.jsonl").values()] == ["done", "done"]
-
-
 def test_a_first_photo_that_fails_keeps_its_row(two: Path, tmp_path: Path) -> None:
     """As with xargs, which makes a run of each photo."""
     (two / "a.png").write_bytes(b"bad")
@@ -515,8 +497,7 @@ def test_a_finished_folder_loads_nothing_for_its_work(two: Path, tmp_path: Path)
             raise AssertionError("torch is imported here")
 
     assert run([two], tmp_path / "out") == 0
-    items = collect_items([str(two)], tmp_path / "out")
-    assert run_items(Lazy(tmp_path), items, BatchOptions(tmp_path / "out"), Settings()) == 0
+    assert run_job(Lazy(tmp_path), two, tmp_path / "out") == 0
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from facerf_cli.batch.inputs import Item, collect_items
 from facerf_cli.batch.recipe import DigestOf, Recipe
-from facerf_cli.batch.run import BatchOptions, Job, Outcome, run_items
-from facerf_cli.batch.settings import Settings, Shard
+from facerf_cli.batch.run import Job, Outcome, run_items
+from facerf_cli.batch.settings import BatchOptions, Settings, Shard
 from facerf_cli.errors import FacerfError, InputError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging
@@ -82,10 +82,15 @@ def run(
     **options: object,
 ) -> int:
     """Copy photos to OUTPUT; notes go to the folder above."""
+    job = Copy(output.parent, recipe or {})
+    return run_job(job, inputs, output, shard=shard or Shard(), ray=ray, **options)
+
+
+def run_job(job: Job, inputs: Path | list[Path], output: Path, **options: object) -> int:
+    """Run a job on photos."""
     configure_logging()
-    batch = BatchOptions(output, shard=shard or Shard(), ray=ray, **options)  # type: ignore[arg-type]
     items = collect_items([str(path) for path in ([inputs] if isinstance(inputs, Path) else inputs)], output)
-    return run_items(Copy(output.parent, recipe or {}), items, batch, Settings())
+    return run_items(job, items, BatchOptions(output, **options), Settings())  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from facerf_cli.main import main
-from tests.kinds import Said
+from tests.kinds import Patch, Said
 
 CONFIG = """
 [global]
@@ -37,3 +37,18 @@ def test_the_file_gives_defaults_and_the_command_line_comes_first(
     said = capsys.readouterr().out
     assert "a_light_5_5.png" in said and "40_10" not in said
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_on_the_command_line_replaces_that_of_the_environment(
+    config: Path, tmp_path: Path, capsys: Said, monkeypatch: Patch
+) -> None:
+    (tmp_path / "a.png").touch()
+    other = tmp_path / "other.toml"
+    other.write_text('[relight]\nlight = ["5,5"]\ndry-run = true\n')
+    line = ["relight", str(tmp_path / "a.png"), "-o", str(tmp_path / "out")]
+    monkeypatch.setenv("FACERF_CONFIG", str(config))
+    for ordered in (["--config", str(other), *line], [*line, "--config", str(other)]):
+        assert main(ordered) == 0
+        said = capsys.readouterr().out
+        assert "a_light_5_5.png" in said and "40_10" not in said
+    assert main(line) == 0 and "40_10" in capsys.readouterr().out

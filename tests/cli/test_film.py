@@ -15,8 +15,7 @@ from PIL import Image
 from skimage.data import astronaut
 
 from facerf_cli.batch.inputs import Item, files_read
-from facerf_cli.batch.run import BatchOptions
-from facerf_cli.batch.settings import Settings
+from facerf_cli.batch.settings import BatchOptions, Settings
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
@@ -155,7 +154,7 @@ def test_each_frame_has_its_image_of_a_moving_background(given: Path, tmp_path: 
     assert "me_b_light.1003.png" in capsys.readouterr().out
     shutil.copy(tmp_path / "bg/b.8.png", tmp_path / "bg/b.9.png")
     assert made("bg/b.%d.png", *plates, *out, "--dry-run") == 0
-    assert "3 to make again: options changed" in capsys.readouterr().err
+    assert "3 items out of date: options changed" in capsys.readouterr().err
     into = ("--light", "60,20", "--name", "b.{frame:1}", "-o", tmp_path / "bg")
     line = [tmp_path / f"plates/me.{number}.png" for number in (8, 9, 10)]
     for path in line:

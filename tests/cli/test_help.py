@@ -12,7 +12,7 @@ import typer.main
 
 from facerf_cli.cli import manual
 from facerf_cli.cli.examples import examples_of
-from facerf_cli.main import FLAGS, VALUED, app, main
+from facerf_cli.main import app, main
 from tests.kinds import Patch, Said
 
 # Options whose value is a small language, which their help explains.
@@ -36,7 +36,8 @@ MAN = Path(__file__).parents[2] / "man"
 def test_the_order_is_that_of_a_day(capsys: Said, monkeypatch: Patch) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     assert main(["--help"]) == 0
-    lines = [line.strip("│╭─╮ ") for line in capsys.readouterr().out.splitlines()]
+    boxed = (line for line in capsys.readouterr().out.splitlines() if line.startswith(("│", "╭")))
+    lines = [line.strip("│╭─╮ ") for line in boxed]
     first = [line.split()[0] for line in lines if line]
     order = ["Relight", "relight", "Take", "estimate-light", "predict-olat", "segment", "fit-geometry"]
     order += ["Make", "envmap", "Train", "synth-stage", "prepare-dataset"]
@@ -111,6 +112,7 @@ def test_help_all_and_the_man_page_have_every_option(
     command: Any = ROOT
     for name in path:
         command = command.commands[name]
+    assert path == () or not {option.name for option in command.params} & {one.name for one in ROOT.params}
     for option in command.params:
         if option.param_type_name == "option":
             assert option.opts[0] in full and manual._text(option.opts[0]) in page
@@ -151,11 +153,11 @@ def test_each_verb_has_one_or_two_examples_of_options_that_it_has(path: tuple[st
         command = command.commands[name]
     if hasattr(command, "commands"):
         return
-    known = {name for option in command.params for name in (*option.opts, *option.secondary_opts)}
+    known = {name for option in (*command.params, *ROOT.params) for name in option.opts}
     lines = examples_of(" ".join(path))
     assert len(lines) in (1, 2) and command.epilog.endswith(f"  {lines[-1]}")
     for line in lines:
         words = shlex.split(line)[1 + len(path) :]
-        assert not {word for word in words if word[0] == "-"} - known - FLAGS - VALUED
+        assert not {word for word in words if word[0] == "-"} - known
     page = manual.pages()[f"facerf-{'-'.join(path)}.1"]
     assert ".SH EXAMPLES" in page and ".SH EXIT STATUS" in page

@@ -5,7 +5,7 @@ from pathlib import Path
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.run import Outcome, _run_one
 from facerf_cli.batch.settings import Settings
-from facerf_cli.main import global_options_first, main
+from facerf_cli.main import main
 from facerf_cli.run import memory
 from tests.kinds import Patch, Said
 
@@ -22,7 +22,7 @@ def test_a_photo_beyond_the_budget_is_refused_before_it_is_decoded(
     photo.write_bytes(b"P5\n7000 5000\n255\n")  # a header alone: decoding it would be another error
     line = ["relight", str(photo), "-o", str(tmp_path / "out"), "--light", "40,20"]
     assert main([*line, "--memory", "0.5"]) == 1
-    assert "7000 x 5000 pixels: needs 0.98 GB of memory, and 0.50 GB are allowed; give --memory 0.98" in said(
+    assert "7000 x 5000 pixels: needs 0.98 GB of memory, and 0.50 GB are allowed; pass --memory 0.98" in said(
         capsys
     )
     assert main([*line, "--memory", "0.98"]) == 1 and "cut short" in said(capsys)
@@ -41,9 +41,3 @@ def test_jobs_have_a_share_each_and_items_give_theirs_back(monkeypatch: Patch) -
     for process in (lambda item: Outcome([]), lambda item: 1 / 0):
         _run_one(process, None, 1 << 30, Item(Path("a"), Path("a"), "a"))
     assert given == ["back", "back"]
-    assert global_options_first(["relight", "a.jpg", "--memory", "2"]) == [
-        "--memory",
-        "2",
-        "relight",
-        "a.jpg",
-    ]

@@ -45,7 +45,7 @@ def test_a_limit_is_a_share_of_what_the_process_may_use(monkeypatch: Patch) -> N
 def test_a_refusal_names_what_is_needed_and_counts_what_is_held() -> None:
     memory.set_limit(1 << 30)
     memory.require("a.exr", 1 << 30, "crop it")
-    words = "a.exr: ... 1.01 GB ... 1.00 GB ... give --memory 1.01 or crop it"
+    words = "a.exr: ... 1.01 GB ... 1.00 GB ... pass --memory 1.01 or crop it"
     refused(InputError, words, memory.require, "a.exr", (1 << 30) + 1, "crop it")
     memory.set_limit(1 << 30)
     with memory.holding(1 << 29):

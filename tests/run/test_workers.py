@@ -13,7 +13,7 @@ from OpenImageIO import ImageSpec
 
 from facerf_cli.errors import FacerfError
 from facerf_cli.run.logs import LOGGER_NAME, configure_logging
-from facerf_cli.run.workers import Workers, in_order, in_shards, spread
+from facerf_cli.run.workers import Workers, in_shards, spread
 from tests.refusals import refused
 
 
@@ -82,13 +82,6 @@ def _refuse(pipe: object, level: int, threads: int) -> None:
 def test_processes_that_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("facerf_cli.run.workers._serve", _refuse)
     refused(FacerfError, "could not start (exit code 3); try --jobs 1", list, run("a", "b"))
-
-
-def test_in_order() -> None:
-    def early() -> Generator[tuple[int, str]]:
-        yield from ((2, "c"), (0, "a"), (1, "b"), (3, "d"))
-
-    assert "".join(in_order(early())) == "abcd"
 
 
 def process_of(item: str) -> str:

@@ -9,8 +9,7 @@ import torch
 
 from facerf_cli._version import __version__
 from facerf_cli.batch.journal import Journal
-from facerf_cli.batch.run import BatchOptions
-from facerf_cli.batch.settings import Overwrite
+from facerf_cli.batch.settings import BatchOptions, Overwrite
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.files.atomic import sweep_leftovers
 from facerf_cli.files.image_metadata import read_header
