@@ -1,4 +1,4 @@
-"""`facerf fit-geometry`: the face model fitted to photos, as files that other programs open."""
+"""`facerf fit-geometry`: the face model fitted to photos, in common file formats."""
 
 from dataclasses import dataclass
 
@@ -30,9 +30,9 @@ class FitGeometry(PhotoWork):
 def fit_geometry(inputs: InputsArgument, work: FitGeometry, batch: FileOrFolder) -> None:
     """Fit the face model to photos: mesh, texture, normals, and an overlay of the fit.
 
-    For each photo: _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, the head upright),
-    _texture.exr and .png (in UV space; the EXR's layer 'visible' marks what the photo shows), _normals.exr
-    (camera space) and .png, and _fit.jpg, the mesh over the photo. The report holds each fit's error (a
-    share of the distance between the outer eye corners), its quality (good, fair, poor) and the pose.
+    Each photo gets _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, head upright), _texture.exr
+    and .png (in UV space; the EXR's layer 'visible' marks visible texels), _normals.exr (camera space) and
+    .png, and _fit.jpg, the mesh over the photo. The report contains each fit's error (relative to the
+    distance between the outer eye corners), its quality (good, fair, poor) and the pose.
     """
     raise typer.Exit(work.run(inputs, batch))

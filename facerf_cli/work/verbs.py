@@ -1,7 +1,7 @@
-"""Verbs that write a few files for each input: the options that their work takes. Light to import.
+"""Commands that write files for each face of a photo: their common work and options. Light to import.
 
-A class has the options of its verb as fields, is sent to the processes that take the items, and is part of
-what the outputs' recipes hold. In the verb's file a subclass imports the work.
+A command's options are fields of a subclass of `PhotoWork`, which is sent to worker processes and is part of
+the outputs' recipes. The subclass in `cli/` imports the heavy modules when it writes.
 """
 
 import os
@@ -26,17 +26,22 @@ from facerf_cli.work.photo_options import (
     networks_of,
     normals_option,
     parse_pose,
+    refuse,
     white_option,
 )
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, recipe_of_shots
 
+PHOTOS_A_PROCESS = 4  # from this number on, another worker saves time
+LARGEST_MAP_PX, MOST_ORDER = 8192, 20
+Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the written faces; facts for the report
+
 
 @dataclass(frozen=True)
 class FileOrFolder(BatchOptions):
-    """The contract of verbs of which one file may be wanted.
+    """The batch options of commands that can also write a single file.
 
     Attributes:
-        output: Write the results to this folder; or one of them, of one input, to this file, by its suffix.
+        output: Output folder; or a file for one result of one input, chosen by its suffix.
     """
 
     output: Path = option(
@@ -49,48 +54,45 @@ class FileOrFolder(BatchOptions):
     )
 
     def of_file(self) -> Self:
-        """The contract of the one file that `-o` names."""
+        """Return the options of a run that writes only the file that `-o` names."""
         return replace(self, output=self.output.parent, file=self.output)
 
 
-def end_of_file(output: Path, ends: Sequence[str]) -> str:
-    """The end of the name of the result that `-o` wants as this file, by its suffix; '' for a folder.
+def ending_of_file(output: Path, endings: Sequence[str]) -> str:
+    """Return the ending with the suffix of the file that `-o` names; '' for a folder.
 
-    Raises UsageError for a file that has the suffix of none of the `ends` that may be written alone.
+    Raises UsageError for a file with another suffix.
     """
-    found = next((end for end in ends if output.suffix and end.endswith(output.suffix.lower())), "")
-    if output.is_dir() or not found:
-        folder_not_file(output, " or ".join(end[end.index(".") :] for end in ends))
-        return ""
-    return found
-
-
-PHOTOS_A_PROCESS = 4  # take longer than its start
-Written = tuple[Sequence[str], Mapping[str, Any]]  # tags of the faces that were written; facts for the report
+    matches = (end for end in endings if output.suffix and end.endswith(output.suffix.lower()))
+    if not output.is_dir() and (ending := next(matches, "")):
+        return ending
+    folder_not_file(output, " or ".join(end[end.index(".") :] for end in endings))
+    return ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoWork(Job):
-    """A verb that writes files for each chosen face of a photo."""
+    """A command that writes files for each chosen face of a photo.
+
+    Subclasses set `verb`, the `endings` of a face's files, which of them `-o` may name as a single file
+    (`alone_as`), and the `networks` that they use.
+    """
 
     items_a_process = PHOTOS_A_PROCESS
     photo: PhotoOptions
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
-    alone: str = field(default="", metadata=NOT_IN_RECIPE)  # the suffix of the one file that -o names
+    alone: str = field(default="", metadata=NOT_IN_RECIPE)  # suffix of the single file that -o names
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """Ends of the names of a face's files."""
         raise NotImplementedError
 
     @property
     def alone_as(self) -> tuple[str, ...]:
-        """Those of them that may be written alone, to the file that `-o` names, one for each suffix."""
         return ()
 
     @property
     def networks(self) -> frozenset[str]:
-        """Names of the networks that are used."""
         raise NotImplementedError
 
     def write(self, item: Item) -> Written:
@@ -98,25 +100,25 @@ class PhotoWork(Job):
         raise NotImplementedError
 
     def checked(self) -> Self:
-        """These options, with what depends on others; UsageError for what would fail every photo."""
+        """Return the options with dependent defaults; raise UsageError if they would fail every photo."""
         self.photo.check()
         return self
 
-    def run(self, inputs: Sequence[str], batch: FileOrFolder, wanted: ShotOptions | None = None) -> int:
-        """Process photos, and with `wanted` the frames of shots; return the exit code."""
+    def run(self, inputs: Sequence[str], batch: FileOrFolder, frames: ShotOptions | None = None) -> int:
+        """Process photos and, if `frames` is given, frames of shots; return the exit code."""
         work, null_separated = self.checked(), self.photo.settings.null_separated
-        if wanted is None:
+        if frames is None:
             items = collect_items(inputs, batch.output, PHOTO_SUFFIXES, batch.name, null_separated)
             return work.run_on(items, batch)
-        items, shots = collect_frames(inputs, wanted, batch, work.photo)
+        items, shots = collect_frames(inputs, frames, batch, work.photo)
         batch = replace(batch, in_a_row=FRAMES_IN_A_ROW if shots else 1)
         return replace(work, shots=Shots(shots)).run_on(items, batch)
 
     def run_on(self, items: Sequence[Item], batch: FileOrFolder) -> int:
         """Process items; return the exit code."""
-        if end_of_file(batch.output, self.alone_as):
+        if ending_of_file(batch.output, self.alone_as):
             if batch.name is not None:
-                raise UsageError(f"--name: is not for -o {batch.output}, one file; leave it out")
+                raise UsageError(f"--name: has no effect with -o {batch.output}; remove it")
             item = only_item(items, batch.output, several=self.photo.face == "all")
             work = replace(self, alone=batch.output.suffix)
             return work.run_on([item], batch.of_file())
@@ -133,30 +135,25 @@ class PhotoWork(Job):
         return self
 
     def files_of(self, item: Item, tag: str) -> list[Path]:
-        """Every file of the face with a tag."""
+        """Return the files of one face, by its tag."""
         return [item.output(tag + ending) for ending in ([self.alone] if self.alone else self.endings)]
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """Every file of an item's (first) face."""
+        """Return the files of an item's first face."""
         return self.files_of(item, self.photo.first_tag)
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
         return [recipe_of(self, digest_of) | recipe_of_shots(self.shots.all, digest_of)]
 
     def __call__(self, item: Item) -> Outcome:
-        """Write the files of an item."""
-        if self.alone:
-            return self._one_file(item)
-        tags, facts = self.write(item)
-        return Outcome([path for tag in tags for path in self.files_of(item, tag)], facts)
-
-    def _one_file(self, item: Item) -> Outcome:
-        """Write the files of an item out of sight, and keep one."""
+        if not self.alone:
+            tags, facts = self.write(item)
+            return Outcome([path for tag in tags for path in self.files_of(item, tag)], facts)
         (path,) = self.outputs_of(item)
-        with atomic_path(path) as temporary:
-            apart = replace(item, output_base=temporary.parent / "all" / item.name)
-            tags, facts = replace(self, alone="").write(apart)
-            os.replace(apart.output(tags[0] + end_of_file(path, self.alone_as)), temporary)
+        with atomic_path(path) as temporary:  # write all files to a hidden folder, and keep one
+            hidden = replace(item, output_base=temporary.parent / "all" / item.name)
+            tags, facts = replace(self, alone="").write(hidden)
+            os.replace(hidden.output(tags[0] + ending_of_file(path, self.alone_as)), temporary)
         return Outcome([path], facts)
 
 
@@ -165,14 +162,14 @@ class PredictOlat(PhotoWork):
     """`facerf predict-olat`.
 
     Attributes:
-        lights: Predict a uniform rig of N lights, or directions: a list in degrees, or a file (az,el or
-            x y z; .lp).
-        pose: Turn the head to a pose, in degrees.
-        frame: Predict the whole person in the photo's frame; the face alone in that of its crop; or UV
-            textures, which other poses can be rendered from.
-        size_px: Scale larger photos down to this longer side, with --frame photo.
-        precision: Compute the network in this precision; bf16 where the device has instructions for it.
-        page: Write the web page of `facerf view`, _page.html, too.
+        lights: Lights to predict: the number of a uniform rig, a list in degrees, or a file of directions
+            (az,el or x y z; .lp).
+        pose: Head pose, in degrees.
+        frame: Frame of the images: photo (the whole person), face (only the face, in its crop), or uv
+            (textures that can be rendered in other poses).
+        size_px: Longer side to scale larger photos down to, with --frame photo.
+        precision: Precision of the network; bf16 is faster on devices with instructions for it.
+        page: Also write the web page of facerf view, _page.html.
     """
 
     lights: str = option("150", metavar="N|FILE|'AZ,EL;...'", panel=LIGHT)
@@ -187,44 +184,38 @@ class PredictOlat(PhotoWork):
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
     page: bool = option(False, panel=IMAGE)
     verb = "predict-olat"
+    alone_as = ("_olat.exr",)
 
     @property
     def endings(self) -> tuple[str, ...]:
-        """Ends of the stack, its contact sheet and, if wanted, its page."""
         return ("_olat.exr", "_olat.png", *(["_page.html"] if self.page else []))
 
     @property
-    def alone_as(self) -> tuple[str, ...]:
-        """The stack."""
-        return self.endings[:1]
-
-    @property
     def networks(self) -> frozenset[str]:
-        """The networks of the whole person, or of its face alone."""
         return networks_of(["portrait" if self.page or self.frame == "photo" else "field"])
 
     def checked(self) -> Self:
-        """These options with their frame; UsageError for those that do not go together."""
         parse_lights(self.lights)
         parse_pose(self.pose)
-        self.photo.check()
-        if self.frame == "photo" and self.pose is not None:
-            raise UsageError("--pose: turns the head out of its photo; use --frame face or uv with it")
-        if self.page and (self.network_alone or self.pose is not None):
-            raise UsageError(
-                "--page: shows the photo's own pose and light; give neither --pose nor --network-alone"
-            )
         check_companion(self.normals_from, "--normals-from")
-        work = replace(self, frame=self.frame or ("photo" if self.pose is None else "face"))
-        if self.normals_from is not None and work.frame != "photo":
-            raise UsageError("--normals-from: is for the whole person; use --frame photo with it")
+        posed = self.pose is not None
+        work = replace(super().checked(), frame=self.frame or ("face" if posed else "photo"))
+        refuse(
+            {
+                "--pose: turns the head away from its photo; use --frame face or uv": (
+                    posed and work.frame == "photo"
+                ),
+                "--page: shows the photo's own pose and light; remove --pose and --network-alone": (
+                    self.page and (self.network_alone or posed)
+                ),
+                "--normals-from: requires the whole person; use --frame photo": (
+                    self.normals_from is not None and work.frame != "photo"
+                ),
+            }
+        )
         return work
 
 
-LARGEST_MAP_PX, MOST_ORDER = 8192, 20
-
-
 def refuse_odd(name: str, width_px: int) -> None:
-    """Raise UsageError for a map whose height is no whole number."""
-    if width_px % 2:
-        raise UsageError(f"{name} {width_px}: an odd width has no half; give an even number")
+    """Raise UsageError for a map width whose half is not an integer."""
+    refuse({f"{name} {width_px}: odd, but the height is half of it; use an even number": width_px % 2 > 0})

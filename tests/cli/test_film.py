@@ -20,12 +20,13 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.files.read import read_image
 from facerf_cli.files.write import write_exr
 from facerf_cli.main import main
+from facerf_cli.relighting.shot_track import ShotTrack
 from facerf_cli.work import estimate_light
 from facerf_cli.work.light_setups import LightSources
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.relight import with_background
 from facerf_cli.work.relight_options import RelightOptions, parse_background, plan_relight
-from facerf_cli.work.sequence import OpenShot, ShotFrames, ShotTrack
+from facerf_cli.work.sequence import OpenShot, ShotFrames
 from facerf_cli.work.sequence import _made_from as made_from
 from facerf_cli.work.shots import FilmOutput, ShotOptions, Shots, collect_frames, film_rate
 from tests.cli.toy_checkpoint import save_toy_checkpoint

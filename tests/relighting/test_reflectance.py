@@ -19,11 +19,11 @@ from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
 from facerf_cli.relighting.fitted import Target
 from facerf_cli.relighting.heads import fit_photo
+from facerf_cli.relighting.memory import require_face
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import Estimator, estimate_light
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.run import memory
-from facerf_cli.work.plan import require_face
 from tests import astronaut
 from tests.refusals import refused
 
