@@ -152,7 +152,8 @@ class RelightOptions:
             folder, or a colour (#RRGGBB or linear R,G,B), which keep their look; envmap; or none (alpha).
         background_blur: Lens blur of a map used as background, in percent of the longer side.
         light_wrap: Amount of background light that wraps over the matte's edge (EXR layer: wrap).
-        aov: Additional EXR layers: albedo, normal, position, depth, shadow, specular, classes, face, uv.
+        aov: Additional EXR layers besides the matte: albedo, normal, position, depth, shadow, specular,
+            classes, face, uv.
         matte: Grey image of the part of the photo to change (mattes/{stem}.png); --person replaces the
             detected matte.
         identity: Report identity_distance, the distance of an image from its photo by dlib's face descriptor
