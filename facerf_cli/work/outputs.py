@@ -18,15 +18,11 @@ from facerf_cli.work.output_options import Format, OutputOptions
 
 @dataclass(frozen=True, eq=False)
 class OutputImage:
-    """An image to write.
+    """An image to write: linear Rec.709 [H, W, 3], not multiplied by alpha [H, W], and layers of the EXR.
 
-    Attributes:
-        pixels: Linear Rec.709 [H, W, 3], not multiplied by alpha.
-        alpha: Alpha [H, W].
-        layers: Layers of the EXR.
-        share: Amount of the soft view per pixel [H, W]; without `share` and `added` it applies to all.
-        added: Light [H, W, 3], by rows, that the photo does not contain (`colour.encode_display`).
-        header: Metadata of the EXR only.
+    `share` [H, W] is the amount of the soft view per pixel; `added` [H, W, 3], by rows, is light that the
+    photo does not contain (`colour.encode_display`); without both the view applies everywhere. `header` is
+    metadata of the EXR only.
     """
 
     pixels: np.ndarray

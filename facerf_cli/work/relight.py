@@ -92,20 +92,14 @@ def relight_item(plan: RelightPlan, item: Item) -> Outcome:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The subject of an image, its lights and its background.
+    """The subject of an image (people in a photo, only a face, or an OLAT stack), its lights and background.
 
     Attributes:
-        subject: People of a photo, only a face, or an OLAT stack.
-        setups: The lights of each image.
-        lights_of: Converts setups to sums of far and near lights.
-        metadata: Metadata of all images.
         people: The people of a photo, from left to right.
-        faces: Their numbers, counted from the left, nearest first.
+        faces: Numbers of their faces, counted from the left, nearest first.
         uniforms: Per face, the intensity of uniform light that makes skin as bright as in the photo.
         tag: Suffix of the photo's name in the images' names.
-        alpha: The photo's alpha [H, W].
-        behind: Returns the background image.
-        plate: The photo's metadata that images keep.
+        plate: Metadata of the photo that images keep.
         identity: Returns the distance of an exposed image from the photo.
         facts: Facts about a stack's fit, for the report.
     """

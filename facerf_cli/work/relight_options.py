@@ -62,19 +62,12 @@ _FORMS = "photo, envmap, none, an image file, a folder, a colour name such as bl
 
 @dataclass(frozen=True)
 class BackgroundChoice:
-    """The background as typed.
-
-    Attributes:
-        kind: Its kind.
-        path: An image, or a folder or pattern with one image per photo.
-        colour: Scene-linear Rec.709.
-        frames: Images for the frames of a shot, instead of `path`.
-    """
+    """The background as typed."""
 
     kind: BackgroundKind
     path: Path | None = option(None, metavar=COMPANION)
-    colour: tuple[float, float, float] | None = None
-    frames: tuple[Path, ...] = ()
+    colour: tuple[float, float, float] | None = None  # scene-linear Rec.709
+    frames: tuple[Path, ...] = ()  # for the frames of a shot, instead of `path`
 
     def listed(self, output: Path) -> Self:
         """List the frames of a folder or pattern; the output folder is not searched."""
@@ -251,7 +244,6 @@ class RelightPlan:
 
     @property
     def photo(self) -> PhotoOptions:
-        """Settings of reading photos."""
         return self.options.photo
 
     @property
@@ -306,6 +298,9 @@ class RelightPlan:
         if self.options.output.file_suffix:
             all_faces = self.photo.face == "all" and self.options.composite == "face"
             only_item(items, self.outputs_of(items[0])[0], several=all_faces or len(self.setups) > 1)
+        face = {int(self.photo.face)} if self.photo.face.isdecimal() else set()
+        if shots.all and (others := self.lit_faces - face):  # its other faces are not tracked
+            raise UsageError(f"--light face={min(others)}: not the tracked face; add --face {min(others)}")
         (path, count), *_ = Counter(path for item in items for path in self.outputs_of(item)).most_common(1)
         if count > 1:
             raise UsageError(f"--name: {path} would be the name of two images; add fields to the pattern")
