@@ -10,8 +10,15 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import FramesArgument
 from facerf_cli.option import LIGHT, option
 from facerf_cli.work.photo_options import LightOptions, refuse
+from facerf_cli.work.photo_work import (
+    LARGEST_MAP_PX,
+    MOST_ORDER,
+    FileOrFolder,
+    PhotoWork,
+    Written,
+    refuse_odd,
+)
 from facerf_cli.work.shots import ShotOptions, Shots, collect_frames, whole_shots
-from facerf_cli.work.verbs import LARGEST_MAP_PX, MOST_ORDER, FileOrFolder, PhotoWork, Written, refuse_odd
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +35,7 @@ class EstimateLight(PhotoWork, LightOptions):
     verb = "estimate-light"
     endings = ("_light.exr", "_light.json", "_light.png")
     networks = LightOptions.networks
-    alone_as = ("_light.exr", "_light.json")
+    file_endings = ("_light.exr", "_light.json")
 
     def run(self, inputs: Sequence[str], batch: FileOrFolder, frames: ShotOptions | None = None) -> int:
         """Estimate the light of each photo, and one light per take of a shot; return the exit code."""

@@ -7,7 +7,7 @@ import typer
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.work.photo_options import FITTING
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written
+from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written
 
 _TEXTURES = ("_texture.exr", "_texture.png", "_normals.exr", "_normals.png")
 _MESHES = ("_mesh.glb", "_mesh.mtl", "_mesh.obj")
@@ -18,7 +18,7 @@ class FitGeometry(PhotoWork):
     """`facerf fit-geometry`."""
 
     verb, endings, networks = "fit-geometry", (*_TEXTURES, *_MESHES, "_fit.jpg", "_fit.npz"), FITTING
-    alone_as = ("_mesh.glb",)
+    file_endings = ("_mesh.glb",)
 
     def write(self, item: Item) -> Written:
         """Fit every chosen face."""

@@ -6,7 +6,7 @@ import typer
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import InputsArgument
-from facerf_cli.work.verbs import FileOrFolder, PredictOlat, Written
+from facerf_cli.work.photo_work import FileOrFolder, PredictOlat, Written
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,9 +22,9 @@ from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.light_setups import LightSources, PhotoLight
 from facerf_cli.work.output_options import STDOUT, SUFFIXES, check_stdout, format_of_file
 from facerf_cli.work.photo_options import networks_of
+from facerf_cli.work.photo_work import PHOTOS_A_PROCESS, FileOrFolder
 from facerf_cli.work.relight_options import RelightOptions, RelightPlan, plan_relight
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, film_output
-from facerf_cli.work.verbs import PHOTOS_A_PROCESS, FileOrFolder
 
 log = logging.getLogger(LOGGER_NAME)
 

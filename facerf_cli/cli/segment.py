@@ -9,8 +9,8 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import FramesArgument
 from facerf_cli.option import Only
 from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written
 from facerf_cli.work.shots import ShotOptions
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Segment(PhotoWork):
     verb = "segment"
     endings = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
     networks = frozenset({"parsing"})
-    alone_as = ("_person.png", "_segment.exr")
+    file_endings = ("_person.png", "_segment.exr")
 
     def write(self, item: Item) -> Written:
         """Segment the person of every chosen face."""

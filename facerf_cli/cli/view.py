@@ -20,7 +20,7 @@ from facerf_cli.work.photo_options import (
     normals_option,
     white_option,
 )
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written, ending_of_file
+from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written, ending_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
 
@@ -38,7 +38,7 @@ class MakePage(PhotoWork):
     white: White = white_option()
     normals_from: Path | None = normals_option()
     verb, endings, networks = "view", (_PAGE,), networks_of(["portrait"])
-    alone_as = (_PAGE,)
+    file_endings = (_PAGE,)
 
     def write(self, item: Item) -> Written:
         """Write the page of every chosen face."""
@@ -61,7 +61,7 @@ def view(
     photo, output = work.checked().photo, batch.output
     check_companion(work.normals_from, "--normals-from")
     items = collect_items(inputs, output, PHOTO_SUFFIXES, null_separated=photo.settings.null_separated)
-    many = not ending_of_file(output, work.alone_as)
+    many = not ending_of_file(output, work.file_endings)
     if many and any(item.name == Path(_INDEX).stem for item in items):
         raise UsageError(f"{_INDEX}: reserved for the list of pages; rename the photo of that name")
     journal = Journal(output, work.verb)

@@ -30,6 +30,7 @@ from facerf_cli.relighting.memory import require_face
 from facerf_cli.relighting.reflectance import reflectance_of
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.threads import one_ahead
+from facerf_cli.work.photo_work import PredictOlat, Written
 from facerf_cli.work.photos import (
     FittedFace,
     load_models_once,
@@ -40,7 +41,6 @@ from facerf_cli.work.photos import (
     rotation_of,
     write_each,
 )
-from facerf_cli.work.verbs import PredictOlat, Written
 from facerf_cli.work.view import write_page
 
 _TILE_PX, _SHEET_PX = 128, 1 << 22  # longer side of a contact sheet's tile; most pixels of all tiles

@@ -75,20 +75,20 @@ class PhotoWork(Job):
     """A command that writes files for each chosen face of a photo.
 
     Subclasses set `verb`, the `endings` of a face's files, which of them `-o` may name as a single file
-    (`alone_as`), and the `networks` that they use.
+    (`file_endings`), and the `networks` that they use.
     """
 
     items_a_process = PHOTOS_A_PROCESS
     photo: PhotoOptions
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
-    alone: str = field(default="", metadata=NOT_IN_RECIPE)  # suffix of the single file that -o names
+    file_suffix: str = field(default="", metadata=NOT_IN_RECIPE)  # suffix of the single file that -o names
 
     @property
     def endings(self) -> tuple[str, ...]:
         raise NotImplementedError
 
     @property
-    def alone_as(self) -> tuple[str, ...]:
+    def file_endings(self) -> tuple[str, ...]:
         return ()
 
     @property
@@ -116,11 +116,11 @@ class PhotoWork(Job):
 
     def run_on(self, items: Sequence[Item], batch: FileOrFolder) -> int:
         """Process items; return the exit code."""
-        if ending_of_file(batch.output, self.alone_as):
+        if ending_of_file(batch.output, self.file_endings):
             if batch.name is not None:
                 raise UsageError(f"--name: has no effect with -o {batch.output}; remove it")
             item = only_item(items, batch.output, several=self.photo.face == "all")
-            work = replace(self, alone=batch.output.suffix)
+            work = replace(self, file_suffix=batch.output.suffix)
             return work.run_on([item], batch.of_file())
         return run_items(self, items, batch, self.photo.settings)
 
@@ -136,7 +136,8 @@ class PhotoWork(Job):
 
     def files_of(self, item: Item, tag: str) -> list[Path]:
         """Return the files of one face, by its tag."""
-        return [item.output(tag + ending) for ending in ([self.alone] if self.alone else self.endings)]
+        endings = (self.file_suffix,) if self.file_suffix else self.endings
+        return [item.output(tag + ending) for ending in endings]
 
     def outputs_of(self, item: Item) -> list[Path]:
         """Return the files of an item's first face."""
@@ -146,14 +147,14 @@ class PhotoWork(Job):
         return [recipe_of(self, digest_of) | recipe_of_shots(self.shots.all, digest_of)]
 
     def __call__(self, item: Item) -> Outcome:
-        if not self.alone:
+        if not self.file_suffix:
             tags, facts = self.write(item)
             return Outcome([path for tag in tags for path in self.files_of(item, tag)], facts)
         (path,) = self.outputs_of(item)
         with atomic_path(path) as temporary:  # write all files to a hidden folder, and keep one
             hidden = replace(item, output_base=temporary.parent / "all" / item.name)
-            tags, facts = replace(self, alone="").write(hidden)
-            os.replace(hidden.output(tags[0] + ending_of_file(path, self.alone_as)), temporary)
+            tags, facts = replace(self, file_suffix="").write(hidden)
+            os.replace(hidden.output(tags[0] + ending_of_file(path, self.file_endings)), temporary)
         return Outcome([path], facts)
 
 
@@ -184,7 +185,7 @@ class PredictOlat(PhotoWork):
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
     page: bool = option(False, panel=IMAGE)
     verb = "predict-olat"
-    alone_as = ("_olat.exr",)
+    file_endings = ("_olat.exr",)
 
     @property
     def endings(self) -> tuple[str, ...]:
