@@ -121,7 +121,7 @@ def relight(
     unused = f"has no effect with -o {output}; remove it"
     if file is not None:
         formats = (file,) if is_default(context, "formats") else formats
-        refuse_given(context, ("name", "fps"), unused)
+        refuse_given(context, ("name",), unused)
         if [SUFFIXES[name] for name in formats] != [SUFFIXES[file]]:
             raise UsageError(f"-o {output}: differs from --format; remove --format, or pass a folder")
         one_file = replace(options.output, file_suffix=output.suffix)

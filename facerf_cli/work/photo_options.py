@@ -216,9 +216,6 @@ class LightOptions(SolveOptions):
                 f"--reflectance {self.reflectance}: estimates its own light; remove --lights, --signed and "
                 "--refine": self.reflectance != "field"
                 and (self.refine != "none" or self.rig != "150" or not self.non_negative),
-                "--vgg-weights: requires --refine features; add it": (
-                    self.vgg_weights is not None and self.refine == "none"
-                ),
                 f"--lights {self.rig}: too many lights to estimate; use {MOST_ESTIMATED} at most": (
                     (lights if isinstance(lights, int) else len(lights)) > MOST_ESTIMATED
                 ),

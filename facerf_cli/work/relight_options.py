@@ -342,7 +342,7 @@ def plan_relight(
     lights = photo_lights(sources, how, image_behind, output, digest_of)
     cached: tuple[CachedMap, ...] = (*drawn_maps(sources, photo.settings.seed), *lights)
     setups = collect_setups(sources, output, cached)
-    refuse(_rules(options, sources, setups))
+    refuse(_rules(options, setups))
     if options.exposure is None:
         setups = _at_photos_exposure(setups, lights)
     face_only, dark = options.is_face_only, background.is_dark
@@ -365,7 +365,7 @@ def plan_relight(
     )
 
 
-def _rules(options: RelightOptions, sources: LightSources, setups: Sequence[LightSetup]) -> dict[str, bool]:
+def _rules(options: RelightOptions, setups: Sequence[LightSetup]) -> dict[str, bool]:
     """Return whether each rule between options is broken, by its message."""
     baseline, whole = options.reflectance not in _FIELDS, not options.is_face_only
     of_field = "requires --reflectance portrait or field"
@@ -383,16 +383,12 @@ def _rules(options: RelightOptions, sources: LightSources, setups: Sequence[Ligh
         f"--white: {of_field}": options.white != "photo" and baseline,
         f"--light {word}: {of_field}": bool(by_photo) and baseline,
         f"--background: {of_whole}": options.background.kind != "photo" and not whole,
-        f"--identity: {of_whole}": options.identity and not whole,
         f"--light {OWN}: {of_whole}": any(setup.has_own for setup in setups) and not whole,
         "--normals-from: requires --reflectance portrait and the whole photo": (
             options.normals_from is not None and (options.reflectance != "portrait" or not whole)
         ),
         "--light-wrap: requires a new background; add --background FILE, COLOUR or envmap": (
             bool(options.light_wrap) and keeps_background
-        ),
-        f"--room {sources.room}: applies to single lights; add --light, or remove it": (
-            sources.room not in (None, "none") and not any(setup.has_single for setup in setups)
         ),
         f"--light: {''.join(taken[:1])} is also a layer of the EXR; rename the light": bool(taken),
     }

@@ -317,14 +317,8 @@ def film_output(output: Path, rate: Fraction | None) -> FilmOutput | None:
 
         require_av(output)
         return FilmOutput(output, rate)
-    refuse(
-        {
-            f"-o {output}: videos are written as .mp4 or .mov; use one of these": (
-                suffix in FILM_SUFFIXES and not output.is_dir()
-            ),
-            "--fps: requires -o FILE.mp4 or FILE.mov; remove it": rate is not None,
-        }
-    )
+    if suffix in FILM_SUFFIXES and not output.is_dir():
+        raise UsageError(f"-o {output}: videos are written as .mp4 or .mov; use one of these")
     folder_not_file(output, ".exr, .png, .jpg, .tif, .mp4 or .mov")
     return None
 

@@ -573,7 +573,6 @@ def test_people_are_cut_out_of_a_film(given: Path, tmp_path: Path) -> None:
         (("{film}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "25"), "--fps: "),
         (("{film}", "--light", "0,0", "-o", "{film}"), "is the input"),
         (("{film}", "--light", "0,0", "-o", "{out}.webm"), "use one of these"),
-        (("{film}", "--light", "0,0", "-o", "{out}", "--fps", "25"), "-o FILE.mp4"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "0"), "not a rate"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4", "--fps", "1/9999999"), "not a rate"),
         (("{photo}", "--light", "0,0", "-o", "{out}.mp4"), "-o "),

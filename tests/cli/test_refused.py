@@ -66,7 +66,6 @@ WRONG: dict[str, dict[str, str]] = {
         "--light own --composite face": "--light own",
         "--light own --reflectance diffuse-sh": "--light own",
         "--light even --reflectance diffuse-sh": "--light even",
-        "--envmap sky.exr --room 0.1": "--room 0.1: ... add --light",
     },
     "relight a.jpg --light 0,0": {
         "--light-from background": "add --background FILE",
@@ -100,7 +99,6 @@ WRONG: dict[str, dict[str, str]] = {
         "--reflectance wax": "specular-sh",
         "--reflectance prt --network-alone": "--network-alone: ... --reflectance portrait or field",
         "--input-colourspace nope": "unknown colour space 'nope'",
-        "--identity --composite face": "--identity: ... remove --pose and --composite face",
         "--aov beauty": "--aov 'beauty': no such layer",
         "--view nope": "unknown view 'nope' (known: none, soft, aces, ",
         "--output-colourspace ACEScgg": "unknown colour space 'ACEScgg' (similar names: ACEScg",
@@ -127,7 +125,6 @@ WRONG: dict[str, dict[str, str]] = {
         "--input-colourspace nonsense": "unknown colour space",
     },
     "estimate-light a.jpg": {
-        "--vgg-weights imagenet": "--refine features",
         "--reflectance prt --signed": "--reflectance prt",
         "--lights 2000": "1024",
         "--width 101": "even",
