@@ -17,6 +17,7 @@ from facerf_cli.batch.recipe import DigestOf, Recipe
 from facerf_cli.batch.run import Job, Outcome, run_items
 from facerf_cli.cli.options import FramesArgument, is_default, refuse_given
 from facerf_cli.errors import FacerfError, UsageError
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.option import Without
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.light_setups import LightSources, PhotoLight
@@ -118,7 +119,7 @@ def relight(
     """
     file, formats = format_of_file(output), options.output.formats
     film = None if file else film_output(output, options.fps)
-    unused = f"has no effect with -o {output}; remove it"
+    unused = f"is not supported with -o {output}; remove it"
     if file is not None:
         formats = (file,) if is_default(context, "formats") else formats
         refuse_given(context, ("name",), unused)
@@ -138,11 +139,10 @@ def relight(
         refuse_given(context, ("aov",), "requires EXR; add exr to --format")
     options = replace(options, output=replace(options.output, formats=formats))
     batch = replace(batch, output=output, name=None if file else options.name)
-    if sources.light_from:  # whose maps are named by digests that the journal may know
+    digest_of: DigestOf = file_sha256
+    if sources.light_from:  # whose maps are named by digests of photos and networks
         digest_of = Journal(output, RelightJob.verb, batch.shard, batch.file).digest_of
-        plan = plan_relight(options, sources, output, digest_of)
-    else:
-        plan = plan_relight(options, sources, output)
+    plan = plan_relight(options, sources, output, digest_of)
     has_alpha = plan.options.background.kind == "none" or plan.options.composite == "face"
     if has_alpha and film and not film.holds_alpha:
         raise UsageError(f"-o {film.path}: has no alpha; use FILE.mov, a folder, or --background COLOUR")

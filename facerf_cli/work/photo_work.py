@@ -118,7 +118,7 @@ class PhotoWork(Job):
         """Process items; return the exit code."""
         if ending_of_file(batch.output, self.file_endings):
             if batch.name is not None:
-                raise UsageError(f"--name: has no effect with -o {batch.output}; remove it")
+                raise UsageError(f"--name: not supported with -o {batch.output}; remove it")
             item = only_item(items, batch.output, several=self.photo.face == "all")
             work = replace(self, file_suffix=batch.output.suffix)
             return work.run_on([item], batch.of_file())

@@ -166,16 +166,19 @@ def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[
 
     The first face's files are therefore written last, and mark the photo as finished.
     """
-    matte, models = person_matte(item, image.pixels, options), load_models_once(options)
+    matte = person_matte(item, image.pixels, options)
     faces = find_people(item, image, options, matte)
+    return (_fitted(faces.pop(), image, options, matte) for _ in range(len(faces)))
 
-    def fitted(face: PhotoFace) -> FittedFace:
+
+def _fitted(
+    face: PhotoFace, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
+) -> FittedFace:
+    with naming(face.name):
+        models = load_models_once(options)
         sides = models.sides(options.texture_side)
-        with naming(face.name):
-            head = head_of(models, image.pixels, face.found, options.geometry, sides, matte)
-        return fitted_face(face, head, matte)
-
-    return (fitted(faces.pop()) for _ in range(len(faces)))
+        head = head_of(models, image.pixels, face.found, options.geometry, sides, matte)
+    return fitted_face(face, head, matte)
 
 
 def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
