@@ -260,7 +260,6 @@ def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
     path, options = item.input_path, plan.options
     lights = [light for setup in plan.setups for light in setup.lights]
     needs_photo = {
-        "--composite photo": plan.keeps_photo,
         "--pose": options.pose is not None,
         "--background": options.background.kind not in ("photo", "none"),
         "--reflectance": options.reflectance not in ("field", "portrait"),

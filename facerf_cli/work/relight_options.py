@@ -225,7 +225,6 @@ class RelightPlan:
         setups: The lights of each image; each recipe contains its own setup.
         sampling: How maps become weights of a rig's lights.
         cached: Maps in the user's cache that the setups use.
-        keeps_photo: True if --composite photo was given, which OLAT stacks do not support.
         has_room: True if --room was given; without it, OLAT stacks get no ambient fill.
         shots: Videos and image sequences among the inputs.
         exposures: Exposures by setup of each take's middle frame, as far as this process knows them.
@@ -235,7 +234,6 @@ class RelightPlan:
     setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)
     sampling: Sampling
     cached: tuple[CachedMap, ...] = field(default=(), metadata=NOT_IN_RECIPE)
-    keeps_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)
     has_room: bool = field(default=False, metadata=NOT_IN_RECIPE)
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     exposures: dict[Path, dict[str, float]] = field(
@@ -360,7 +358,6 @@ def plan_relight(
         tuple(in_room(setup, sources.room, face_only or dark(setup)) for setup in setups),
         sources.sampling or ("smooth" if sweeps else "cell"),
         cached,
-        keeps_photo=options.composite == "photo",
         has_room=sources.room is not None,
     )
 

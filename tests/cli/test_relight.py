@@ -344,7 +344,6 @@ def test_near_lights_may_turn_the_head(given: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lights", "line"),
     [
-        ("0,0", "--composite photo"),
         ("0,0", "--pose 1,2,3"),
         ("0,0", "--background 0,0,0"),
         ("0,0", "--network-alone"),
