@@ -50,7 +50,7 @@ def demo(
         return
     log.setLevel(logging.WARNING if level == logging.INFO else level)  # hides the photo's long path
     options = RelightOptions(
-        PhotoOptions(settings),
+        photo=PhotoOptions(settings),
         background=BackgroundChoice("envmap"),
         output=OutputOptions(formats=("png",)),
     )

@@ -12,21 +12,14 @@ from facerf_cli.batch.run import sums_up
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.option import IMAGE, Without, option
-from facerf_cli.relighting import White
-from facerf_cli.work.photo_options import (
-    PhotoOptions,
-    check_companion,
-    networks_of,
-    normals_option,
-    white_option,
-)
+from facerf_cli.work.photo_options import PhotoOptions, PortraitOptions, check_companion, networks_of
 from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written, ending_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
 
 
 @dataclass(frozen=True, kw_only=True)
-class MakePage(PhotoWork):
+class MakePage(PhotoWork, PortraitOptions):
     """`facerf view`.
 
     Attributes:
@@ -35,8 +28,6 @@ class MakePage(PhotoWork):
 
     photo: Annotated[PhotoOptions, Without("texture_side")]
     size_px: int = option(1024, metavar="PX", least=256, most=4096, panel=IMAGE, everyday=True)
-    white: White = white_option()
-    normals_from: Path | None = normals_option()
     verb, endings, networks = "view", (_PAGE,), networks_of(["portrait"])
     file_endings = (_PAGE,)
 

@@ -14,6 +14,7 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
 from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
+from facerf_cli.relighting import White
 
 MOST_ESTIMATED = 1024  # lights; above it the non-negative least squares take minutes
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
@@ -26,37 +27,6 @@ NETWORKS = {  # of reflectance models
 Geometry = Literal["landmarks", "network"]
 Refine = Literal["none", "features"]
 PoseDeg = tuple[float, float, float]
-
-
-def network_alone_option() -> Any:
-    """Make the field of `--network-alone`."""
-    return option(
-        False,
-        "Use the network's field without the correction by the photo's ratio image.",
-        flags=("--network-alone",),
-        panel=METHOD,
-    )
-
-
-def white_option() -> Any:
-    """Make the field of `--white`."""
-    return option(
-        "photo",
-        "White balance: photo (as in the photo), or scene (neutralise coloured light, such as sodium lamps).",
-        flags=("--white",),
-        panel=IMAGE,
-    )
-
-
-def normals_option() -> Any:
-    """Make the field of `--normals-from`."""
-    return option(
-        None,
-        "Normals from another method (.npy, .exr, .png).",
-        metavar=COMPANION,
-        shown_default=False,
-        panel=METHOD,
-    )
 
 
 def fov_option() -> Any:
@@ -74,9 +44,27 @@ def fov_option() -> Any:
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """How a photo's face field is made."""
+    """How a photo's face field is made.
 
-    network_alone: bool = network_alone_option()
+    Attributes:
+        network_alone: Use the network's field without the correction by the photo's ratio image.
+    """
+
+    network_alone: bool = option(False, panel=METHOD)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PortraitOptions:
+    """How the portrait field of a photo's person is made.
+
+    Attributes:
+        white: White balance: photo (as in the photo), or scene (neutralise coloured light, such as sodium
+            lamps).
+        normals_from: Normals from another method (.npy, .exr, .png).
+    """
+
+    white: White = option("photo", panel=IMAGE)
+    normals_from: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=METHOD)
 
 
 @dataclass(frozen=True)

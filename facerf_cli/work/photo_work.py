@@ -18,16 +18,14 @@ from facerf_cli.errors import UsageError
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.light.entries import parse_lights
 from facerf_cli.option import IMAGE, LIGHT, METHOD, option
-from facerf_cli.relighting import White
 from facerf_cli.work.photo_options import (
+    FieldOptions,
     PhotoOptions,
+    PortraitOptions,
     check_companion,
-    network_alone_option,
     networks_of,
-    normals_option,
     parse_pose,
     refuse,
-    white_option,
 )
 from facerf_cli.work.shots import FRAMES_IN_A_ROW, ShotOptions, Shots, collect_frames, recipe_of_shots
 
@@ -159,7 +157,7 @@ class PhotoWork(Job):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PredictOlat(PhotoWork):
+class PredictOlat(PhotoWork, FieldOptions, PortraitOptions):
     """`facerf predict-olat`.
 
     Attributes:
@@ -179,9 +177,6 @@ class PredictOlat(PhotoWork):
         None, shown_default="photo; face with --pose", panel=IMAGE
     )
     size_px: int = option(1024, metavar="PX", least=64, most=16384, panel=IMAGE)
-    network_alone: bool = network_alone_option()
-    white: White = white_option()
-    normals_from: Path | None = normals_option()
     precision: Literal["float32", "bf16"] = option("float32", panel=METHOD)
     page: bool = option(False, panel=IMAGE)
     verb = "predict-olat"

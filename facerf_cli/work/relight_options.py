@@ -25,7 +25,6 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.light.entries import EVEN, OWN, Sampling, is_sweep, numbers, parse_lights
 from facerf_cli.light.setups import LightSetup
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
-from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
     BACKGROUND,
     CachedMap,
@@ -39,15 +38,14 @@ from facerf_cli.work.light_setups import (
 )
 from facerf_cli.work.output_options import Exposure, OutputOptions, parse_exposure
 from facerf_cli.work.photo_options import (
+    FieldOptions,
     LightOptions,
     PhotoOptions,
+    PortraitOptions,
     check_companion,
     for_other_photos,
-    network_alone_option,
-    normals_option,
     parse_pose,
     refuse,
-    white_option,
 )
 from facerf_cli.work.shots import Shots, film_rate, recipe_of_shots
 
@@ -128,8 +126,8 @@ def _srgb_to_linear(encoded: float) -> float:
     return encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
 
 
-@dataclass(frozen=True)
-class RelightOptions:
+@dataclass(frozen=True, kw_only=True)
+class RelightOptions(FieldOptions, PortraitOptions):
     """The options that all images share.
 
     Attributes:
@@ -195,9 +193,6 @@ class RelightOptions:
     )
     matte: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=IMAGE)
     identity: bool = option(False, in_recipe=False, panel=METHOD)
-    network_alone: bool = network_alone_option()
-    white: White = white_option()
-    normals_from: Path | None = normals_option()
     fps: Fraction | None = option(
         None, metavar="RATE", in_recipe=False, shown_default="the EXR's, or 24", parse=film_rate, panel=IMAGE
     )

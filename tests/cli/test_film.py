@@ -199,7 +199,7 @@ def test_photos_have_backgrounds_by_their_names(tmp_path: Path) -> None:
     shown = {}
     for background, stem in ((tmp_path, "a"), (tmp_path, "b"), (tmp_path / "{stem}_sky.png", "c")):
         item = Item(Path(f"photos/{stem}.jpg"), tmp_path / "out" / stem, stem, PurePosixPath(f"{stem}.jpg"))
-        options = RelightOptions(photo, background=parse_background(str(background)))
+        options = RelightOptions(photo=photo, background=parse_background(str(background)))
         plan = plan_relight(options, sources, tmp_path / "out").of_items([item], Shots(), tmp_path / "out")
         shown[stem] = with_background(plan, item).options.background.path
         assert list(files_read(plan, [item])) == [shown[stem]]
