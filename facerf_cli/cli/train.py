@@ -32,6 +32,15 @@ _STAGES = {  # that options apply to
     "heads": _HEAD_STAGES,
     "bank": _HEAD_STAGES,
 }
+_EXCLUSIVE = (
+    ("heads_from", "dataset"),
+    ("heads", "dataset"),
+    ("views", "dataset"),
+    ("bank", "dataset"),
+    ("appearance_features", "vgg_weights"),
+    ("form", "start_from"),
+    ("without_normals", "start_from"),
+)
 
 
 def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> None:
@@ -95,36 +104,28 @@ def _refuse_conflicts(context: typer.Context, options: TrainOptions) -> None:
         f"{flag(name)}: does not apply to the stage {stage}; remove it": name in given and stage not in stages
         for name, stages in _STAGES.items()
     }
-    rules[f"--stage {stage}: requires a prepared dataset; add --dataset"] = (
-        stage in _CROP_STAGES and options.dataset is None
-    )
-    for name in ("heads_from", "heads", "views", "bank"):
-        rules[f"{flag(name)}: requires synthetic heads, not --dataset; use one of them"] = {
-            name,
-            "dataset",
-        } <= given
-    for name in ("photos", "mean_face"):
-        rules[f"{flag(name)}: requires the Geometry Network; remove --geometry landmarks"] = (
-            name in given and context.params["geometry"] == "landmarks"
+    rules |= {
+        f"--stage {stage}: requires a prepared dataset; add --dataset": (
+            stage in _CROP_STAGES and options.dataset is None
+        ),
+        "--texture-size: requires a dataset; add --dataset": (
+            "texture_size" in given and options.dataset is None
+        ),
+        "--mean-face: datasets are fitted already; use --stage joint, or synthetic heads": (
+            {"mean_face", "dataset"} <= given and stage == "reflectance"
+        ),
+        "--fit-with: the Geometry Network needs the built-in face model; add --geometry landmarks": (
+            stage == "joint" and options.geometry == "network" and options.fit_with != "builtin"
+        ),
+    }
+    rules |= {
+        f"{flag(name)}: requires the Geometry Network; remove --geometry landmarks": (
+            name in given and options.geometry == "landmarks"
         )
-    refuse(
-        rules
-        | {
-            "--appearance-features: replaces --vgg-weights; use one of them": (
-                {"vgg_weights", "appearance_features"} <= given
-            ),
-            "--fit-with: the Geometry Network needs the built-in face model; add --geometry landmarks": (
-                stage == "joint" and options.geometry == "network" and options.fit_with != "builtin"
-            ),
-            "--texture-size: requires a dataset; add --dataset": (
-                "texture_size" in given and options.dataset is None
-            ),
-            "--mean-face: datasets are fitted already; use --stage joint, or synthetic heads": (
-                {"mean_face", "dataset"} <= given and stage == "reflectance"
-            ),
-            "--form: --start-from determines it; use one of them": {"form", "start_from"} <= given,
-            "--without-normals: --start-from determines the inputs; use one of them": (
-                {"without_normals", "start_from"} <= given
-            ),
-        }
-    )
+        for name in ("photos", "mean_face")
+    }
+    rules |= {
+        f"{flag(one)}: cannot be combined with {flag(other)}; use one of them": {one, other} <= given
+        for one, other in _EXCLUSIVE
+    }
+    refuse(rules)

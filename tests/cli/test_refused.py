@@ -171,7 +171,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--photos p": "--photos: does not apply to the stage reflectance",
         "--stage light-features --mean-face": "--mean-face: does not apply to the stage light",
         "--dataset d --mean-face": "--mean-face: ... use --stage joint",
-        "--without-normals --start-from f": "--without-normals: --start-from ... use one",
+        "--without-normals --start-from f": "--without-normals: ... use one",
         "--stage joint --dataset d --geometry landmarks --photos p": "--photos: ... remove --geometry",
         "--stage joint --dataset d --fit-with m.npz": "--fit-with: ... add --geometry landmarks",
         "--geometry landmarks": "--geometry: does not apply to the stage reflectance",
