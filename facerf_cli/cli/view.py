@@ -12,14 +12,14 @@ from facerf_cli.batch.run import sums_up
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.option import IMAGE, Without, option
-from facerf_cli.work.photo_options import PhotoOptions, PortraitOptions, check_companion, networks_of
-from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written, ending_of_file
+from facerf_cli.work.photo_options import PhotoOptions, check_companion, networks_of
+from facerf_cli.work.photo_work import FileOrFolder, PageWork, Written, ending_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
 
 
 @dataclass(frozen=True, kw_only=True)
-class MakePage(PhotoWork, PortraitOptions):
+class MakePage(PageWork):
     """`facerf view`.
 
     Attributes:
@@ -35,7 +35,7 @@ class MakePage(PhotoWork, PortraitOptions):
         """Write the page of every chosen face."""
         from facerf_cli.work.view import write_pages
 
-        return write_pages(item, self.photo, self.size_px, self.white, self.normals_from)
+        return write_pages(item, self)
 
 
 def view(

@@ -157,7 +157,14 @@ class PhotoWork(Job):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PredictOlat(PhotoWork, FieldOptions, PortraitOptions):
+class PageWork(PhotoWork, PortraitOptions):
+    """A command that writes pages of `facerf view`; `size_px` is the longer side of the photo in a page."""
+
+    size_px: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictOlat(PageWork, FieldOptions):
     """`facerf predict-olat`.
 
     Attributes:

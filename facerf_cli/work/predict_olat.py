@@ -61,8 +61,7 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
         write_olat_stack(stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
         for path in pages:
-            pixels, size_px = image.pixels, work.size_px
-            write_page(path, item, work.photo, pixels, face, size_px, work.white, work.normals_from)
+            write_page(path, item, image.pixels, face, work)
         return {}
 
     tags, facts = write_each(item, image, work.photo, write)

@@ -28,6 +28,7 @@ from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
+from facerf_cli.work.photo_work import PageWork, Written
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
@@ -44,45 +45,33 @@ _STRIP_PX = 160  # longer side of an image of the strip
 _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
 
 
-def write_pages(
-    item: Item, options: PhotoOptions, size_px: int, white: White, normals_from: Path | None = None
-) -> tuple[list[str], dict[str, Any]]:
-    """Write a page for each chosen face of a photo, or for a stack; return tags, and facts for the report."""
+def write_pages(item: Item, work: PageWork) -> Written:
+    """Write a page for each chosen face of a photo, or for a stack."""
     if is_olat_stack(item.input_path):
-        if normals_from is not None:
+        if work.normals_from is not None:
             raise InputError(f"{item.input_path}: a stack contains its normals; remove --normals-from")
-        tag = options.first_tag
-        return [tag], _write_page_of_stack(item.output(tag + ".html"), item, options, size_px)
-    image = read_photo(item, options)
+        tag = work.photo.first_tag
+        return [tag], _write_page_of_stack(item.output(tag + ".html"), item, work)
+    image = read_photo(item, work.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        path = item.output(face.tag + ".html")
-        write_page(path, item, options, image.pixels, face, size_px, white, normals_from)
+        write_page(item.output(face.tag + ".html"), item, image.pixels, face, work)
         return {}
 
-    return write_each(item, image, options, write)
+    return write_each(item, image, work.photo, write)
 
 
-def write_page(
-    path: Path,
-    item: Item,
-    options: PhotoOptions,
-    photo: np.ndarray,
-    face: FittedFace,
-    size_px: int,
-    white: White,
-    normals_from: Path | None = None,
-) -> None:
-    """Write the page of a face of a photo [H, W, 3], whose longer side in the page is at most `size_px`."""
-    photo, head = shrunk_photo(photo, face.head, size_px)
+def write_page(path: Path, item: Item, photo: np.ndarray, face: FittedFace, work: PageWork) -> None:
+    """Write the page of a face of a photo [H, W, 3]."""
+    photo, head = shrunk_photo(photo, face.head, work.size_px)
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
-    normals = read_normals(item, normals_from, photo.shape[:2])
+    normals = read_normals(item, work.normals_from, photo.shape[:2])
     with naming(item.input_path):
-        basis, plate = of_photo(load_models_once(options), photo, head, matte, white, normals)
+        basis, plate = of_photo(load_models_once(work.photo), photo, head, matte, work.white, normals)
     title = item.input_path.name + face.tag.replace("_", " ")
-    more = ["--white", white] if white != "photo" else []
-    more += [] if normals_from is None else ["--normals-from", str(normals_from)]
-    words = [str(item.input_path), *photo_words(options, face.number), *more]
+    more = ["--white", work.white] if work.white != "photo" else []
+    more += [] if work.normals_from is None else ["--normals-from", str(work.normals_from)]
+    words = [str(item.input_path), *photo_words(work.photo, face.number), *more]
     _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte), item.key)
 
 
@@ -101,18 +90,17 @@ def of_photo(
     return basis, Plate(photo, people.matte, photo - people.own_layer(), person.even_brightness)
 
 
-def _write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:
+def _write_page_of_stack(path: Path, item: Item, work: PageWork) -> dict[str, Any]:
     header = read_olat_header(item.input_path)
     face, head = None, (0.5, 0.5, 0.5)
     if header.kind == "photo":
-        face_fit, coverage = face_in_stack(item.input_path, header, face_model(options))
+        face_fit, coverage = face_in_stack(item.input_path, header, face_model(work.photo))
         face, head = coverage * header.seen, head_place(face_fit.crop, header.seen)
-    basis = basis_of_stack(
-        header.directions, stream_olats(item.input_path), header.seen, size_px, face, header.source
-    )
+    olats = stream_olats(item.input_path)
+    basis = basis_of_stack(header.directions, olats, header.seen, work.size_px, face, header.source)
     size = basis.guide.shape[:2]
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
-    words = [str(item.input_path), *photo_words(options)]
+    words = [str(item.input_path), *photo_words(work.photo)]
     _write(path, item.input_path.name, words, basis, plate, head, item.key)
     return {"lights": len(header.directions)}
 
