@@ -51,8 +51,8 @@ class LightSources:
         light: Light: AZ,EL in degrees (AZ > 0: image right), left, own (the photo's light), even (uniform), a
             preset (rembrandt), a rig file, or keys (at=, size=); NAME=LIGHT;stops=-1. See docs/lights.md.
             Repeatable.
-        light_from: Photo to estimate the light from, as estimate-light does; or background, the image of
-            --background. NAME=PHOTO joins its light with the named lights. Repeatable.
+        light_from: Photo to estimate the light from, as estimate-light does; or background, for the image
+            behind the person. NAME=PHOTO joins its light with the named lights. Repeatable.
         fov_deg: Horizontal angle of view of an image without a face.
         room: Ambient fill of lights: a fraction of their sum from all around, a map, or none.
         rotate: Azimuth to add to the maps; or FROM:TO:N, which renders N frames up to, not including, TO.
