@@ -70,6 +70,7 @@ WRONG: dict[str, dict[str, str]] = {
         "--light-from background": "add --background FILE",
         "--light-from sky=background": "add --background FILE",
         "--fov 180 --light-from a.jpg": "170",
+        "--pose 1,2": "YAW,PITCH,ROLL",
         "--pose 100,20,0": "use yaw",
         "--pose 25,0,0 --composite photo": "use --composite face",
         "--exposure bright": "auto or face or EV",
