@@ -1,4 +1,4 @@
-"""`facerf demo`: a photo that facerf brings along, relit, on one sheet."""
+"""`facerf demo`: a contact sheet of a photo that is installed with facerf, relit."""
 
 import logging
 import tempfile
@@ -30,27 +30,27 @@ log = logging.getLogger(LOGGER_NAME)
 def demo(
     context: typer.Context,
     output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="FILE", help="Write the sheet to this .jpg or .png.")
+        Path, typer.Option("--output", "-o", metavar="FILE", help="Contact sheet to write, .jpg or .png.")
     ] = Path("facerf_demo.jpg"),
 ) -> None:
-    """Relight a photo that facerf brings along, under four maps and four single lights, on one sheet.
+    """Relight an included photo under four maps and four single lights, and write a contact sheet.
 
-    It takes a quarter of a minute. A file that facerf did not write is not replaced. The photo is of Eileen
+    This takes about 15 seconds. Files that facerf did not write are not replaced. The photo shows Eileen
     Collins (NASA, public domain).
     """
     if output.suffix.lower() not in (".jpg", ".png"):
-        raise UsageError(f"-o {output}: not an image; give a file that ends in .jpg or .png")
+        raise UsageError(f"-o {output}: not an image; use a file that ends in .jpg or .png")
     settings, level = settings_of(context), log.level
     photo, maps = _DEMO / "astronaut.jpg", sorted(map(str, _DEMO.glob("maps/*.exr")))
     journal = Journal(output.parent, "demo", file=output)
     recipe = key_of(recipe_of(settings, journal.digest_of))
     (item,) = collect_items([str(photo)], output.parent)
     if not journal.to_make(item, [output], [recipe], "changed"):
-        log.info("%s: is finished and kept", output)
+        log.info("%s: up to date", output)
         return
-    log.setLevel(logging.WARNING if level == logging.INFO else level)  # lines with the photo's long path
+    log.setLevel(logging.WARNING if level == logging.INFO else level)  # hides the photo's long path
     options = RelightOptions(
-        PhotoOptions(settings),
+        photo=PhotoOptions(settings),
         background=BackgroundChoice("envmap"),
         output=OutputOptions(formats=("png",)),
     )
@@ -58,19 +58,19 @@ def demo(
         plan = plan_relight(options, LightSources(envmap=maps, light=[*_LIGHTS]), Path(folder))
         (item,) = collect_items([str(photo)], Path(folder))
         images = RelightJob(plan).ready(dry_run=False).process(item).outputs
-        words = [*(f"--envmap {Path(one).name}" for one in maps), *(f"--light {one}" for one in _LIGHTS)]
+        words = [*(f"--envmap {Path(path).name}" for path in maps), *(f"--light {azel}" for azel in _LIGHTS)]
         key = journal.key_of(item, recipe)
         _write_sheet(output, [photo, *images], ["the photo", *words], {"facerf:key": key})
         journal.add_file(item, output, recipe)
     log.setLevel(level)
     print(output)
-    log.info("a photo of yours: %s", examples_of("relight")[0])
+    log.info("your own photo: %s", examples_of("relight")[0])
 
 
 def _write_sheet(
     sheet: Path, images: Sequence[Path], words: Sequence[str], metadata: dict[str, str | int | float]
 ) -> None:
-    """Write images, each over its word, in three columns."""
+    """Write images in three columns, each with its word below."""
     import numpy as np  # --help does without it
 
     from facerf_cli.files.read import read_image

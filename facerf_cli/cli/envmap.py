@@ -1,4 +1,4 @@
-"""`facerf envmap`: write procedural environment maps."""
+"""`facerf envmap`: draw procedural environment maps."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -7,9 +7,8 @@ import typer
 
 from facerf_cli.batch.settings import BatchOptions
 from facerf_cli.cli.options import settings_of
-from facerf_cli.errors import UsageError
 from facerf_cli.option import LIGHT, Only, option
-from facerf_cli.work.verbs import LARGEST_MAP_PX
+from facerf_cli.work.photo_work import LARGEST_MAP_PX, refuse_odd
 
 
 @dataclass(frozen=True)
@@ -17,10 +16,9 @@ class DrawnMaps:
     """Maps to draw.
 
     Attributes:
-        count: Write so many maps.
-        kind: Draw from this kind alone (may be repeated): sun, dusk, overcast, windows, hall, studio, night,
-            stage.
-        size_px: Write maps of this width; the height is half.
+        count: Number of maps.
+        kind: Kind of map: sun, dusk, overcast, windows, hall, studio, night, stage. Repeatable.
+        size_px: Width of the maps; the height is half of it.
     """
 
     count: int = option(10, metavar="N", least=1, panel=LIGHT)
@@ -33,14 +31,13 @@ def envmap(
     maps: DrawnMaps,
     batch: Annotated[BatchOptions, Only("output", "overwrite", "dry_run")],
 ) -> None:
-    """Write environment maps drawn from a seed: suns, overcast skies, rooms, studios, streets and stages.
+    """Draw environment maps from a seed: suns, overcast skies, rooms, studios, streets and stages.
 
-    Lat-long OpenEXR, scene-linear Rec.709; --size changes the resolution, not the scene. Map number n depends
-    only on --seed, n and the kinds, so a larger --count adds maps and changes none. envmaps.png shows all of
-    them, each beside a white ball under its light; `relight --envmap DIR` reads the maps alone.
+    Maps are lat-long OpenEXR files, scene-linear Rec.709. --size changes the resolution, not the scene. Map
+    number n depends only on --seed, n and the kinds, so a larger --count adds maps without changing others.
+    envmaps.png shows each map beside a white ball under its light; `relight --envmap DIR` ignores it.
     """
-    if maps.size_px % 2:
-        raise UsageError(f"--size {maps.size_px}: the height is half of it; give an even number")
+    refuse_odd("--size", maps.size_px)
     from facerf_cli.synth.sky.maps import write_envmaps
 
     write_envmaps(batch, maps.count, maps.kind, maps.size_px, settings_of(context).seed)

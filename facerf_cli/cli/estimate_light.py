@@ -8,11 +8,17 @@ import typer
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import FramesArgument
-from facerf_cli.errors import UsageError
 from facerf_cli.option import LIGHT, option
-from facerf_cli.work.photo_options import LightOptions
+from facerf_cli.work.photo_options import LightOptions, refuse
+from facerf_cli.work.photo_work import (
+    LARGEST_MAP_PX,
+    MOST_ORDER,
+    FileOrFolder,
+    PhotoWork,
+    Written,
+    refuse_odd,
+)
 from facerf_cli.work.shots import ShotOptions, Shots, collect_frames, whole_shots
-from facerf_cli.work.verbs import LARGEST_MAP_PX, MOST_ORDER, FileOrFolder, PhotoWork, Written, refuse_odd
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,8 +26,8 @@ class EstimateLight(PhotoWork, LightOptions):
     """`facerf estimate-light`.
 
     Attributes:
-        width_px: Write a map of this width; the height is half of it.
-        sh_order: Write spherical harmonics of this order in the JSON.
+        width_px: Width of the map; its height is half of it.
+        sh_order: Order of the spherical harmonics in the JSON.
     """
 
     width_px: int = option(512, metavar="PX", least=16, most=LARGEST_MAP_PX, panel=LIGHT)
@@ -29,19 +35,17 @@ class EstimateLight(PhotoWork, LightOptions):
     verb = "estimate-light"
     endings = ("_light.exr", "_light.json", "_light.png")
     networks = LightOptions.networks
-    alone_as = ("_light.exr", "_light.json")
+    file_endings = ("_light.exr", "_light.json")
 
-    def run(self, inputs: Sequence[str], batch: FileOrFolder, wanted: ShotOptions | None = None) -> int:
-        """Estimate the light of photos, and one for each shot; return the exit code."""
+    def run(self, inputs: Sequence[str], batch: FileOrFolder, frames: ShotOptions | None = None) -> int:
+        """Estimate the light of each photo, and one light per take of a shot; return the exit code."""
         refuse_odd("--width", self.width_px)
         self.photo.check()
         self.check()
-        items, shots = collect_frames(inputs, wanted or ShotOptions(), batch, self.photo)
-        if shots and (self.refine != "none" or self.reflectance != "field" or self.matte is not None):
-            raise UsageError(
-                "a film or --sequence: its light is that of the field; leave out --refine, "
-                "--reflectance and --matte"
-            )
+        items, shots = collect_frames(inputs, frames or ShotOptions(), batch, self.photo)
+        message = "a shot's light is that of the face field; remove --refine, --reflectance and --matte"
+        plain = self.refine == "none" and self.reflectance == "field" and self.matte is None
+        refuse({f"a video or --sequence: {message}": bool(shots) and not plain})
         return replace(self, shots=Shots(shots)).run_on(whole_shots(items, shots), batch)
 
     def ready(self, dry_run: bool) -> Self:
@@ -54,7 +58,7 @@ class EstimateLight(PhotoWork, LightOptions):
         return self
 
     def write(self, item: Item) -> Written:
-        """Estimate the light of every chosen face, or that of a shot."""
+        """Estimate and write the light of every chosen face, or of each take of a shot."""
         from facerf_cli.work.estimate_light import write_lights, write_shot_light
 
         for shot in self.shots.all:
@@ -68,15 +72,15 @@ def estimate_light(
 ) -> None:
     """Estimate the light of photos from the shading of their faces.
 
-    For each photo: _light.exr, a lat-long map for `relight --envmap`; _light.json, the weights of the lights
-    and their spherical harmonics; and _light.png: the photo, the face under the estimated light, where that
-    is too bright (red) and too dark (blue), a mirror ball and a diffuse ball. The report holds the residual
-    inside the mask, the brightest direction (azimuth, elevation) and the share of clipped texels.
+    Each photo gets _light.exr, a lat-long map for `relight --envmap`; _light.json, the weights of the lights
+    and their spherical harmonics; and _light.png, which shows the photo, the face under the estimated light,
+    its errors (red: too bright, blue: too dark), a mirror ball and a diffuse ball. The report contains the
+    residual inside the mask, the brightest direction (azimuth, elevation) and the fraction of clipped texels.
 
-    A film, or images with --sequence, has one light between cuts, estimated from several frames together
-    (_take2_light.exr after the first cut).
+    A video, or an image sequence with --sequence, has one light between cuts, estimated from several frames
+    together (_take2_light.exr after the first cut).
 
     A face shows much of the light in front of it and little of the light behind it. Brightness and colour of
-    the light cannot be separated from those of the skin; they depend on the albedo that the network assumes.
+    the light cannot be separated from those of the skin; they depend on the albedo that the network predicts.
     """
     raise typer.Exit(work.run(inputs, batch, shots))

@@ -1,4 +1,4 @@
-"""`facerf evaluate`: the paper's comparisons, a verb for each protocol, on the user's own data."""
+"""`facerf evaluate`: the paper's comparisons on your own data, one command per protocol."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,7 +27,7 @@ from facerf_cli.work.photo_options import PhotoOptions
 app = typer.Typer(
     cls=Verbs,
     add_completion=False,
-    help="Measure the paper's tables on prepared data and photos, and any methods on frozen cases.",
+    help="Measure the paper's tables on prepared data and photos, and any methods on fixed cases.",
 )
 
 _CAPTURE_FILE, _DATASET_FILE = "stage.json", "dataset.json"
@@ -62,13 +62,13 @@ def olat(
 ) -> None:
     """Predict single lights of held-out people from images in natural light (the paper's Table 1).
 
-    In each source of the split's pairs the face is found and fitted, as in any photo, and relit by the light
-    that the pair names, in the pose of the target camera; the truth is that light of the target's stack. That
-    pose is fitted to the target camera's image under all lights. The image is the rendered face alone, as in
-    the paper. In the same pose a row 'composite' is that of `facerf relight`, with the photo's detail. Tables
-    are by pose, by the angle of the light, and by skin tone if the capture holds it. The row 'lambert' is the
-    source's own texture under the cosine of the light: the least that a method must beat. A second
-    checkpoint, --against without_normals.safetensors, gives the paper's Table 3.
+    The face in each source of the split's pairs is found and fitted like any photo, and relit by the pair's
+    light in the target camera's pose, which is fitted to that camera's image under all lights. The ground
+    truth is that light of the target's stack. The image is only the rendered face, as in the paper; in the
+    same pose, a row 'composite' is the result of `facerf relight`, with the photo's detail. Tables are by
+    pose, by the angle of the light, and by skin tone if the capture states it. The row 'lambert', the
+    source's texture under the cosine of the light, is the lower bound. A second checkpoint, --against
+    without_normals.safetensors, gives the paper's Table 3.
     """
     _evaluate(context, "olat", replace(options, dataset=dataset), photo)
 
@@ -80,12 +80,12 @@ def reconstruction(
     photo: Annotated[PhotoOptions, Without("texture_side", "person")],
     options: ReconstructionOptions,
 ) -> None:
-    """Explain photos by reflectance and light, and render them again (the paper's Table 2).
+    """Explain photos by reflectance and light, and re-render them (the paper's Table 2).
 
-    Each method estimates its own light and reflectance; the face is rendered alone into the photo's crop and
-    compared with it. The field is the network's own, without the correction by the photo that `relight`
-    makes: that would be exact by construction. Of a DATASET the sources of its pairs are measured; its true
-    light is known, so light_error_deg is the angle between the brightest single lights.
+    Each method estimates its own light and reflectance; the rendered face is compared with the photo's crop.
+    The field is the network's, without the correction by the photo's ratio image, which would be exact by
+    construction. For a DATASET, the sources of its pairs are measured; their light is known, so
+    light_error_deg is the angle between the brightest single lights.
     """
     _evaluate(context, "reconstruction", replace(options, dataset=_only_dataset(inputs)), photo, inputs)
 
@@ -107,13 +107,13 @@ def transfer(
 ) -> None:
     """Exchange the reflectances of two images of a person (the paper's Table 2).
 
-    Image A is rendered from the reflectance that was read from B, turned to A's pose, under A's light; then B
-    from A's. The same method estimates that light in the image with its own reflectance. Of a DATASET,
-    couples are sources of one person with different cameras and different maps.
+    Image A is rendered with B's reflectance in A's pose and light, then B with A's reflectance. The same
+    method estimates the light of each image with the image's own reflectance. For a DATASET, pairs are
+    sources of one person with different cameras and different maps.
     """
     dataset = None if options.photos else _only_dataset(inputs)
     if dataset is None and not options.photos:
-        raise UsageError(f"{inputs[0]}: not a prepared dataset; give --photos for images of people")
+        raise UsageError(f"{inputs[0]}: not a prepared dataset; add --photos for images of people")
     options = replace(options, dataset=dataset, network_alone=not options.held_to_photo)
     _evaluate(context, "transfer", options, photo, inputs)
 
@@ -128,7 +128,7 @@ def geometry(
     """Reconstruct photos with the fitted face and with the mean face in its pose (the paper's Table 4).
 
     Both are fitted to the same landmarks of one image, or with --geometry network regressed from the same
-    crop, and compared where both show the face. The paper trained networks with the mean face: give them as
+    crop, and compared where both show the face. The paper trained networks with the mean face: pass them as
     --mean-checkpoint.
     """
     _evaluate(context, "geometry", replace(options, dataset=_only_dataset(inputs)), photo, inputs)
@@ -148,13 +148,13 @@ def yale_b(
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
     options: YaleOptions,
 ) -> None:
-    """Relight real people to real point lights and compare with their photos under these.
+    """Relight real people by real point lights, and compare with photos under these lights.
 
-    Sources are an image under one flash and four soft lights summed from the subject's own images; targets
-    are single flashes and four environments. Lights are given, not estimated. Images are read as linear, as
-    measured, relit as by `facerf relight`, and compared inside one ellipse, open eyes included. Cases are
-    SUBJECT/SOURCE/LIGHT. To measure a Reflectance Network of your own without the shipped Portrait Network,
-    pass --reflectance field. The database is for research and never trained on.
+    Sources are an image under one flash, and four soft lights summed from the subject's images; targets are
+    single flashes and four environments. Lights are known, not estimated. Images are read as linear, relit
+    like `facerf relight`, and compared inside one ellipse, which includes the open eyes. Cases are
+    SUBJECT/SOURCE/LIGHT. To measure your own Reflectance Network without the shipped Portrait Network, use
+    --reflectance field. The database is for research, and facerf is not trained on it.
     """
     _evaluate(context, "yale-b", options, photo, [str(folder)])
 
@@ -166,12 +166,12 @@ def cases(
     photo: Annotated[PhotoOptions, Only("face_model")],
     options: CasesOptions,
 ) -> None:
-    """Freeze pairs of a dataset as cases that any method can render, for `evaluate compare`.
+    """Write pairs of a dataset as fixed cases that any method can render, for `evaluate compare`.
 
-    A case has a source image, the pose and the light to render, the truth and the mask of the comparison, in
-    the frame of the dataset's crops: no checkpoint has a part in them. DIR/cases.csv lists them, with poses
-    and lights in numbers; DIR/light has each light as a lat-long map. Sources in which no face is found are
-    named and left out. docs/evaluation.md says what a method has to render.
+    A case is a source image, the pose and light to render, the ground truth and the mask of the comparison,
+    in the frame of the dataset's crops; cases do not depend on a checkpoint. DIR/cases.csv lists poses and
+    lights as numbers; DIR/light contains each light as a lat-long map. Sources without a detected face are
+    logged and skipped. docs/evaluation.md describes what a method must render.
     """
     _evaluate(context, "cases", replace(options, dataset=dataset), photo)
 
@@ -182,7 +182,7 @@ def compare(
         Path,
         typer.Argument(
             metavar="CASES",
-            help="Folder of `evaluate cases`, of images that --pictures kept, or of any true images.",
+            help="Folder of `evaluate cases`, of images that --pictures kept, or of ground truth images.",
             show_default=False,
         ),
     ],
@@ -190,13 +190,12 @@ def compare(
     photo: Annotated[PhotoOptions, Only("face_model", "geometry", "form")],
     options: CompareOptions,
 ) -> None:
-    """Compare any number of methods on frozen cases: folders of images, and facerf's own.
+    """Compare any number of methods on fixed cases: folders of images, and facerf's own.
 
-    Each --method is a folder of images with the names of the truths; trees are mirrored, suffixes may differ.
-    --reflectance and --against render the cases of `evaluate cases` by facerf, as any other method has to: in
-    the source's pose as `facerf relight`, in another the face alone. The others are compared with the first
-    method. A missing, an additional or a differently sized image is an error: no table is made of what is
-    left.
+    Each --method is a folder of images with the names of the ground truth; trees are mirrored, suffixes may
+    differ. --reflectance and --against render the cases of `evaluate cases` with facerf: in the source's pose
+    like `facerf relight`, in other poses only the face. All methods are compared with the first one. A
+    missing, additional or differently sized image is an error, and no table is written.
     """
     _evaluate(context, "compare", replace(options, truth=truth), photo)
 
@@ -212,15 +211,14 @@ def _evaluate(
     photo: PhotoOptions,
     inputs: Sequence[str] = (),
 ) -> None:
-    """Run a protocol and exit; raises UsageError for options that would fail every item, or do nothing."""
+    """Run a protocol and exit; raise UsageError for options that would fail every item, or have no effect."""
     options.check()
     photo.check()
     if isinstance(options, FaceOptions):
         names, what = (_PAIRS, "a prepared dataset") if options.dataset is None else (_OF_PHOTOS, "photos")
-        refuse_given(context, names, f"is for {what}; leave it out here")
+        refuse_given(context, names, f"requires {what}; remove it")
     if not options.has_field:
-        why = "is for the field; give --reflectance field too, or leave it out"
-        refuse_given(context, _MADE_BY_FIELD, why)
+        refuse_given(context, _MADE_BY_FIELD, "requires the field; add --reflectance field, or remove it")
     from facerf_cli.evaluation.protocols import PROTOCOLS
     from facerf_cli.evaluation.run import Evaluation
 
@@ -229,13 +227,11 @@ def _evaluate(
 
 
 def _only_dataset(inputs: Sequence[str]) -> Path | None:
-    """The dataset of the inputs, or None for photos; raises UsageError for both, or for a capture."""
+    """Return the dataset among the inputs, None for photos; raise UsageError for both, or for a capture."""
     for path in map(Path, inputs):
         if (path / _CAPTURE_FILE).is_file():
-            raise UsageError(
-                f"{path}: a capture, not a dataset; run prepare-dataset on it and give the result"
-            )
+            raise UsageError(f"{path}: a capture, not a dataset; run prepare-dataset, and pass its output")
     datasets = [path for path in map(Path, inputs) if (path / _DATASET_FILE).is_file()]
     if datasets and len(inputs) > 1:
-        raise UsageError(f"{datasets[0]}: one dataset among several inputs; give it alone, or give photos")
+        raise UsageError(f"{datasets[0]}: one dataset among several inputs; pass only it, or only photos")
     return datasets[0] if datasets else None

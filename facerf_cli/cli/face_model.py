@@ -49,14 +49,14 @@ def import_model(
 ) -> None:
     """Import a published morphable model as a file for --face-model.
 
-    The mean and the shapes are resampled to facerf's UV layout, so that one checkpoint serves every model.
-    The file keeps the model's licence. No code in FLAME's pickle is run.
+    The mean and the shapes are resampled to facerf's UV layout, so one checkpoint works with every model.
+    The file keeps the model's licence. Code in FLAME's pickle is not executed.
     """
     if output.suffix != ".npz":
-        raise UsageError(f"-o {output}: not a face model; give a file that ends in .npz")
+        raise UsageError(f"-o {output}: not a face model; use a file that ends in .npz")
     refuse_read([output], [path for path in (source, landmarks) if path])
     if output.exists() and not overwrite:
-        raise UsageError(f"{output}: the file exists; give --overwrite to replace it")
+        raise UsageError(f"{output}: file exists; add --overwrite to replace it")
     from facerf_cli.face.importers.resample import import_face_model
     from facerf_cli.face.morphable import save_face_model
     from facerf_cli.files.atomic import atomic_path

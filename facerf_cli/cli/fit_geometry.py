@@ -1,4 +1,4 @@
-"""`facerf fit-geometry`: the face model fitted to photos, as files that other programs open."""
+"""`facerf fit-geometry`: the face model fitted to photos, in common file formats."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import typer
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.work.photo_options import FITTING
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written
+from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written
 
 _TEXTURES = ("_texture.exr", "_texture.png", "_normals.exr", "_normals.png")
 _MESHES = ("_mesh.glb", "_mesh.mtl", "_mesh.obj")
@@ -18,7 +18,7 @@ class FitGeometry(PhotoWork):
     """`facerf fit-geometry`."""
 
     verb, endings, networks = "fit-geometry", (*_TEXTURES, *_MESHES, "_fit.jpg", "_fit.npz"), FITTING
-    alone_as = ("_mesh.glb",)
+    file_endings = ("_mesh.glb",)
 
     def write(self, item: Item) -> Written:
         """Fit every chosen face."""
@@ -30,9 +30,9 @@ class FitGeometry(PhotoWork):
 def fit_geometry(inputs: InputsArgument, work: FitGeometry, batch: FileOrFolder) -> None:
     """Fit the face model to photos: mesh, texture, normals, and an overlay of the fit.
 
-    For each photo: _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, the head upright),
-    _texture.exr and .png (in UV space; the EXR's layer 'visible' marks what the photo shows), _normals.exr
-    (camera space) and .png, and _fit.jpg, the mesh over the photo. The report holds each fit's error (a
-    share of the distance between the outer eye corners), its quality (good, fair, poor) and the pose.
+    Each photo gets _fit.npz (pose, shape, crop), _mesh.glb and _mesh.obj (metres, head upright), _texture.exr
+    and .png (in UV space; the EXR's layer 'visible' marks visible texels), _normals.exr (camera space) and
+    .png, and _fit.jpg, the mesh over the photo. The report contains each fit's error (relative to the
+    distance between the outer eye corners), its quality (good, fair, poor) and the pose.
     """
     raise typer.Exit(work.run(inputs, batch))

@@ -1,4 +1,4 @@
-"""`facerf predict-olat`: a photo's face under every light of a rig, as an OLAT stack."""
+"""`facerf predict-olat`: a photo's person under every light of a rig, as an OLAT stack."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import typer
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import InputsArgument
-from facerf_cli.work.verbs import FileOrFolder, PredictOlat, Written
+from facerf_cli.work.photo_work import FileOrFolder, PredictOlat, Written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,9 +23,9 @@ class PredictStacks(PredictOlat):
 def predict_olat(inputs: InputsArgument, work: PredictStacks, batch: FileOrFolder) -> None:
     """Predict a photo's person under every single light of a rig (OLAT, one light at a time).
 
-    Each photo gives an OLAT stack (an OpenEXR file with a part for each light, the person over black;
-    `facerf relight` takes it in place of a photo, unless it is of UV textures) and a contact sheet. Lights
-    are fixed to the camera and of unit intensity: AZ > 0 lights the image's right side, EL > 0 comes from
+    Each photo gets an OLAT stack and a contact sheet. The stack is an OpenEXR file with one part per light,
+    with the person over black; `facerf relight` accepts it instead of a photo, except for UV textures. Lights
+    are fixed to the camera and have unit intensity: AZ > 0 lights the image's right side, EL > 0 comes from
     above.
     """
     raise typer.Exit(work.run(inputs, batch))

@@ -1,4 +1,4 @@
-"""`facerf prepare-dataset`: a light stage's capture as crops, fits, OLAT stacks and splits."""
+"""`facerf prepare-dataset`: crops, fits, OLAT stacks and splits of a light stage's capture."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ def prepare_dataset(
             "--output",
             "-o",
             metavar="DATASET",
-            help="Write the dataset to this folder; with --describe, the draft to this file.",
+            help="Folder of the dataset; with --describe, file of the draft.",
             show_default="CAPTURE/stage.json with --describe",
         ),
     ] = None,
@@ -45,8 +45,7 @@ def prepare_dataset(
         bool,
         typer.Option(
             "--describe",
-            help="Write a first draft of stage.json from file names and headers, list what to fill in, and "
-            "prepare nothing.",
+            help="Only write a draft of stage.json from file names and headers, and list what to fill in.",
             rich_help_panel=CAPTURE,
         ),
     ] = False,
@@ -54,7 +53,7 @@ def prepare_dataset(
         str,
         typer.Option(
             metavar="PATTERN",
-            help="With --describe, find the images by this path below CAPTURE, such as "
+            help="With --describe, pattern of image paths below CAPTURE, such as "
             "'{subject}/{camera}/{light}.exr'.",
             show_default=False,
             rich_help_panel=CAPTURE,
@@ -63,27 +62,25 @@ def prepare_dataset(
 ) -> None:
     """Prepare a light stage's capture for training: crops, fits, OLAT stacks, splits.
 
-    Frames are converted to linear Rec.709, less the black level, and divided by each light's intensity. One
-    head is fitted to all cameras of a subject. DATASET gets olat/SUBJECT/CAMERA.exr (OLAT stacks for `facerf
-    relight`), fits, a contact sheet per subject, index.html, and dataset.json at the end. A second run
-    continues an interrupted one.
+    Frames are converted to linear Rec.709, the black level is subtracted, and each is divided by its light's
+    intensity. One head is fitted to all cameras of a subject. DATASET gets olat/SUBJECT/CAMERA.exr (OLAT
+    stacks for `facerf relight`), fits, a contact sheet per subject, index.html and finally dataset.json. A
+    second run continues an interrupted one.
 
-    A light whose frame is missing or broken in one camera is left out of that subject's stacks. A camera that
-    lacks most frames, or in which no face is found, is left out, too; dataset.json lists both. A subject with
-    less than half of the lights, or fewer than 10, fails. findings.jsonl has the findings of the checks.
+    A light whose frame is missing or broken in one camera is removed from that subject's stacks. A camera is
+    removed if it lacks most frames, or if no face is found in it; dataset.json lists both. A subject with
+    less than half of the lights, or fewer than 10, fails. findings.jsonl contains the results of the checks.
     """
     if describe:
         others = [name for name in context.params if name not in _DESCRIBES]
-        refuse_given(context, others, "is for preparing; leave it out with --describe")
+        refuse_given(context, others, "has no effect with --describe; remove it")
         from facerf_cli.capture.draft import describe_capture
 
         describe_capture(capture, pattern, output, batch.dry_run)
         return
-    refuse_given(context, ["pattern"], "is for --describe; leave it out, stage.json has the pattern")
+    refuse_given(context, ["pattern"], "requires --describe; otherwise set the pattern in stage.json")
     if output is None:
-        raise UsageError(
-            "-o: is missing; give -o DATASET, a folder (or --describe, for a draft of stage.json)"
-        )
+        raise UsageError("-o: missing; pass -o DATASET, a folder, or --describe for a draft of stage.json")
     from facerf_cli.dataset.prepare_capture import prepare_capture
 
     batch = replace(batch, output=output)

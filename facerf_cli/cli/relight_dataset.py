@@ -1,4 +1,4 @@
-"""`facerf relight-dataset`: relight a prepared dataset under environment maps, into pairs to train on."""
+"""`facerf relight-dataset`: training pairs from a prepared dataset under environment maps."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,17 +21,17 @@ def relight_dataset(
     pairs: PairSettings,
     batch: Annotated[BatchOptions, Without("output", "name")],
 ) -> None:
-    """Relight a prepared dataset under environment maps, into the pairs of `facerf train --dataset`.
+    """Relight a prepared dataset under environment maps, as pairs for `facerf train --dataset`.
 
-    DATASET/relit/pairs.jsonl gets a row a pair: a subject, a camera, an envmap and its rotation, and the
-    light and camera to predict. The row alone reproduces the image, bit for bit. Row n of a subject depends
-    on --seed, n and the envmaps, so a larger --per-subject adds pairs and changes none. Sources are
-    half-float EXRs, DATASET/relit/SUBJECT/00000.exr and on, exposed so that the envmap's mean radiance is
+    DATASET/relit/pairs.jsonl gets one row per pair: a subject, a camera, an environment map and its rotation,
+    and the light and camera to predict. The row reproduces the image bit for bit. Row n of a subject depends
+    only on --seed, n and the maps, so a larger --per-subject adds pairs without changing others. Sources are
+    half-float EXRs, DATASET/relit/SUBJECT/00000.exr and so on, exposed so that the map's mean radiance is
     near 1 (exposure_ev).
 
-    --dry-run says what the pairs take, by making some: at the paper's scale (350 subjects, 8 cameras, 512
-    pixels) about 310 GB and 6 hours of a core. --lazy writes .7 GB of recipes and weights instead, and
-    training sums stacks.
+    --dry-run estimates the size and time of the pairs by making some: at the paper's scale (350 subjects, 8
+    cameras, 512 pixels) about 310 GB and 6 hours of one core. --lazy writes .7 GB of recipes and weights
+    instead, and training sums the stacks.
     """
     from facerf_cli.dataset.pairs import RELIT
     from facerf_cli.dataset.relight_subjects import relight_subjects

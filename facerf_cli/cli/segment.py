@@ -1,4 +1,4 @@
-"""`facerf segment`: who and what a photo shows: matte and classes of a person, as files."""
+"""`facerf segment`: matte and classes of the people in a photo."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -9,8 +9,8 @@ from facerf_cli.batch.inputs import Item
 from facerf_cli.cli.options import FramesArgument
 from facerf_cli.option import Only
 from facerf_cli.work.photo_options import PhotoOptions
+from facerf_cli.work.photo_work import FileOrFolder, PhotoWork, Written
 from facerf_cli.work.shots import ShotOptions
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +24,7 @@ class Segment(PhotoWork):
     verb = "segment"
     endings = ("_segment.exr", "_person.png", "_overlay.jpg", "_landmarks.json")
     networks = frozenset({"parsing"})
-    alone_as = ("_person.png", "_segment.exr")
+    file_endings = ("_person.png", "_segment.exr")
 
     def write(self, item: Item) -> Written:
         """Segment the person of every chosen face."""
@@ -36,12 +36,12 @@ class Segment(PhotoWork):
 def segment(inputs: FramesArgument, work: Segment, shots: ShotOptions, batch: FileOrFolder) -> None:
     """Cut people out of photos: matte, hair, skin, garment and other classes, and landmarks.
 
-    For each photo: _segment.exr (RGBA: the person without the background's colour, premultiplied; layers
-    'person.A' and 'class.skin', 'class.hair', 'class.ears', 'class.neck', 'class.garment' and others, 0 to 1,
-    which sum to the matte), _person.png (the person over nothing), _overlay.jpg (classes and landmarks over
-    the photo), _landmarks.json (for --landmarks). The report says how sure facerf is of each photo.
-    -o cut.png or cut.exr writes the person or the layers of one photo alone.
+    Each photo gets _segment.exr (RGBA: the person without background colour, premultiplied; layers 'person.A'
+    and 'class.skin', 'class.hair', 'class.ears', 'class.neck', 'class.garment' and others, 0 to 1, which sum
+    to the matte), _person.png (a transparent cutout), _overlay.jpg (classes and landmarks over the photo) and
+    _landmarks.json (for --landmarks). The report contains each photo's confidence. -o cut.png or cut.exr
+    writes only the cutout or the layers of one photo.
 
-    Each frame of a film, or with --sequence of numbered images, is steadied by the frames around it.
+    Frames of a video, or of an image sequence with --sequence, are smoothed with the frames around them.
     """
     raise typer.Exit(work.run(inputs, batch, shots))

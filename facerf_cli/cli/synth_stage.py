@@ -1,4 +1,4 @@
-"""`facerf synth-stage`: photograph synthetic people in a virtual light stage."""
+"""`facerf synth-stage`: render synthetic people in a virtual light stage."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,17 +16,17 @@ from facerf_cli.synth.stage_settings import StageSettings
 
 @dataclass(frozen=True)
 class Photograph(Job):
-    """Photographs people."""
+    """Renders the captures of synthetic people."""
 
     stage: StageSettings
     verb = "synth-stage"
 
     def outputs_of(self, item: Item) -> list[Path]:
-        """The person's folder."""
+        """Return the person's folder."""
         return [item.output_base]
 
     def __call__(self, item: Item) -> Outcome:
-        """Draw and photograph a person."""
+        """Draw and render a person."""
         from facerf_cli.run.workers import one_thread
         from facerf_cli.synth.bank.heads import cached_face_model
         from facerf_cli.synth.stage import write_subject
@@ -47,7 +47,7 @@ def synth_stage(
             min=1,
             max=9999,
             metavar="N",
-            help="Photograph so many people.",
+            help="Number of people.",
             rich_help_panel="People and stage",
         ),
     ] = 10,
@@ -55,12 +55,11 @@ def synth_stage(
     stage: StageSettings,
     batch: Annotated[BatchOptions, Without("name")],
 ) -> None:
-    """Photograph synthetic people in a light stage: one light at a time, several cameras, one exposure.
+    """Render synthetic people in a light stage: one light at a time, several cameras, one exposure.
 
-    Writes a capture for `facerf prepare-dataset`: stage.json, and SUBJECT/CAMERA/LIGHT.exr in half floats,
-    scene-linear Rec.709.
-    Person number n depends on --seed, n and the face model alone, so a larger --subjects adds people and
-    changes none.
+    The capture, for `facerf prepare-dataset`, has stage.json and SUBJECT/CAMERA/LIGHT.exr in half floats,
+    scene-linear Rec.709. Person number n depends only on --seed, n and the face model, so a larger --subjects
+    adds people without changing others.
     """
     from facerf_cli.synth.bank.heads import cached_face_model
     from facerf_cli.synth.stage import close_capture, open_capture

@@ -6,16 +6,16 @@ from typing import Any
 import typer
 
 from facerf_cli.cli.options import is_default, was_given
-from facerf_cli.errors import UsageError
 from facerf_cli.option import flag
 from facerf_cli.training.options import PaceOptions, TrainOptions
 from facerf_cli.training.settings import KINDS, TrainSettings
+from facerf_cli.work.photo_options import refuse
 
 _TEXTURE_STAGES = ("reflectance", "light-features", "diffuse-sh")
-_PEOPLE_STAGES = ("parsing", "portrait")  # which draw whole synthetic people
-_HEAD_STAGES = (*_TEXTURE_STAGES, "geometry", *_PEOPLE_STAGES)  # which draw synthetic heads
-_CROP_STAGES = ("joint", "appearance-features")  # which read a dataset's crops
-_STAGES = {  # the stages that an option applies to
+_PEOPLE_STAGES = ("parsing", "portrait")  # draw whole synthetic people
+_HEAD_STAGES = (*_TEXTURE_STAGES, "geometry", *_PEOPLE_STAGES)  # draw synthetic heads
+_CROP_STAGES = ("joint", "appearance-features")  # read a dataset's crops
+_STAGES = {  # that options apply to
     "vgg_weights": ("joint",),
     "appearance_features": ("joint",),
     "photos": ("joint",),
@@ -32,26 +32,35 @@ _STAGES = {  # the stages that an option applies to
     "heads": _HEAD_STAGES,
     "bank": _HEAD_STAGES,
 }
+_EXCLUSIVE = (
+    ("heads_from", "dataset"),
+    ("heads", "dataset"),
+    ("views", "dataset"),
+    ("bank", "dataset"),
+    ("appearance_features", "vgg_weights"),
+    ("form", "start_from"),
+    ("without_normals", "start_from"),
+)
 
 
 def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> None:
     """Train the networks on synthetic heads, without a light stage, or on a prepared dataset.
 
-    Stages: reflectance, the Reflectance Network on textures; geometry, the Geometry Network on rendered
-    heads; joint, both through the rasterizer; parsing and portrait, the networks of those names on whole
-    synthetic people; light-features and appearance-features, the networks of those options; diffuse-sh, the
+    Stages: reflectance trains the Reflectance Network on textures; geometry, the Geometry Network on rendered
+    heads; joint, both through the rasterizer; parsing and portrait, the networks of these names on whole
+    synthetic people; light-features and appearance-features, the networks of these options; diffuse-sh, the
     network of that baseline.
 
     Synthetic heads are drawn from a face model, and their light transport is baked once; each step draws new
-    skins, lights and cameras. A dataset is unwrapped once into DATASET/textures-PX. Training uses its split
-    train and validation its split validation; the split test stays unused. Sources are those of
-    relight-dataset or, if there are none, the stacks under random lights.
+    skins, lights and cameras. A dataset is unwrapped once into DATASET/textures-PX. Training uses the splits
+    train and validation; the split test is not used. Sources are those of relight-dataset or, if there are
+    none, the stacks under random lights.
 
     DIR gets last.safetensors and best.safetensors (for --checkpoint and --start-from), log.jsonl,
-    validation-STEP.png, TensorBoard events (tensorboard --logdir DIR), and state.pt for --resume. On a CPU a
-    run of --steps gives the same result to the last digit however often it is stopped.
+    validation-STEP.png, TensorBoard events (tensorboard --logdir DIR), and state.pt for --resume. On a CPU, a
+    run of --steps gives bit-identical results no matter how often it is interrupted.
 
-    Several processes, one a GPU: torchrun --nproc-per-node N -m facerf_cli train ...
+    Use torchrun for several processes, one per GPU: torchrun --nproc-per-node N -m facerf_cli train ...
     """
     if options.preset == "paper":
         joint, paper = is_default(context, "stage"), is_default(context, "form")
@@ -68,7 +77,7 @@ def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> N
 
 
 def _typed(context: typer.Context, options: TrainOptions, training: TrainSettings) -> dict[str, Any]:
-    """The options that were given, by name, and values in force that a preset gave."""
+    """Return the options as typed, by name, and the values that a preset set."""
     names = {parameter.name: parameter.opts[0].lstrip("-") for parameter in context.command.params}
     given = {
         names[name]: list(value) if isinstance(value, tuple) else value
@@ -89,35 +98,34 @@ def _typed(context: typer.Context, options: TrainOptions, training: TrainSetting
 
 
 def _refuse_conflicts(context: typer.Context, options: TrainOptions) -> None:
-    """Raise UsageError for options that do not apply to the stage or contradict each other."""
+    """Raise UsageError for options that do not apply to the stage or exclude each other."""
     stage, given = options.stage, {name for name in context.params if was_given(context, name)}
-    for name, stages in _STAGES.items():
-        if name in given and stage not in stages:
-            raise UsageError(f"{flag(name)}: does not apply to the stage {stage}; leave it out")
-    if stage in _CROP_STAGES and options.dataset is None:
-        raise UsageError(f"--stage {stage}: needs a prepared dataset; give --dataset")
-    if {"vgg_weights", "appearance_features"} <= given:
-        raise UsageError("--appearance-features: takes the place of --vgg-weights; give one of them")
-    for name in ("heads_from", "heads", "views", "bank"):
-        if {name, "dataset"} <= given:
-            raise UsageError(
-                f"{flag(name)}: is for synthetic heads, which --dataset replaces; give one of them"
-            )
-    for name in ("photos", "mean_face"):
-        if name in given and context.params["geometry"] == "landmarks":
-            raise UsageError(
-                f"{flag(name)}: is for the Geometry Network, which --geometry landmarks leaves out"
-            )
-    if stage == "joint" and options.geometry == "network" and options.fit_with != "builtin":
-        raise UsageError(
-            "--fit-with: the Geometry Network learns the built-in face model; leave it out, or give "
-            "--geometry landmarks"
+    rules = {
+        f"{flag(name)}: does not apply to the stage {stage}; remove it": name in given and stage not in stages
+        for name, stages in _STAGES.items()
+    }
+    rules |= {
+        f"--stage {stage}: requires a prepared dataset; add --dataset": (
+            stage in _CROP_STAGES and options.dataset is None
+        ),
+        "--texture-size: requires a dataset; add --dataset": (
+            "texture_size" in given and options.dataset is None
+        ),
+        "--mean-face: datasets are fitted already; use --stage joint, or synthetic heads": (
+            {"mean_face", "dataset"} <= given and stage == "reflectance"
+        ),
+        "--fit-with: the Geometry Network needs the built-in face model; add --geometry landmarks": (
+            stage == "joint" and options.geometry == "network" and options.fit_with != "builtin"
+        ),
+    }
+    rules |= {
+        f"{flag(name)}: requires the Geometry Network; remove --geometry landmarks": (
+            name in given and options.geometry == "landmarks"
         )
-    if "texture_size" in given and options.dataset is None:
-        raise UsageError("--texture-size: applies to a dataset; give --dataset, too")
-    if {"mean_face", "dataset"} <= given and stage == "reflectance":
-        raise UsageError("--mean-face: the dataset is fitted already; give --stage joint, or synthetic heads")
-    if {"form", "start_from"} <= given:
-        raise UsageError("--form: --start-from fixes the form; give one of them")
-    if {"without_normals", "start_from"} <= given:
-        raise UsageError("--without-normals: --start-from fixes the networks' inputs; give one of them")
+        for name in ("photos", "mean_face")
+    }
+    rules |= {
+        f"{flag(one)}: cannot be combined with {flag(other)}; use one of them": {one, other} <= given
+        for one, other in _EXCLUSIVE
+    }
+    refuse(rules)

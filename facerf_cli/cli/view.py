@@ -1,4 +1,4 @@
-"""`facerf view`: photos and OLAT stacks as pages in which lights are moved by hand."""
+"""`facerf view`: photos and OLAT stacks as web pages with movable lights."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,39 +12,30 @@ from facerf_cli.batch.run import sums_up
 from facerf_cli.cli.options import InputsArgument
 from facerf_cli.errors import InputError, UsageError
 from facerf_cli.option import IMAGE, Without, option
-from facerf_cli.relighting import White
-from facerf_cli.work.photo_options import (
-    PhotoOptions,
-    check_companion,
-    networks_of,
-    normals_option,
-    white_option,
-)
-from facerf_cli.work.verbs import FileOrFolder, PhotoWork, Written, end_of_file
+from facerf_cli.work.photo_options import PhotoOptions, check_companion, networks_of
+from facerf_cli.work.photo_work import FileOrFolder, PageWork, Written, ending_of_file
 
 _PAGE, _INDEX = ".html", "index.html"
 
 
 @dataclass(frozen=True, kw_only=True)
-class MakePage(PhotoWork):
+class MakePage(PageWork):
     """`facerf view`.
 
     Attributes:
-        size_px: Show photos with so many pixels along the longer side.
+        size_px: Longer side of the photo in the page.
     """
 
     photo: Annotated[PhotoOptions, Without("texture_side")]
     size_px: int = option(1024, metavar="PX", least=256, most=4096, panel=IMAGE, everyday=True)
-    white: White = white_option()
-    normals_from: Path | None = normals_option()
     verb, endings, networks = "view", (_PAGE,), networks_of(["portrait"])
-    alone_as = (_PAGE,)
+    file_endings = (_PAGE,)
 
     def write(self, item: Item) -> Written:
         """Write the page of every chosen face."""
         from facerf_cli.work.view import write_pages
 
-        return write_pages(item, self.photo, self.size_px, self.white, self.normals_from)
+        return write_pages(item, self)
 
 
 def view(
@@ -52,18 +43,18 @@ def view(
     work: MakePage,
     batch: Annotated[FileOrFolder, Without("name")],
 ) -> None:
-    """Make a web page in which a photo, or an OLAT stack, is relit by moving lights.
+    """Make a web page in which a photo or an OLAT stack is relit by moving lights.
 
-    A folder of pages has a list of them, index.html; -o me.html writes one page. A page is
-    one file of about 5 MB, which a browser opens without a server or a network: single lights, rotated
-    environment maps (.hdr and .exr can be dropped in), exposure, and the command that makes the same image.
+    A folder of pages gets a list of them, index.html; -o me.html writes a single page. Each page is one file
+    of about 5 MB that a browser opens without a server or network. It has single lights, rotated environment
+    maps (.hdr and .exr can be dropped in), exposure, and the command that renders the same image.
     """
     photo, output = work.checked().photo, batch.output
     check_companion(work.normals_from, "--normals-from")
     items = collect_items(inputs, output, PHOTO_SUFFIXES, null_separated=photo.settings.null_separated)
-    many = not end_of_file(output, work.alone_as)
+    many = not ending_of_file(output, work.file_endings)
     if many and any(item.name == Path(_INDEX).stem for item in items):
-        raise UsageError(f"{_INDEX}: is the list of all pages; rename the photo of that name")
+        raise UsageError(f"{_INDEX}: reserved for the list of pages; rename the photo of that name")
     journal = Journal(output, work.verb)
     refusal = journal.refusal(output / _INDEX) if many and batch.overwrite != "always" else ""
     if refusal and batch.overwrite == "changed":

@@ -1,8 +1,7 @@
-"""Basis images of an OLAT stack: an image under any light is a guide times a weighted sum of ratios.
+"""Basis images of an OLAT stack: an image under any light is a guide times a weighted sum of ratio images.
 
-The guide is the mean of all lights' images, as large as the photo, and keeps every pore and hair. A ratio,
-a light's image over the mean, both small, is smooth. Both are bytes: the guide of sRGB, a ratio of its
-square root.
+The guide is the mean image of all lights at the photo's size. A ratio image, a light's image divided by the
+mean, is smooth and therefore small. Both are 8-bit: the guide in sRGB, a ratio as its square root.
 """
 
 import math
@@ -30,22 +29,21 @@ from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.portrait_field import PersonShading, PortraitField, PortraitView
 from facerf_cli.relighting.relightable import Relit
 
-RATIO_PX = 320  # the longer side of a ratio
-MOST_LIGHTS = 400  # of a stack with more, so many evenly spread ones are kept
+RATIO_PX = 320  # longer side of a ratio image
+MOST_LIGHTS = 400  # from larger stacks, this many evenly spread lights are used
 _LIGHTS_AT_ONCE = 10
-_DARK = 5e-3  # added to the guide, as a share of its mean over the person: no ratio divides by 0
-_PERSON = 0.02  # share of the person from which on a pixel has a ratio
-_SURE = 0.5  # share from which on a pixel is skin, or the person's
-_SAMPLES = 5000  # pixels of the face, and of the person, at most, by which a page chooses its exposure
-_WHITE_PERCENTILE = 99.9  # of a guide and of a ratio: the white of their bytes
+_DARK = 5e-3  # of the guide's mean over the person, added to the guide to avoid division by 0
+_PERSON = 0.02  # least matte of a pixel with a ratio
+_SURE = 0.5  # least matte or class probability of pixels for the exposure
+_SAMPLES = 5000  # most pixels of the person from which a page chooses its exposure
+_WHITE_PERCENTILE = 99.9  # of a guide or ratio: its 8-bit white
 
 
 @dataclass(frozen=True, eq=False)
 class Brightest:
-    """Pixels of a region that are among its brightest under some light, for a percentile under any lights.
+    """Pixels that are among the brightest of a region's `total` pixels under some light.
 
-    `luminances` [L, N] are under white lights; `shares` [N, 3] of them, which sum to 1, are of each primary.
-    They stand for the brightest of `total` pixels.
+    `luminances` [L, N] are under white lights; `shares` [N, 3] are the fractions of each primary in them.
     """
 
     luminances: np.ndarray
@@ -54,7 +52,7 @@ class Brightest:
 
     @staticmethod
     def of(images: np.ndarray, mask: np.ndarray, percentile: float) -> "Brightest":
-        """The pixels of a mask [...] in images [L, ..., 3] that decide their percentile of luminance."""
+        """Select the pixels of a mask [...] in images [L, ..., 3] that decide their luminance percentile."""
         values = np.stack([luminance(image[mask].astype(np.float32)) for image in images])
         if not mask.any():
             return Brightest(values, np.zeros((0, 3), np.float32), 0.0)
@@ -69,10 +67,10 @@ class Brightest:
 
 @dataclass(frozen=True, eq=False)
 class LightSamples:
-    """Pixels by which the exposure is chosen, as `relight` chooses it.
+    """Pixels that a page uses to choose the exposure like `relight`.
 
-    With a `face` it is left as bright as in its photo. `face` [L, 3] is its mean luminance under each light,
-    by the light's primaries; `plate` is that in the photo, and the person's brightest there.
+    `face` [L, 3] is the face's mean luminance under each light, by the light's primaries. `plate` is the mean
+    luminance of the face in the photo, which the exposure keeps, and the percentile of the person there.
     """
 
     person: Brightest
@@ -86,7 +84,7 @@ class LightSamples:
         face: np.ndarray | None = None,
         photo: np.ndarray | None = None,
     ) -> "LightSamples":
-        """Samples of images [L, h, w, 3]; shares [h, w] of a person and its face, and the photo [h, w, 3]."""
+        """Sample images [L, h, w, 3] by mattes [h, w] of a person and its face, and the photo [h, w, 3]."""
         body = Brightest.of(images, person > _SURE, AUTO_EXPOSURE_PERCENTILE)
         if face is None or photo is None or not (face > _SURE).any():
             return LightSamples(body)
@@ -101,10 +99,10 @@ class LightSamples:
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """A person over black under lights [L, 3], as ratios [L, h, w, 3] to a guide [H, W, 3], in bytes.
+    """A person over black under lights [L, 3], as 8-bit ratios [L, h, w, 3] to a guide [H, W, 3].
 
-    A last ratio more, if there is one, is that under the mean of lights all around, as of a room. The linear
-    guide is that of sRGB times `white`; a linear ratio (byte / 255)^2 times `scales` [L].
+    An additional last ratio is under uniform light. The linear guide is the decoded sRGB times `white`; a
+    linear ratio is (byte / 255)^2 times `scales` [L].
     """
 
     directions: np.ndarray
@@ -118,7 +116,7 @@ class Basis:
     def of(
         directions: np.ndarray, images: np.ndarray, mean: np.ndarray, matte: np.ndarray, samples: LightSamples
     ) -> "Basis":
-        """The basis of small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W]."""
+        """Encode small images [L, h, w, 3], their mean [H, W, 3] and the matte [H, W]."""
         dark = np.float32(_DARK * mean.sum() / max(3 * float(matte.sum()), 1.0))
         guide = np.maximum(mean, 0) + dark * matte[..., None]
         white = max(float(np.percentile(guide, _WHITE_PERCENTILE)), 1e-9)
@@ -137,7 +135,7 @@ class Basis:
         return Basis(directions, ratios, scales, encoded, white, samples)
 
     def image(self, toward: np.ndarray) -> np.ndarray:
-        """The small image [h, w, 3] over black under the light that is nearest to a direction [3]."""
+        """Return the small image [h, w, 3] over black under the light nearest to a direction [3]."""
         light = int((self.directions @ toward).argmax())
         ratio = (self.ratios[light].astype(np.float32) / 255) ** 2 * self.scales[light]
         return np.asarray(resized(_linear(self.guide, self.white), *ratio.shape[:2]) * ratio)
@@ -148,10 +146,10 @@ def _linear(encoded: np.ndarray, white: float) -> np.ndarray:
 
 
 def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
-    """The basis of a person, the only one of `people`, under the lights over which `relight` integrates maps.
+    """Render the basis of a person, the only one of `people`, under the lights that `relight` uses for maps.
 
-    The images of single lights and of their mean, the last, are rendered small; the mean is rendered as large
-    as the photo, too.
+    The images of single lights, and of their mean as the last one, are rendered small; the mean is also
+    rendered at the photo's size.
     """
     photo, field = person.photo, person.reflectance
     assert photo is not None and isinstance(field, PortraitField)
@@ -178,25 +176,24 @@ def basis_of_photo(person: Person, people: PeopleInPhoto) -> Basis:
     count = len(maps) // len(field.views)
     views = tuple(PersonShading(*maps[at : at + count]) for at in range(0, len(maps), count))
     mean = Relit(texture, views=views, eye_reflections=mirrored, mouth=mouth)
-    add(replace(mean, eye_reflections=torch.zeros_like(mirrored)))  # eyes, which do not mirror a room
-    shown = people.light_layer([mean])
+    add(replace(mean, eye_reflections=torch.zeros_like(mirrored)))  # eyes that reflect no room
+    large_mean = people.light_layer([mean])
     classes, source = field.person.classes.numpy(), field.person.image.permute(1, 2, 0).numpy()
     samples = LightSamples.of(np.stack(coarse), 1 - classes[0], classes[class_index("skin")], source)
-    return Basis.of(rig.numpy(), np.stack(images), shown, people.matte, samples)
+    return Basis.of(rig.numpy(), np.stack(images), large_mean, people.matte, samples)
 
 
 def _shrunk(field: PortraitField, photo: np.ndarray, width: int, height: int) -> PortraitField:
-    """The same field for the photo at a smaller size."""
+    """Return the field for the photo at a smaller size."""
     segmentation = field.person.segmentation
     segmentation = replace(segmentation, matte=resized(segmentation.matte, height, width))
     scale = width / photo.shape[1]
 
     def shrunk(view: PortraitView) -> PortraitView:
-        square = view.person.square.of_scaled(scale)
-        eyes = view.person.eyes.scaled(scale)
-        normals = view.person.normals
-        normals = None if normals is None else resized(normals, height, width)
-        person = replace(view.person, square=square, segmentation=segmentation, eyes=eyes, normals=normals)
+        person = view.person
+        normals = None if person.normals is None else resized(person.normals, height, width)
+        square, eyes = person.square.of_scaled(scale), person.eyes.scaled(scale)
+        person = replace(person, square=square, segmentation=segmentation, eyes=eyes, normals=normals)
         return replace(view, person=person)
 
     return replace(field, views=tuple(map(shrunk, field.views)))
@@ -210,10 +207,10 @@ def basis_of_stack(
     face: np.ndarray | None = None,
     photo: np.ndarray | None = None,
 ) -> Basis:
-    """The basis of a stack, shown with `most_px` pixels at most along the longer side.
+    """Make the basis of a stack, from batches of images [l, 3, H, W] over black, at most `most_px` large.
 
-    Its images are read in batches [l, 3, H, W] over black; `seen` [H, W] is the person's share, of which
-    `face` is the face's. Its exposure leaves a face as bright as in the `photo` [H, W, 3].
+    `seen` [H, W] is the person's matte, `face` the face's. The exposure keeps the face's brightness in the
+    `photo` [H, W, 3].
     """
     kept = evenly_spread(directions)
     size = fitted(seen.shape[0], seen.shape[1], most_px)
@@ -232,7 +229,7 @@ def basis_of_stack(
 
 
 def evenly_spread(directions: np.ndarray, most: int = MOST_LIGHTS) -> list[int]:
-    """Lights [L, 3] to keep, at most so many, spread over the sphere; in order."""
+    """Return the sorted indices of at most `most` lights [L, 3], spread over the sphere."""
     if len(directions) <= most:
         return list(range(len(directions)))
     return sorted({int(i) for i in (rig_directions(most).numpy() @ directions.T).argmax(1)})

@@ -1,4 +1,4 @@
-"""The page of a person under moving lights: one file of HTML, style, script and data that loads nothing."""
+"""The page of a person under movable lights: one HTML file with style, script and data."""
 
 import base64
 import hashlib
@@ -29,7 +29,7 @@ from facerf_cli.light.entries import (
     preset_names,
 )
 from facerf_cli.light.envmap import rig_triangles
-from facerf_cli.viewer.basis import Basis, Brightest, LightSamples
+from facerf_cli.viewer.basis import Basis, LightSamples
 
 _HERE = Path(__file__).parent
 SCRIPTS = ("light.js", "lights.js", "readers.js", "image.js", "page.js")
@@ -38,20 +38,19 @@ _RATIO_QUALITY, _PHOTO_QUALITY, _STRIP_QUALITY = 90, 97, 82
 
 @dataclass(frozen=True, eq=False)
 class PageMap:
-    """An environment map of a page: lat-long [h, 2 h, 3], and the command that draws it."""
+    """An environment map of a page: lat-long [h, 2 h, 3], and the command that draws it to `path`."""
 
     name: str
     pixels: np.ndarray
     command: str
-    path: str  # that the command writes
+    path: str
 
 
 @dataclass(frozen=True, eq=False)
 class Plate:
-    """Images that a page shows besides its basis: all [H, W, ...].
+    """Further images [H, W, ...] of a page: the photo (`before`), the matte, the photo without its person.
 
-    `before` is the photo, or what stands for it; `background` the photo without its person, if it is shown;
-    `even` the brightness of even light by which skin is as bright as in the photo.
+    `even` is the intensity of uniform light that makes skin as bright as in the photo.
     """
 
     before: np.ndarray
@@ -70,13 +69,13 @@ class IndexEntry:
 
 
 def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[PageMap]) -> dict[str, Any]:
-    """The document of a page: all that its script needs, without names.
+    """Return the data of a page's script.
 
-    `head` is the middle of the face as shares of the sides, and the radius of the head in the shorter one.
+    `head` is the face's centre relative to the sides, and the head's radius relative to the shorter side.
     """
     height, width = plate.matte.shape
     background = np.zeros_like(plate.before) if plate.background is None else plate.background
-    # Shares of a room's light, before a bright background and before a dark one; an OLAT stack has no room.
+    # Ambient fill over bright and dark backgrounds; OLAT stacks have none.
     room = {"bright": ROOM_BEFORE_BRIGHT, "dark": ROOM_BEFORE_DARK}
     return {
         "size": [width, height],
@@ -97,21 +96,21 @@ def packed(basis: Basis, plate: Plate, head: Sequence[float], maps: Sequence[Pag
         **packed_lights(plate.background is not None, plate.even),
         "envmaps": [
             {
-                "name": one.name,
-                "size": [one.pixels.shape[1], one.pixels.shape[0]],
-                "pixels": _floats(one.pixels),
-                "command": one.command,
-                "path": one.path,
+                "name": envmap.name,
+                "size": [envmap.pixels.shape[1], envmap.pixels.shape[0]],
+                "pixels": _floats(envmap.pixels),
+                "command": envmap.command,
+                "path": envmap.path,
             }
-            for one in maps
+            for envmap in maps
         ],
     }
 
 
 def _triangles(directions: np.ndarray) -> dict[str, str]:
-    """Lights of the triangles between which a page interpolates; none where they surround nothing.
+    """Return the triangles of lights between which a page interpolates.
 
-    The matrix of a triangle turns a direction into shares of its lights, up to their sum.
+    A triangle's matrix converts a direction to weights of its lights, up to their sum.
     """
     corners = rig_triangles(directions)
     to_shares = np.linalg.pinv(directions[corners].astype(float).mT)
@@ -119,9 +118,9 @@ def _triangles(directions: np.ndarray) -> dict[str, str]:
 
 
 def packed_lights(of_photo: bool, even: float = 1.0) -> dict[str, Any]:
-    """The light of each word, and those of each shipped rig, with names.
+    """Return the light of each word, and the named lights of each shipped rig.
 
-    The photo's own, and even light of a brightness, only `of_photo`.
+    The photo's original light, and uniform light of intensity `even`, are included only `of_photo`.
     """
     words = {word: light for word, light in WORDS.items() if of_photo or not (light.own or light.even)}
     if of_photo:
@@ -140,10 +139,21 @@ def packed_lights(of_photo: bool, even: float = 1.0) -> dict[str, Any]:
 
 
 def _exposure(samples: LightSamples) -> dict[str, Any]:
-    """Pixels by which a page chooses its exposure, and what it compares them with."""
+    """Return sample pixels for automatic exposure, and their target.
+
+    Luminances are encoded as an image of square roots, with one row and one scale per light.
+    """
+    person = samples.person
+    values = np.pad(person.luminances.clip(min=0), ((0, 0), (0, not person.luminances.size)))  # not empty
+    scales = np.maximum(values.max(1), 1e-9)
     return {
         "face": None if samples.face is None else _floats(samples.face),
-        "person": _brightest(samples.person),
+        "person": {
+            "roots": _webp(np.round(255 * np.sqrt(values / scales[:, None])).astype(np.uint8)),
+            "scales": scales.tolist(),
+            "shares": _floats(person.shares),
+            "total": person.total,
+        },
         "plate": samples.plate,
         "personPercentile": AUTO_EXPOSURE_PERCENTILE,
         "target": AUTO_EXPOSURE_TARGET_LINEAR,
@@ -151,22 +161,10 @@ def _exposure(samples: LightSamples) -> dict[str, Any]:
     }
 
 
-def _brightest(some: Brightest) -> dict[str, Any]:
-    """Luminances as an image of their square roots, a row a light, each by its own scale."""
-    values = np.pad(some.luminances.clip(min=0), ((0, 0), (0, not some.luminances.size)))  # none is no image
-    scales = np.maximum(values.max(1), 1e-9)
-    return {
-        "roots": _webp(np.round(255 * np.sqrt(values / scales[:, None])).astype(np.uint8)),
-        "scales": scales.tolist(),
-        "shares": _floats(some.shares),
-        "total": some.total,
-    }
-
-
 def page(title: str, photo: Sequence[str], document: Mapping[str, Any], strip: str, key: str = "") -> str:
-    """Return the page of a photo.
+    """Return the HTML of a page.
 
-    `photo` is its path and options on a command line, `strip` a JPEG in base64, `key` that of `-o FILE`.
+    `photo` is its path and options on a command line; `document` is from `packed`, `strip` from `strip_jpeg`.
     """
     data = json_text({**document, "title": title, "source": shlex.join(photo)}).replace("<", "\\u003c")
     script = '"use strict";\n' + "".join(map(_text, SCRIPTS))
@@ -174,20 +172,19 @@ def page(title: str, photo: Sequence[str], document: Mapping[str, Any], strip: s
 
 
 def index_page(entries: Sequence[IndexEntry]) -> str:
-    """A page of links to pages, each with its strip."""
+    """Return the HTML of a list of pages, with their strips."""
     return _filled("index.html", "", entries=entries)
 
 
 def strip_of(text: str) -> str:
-    """The strip of a page that was written; empty where it holds none."""
-    _, found, rest = text.partition('<meta name="facerf:strip" content="')
-    return rest.partition('"')[0] if found else ""
+    """Return the strip of a written page; '' without one."""
+    _, marker, rest = text.partition('<meta name="facerf:strip" content="')
+    return rest.partition('"')[0] if marker else ""
 
 
 def strip_jpeg(images: Sequence[np.ndarray]) -> str:
-    """Images [h, w, 3], encoded 0..1, side by side as a JPEG in base64."""
-    whole = np.concatenate(list(images), 1)
-    return _jpeg(np.round(whole.clip(0, 1) * 255).astype(np.uint8), _STRIP_QUALITY)
+    """Return images [h, w, 3], encoded 0..1, side by side as a JPEG in base64."""
+    return _jpeg(np.round(np.concatenate(list(images), 1).clip(0, 1) * 255).astype(np.uint8), _STRIP_QUALITY)
 
 
 def _filled(name: str, script: str, **values: Any) -> str:
@@ -197,7 +194,7 @@ def _filled(name: str, script: str, **values: Any) -> str:
 
 
 def _hash(text: str) -> str:
-    """The name of an inline element in a content security policy."""
+    """Return the hash of an inline element for a content security policy."""
     return "'sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii") + "'"
 
 
@@ -206,21 +203,20 @@ def _text(name: str) -> str:
 
 
 def _encoded(linear: np.ndarray) -> np.ndarray:
-    """Scene-linear [H, W, 3] as 8-bit sRGB."""
-    data: np.ndarray = np.round(linear_to_srgb(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
-    return data
+    return np.asarray(np.round(linear_to_srgb(np.clip(linear, 0, 1)) * 255), np.uint8)
 
 
 def _jpeg(data: np.ndarray, quality: int) -> str:
-    stream = io.BytesIO()
-    Image.fromarray(data).save(stream, "JPEG", quality=quality, subsampling=0, optimize=True)
-    return _bytes(stream.getvalue())
+    return _image(data, "JPEG", quality=quality, subsampling=0, optimize=True)
 
 
 def _webp(data: np.ndarray) -> str:
-    """An image without loss."""
+    return _image(data, "WEBP", lossless=True, quality=60, method=4, exact=True)
+
+
+def _image(data: np.ndarray, form: str, **settings: Any) -> str:
     stream = io.BytesIO()
-    Image.fromarray(data).save(stream, "WEBP", lossless=True, quality=60, method=4, exact=True)
+    Image.fromarray(data).save(stream, form, **settings)
     return _bytes(stream.getvalue())
 
 

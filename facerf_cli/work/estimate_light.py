@@ -1,6 +1,6 @@
-"""What `facerf estimate-light` writes: the light of a photo as a map, as JSON and as an image to look at.
+"""Write the light of a photo for `facerf estimate-light`: a map, JSON, and a contact sheet.
 
-The light of a photo is that on its face; the light of a picture without a face is a guess.
+The light of a photo is estimated from a face; the light of an image without a face is a guess.
 """
 
 import logging
@@ -16,10 +16,8 @@ import torch
 from torch import Tensor
 
 from facerf_cli.batch.inputs import Item
-from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.head import Head
-from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import region_mask
 from facerf_cli.face.view import render_face, see_face
 from facerf_cli.files.light_files import LightRecord, write_light
@@ -38,6 +36,7 @@ from facerf_cli.network.files import SHIPPED
 from facerf_cli.network.inputs import resize
 from facerf_cli.portrait.confidence import confidence_of
 from facerf_cli.portrait.find import NoFaceError
+from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import Estimator, LightEstimate, estimate_light
 from facerf_cli.run.logs import LOGGER_NAME, Provenance
 from facerf_cli.work.photo_options import LightOptions
@@ -45,6 +44,7 @@ from facerf_cli.work.photos import (
     FittedFace,
     facts_of_networks,
     load_models_once,
+    naming,
     provenance,
     read_matte,
     read_photo,
@@ -55,42 +55,43 @@ from facerf_cli.work.shots import Shot
 
 _TILE_PX, _LABEL_PX = 256, 20
 _BALL_PX = 236  # within its tile
-_FILM_MM = 36.0  # longer side of the frame that EXIF's focal length is of
-_UNEXPLAINED = 0.25  # of the photo's norm: photos leave 0.05 to 0.2
-_SOFT = 0.32  # share of one lamp below which the brightest direction was 15 to 120 degrees off
-Pictures = dict[str, np.ndarray]  # tiles [256, w, 3] of a sheet, linear, by their labels
+_FILM_MM = 36.0  # longer side of the frame that EXIF's 35 mm focal length refers to
+_UNEXPLAINED = 0.25  # of the photo's norm: larger residuals are logged; usual ones are 0.05 to 0.2
+_SOFT = 0.32  # key light's fraction below which the brightest direction was off by 15 to 120 degrees
+Tiles = dict[str, np.ndarray]  # images [256, w, 3] of a sheet, linear, by their labels
 log = logging.getLogger(LOGGER_NAME)
 
 
 def write_shot_light(
     shot: Shot, item: Item, options: LightOptions, width_px: int, sh_order: int
 ) -> tuple[list[str], Any]:
-    """Estimate and write the one light of each take of a shot; their tags, and facts for the report.
+    """Estimate and write the light of each take that shows the face, from key frames together.
 
-    A light is estimated from key frames together. Takes that do not show the face have none.
+    Returns the takes' tags, and facts for the report.
     """
     tags: list[str] = []
     facts: list[dict[str, Any]] = []
-    followed = OpenShot(shot, options.photo)
-    for frames in followed.track.takes_with_face:
-        take = followed.take_of(frames.start)
-        image, face = followed.fitted(take.middle, portrait=False)
+    opened = OpenShot(shot, options.photo)
+    for frames in opened.track.takes_with_face:
+        take = opened.take_of(frames.start)
+        image, face = opened.fitted(take.middle, portrait=False)
         face = replace(face, tag=f"_take{len(tags) + 1}" if tags else "")
-        found = _write_estimate(item, image, face, options, width_px, sh_order, take.other_heads)
+        written = _write_estimate(item, image, face, options, width_px, sh_order, take.other_heads)
         tags.append(face.tag)
-        facts.append(face.described() | found | {"frames": take.key_frames})
+        facts.append(face.described() | written | {"frames": take.key_frames})
     return tags, (facts[0] if len(facts) == 1 else {"takes": facts}) | facts_of_networks(options.photo)
 
 
 def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int) -> tuple[list[str], Any]:
-    """Estimate and write the light of each chosen face of a photo, or guess that of a picture without one.
+    """Estimate and write the light of each chosen face of a photo; without a face, guess it.
 
     Returns the faces' tags, and facts for the report.
     """
     image = read_photo(item, options.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        _require_light_on(face, options)
+        if options.photo.landmarks is None and confidence_of(face.facts).word == "doubtful":
+            raise NoFaceError(f"{face.name}: its face is too small, dark or unclear to read light from")
         return {"light_from": "face"} | _write_estimate(item, image, face, options, width_px, sh_order)
 
     try:
@@ -99,52 +100,55 @@ def write_lights(item: Item, options: LightOptions, width_px: int, sh_order: int
         return [""], _write_guess(item, image, options, width_px, sh_order)
 
 
-def _require_light_on(face: FittedFace, options: LightOptions) -> None:
-    """Raise NoFaceError for a detected face that is too small, dark or doubtful to read light from."""
-    if options.photo.landmarks is None and confidence_of(face.facts).word == "doubtful":
-        raise NoFaceError(f"{face.name}: its face is doubtful")
-
-
-def _estimate(
-    item: Item, image: LinearImage, head: Head, options: LightOptions, more: Sequence[Head] = ()
-) -> tuple[LightEstimate, dict[str, Any]]:
-    """The light of one fitted face, and facts for the report."""
+def _write_estimate(
+    item: Item,
+    image: LinearImage,
+    face: FittedFace,
+    options: LightOptions,
+    width_px: int,
+    sh_order: int,
+    other_heads: Sequence[Head] = (),
+) -> dict[str, Any]:
+    """Estimate and write the light of a fitted face and `other_heads` of its shot; return facts."""
     models = load_models_once(options.photo)
     features, name = feature_network(options) if options.refine == "features" else (None, None)
-    try:
+    with naming(item.input_path):
         estimate = estimate_light(
             models,
-            _unmasked(item, image, head, options),
+            _masked(item, image, face.head, options, models),
             options.reflectance,
             rig_by_text(options.rig),
             Estimator(options.non_negative, features),
             options.keep_eyes,
-            more,
+            other_heads,
             white="scene",
         )
-    except InputError as error:
-        raise InputError(f"{item.input_path}: {error}") from None
     residual = estimate.evidence.residual(estimate.explained)
     if residual > _UNEXPLAINED:
         log.warning(
-            "%s: the light found does not give this face (%.0f %% of it differs); look at _light.png: "
-            "perhaps the face model is off, or it is not a face",
+            "%s: the estimated light does not reproduce the face (residual %.0f %%); check _light.png: the "
+            "face fit may be wrong, or this may not be a face",
             item.input_path,
             100 * residual,
         )
     if estimate.key_share is not None and estimate.key_share < _SOFT:
-        log.info("%s: soft light; its brightest direction is doubtful", item.input_path)
-    return estimate, _facts(estimate, residual, options, name)
+        log.info("%s: the light is soft; its brightest direction is uncertain", item.input_path)
+    facts = _facts(estimate, residual, options, name)
+    metadata = provenance(item, options.photo, models.checkpoint_name())
+    tiles = _explained_tiles(face.head, models, estimate.explained)
+    envmap = rig_to_latlong(estimate.light, width_px // 2)
+    base = item.output(f"{face.tag}_light")
+    _write(base, envmap, estimate.light, sh_order, tiles, options, metadata, facts)
+    return facts
 
 
-def _unmasked(item: Item, image: LinearImage, head: Head, options: LightOptions) -> Head:
-    """The head without what the photo's alpha or --matte leaves out."""
+def _masked(item: Item, image: LinearImage, head: Head, options: LightOptions, models: Models) -> Head:
+    """Return the head without the parts that the photo's alpha or --matte masks out."""
     masks = [] if image.alpha is None else [image.alpha]
     if options.matte is not None:
         masks.append(read_matte(item, options.matte, image.pixels.shape[:2]))
     for mask in masks:
-        in_crop = head.fit.crop.apply(mask[..., None])[..., 0]
-        head = head.without(load_models_once(options.photo).face, in_crop)
+        head = head.without(models.face, head.fit.crop.apply(mask[..., None])[..., 0])
     return head
 
 
@@ -177,46 +181,25 @@ def _facts(
 
 @cache
 def feature_network(options: LightOptions) -> tuple[FeatureNetwork, str]:
-    """V_f if its weights were given, else S_f; and its name for the report."""
+    """Return V_f if the user passed its weights, otherwise S_f; and its name for the report."""
     networks = load_models_once(options.photo).networks
     if options.vgg_weights is not None:
-        from facerf_cli.network.vgg import load_vgg  # a relight does without it
+        from facerf_cli.network.vgg import load_vgg  # relight does without it
 
         return load_vgg(options.vgg_weights).to(networks.device), "V_f (VGG-16, ImageNet)"
     path = networks.files["light_features"]
     return networks.light_features, f"S_f ({'shipped' if path == SHIPPED['light_features'] else path.name})"
 
 
-def _write_estimate(
-    item: Item,
-    image: LinearImage,
-    face: FittedFace,
-    options: LightOptions,
-    width_px: int,
-    sh_order: int,
-    more: Sequence[Head] = (),
-) -> dict[str, Any]:
-    """Write the light of one fitted face, which `more` heads of its shot share; return facts."""
-    estimate, facts = _estimate(item, image, face.head, options, more)
-    models = load_models_once(options.photo)
-    stamp = provenance(item, options.photo, models.checkpoint_name())
-    pictures = _explained(face.head, models.face, estimate.explained)
-    envmap = rig_to_latlong(estimate.light, width_px // 2)
-    _write(
-        item.output(f"{face.tag}_light"), envmap, estimate.light, sh_order, pictures, options, stamp, facts
-    )
-    return facts
-
-
 def _write_guess(
     item: Item, image: LinearImage, options: LightOptions, width_px: int, sh_order: int
 ) -> dict[str, Any]:
-    """Guess and write the light of a picture, with a warning of the error to expect; return facts."""
+    """Guess and write the light of an image without a face; log the expected error, and return facts."""
     fov_deg = options.fov_deg or stated_fov_deg(image) or FOV_DEG
     guess = light_of_picture(torch.from_numpy(image.pixels), fov_deg)
     log.warning(
-        "%s: has no face to find the light by, so the light is a guess from the picture, %.0f degrees wide "
-        "(--fov); the shading that it gives a matte white ball is expected to be wrong by %.0f %% (RMS)",
+        "%s: no usable face, so the light is a guess from the image, %.0f degrees wide (--fov); shading of a "
+        "matte white ball is expected to be wrong by %.0f %% (RMS)",
         item.input_path,
         fov_deg,
         100 * guess.error,
@@ -225,15 +208,16 @@ def _write_guess(
     directions = rig_by_text(options.rig)
     light = RigLight(directions, envmap_weights(guess.envmap, directions))
     height, width = image.pixels.shape[:2]
-    shown = resized(image.pixels, _TILE_PX, max(1, round(width * _TILE_PX / height)))
-    pictures = {"picture": shown * np.float32(2 ** auto_exposure_ev(image.pixels, None))}
-    stamp, envmap = Provenance(item.input_path.name, key=item.key), resampled(guess.envmap, width_px // 2)
-    _write(item.output("_light"), envmap, light, sh_order, pictures, options, stamp.attributes(), facts)
+    small = resized(image.pixels, _TILE_PX, max(1, round(width * _TILE_PX / height)))
+    tiles = {"picture": small * np.float32(2 ** auto_exposure_ev(image.pixels, None))}
+    metadata = Provenance(item.input_path.name, key=item.key).attributes()
+    envmap = resampled(guess.envmap, width_px // 2)
+    _write(item.output("_light"), envmap, light, sh_order, tiles, options, metadata, facts)
     return facts
 
 
 def stated_fov_deg(image: LinearImage) -> float | None:
-    """The angle of view across a picture's width by its EXIF, of a frame of 36 mm; or None."""
+    """Return an image's horizontal angle of view by the focal length in its EXIF; None without one."""
     focal_mm = image.metadata.get("Exif:FocalLengthIn35mmFilm")
     if not isinstance(focal_mm, (int, float)) or not 4 <= focal_mm <= 2000:
         return None
@@ -246,70 +230,60 @@ def _write(
     envmap: Tensor,
     light: RigLight,
     sh_order: int,
-    pictures: Pictures,
+    tiles: Tiles,
     options: LightOptions,
-    stamp: Mapping[str, str | int],
+    provenance: Mapping[str, str | int],
     facts: Mapping[str, Any],
 ) -> None:
-    """Write a light as a map [H, 2 H, 3], as numbers, and as a sheet of pictures and balls under it."""
-    metadata: dict[str, Any] = dict(stamp)
-    for name, value in facts.items():  # a file's header holds words and numbers
-        said = value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))
-        metadata[f"facerf:light_{name}"] = said
+    """Write a light as a map [H, 2 H, 3], as JSON, and as a sheet of images and balls under it."""
+    metadata: dict[str, Any] = dict(provenance)
+    for name, value in facts.items():  # headers contain only words and numbers
+        plain = value if isinstance(value, (int, float, str)) else " ".join(map(str, value or ["none"]))
+        metadata[f"facerf:light_{name}"] = plain
     write_exr(Path(f"{base}.exr"), envmap.numpy(), metadata=metadata)
     harmonics, rig = rig_coefficients(light, sh_order), f"--lights {options.rig}"
     record = LightRecord(light.directions, light.weights, rig, harmonics, metadata)
     write_light(Path(f"{base}.json"), record)
-    write_display(Path(f"{base}.png"), _sheet(pictures, envmap), metadata=metadata)
+    write_display(Path(f"{base}.png"), _sheet(tiles, envmap), metadata=metadata)
 
 
-def _sheet(pictures: Pictures, envmap: Tensor) -> np.ndarray:
-    """Pictures, a mirror ball and a diffuse ball side by side [H, W, 3], linear, with their labels above."""
+def _sheet(tiles: Tiles, envmap: Tensor) -> np.ndarray:
+    """Return tiles, a mirror ball and a diffuse ball side by side [H, W, 3], linear, with labels above."""
     light = envmap.clamp_min(0)
     both = np.stack([ball(light, _BALL_PX, "mirror").numpy(), ball(light, _BALL_PX, "diffuse").numpy()])
     both *= np.float32(2 ** auto_exposure_ev(both[1], both[1].max(-1) > 0))
     margin = (_TILE_PX - _BALL_PX) // 2
     mirror, diffuse = np.pad(both, ((0, 0), (margin, margin), (margin, margin), (0, 0)))
-    tiles = pictures | {"mirror ball": mirror, "diffuse ball": diffuse}
     labelled = [
         np.concatenate([labels([label], tile.shape[1], _LABEL_PX), tile.clip(0, 1)])
-        for label, tile in tiles.items()
+        for label, tile in (tiles | {"mirror ball": mirror, "diffuse ball": diffuse}).items()
     ]
     return np.concatenate(labelled, 1)
 
 
-def _explained(head: Head, model: MorphableModel, explained: Tensor) -> Pictures:
-    """The photo's face, the face as its light explains it, and the difference, exposed for display.
+def _explained_tiles(head: Head, models: Models, explained: Tensor) -> Tiles:
+    """Return the photo's face, the face under the estimated light, and their difference, exposed.
 
-    `explained` [3, t, t] is the face's texture under that light.
+    `explained` [3, t, t] is the face's texture under that light. In the difference, red is too bright for the
+    eye, blue too dark.
     """
-    whole = Crop(0.0, 0.0, float(len(head.cropped)), _TILE_PX)
-    image, mask = _explained_in_crop(head, model, explained)
-    gain = np.float32(2 ** auto_exposure_ev(head.cropped, mask))
-    photo = head.cropped * gain
-    remade = (mask[..., None] * image + (1 - mask[..., None]) * head.cropped) * gain
-    tiles = {
-        "photo": photo,
-        "explained": remade,
-        "red: too bright, blue: too dark": _difference(photo, remade, mask),
-    }
-    return {label: whole.apply(tile.clip(0, 1)) for label, tile in tiles.items()}
-
-
-def _explained_in_crop(head: Head, model: MorphableModel, explained: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The explained face in the crop [S, S, 3], and how far it stands there for the photo [S, S] in 0..1."""
-    uv, coverage = see_face(head.fit.vertices_camera(model), head.fit.camera)
+    uv, coverage = see_face(head.fit.vertices_camera(models.face), head.fit.camera)
     side = head.face.texture.shape[-1]
     inside = (head.face.visible * region_mask("face", side))[None]
     planes = torch.cat([resize(explained[None], side)[0], inside])
     rendered = render_face(planes[None], uv, coverage)[0].permute(1, 2, 0).numpy()
-    return rendered[..., :3], rendered[..., 3].clip(0, 1)
-
-
-def _difference(photo: np.ndarray, remade: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """On grey: red where the face was made too bright for the eye, blue where too dark."""
+    mask = rendered[..., 3].clip(0, 1)
+    gain = np.float32(2 ** auto_exposure_ev(head.cropped, mask))
+    photo = head.cropped * gain
+    remade = (mask[..., None] * rendered[..., :3] + (1 - mask[..., None]) * head.cropped) * gain
     encoded = [linear_to_srgb(tile.clip(0, 1)).mean(-1) for tile in (remade, photo)]
     error = 2 * (encoded[0] - encoded[1]) * mask
     bright, dark = error.clip(0, 0.5), (-error).clip(0, 0.5)
-    shown = np.stack([0.5 + bright - dark, 0.5 - bright - dark, 0.5 - bright + dark], -1)
-    return np.asarray(srgb_to_linear(shown.astype(np.float32)))
+    difference = np.stack([0.5 + bright - dark, 0.5 - bright - dark, 0.5 - bright + dark], -1)
+    tiles = {
+        "photo": photo,
+        "explained": remade,
+        "red: too bright, blue: too dark": np.asarray(srgb_to_linear(difference.astype(np.float32))),
+    }
+    whole = Crop(0.0, 0.0, float(len(head.cropped)), _TILE_PX)
+    return {label: whole.apply(tile.clip(0, 1)) for label, tile in tiles.items()}

@@ -1,4 +1,4 @@
-"""Write the files of `facerf fit-geometry`: the fitted faces of a photo."""
+"""Write the files of `facerf fit-geometry`: meshes, textures, normals and fits of a photo's faces."""
 
 import math
 from pathlib import Path
@@ -28,7 +28,7 @@ from facerf_cli.work.photos import (
 
 
 def write_fits(item: Item, options: PhotoOptions) -> tuple[list[str], dict[str, Any]]:
-    """Fit and write each chosen face of a photo; their tags, and facts for the report."""
+    """Fit and write each chosen face of a photo; return tags, and facts for the report."""
     image = read_photo(item, options)
 
     def write(face: FittedFace) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _write_fit(item: Item, image: LinearImage, face: FittedFace, options: PhotoO
 def _mesh(
     face: FittedFace, texture_srgb: np.ndarray, options: PhotoOptions, metadata: dict[str, Any]
 ) -> TexturedMesh:
-    """The fitted mesh in the head's own frame; the fit holds its pose."""
+    """Return the fitted mesh in the head frame; the fit contains its pose."""
     vertices = face_model(options).vertices(face.fit.alpha[None], face.fit.beta[None])[0]
     return TexturedMesh(
         vertices_m=vertices.numpy(),

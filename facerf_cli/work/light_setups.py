@@ -1,4 +1,4 @@
-"""The light setups that `facerf relight` renders (maps, rotations, single lights) and their names."""
+"""Light options of `facerf relight`, and the light setups that they name. Light to import."""
 
 import logging
 from collections.abc import Sequence
@@ -13,10 +13,8 @@ from facerf_cli.batch.inputs import (
     collect_items,
     split_frame,
 )
-from facerf_cli.batch.journal import file_row
-from facerf_cli.batch.recipe import RESULTS_VERSION, key_of, recipe_of
+from facerf_cli.batch.recipe import RESULTS_VERSION, DigestOf, key_of, recipe_of
 from facerf_cli.errors import UsageError
-from facerf_cli.files.texts import file_sha256
 from facerf_cli.light.entries import (
     MOST_FRAMES,
     ROOM_BEFORE_BRIGHT,
@@ -30,37 +28,36 @@ from facerf_cli.light.entries import (
     numbers,
     sweep,
 )
+from facerf_cli.light.setups import ROOM, LightSetup
 from facerf_cli.option import LIGHT, option
 from facerf_cli.run.logs import LOGGER_NAME
 from facerf_cli.work.photo_options import LightOptions, fov_option
 
-DRAWN = "procedural:"
-BACKGROUND = "background"  # the picture behind the person, as --light-from names it
-_LIGHT = "_light"  # ends the name of the light of a photo
+BACKGROUND = "background"  # value of --light-from: the background image
+_DRAWN = "procedural:"
+_LIGHT = "_light"  # ends the name of a photo's light
 _WIDTH_PX = 512  # of maps in the cache
-ROOM = "room"  # the name of a room's light, and of its layer
-_MOST_ROOM = 1.0
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True)
 class LightSources:
-    """The lights, as the command line names them.
+    """The light options as typed.
 
     Attributes:
-        envmap: Relight under lat-long maps (.exr, .hdr; files, folders, quoted patterns), lights of
-            estimate-light (.json), or procedural:N, maps of facerf envmap; NAME=MAP together with lights that
-            have names. Repeatable.
-        light: Relight under AZ,EL in degrees (AZ > 0: from the right), left, own (the photo's), even
-            (delight), a preset (rembrandt), a rig file, keys (at=, size=), NAME=LIGHT;stops=-1;
-            docs/lights.md. Repeatable.
-        light_from: Relight under the light of another photo, or of the picture of --background (background),
-            as estimate-light finds it; NAME=PHOTO together with lights that have names. Repeatable.
-        fov_deg: The angle of view of a picture without face.
-        room: Add what a room sends back to lights: a share of them, from all around; a map; or none.
-        rotate: Rotate the maps: add DEG to every azimuth; or render N frames .0000 on, without TO.
-        sampling: Give each light the map's integral over its cell; share it smoothly among lights; or, as in
-            the paper, one pixel.
+        envmap: Environment map: .exr, .hdr, .json of estimate-light, a folder or a quoted pattern; or
+            procedural:N, the first N maps of facerf envmap. NAME=MAP joins the map with the named lights.
+            Repeatable.
+        light: Light: AZ,EL in degrees (AZ > 0: image right), left, own (the photo's light), even (uniform), a
+            preset (rembrandt), a rig file, or keys (at=, size=); NAME=LIGHT;stops=-1. See docs/lights.md.
+            Repeatable.
+        light_from: Photo to estimate the light from, as estimate-light does; or background, for the image
+            behind the person. NAME=PHOTO joins its light with the named lights. Repeatable.
+        fov_deg: Horizontal angle of view of an image without a face.
+        room: Ambient fill of lights: a fraction of their sum from all around, a map, or none.
+        rotate: Azimuth to add to the maps; or FROM:TO:N, which renders N frames up to, not including, TO.
+        sampling: How maps become weights of lights: cell (integral over the light's cell), smooth (shared
+            between neighbours), or paper (one pixel).
     """
 
     envmap: list[str] | None = option(None, metavar="MAP|DIR", shown_default=False, panel=LIGHT)
@@ -70,7 +67,7 @@ class LightSources:
     )
     fov_deg: float | None = fov_option()
     room: str | None = option(
-        None, metavar="SHARE|MAP|none", shown_default="0.06; 0.03 before black", panel=LIGHT
+        None, metavar="FRACTION|MAP|none", shown_default="0.06; 0.03 over black", panel=LIGHT
     )
     rotate: str | None = option(None, metavar="DEG|FROM:TO:N", shown_default="as they are", panel=LIGHT)
     sampling: Sampling | None = option(
@@ -79,101 +76,85 @@ class LightSources:
 
 
 @dataclass(frozen=True)
+class DrawnMap:
+    """A procedural map in the user's cache, drawn when the work begins."""
+
+    envmap: Path
+    index: int
+    seed: int
+    layer: str = ""
+
+    def write(self) -> None:
+        """Draw the map."""
+        from facerf_cli.files.write import write_exr
+        from facerf_cli.synth.sky.skies import draw_sky
+
+        write_exr(self.envmap, draw_sky(self.index, self.seed, _WIDTH_PX)[0])
+
+
+@dataclass(frozen=True)
 class PhotoLight:
     """The light of a photo: a map in the user's cache, as `facerf estimate-light` writes it.
 
     Attributes:
-        photo: A photo, or the picture behind the person if `is_background`.
-        envmap: The map, whose folder is named by the content of the photo and by the options.
+        envmap: The map, in a folder named by the photo's content and the options.
+        photo: A photo, or the background image.
         options: How the light is estimated.
-        layer: Name of the light in an image of several; '' for an image of its own.
-        is_background: True for a light on the scale of the background.
+        layer: Name of the light in an image of several; '' if it has its own image.
+        is_background: True if the light has the brightness of the background image.
     """
 
-    photo: Path
     envmap: Path
+    photo: Path
     options: LightOptions
     layer: str = ""
     is_background: bool = False
 
-    def estimate(self) -> None:
-        """Write the map if it is not there yet; raises InputError for a photo that cannot be used."""
-        if not self.envmap.is_file():
-            from facerf_cli.work.estimate_light import write_lights
+    def write(self) -> None:
+        """Estimate the light; raise InputError if the photo cannot be used."""
+        from facerf_cli.work.estimate_light import write_lights
 
-            base = self.envmap.with_name(self.envmap.name.removesuffix(f"{_LIGHT}.exr"))
-            write_lights(Item(self.photo, base, self.photo.stem), self.options, _WIDTH_PX, sh_order=2)
+        base = self.envmap.with_name(self.envmap.name.removesuffix(f"{_LIGHT}.exr"))
+        write_lights(Item(self.photo, base, self.photo.stem), self.options, _WIDTH_PX, sh_order=2)
 
 
-@dataclass(frozen=True)
-class LightSetup:
-    """The lights of one image of every photo: a map, rotated, or single lights, or both.
+CachedMap = DrawnMap | PhotoLight
 
-    Lights with `names` are layers of the image, too. `room` is the share of the lights, without maps, that
-    comes from all around besides. `exposure_ev` is the image's, where none is asked for.
+
+def image_path(
+    setup: LightSetup, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None
+) -> Path:
+    """Return the file of a setup's image, by default or by a pattern of --name.
+
+    By default it ends in the photo's own frame number.
     """
-
-    name: str
-    frame: str = ""  # '.0001': frame numbers, which end a file's name
-    lights: tuple[StudioLight, ...] = ()
-    names: tuple[str, ...] = ()
-    room: float = 0.0
-    exposure_ev: float | None = None
-
-    @property
-    def envmap(self) -> StudioLight | None:
-        """The map among the lights, the first of several."""
-        return next((light for light in self.lights if light.envmap is not None), None)
-
-    @property
-    def has_single(self) -> bool:
-        """True where some light is neither a map nor the photo's own."""
-        return any(light.envmap is None and not light.own for light in self.lights)
-
-    @property
-    def has_own(self) -> bool:
-        """True where the photo's own light is one of the lights."""
-        return any(light.own for light in self.lights)
-
-    @property
-    def by_photo(self) -> list[StudioLight]:
-        """The lights that are as bright as the photo."""
-        return [light for light in self.lights if light.own or light.even]
-
-    def output(self, item: Item, tag: str, suffix: str, pattern: NamePattern | None = None) -> Path:
-        """The image's file, by a pattern of --name or the default: the photo's own frame number goes last."""
-        stem, frame = split_frame(item.output_base.name)
-        if pattern is None:
-            return item.output_base.with_name(f"{stem}{tag}_{self.name}{self.frame}{frame}{suffix}")
-        path = item.filled(pattern, tag, light=self.name, frame=self.frame.rpartition(".")[2])
-        return path.with_name(f"{path.name}{suffix}")
+    stem, frame = split_frame(item.output_base.name)
+    if pattern is None:
+        return item.output_base.with_name(f"{stem}{tag}_{setup.name}{setup.frame}{frame}{suffix}")
+    path = item.filled(pattern, tag, light=setup.name, frame=setup.frame.rpartition(".")[2])
+    return path.with_name(f"{path.name}{suffix}")
 
 
 def collect_setups(
-    sources: LightSources, output: Path, seed: int = 0, photos: Sequence[PhotoLight] = ()
+    sources: LightSources, output: Path, cached: Sequence[CachedMap] = ()
 ) -> tuple[LightSetup, ...]:
-    """List the light setups that the options name; maps are read later.
+    """List the light setups that the options name, without reading maps.
 
     Args:
         sources: The options.
         output: The output folder, which is not searched for maps.
-        seed: The seed of drawn maps.
-        photos: The lights of photos.
+        cached: Maps that are drawn and photos' lights.
     """
     rotate = sources.rotate
     rotations = parse_rotations(rotate)
     entries = [named_entry(entry) for entry in dict.fromkeys(sources.envmap or ())]
     named = [(name, Path(path)) for name, path in entries if name]
-    named += [(photo.layer, photo.envmap) for photo in photos if photo.layer]
-    words = [path for name, path in entries if not name and path.startswith(DRAWN)]
-    paths = [path for name, path in entries if not name and path not in words]
+    named += [(made.layer, made.envmap) for made in cached if made.layer]
+    paths = [path for name, path in entries if not name and not path.startswith(_DRAWN)]
     files = collect_items(paths, output, MAP_SUFFIXES) if paths else []
     short = map(split_frame, _short_names(files))
-    maps = [
-        *((path.stem, "", path) for path in drawn_maps(words, seed)),
-        *((name, frame, file.input_path) for (name, frame), file in zip(short, files, strict=True)),
-        *((photo.envmap.stem, "", photo.envmap) for photo in photos if not photo.layer),
-    ]
+    maps = [(name, frame, file.input_path) for (name, frame), file in zip(short, files, strict=True)]
+    maps += [(made.envmap.stem, "", made.envmap) for made in cached if not made.layer]
     setups = [
         LightSetup(name + turn, frame + number, (StudioLight(envmap=envmap, rotate_deg=degrees),))
         for name, frame, envmap in maps
@@ -189,122 +170,118 @@ def collect_setups(
         for name, envmap in named
     ]
     images = lit_images(sources.light or (), together)
-    apart = dict.fromkeys([one.name for one in setups] + [image.name for image in images[:-1]])
+    apart = dict.fromkeys([setup.name for setup in setups] + [image.name for image in images[:-1]])
     if apart and images and images[-1].is_shared:
         log.warning(
-            "%s: not in the image of the lights that have names (%s); to add a light there, name it: "
+            "%s: not in the image of the named lights (%s); to combine a light with them, name it: "
             "fill=40,20, fill=rembrandt or --envmap sky=MAP",
             ", ".join(apart),
             images[-1].name,
         )
     for image in images:
-        for number, shining in enumerate(image.frames):
+        for number, lights in enumerate(image.frames):
             frame = f".{number:04d}" if image.is_numbered else ""
-            setups.append(LightSetup(image.name, frame, shining, image.names))
+            setups.append(LightSetup(image.name, frame, lights, image.names))
     if not setups:
         raise UsageError("no light given; add --envmap, --light, or --light-from with a photo")
     if rotate is not None and not any(setup.envmap for setup in setups):
-        raise UsageError("--rotate: turns maps; add --envmap or --light-from, or leave it out")
+        raise UsageError("--rotate: rotates maps only; add --envmap or --light-from, or remove it")
     names = [setup.name + setup.frame for setup in setups]
     if twice := {name for name in names if names.count(name) > 1}:
-        raise UsageError(f"two images would be named {min(twice)}; give each light once")
+        raise UsageError(f"two images would be named {min(twice)}; pass each light once")
     return tuple(setups)
 
 
-def in_room(setup: LightSetup, room: str | None, is_before_dark: bool) -> LightSetup:
-    """Add the light of a room to a setup's lights, by `--room` or by default.
+def in_room(setup: LightSetup, room: str | None, over_dark: bool) -> LightSetup:
+    """Add ambient fill to a setup's lights, by `--room` or by default.
 
-    Raises UsageError where `room` is neither `none` nor a share nor a map, or where two lights have its name.
+    Raises UsageError if `room` is not `none`, a fraction or a map, or if two lights would have its name.
     """
     if not setup.has_single:
         return setup
     if room is None:
-        has_one = ROOM in setup.names or any(light.is_around or light.own for light in setup.lights)
-        default = ROOM_BEFORE_DARK if is_before_dark else ROOM_BEFORE_BRIGHT
-        return replace(setup, room=0.0 if has_one else default)
+        has_fill = ROOM in setup.names or any(light.is_around or light.own for light in setup.lights)
+        default = ROOM_BEFORE_DARK if over_dark else ROOM_BEFORE_BRIGHT
+        return replace(setup, room=0.0 if has_fill else default)
     if room == "none":
         return setup
     if ROOM in setup.names:
-        raise UsageError(
-            f"--room {room}: a light has the name {ROOM}, too; give another name, or leave it out"
-        )
+        raise UsageError(f"--room {room}: a light is also named {ROOM}; rename it, or remove --room")
     if Path(room).suffix.lower() in (*MAP_SUFFIXES, ".json"):
         light = StudioLight(envmap=Path(room))
         names = (*setup.names, ROOM) if setup.names else ()
         return replace(setup, lights=(*setup.lights, light), names=names)
-    (share,) = numbers(room, ("SHARE or MAP or none",), "--room")
-    if not 0 <= share <= _MOST_ROOM:
-        raise UsageError(f"--room {room}: out of range; give 0 to {_MOST_ROOM:g}, a map, or none")
-    return replace(setup, room=share)
+    (fraction,) = numbers(room, ("FRACTION or MAP or none",), "--room")
+    if not 0 <= fraction <= 1:
+        raise UsageError(f"--room {room}: out of range; use 0 to 1, a map, or none")
+    return replace(setup, room=fraction)
 
 
-def drawn_maps(words: Sequence[str], seed: int) -> list[Path]:
-    """Draw the maps of `procedural:N` into the user's cache; of several such words the largest N counts."""
+def drawn_maps(sources: LightSources, seed: int) -> tuple[DrawnMap, ...]:
+    """List the maps of `procedural:N`; if it is there several times, the largest N counts."""
+    words = [entry for entry in sources.envmap or () if entry.startswith(_DRAWN)]
     if not words:
-        return []
-    from facerf_cli.files.write import write_exr
-    from facerf_cli.synth.sky.skies import draw_sky, kind_of, parse_envmaps
+        return ()
+    from facerf_cli.synth.sky.skies import kind_of, parse_envmaps
 
     most = max(len(parse_envmaps(word, seed)) for word in words)
     if most > MOST_FRAMES:
-        raise UsageError(f"--envmap {DRAWN}{most}: {MOST_FRAMES} maps are the most; give fewer")
+        raise UsageError(f"--envmap {_DRAWN}{most}: too many maps; use {MOST_FRAMES} at most")
     folder = _cached("maps", f"{RESULTS_VERSION}-{seed}")
-    maps = [folder / f"{index:05d}_{kind_of(index, seed)}.exr" for index in range(most)]
-    for index, path in enumerate(maps):
-        if not path.is_file():
-            write_exr(path, draw_sky(index, seed, _WIDTH_PX)[0])
-    return maps
+    return tuple(
+        DrawnMap(folder / f"{index:05d}_{kind_of(index, seed)}.exr", index, seed) for index in range(most)
+    )
 
 
 def photo_lights(
-    sources: LightSources, how: LightOptions, background: Path | None, output: Path
+    sources: LightSources, how: LightOptions, background: Path | None, output: Path, digest_of: DigestOf
 ) -> tuple[PhotoLight, ...]:
     """List the lights of photos that --light-from names, each once.
 
     Args:
         sources: The options.
         how: How the lights are estimated.
-        background: The picture behind the person.
+        background: The background image.
         output: The output folder, which is not searched for photos.
+        digest_of: Returns the SHA-256 of a photo or a network.
     """
     entries = dict.fromkeys(sources.light_from or ())
-    if sources.fov_deg is not None and not entries:
-        raise UsageError("--fov: is for --light-from; add it, or leave --fov out")
+    if not entries:
+        return ()
     options = replace(how, fov_deg=sources.fov_deg)
+    recipe = recipe_of(options, digest_of)
 
     def light(photo: Path, name: str, layer: str = "", is_background: bool = False) -> PhotoLight:
-        recipe = recipe_of(options, file_sha256) | {"photo": file_row(photo)["sha256"]}
-        envmap = _cached("lights", key_of(recipe), f"{name}{_LIGHT}.exr")
-        return PhotoLight(photo, envmap, options, layer, is_background)
+        folder = _cached("lights", key_of(recipe | {"photo": digest_of(photo)}))
+        return PhotoLight(folder / f"{name}{_LIGHT}.exr", photo, options, layer, is_background)
 
-    lights, alone = [], []
+    lights, unnamed = [], []
     for layer, path in map(named_entry, entries):
         if path == BACKGROUND:
             if background is None:
                 raise UsageError(
-                    "--light-from background: no picture is behind the person; add --background FILE, or "
-                    "give ./background for a file of that name"
+                    "--light-from background: there is no background image; add --background FILE, or write "
+                    "./background for a file of that name"
                 )
             lights.append(light(background, split_frame(background.stem)[0], layer, is_background=True))
         elif layer:
             (item,) = collect_items([path], Path(), PHOTO_SUFFIXES)
             lights.append(light(item.input_path, Path(item.name).name, layer))
         else:
-            alone.append(path)
-    items = collect_items(alone, output, PHOTO_SUFFIXES) if alone else []
+            unnamed.append(path)
+    items = collect_items(unnamed, output, PHOTO_SUFFIXES) if unnamed else []
     lights += [light(item.input_path, name) for item, name in zip(items, _short_names(items), strict=True)]
     return tuple(lights)
 
 
 def _cached(*parts: str) -> Path:
-    """A path in the user's cache."""
     from facerf_cli.files.downloads import cache_folder  # --help does without it
 
     return cache_folder().joinpath(*parts)
 
 
 def _short_names(items: Sequence[Item]) -> list[str]:
-    """The last part of each item's name, or the whole name where several items share that part."""
+    """Return the last part of each item's name, or the whole name if several items share that part."""
     last_parts = [Path(item.name).name for item in items]
     return [
         short if last_parts.count(short) == 1 else item.name.replace("/", "_")
@@ -313,7 +290,7 @@ def _short_names(items: Sequence[Item]) -> list[str]:
 
 
 def parse_rotations(text: str | None) -> list[tuple[str, str, float]]:
-    """Parse `DEG` or `FROM:TO:N` (N frames, TO left out) to (suffix of the name, frame, degrees)."""
+    """Parse `DEG` or `FROM:TO:N` (N frames, without TO) to (suffix of the name, frame, degrees)."""
     if text is None:
         return [("", "", 0.0)]
     if not is_sweep(text):

@@ -1,9 +1,9 @@
-"""Options of every verb that reads photos: face, landmarks, face model, texture; how light is estimated.
+"""Options of the commands that read photos: face, landmarks, face model, texture; how light is estimated.
 
 Light to import: the help reads them without torch and numpy.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,13 +14,12 @@ from facerf_cli.batch.settings import Settings
 from facerf_cli.errors import UsageError
 from facerf_cli.light.entries import numbers, parse_lights
 from facerf_cli.option import FACE, IMAGE, LIGHT, METHOD, flag, option
+from facerf_cli.relighting import White
 
-MOST_ESTIMATED = 1024  # in the least squares; with more, non-negative ones take minutes
-_TURNED_AWAY_DEG, _MOST_ROLL_DEG = 90.0, 180.0
+MOST_ESTIMATED = 1024  # lights; above it the non-negative least squares take minutes
 _TEXTURE_STEP, _TEXTURE_MOST = 256, 2048
 FITTING = frozenset({"parsing"})  # networks that find faces for a fit
-# Networks of the reflectance models.
-NETWORKS = {
+NETWORKS = {  # of reflectance models
     "field": frozenset({"reflectance"}),
     "portrait": frozenset({"reflectance", "portrait"}),
     "diffuse-sh": frozenset({"diffuse_sh"}),
@@ -30,123 +29,8 @@ Refine = Literal["none", "features"]
 PoseDeg = tuple[float, float, float]
 
 
-def network_alone_option() -> Any:
-    """Make the field of `--network-alone`."""
-    return option(
-        False,
-        "Use the network's own field, without the correction by the photo's quotient.",
-        flags=("--network-alone",),
-        panel=METHOD,
-    )
-
-
-def white_option() -> Any:
-    """Make the field of `--white`."""
-    return option(
-        "photo",
-        "Keep the photo's white, or take the colour of the scene's light out (sodium, party).",
-        flags=("--white",),
-        panel=IMAGE,
-    )
-
-
-def normals_option() -> Any:
-    """Make the field of `--normals-from`."""
-    return option(
-        None,
-        "Relight by normals of another method (.npy, .exr, .png).",
-        metavar=COMPANION,
-        shown_default=False,
-        panel=METHOD,
-    )
-
-
-@dataclass(frozen=True)
-class FieldOptions:
-    """The making of the field of a photo."""
-
-    network_alone: bool = network_alone_option()
-
-
-@dataclass(frozen=True)
-class PhotoOptions:
-    """Settings of reading and fitting photos, which can be sent to other processes.
-
-    Attributes:
-        colourspace: Read the input in this colour space: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or
-            any name of the OCIO configuration.
-        layer: Read this layer of an EXR, such as beauty, in place of its image.
-        face_model: Fit this morphable model: builtin, or a .npz of `face-model import`.
-        face: Choose the face of a photo with several; INDEX counts from the left, from 0.
-        landmarks: Read 68 landmarks (.pts or .json) from a file; for each photo from a folder, or by a
-            pattern (points/{stem}.pts).
-        geometry: Fit the face model to landmarks, or regress it by the Geometry Network, without landmarks.
-        texture_side: Side of the UV texture; a multiple of 256.
-        form: Class of a Reflectance Network of your own.
-        person: Replace the matte that facerf finds by a grey image, or its alpha; --matte only multiplies
-            it.
-    """
-
-    settings: Settings
-    colourspace: str | None = option(
-        None, metavar="NAME", flags=("--input-colourspace",), shown_default="the file's", panel=IMAGE
-    )
-    layer: str | None = option(None, metavar="NAME", shown_default="the image", panel=IMAGE)
-    face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
-    face: str = option("largest", metavar="largest|all|INDEX", panel=FACE, everyday=True)
-    landmarks: Path | None = option(None, metavar=COMPANION, shown_default="detect them", panel=FACE)
-    geometry: Geometry | None = option(None, shown_default="as the checkpoint was trained", panel=FACE)
-    texture_side: int | None = option(
-        None,
-        metavar="T",
-        flags=("--texture-size",),
-        shown_default="the checkpoint's; 256 for the shipped one",
-        panel=METHOD,
-    )
-    form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
-    person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
-    ocio_config: str = ""  # that knows the colour space; '' is $OCIO, or the built-in one
-
-    def check(self) -> None:
-        """Raise UsageError for an option that would fail every photo; nothing heavy is loaded."""
-        if self.face not in ("largest", "all") and not self.face.isdecimal():
-            raise UsageError(f"--face {self.face!r}: not a face; give largest, all or a number from 0")
-        side = self.texture_side
-        if side is not None and (side % _TEXTURE_STEP or not 0 < side <= _TEXTURE_MOST):
-            raise UsageError(
-                f"--texture-size {self.texture_side}: give a multiple of 256 up to {_TEXTURE_MOST}"
-            )
-        if self.landmarks is not None and self.geometry == "network":
-            raise UsageError("--landmarks: --geometry network uses none; leave one out")
-        check_companion(self.landmarks, "--landmarks")
-        if self.face == "all" and self.person is not None:
-            raise UsageError("--face all: --person shows one person; pass --face INDEX")
-        check_companion(self.person, "--person")
-
-    @property
-    def first_tag(self) -> str:
-        """The tag of a photo's first face in the names of its outputs; faces are written last to first.
-
-        The number of faces that `--face all` finds is not known beforehand. So the first one's outputs are
-        written last and mark the photo as finished.
-        """
-        return "_face0" if self.face == "all" else ""
-
-
-def photo_words(options: PhotoOptions, number: int = 0) -> list[str]:
-    """Options that are not defaults, as they are typed; of all faces that of a `number` alone."""
-    words, settings = [], options.settings
-    for one in fields(options):
-        value, about = getattr(options, one.name), one.metadata.get("option")
-        if about and value != one.default:
-            text = number if value == "all" else value
-            words += [about.flags[0] if about.flags else flag(one.name), str(text)]
-    checkpoints = () if settings.checkpoints_by_default else settings.checkpoints
-    return words + [word for path in checkpoints for word in ("--checkpoint", str(path))]
-
-
 def fov_option() -> Any:
-    """`--fov`, the angle of view of pictures without a face."""
+    """Make the field of `--fov`."""
     return option(
         None,
         flags=("--fov",),
@@ -159,13 +43,120 @@ def fov_option() -> Any:
 
 
 @dataclass(frozen=True)
-class SolveOptions:
-    """The solution for the light.
+class FieldOptions:
+    """How a photo's face field is made.
 
     Attributes:
-        non_negative: Solve for weights from 0 up, robust to hair and glasses; or for the paper's least
-            squares, with negative ones.
-        refine: Refine the least squares by comparing features of the texture.
+        network_alone: Use the network's field without the correction by the photo's ratio image.
+    """
+
+    network_alone: bool = option(False, panel=METHOD)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PortraitOptions:
+    """How the portrait field of a photo's person is made.
+
+    Attributes:
+        white: White balance: photo (as in the photo), or scene (neutralise coloured light, such as sodium
+            lamps).
+        normals_from: Normals from another method (.npy, .exr, .png).
+    """
+
+    white: White = option("photo", panel=IMAGE)
+    normals_from: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=METHOD)
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """Settings of reading and fitting photos; picklable.
+
+    Attributes:
+        colourspace: Colour space of the input: sRGB, linear, ACEScg, Rec.2020, 'Display P3', or a name of the
+            OCIO configuration.
+        layer: Layer of an EXR to read, such as beauty.
+        face_model: Morphable face model to fit: builtin, or a .npz of face-model import.
+        face: Face to use if a photo has several: largest, all, or an index from the left, starting at 0.
+        landmarks: 68 landmarks (.pts or .json): a file, a folder with one per photo, or a pattern
+            (points/{stem}.pts).
+        geometry: How the face is fitted: to landmarks, or by the Geometry Network, without landmarks.
+        texture_side: Side of the UV texture, a multiple of 256.
+        form: Class of your own Reflectance Network.
+        person: Matte of the person, a grey image or its alpha, instead of the detected one.
+    """
+
+    settings: Settings
+    colourspace: str | None = option(
+        None, metavar="NAME", flags=("--input-colourspace",), shown_default="the file's", panel=IMAGE
+    )
+    layer: str | None = option(None, metavar="NAME", shown_default="the image", panel=IMAGE)
+    face_model: str = option("builtin", metavar="NAME|PATH", panel=FACE)
+    face: str = option("largest", metavar="largest|all|INDEX", panel=FACE, everyday=True)
+    landmarks: Path | None = option(None, metavar=COMPANION, shown_default="detected", panel=FACE)
+    geometry: Geometry | None = option(None, shown_default="as the checkpoint was trained", panel=FACE)
+    texture_side: int | None = option(
+        None,
+        metavar="T",
+        flags=("--texture-size",),
+        shown_default="the checkpoint's; 256 for the shipped one",
+        panel=METHOD,
+    )
+    form: str | None = option(None, metavar="MODULE:CLASS", shown_default=False, panel=METHOD)
+    person: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=FACE)
+    ocio_config: str = ""  # defines the colour space; '' is $OCIO, or the built-in one
+
+    def check(self) -> None:
+        """Raise UsageError for options that would fail every photo."""
+        side, face = self.texture_side, self.face
+        refuse(
+            {
+                f"--face {face!r}: not a face; use largest, all, or an index starting at 0": (
+                    face not in ("largest", "all") and not face.isdecimal()
+                ),
+                f"--texture-size {side}: use a multiple of 256 up to {_TEXTURE_MOST}": (
+                    side is not None and (side % _TEXTURE_STEP > 0 or not 0 < side <= _TEXTURE_MOST)
+                ),
+                "--landmarks: not used by --geometry network; remove one of them": (
+                    self.landmarks is not None and self.geometry == "network"
+                ),
+                "--face all: a --person matte shows one person; use --face INDEX": (
+                    face == "all" and self.person is not None
+                ),
+            }
+        )
+        check_companion(self.landmarks, "--landmarks")
+        check_companion(self.person, "--person")
+
+    @property
+    def first_tag(self) -> str:
+        """Tag of a photo's first face in output names.
+
+        The number of faces that `--face all` finds is unknown beforehand. Faces are therefore written last to
+        first, and the first one's outputs mark the photo as finished.
+        """
+        return "_face0" if self.face == "all" else ""
+
+
+def photo_words(options: PhotoOptions, number: int = 0) -> list[str]:
+    """Return options that differ from defaults, as typed; `--face all` becomes `--face` and a `number`."""
+    words, settings = [], options.settings
+    for part in fields(options):
+        value, about = getattr(options, part.name), part.metadata.get("option")
+        if about and value != part.default:
+            text = number if value == "all" else value
+            words += [about.flags[0] if about.flags else flag(part.name), str(text)]
+    checkpoints = () if settings.checkpoints_by_default else settings.checkpoints
+    return words + [word for path in checkpoints for word in ("--checkpoint", str(path))]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    """How the light is solved for.
+
+    Attributes:
+        non_negative: Solve for non-negative weights, robust to hair and glasses; or for the paper's signed
+            least squares.
+        refine: Refinement of the light: features compares features of the texture.
     """
 
     non_negative: bool = option(True, flags=("--non-negative/--signed",), panel=METHOD)
@@ -174,15 +165,15 @@ class SolveOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LightOptions(SolveOptions):
-    """Settings of estimating the light of a photo, which can be sent to other processes.
+    """Settings of estimating the light of a photo; picklable.
 
     Attributes:
-        reflectance: Choose the reflectance model; each baseline estimates its own light.
-        rig: Solve for the light of a rig of N lights, or of a file of directions (az,el or x y z; .lp).
-        vgg_weights: Use the paper's V_f in --refine features: download it once (528 MiB), or read a file.
-        keep_eyes: Use the eyes, too (the paper leaves them out).
-        fov_deg: The angle of view of a picture without face.
-        matte: Use only what a grey image, or its alpha, shows, such as skin alone; --person replaces the
+        reflectance: Reflectance model; each baseline estimates its own light.
+        rig: Lights to solve for: the number of a uniform rig, or a file of directions (az,el or x y z; .lp).
+        vgg_weights: The paper's V_f for --refine features: imagenet downloads it once (528 MiB); or a file.
+        keep_eyes: Also use the eyes, which the paper leaves out.
+        fov_deg: Horizontal angle of view of an image without a face.
+        matte: Grey image, or its alpha, of the part to use, such as skin; --person replaces the detected
             matte.
     """
 
@@ -206,51 +197,52 @@ class LightOptions(SolveOptions):
         return networks_of([self.reflectance]) | (frozenset({"light_features"}) if features else frozenset())
 
     def check(self) -> None:
-        """Raise UsageError for options that do not go together or would fail every photo."""
-        if self.reflectance != "field" and (
-            self.refine != "none" or self.rig != "150" or not self.non_negative
-        ):
-            raise UsageError(
-                f"--reflectance {self.reflectance}: estimates its own light; "
-                "leave out --lights, --signed and --refine"
-            )
-        if self.vgg_weights is not None and self.refine == "none":
-            raise UsageError("--vgg-weights: used by --refine features only; give both")
+        """Raise UsageError for options that exclude each other or would fail every photo."""
         lights = parse_lights(self.rig)
-        if (lights if isinstance(lights, int) else len(lights)) > MOST_ESTIMATED:
-            raise UsageError(
-                f"--lights {self.rig}: too many lights to estimate; give {MOST_ESTIMATED} at most"
-            )
+        refuse(
+            {
+                f"--reflectance {self.reflectance}: estimates its own light; remove --lights, --signed and "
+                "--refine": self.reflectance != "field"
+                and (self.refine != "none" or self.rig != "150" or not self.non_negative),
+                f"--lights {self.rig}: too many lights to estimate; use {MOST_ESTIMATED} at most": (
+                    (lights if isinstance(lights, int) else len(lights)) > MOST_ESTIMATED
+                ),
+            }
+        )
         check_companion(self.matte, "--matte")
 
 
+def refuse(rules: Mapping[str, bool]) -> None:
+    """Raise UsageError for the first broken rule between options; the keys are messages."""
+    for message, is_broken in rules.items():
+        if is_broken:
+            raise UsageError(message)
+
+
 def for_other_photos(photo: PhotoOptions) -> PhotoOptions:
-    """Options for photos of which only the light is used: those of the inputs that describe one file go."""
+    """Return the options for photos of which only the light is used, without those of a particular file."""
     folder = photo.landmarks if photo.landmarks is not None and not photo.landmarks.is_file() else None
-    alone = replace(photo, colourspace=None, layer=None, person=None)
-    return replace(alone, face="largest", landmarks=folder)
+    return replace(photo, colourspace=None, layer=None, person=None, face="largest", landmarks=folder)
 
 
 def networks_of(kinds: Iterable[str]) -> frozenset[str]:
-    """Names of the networks that reading photos by some reflectance models uses."""
+    """Return names of the networks that some reflectance models use, with those that find faces."""
     return FITTING.union(*(NETWORKS.get(kind, ()) for kind in kinds))
 
 
-def check_companion(given: Path | None, option: str) -> None:
-    """Raise UsageError for a file or folder that does not exist; a pattern is filled in for each photo."""
-    if given is not None and not given.exists():
-        if "{" not in str(given):
-            raise UsageError(f"{option} {given}: no such file or folder; give one that exists")
-        NamePattern.parse(given.as_posix().lstrip("/"), option, OF_FILES)
+def check_companion(path: Path | None, option: str) -> None:
+    """Raise UsageError for a missing file or folder, and for a pattern with unknown fields."""
+    if path is not None and not path.exists():
+        if "{" not in str(path):
+            raise UsageError(f"{option} {path}: no such file or folder; pass one that exists")
+        NamePattern.parse(path.as_posix().lstrip("/"), option, OF_FILES)
 
 
 def parse_pose(text: str | None) -> PoseDeg | None:
-    """Parse `YAW,PITCH,ROLL` in degrees; None stays None (the photo's own pose)."""
+    """Parse `YAW,PITCH,ROLL` in degrees; None, the photo's own pose, stays None."""
     if text is None:
         return None
     yaw_deg, pitch_deg, roll_deg = numbers(text, ("YAW,PITCH,ROLL",), "--pose")
-    if max(abs(yaw_deg), abs(pitch_deg)) > _TURNED_AWAY_DEG or abs(roll_deg) > _MOST_ROLL_DEG:
-        raise UsageError(
-            f"--pose {text!r}: turns the face away; give yaw and pitch of -90 to 90, roll of -180 to 180"
-        )
+    if max(abs(yaw_deg), abs(pitch_deg)) > 90 or abs(roll_deg) > 180:
+        raise UsageError(f"--pose {text!r}: out of range; use yaw, pitch of -90 to 90, roll of -180 to 180")
     return yaw_deg, pitch_deg, roll_deg

@@ -1,4 +1,4 @@
-"""Photos of a batch: read, their faces found and fitted, and the models loaded once a process."""
+"""Photos of a batch: read them, find and fit their faces; the models are loaded once per process."""
 
 import logging
 import math
@@ -31,67 +31,57 @@ from facerf_cli.portrait.person import unit_normals
 from facerf_cli.portrait.segment import Segmentation, segment
 from facerf_cli.raster.camera import pose_to_rotation, rotation_to_pose
 from facerf_cli.relighting.fitting import head_of
+from facerf_cli.relighting.memory import KEPT_PX, beside
 from facerf_cli.relighting.models import Models, load_models
 from facerf_cli.relighting.portrait_field import SmoothedFrame
 from facerf_cli.run.logs import LOGGER_NAME, Provenance, step
 from facerf_cli.run.threads import compute_apart
 from facerf_cli.work.photo_options import PhotoOptions, parse_pose
-from facerf_cli.work.plan import KEPT_PX, beside
 
-
-def companion(item: Item, given: Path, option: str) -> Path:
-    """The file of an option that goes with a photo, as `companions` lists; InputError where there is none."""
-    places = companions(item, given, option)
-    for path in places:
-        if path == given or path.is_file():
-            return path
-    missing = str(places[0])
-    if given.is_dir():
-        kinds = " ".join(dict.fromkeys(path.suffix for path in places))
-        missing = f"{places[0].with_suffix('')} with one of the suffixes {kinds}"
-    raise InputError(f"{item.input_path}: {option} has no {missing}; add it there")
-
-
-_WHITE, _LABEL = 0.9, 1.5 / 255  # of mattes: the least white, and what only label 1 of 8 or 16 bits is below
-_MOST_RADIANCE = 1e10  # in a photo: the sun in cd/m2 is below it, and sums of its square are finite
+_WHITE = 0.9  # least maximum of a --person matte
+_LABEL = 1.5 / 255  # a --matte whose maximum is below it contains labels 0 and 1, of 8 or 16 bits
+_MOST_RADIANCE = 1e10  # the sun in cd/m2 is below it, and sums of its square are finite
 log = logging.getLogger(LOGGER_NAME)
 
 
 @dataclass(frozen=True, eq=False)
 class PhotoFace:
-    """One face of a photo; `tag` goes into the names of its outputs: '' or, with `--face all`, '_face0'.
+    """One face of a photo.
 
-    `name` is for messages. `facts` say how far it can be relied on; those of a frame leave out its own matte.
+    Attributes:
+        tag: Part of its outputs' names: '' or, with `--face all`, '_face0'.
+        name: Its name in messages.
+        found: The detected face.
+        facts: Measurements of its reliability; those of a shot's frame leave out the frame's own matte.
+        number: Its index from the left.
     """
 
     tag: str
     name: str
     found: Face
     facts: dict[str, float] = field(default_factory=dict)
-    number: int = 0  # from the left
+    number: int = 0
 
     def see(self, segmentation: Segmentation) -> None:
-        """Add the facts of its person's matte."""
+        """Add the measurements of its person's matte."""
         if self.facts:
             self.facts.update(segmentation.facts)
 
     def rated(self, quiet: bool = False) -> dict[str, Any]:
-        """Rate the face for the report, and unless `quiet` in a line."""
+        """Return its confidence for the report and, unless `quiet`, log it."""
         if not self.facts:
             return {}
         confidence = confidence_of(self.facts)
         why = ", ".join(SCALES[name].said or name for name in confidence.reasons)
         if not quiet:
-            log.info(
-                "%s: facerf is %s of the person%s", self.name, confidence.word, f" ({why})" if why else ""
-            )
+            log.info("%s: detection is %s%s", self.name, confidence.word, f" ({why})" if why else "")
         factors = {name: round(factor, 3) for name, factor in confidence.factors.items()}
         return {"confidence": round(confidence.score, 3), "certainty": confidence.word, "factors": factors}
 
 
 @dataclass(frozen=True, eq=False)
 class FittedFace(PhotoFace):
-    """A face with its head; `steady` is of a frame of a shot, `matte` [H, W] is the person's if given."""
+    """A face with its head; `steady` belongs to a shot's frame, `matte` [H, W] is the user's."""
 
     head: Head = field(kw_only=True)
     steady: SmoothedFrame | None = None
@@ -99,20 +89,19 @@ class FittedFace(PhotoFace):
 
     @property
     def fit(self) -> FaceFit:
-        """The fitted face model."""
         return self.head.fit
 
     def described(self) -> dict[str, Any]:
-        """Describe the face for the report, and unless it is of a shot in a line."""
+        """Return its fit, pose and confidence for the report; log the confidence unless it is of a shot."""
         pose_deg = [round(angle, 2) for angle in rotation_to_pose(self.fit.rotation)]
         return {**fit_facts(self.fit), "pose_deg": pose_deg, **self.rated(quiet=self.steady is not None)}
 
 
 @step("load")
 def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: bool = True) -> None:
-    """Load what every photo needs, and the networks of some names.
+    """Load what every photo needs, and the networks named in `uses`.
 
-    Raises UsageError or InputError for what would fail all photos, and for a checkpoint without use.
+    Raises UsageError or InputError for options that would fail all photos, and for an unused checkpoint.
     """
     if options.colourspace is not None:
         named_space(options.colourspace, options.ocio_config)
@@ -121,8 +110,8 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
     if (options.geometry or models.default_geometry) == "network":
         if options.face_model != BUILTIN:
             raise UsageError(
-                f"--face-model {options.face_model}: --geometry network regresses heads of the built-in one; "
-                "leave it out, or give --geometry landmarks"
+                f"--face-model {options.face_model}: --geometry network supports only the built-in model; "
+                "remove it, or use --geometry landmarks"
             )
         uses = {*uses, "geometry"}
     if not settings.checkpoints_by_default:
@@ -133,7 +122,7 @@ def prepare_photos(options: PhotoOptions, uses: Collection[str], with_networks: 
 
 @cache
 def load_models_once(options: PhotoOptions) -> Models:
-    """The face model and the networks of the checkpoint, on the device, once a process."""
+    """Load the face model and the networks of the checkpoints, on the device."""
     compute_apart()
     settings = options.settings
     return load_models(settings.checkpoints, options.face_model, torch_device(settings), options.form)
@@ -141,7 +130,7 @@ def load_models_once(options: PhotoOptions) -> Models:
 
 @cache
 def face_model(options: PhotoOptions) -> MorphableModel:
-    """The face model alone, once a process."""
+    """Load only the face model."""
     return load_face_model(options.face_model)
 
 
@@ -149,26 +138,23 @@ def face_model(options: PhotoOptions) -> MorphableModel:
 def read_photo(
     item: Item, options: PhotoOptions, kept_px: int = KEPT_PX, in_shot: bool = False
 ) -> LinearImage:
-    """The item's image, scene-linear Rec.709; it leads to `kept_px` bytes of memory a pixel.
+    """Read the item's image, scene-linear Rec.709; later work takes `kept_px` bytes of memory per pixel.
 
-    Alpha that is 0 everywhere, over colour, is none, with a warning; of a frame of a shot it is kept.
+    Alpha that is 0 everywhere is removed, with a warning, unless the image is a frame of a shot or black.
     """
     space = None if options.colourspace is None else named_space(options.colourspace, options.ocio_config)
     image = read_image(item.input_path, space, kept_px=kept_px, layer=options.layer)
     if (most := float(image.pixels.max())) > _MOST_RADIANCE:
-        raise InputError(
-            f"{item.input_path}: its brightest value is {most:.3g}, and {_MOST_RADIANCE:.0e} is the most; "
-            "clip it"
-        )
+        raise InputError(f"{item.input_path}: its maximum is {most:.3g}; clip it to {_MOST_RADIANCE:.0e}")
     if image.alpha is not None and not in_shot and not image.alpha.any() and most > 0:
-        log.warning("%s: is transparent everywhere; its alpha is left out", item.input_path)
+        log.warning("%s: transparent everywhere; ignoring its alpha", item.input_path)
         return replace(image, alpha=None)
     return image
 
 
 @contextmanager
 def naming(name: object) -> Iterator[None]:
-    """Let errors of the block begin with the name of the input, once."""
+    """Prefix the errors of the block with the name of the input, once."""
     try:
         yield
     except InputError as error:
@@ -176,105 +162,13 @@ def naming(name: object) -> Iterator[None]:
 
 
 def fit_each(item: Item, image: LinearImage, options: PhotoOptions) -> Iterator[FittedFace]:
-    """Find the faces of a photo that the options choose; fit one after the other, from right to left.
+    """Find the faces of a photo that the options choose, and fit one after the other, from right to left.
 
-    So the first one's files are written last, and mark the photo as finished.
+    The first face's files are therefore written last, and mark the photo as finished.
     """
     matte = person_matte(item, image.pixels, options)
-    found = find_people(item, image, options, matte)
-    return (_fitted(found.pop(), image, options, matte) for _ in range(len(found)))
-
-
-def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
-    """Fit the faces of a photo that the options choose, from left to right."""
-    return list(fit_each(item, image, options))[::-1]
-
-
-def write_each(
-    item: Item, image: LinearImage, options: PhotoOptions, write: Callable[[FittedFace], dict[str, Any]]
-) -> tuple[list[str], dict[str, Any]]:
-    """Fit, write and rate one face after the other.
-
-    Return their tags and their entries in the report, to which `write` may add.
-    """
-    made: list[tuple[str, dict[str, Any]]] = []
-    people = load_models_once(options).networks.people
-    for face in fit_each(item, image, options):
-        added, landmarks_px = write(face), face.fit.crop.to_photo(face.head.landmarks_px)
-        face.see(segment(people, to_display(image.pixels), landmarks_px, face.matte, face.head.others))
-        made.insert(0, (face.tag, face.described() | added))
-    return [tag for tag, _ in made], facts_of([facts for _, facts in made], options)
-
-
-def find_people(
-    item: Item, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
-) -> list[PhotoFace]:
-    """Find the faces that the options choose, from left to right.
-
-    Raises InputError for given landmarks, or a given matte [H, W], that do not show the face.
-    """
-    models = load_models_once(options)
-    if options.landmarks is not None:
-        path = companion(item, options.landmarks, "--landmarks")
-        landmarks_px = read_landmarks(path)
-        with naming(path):
-            faces = [face_with(models.networks.people, to_display(image.pixels), landmarks_px)]
-    else:
-        faces = find_faces(models, image.pixels, options.face, str(item.input_path))
-    found = []
-    for face in faces:
-        name, number, (left, top, right, bottom) = str(item.input_path), face.number, face.box_px
-        if len(faces) > 1:
-            x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
-            name += f": face {number} from the left, at x {x_px}, y {y_px} px"
-        facts = facts_of_face(item, face, image.pixels, options, matte)
-        found.append(
-            PhotoFace(f"_face{number}" if options.face == "all" else "", name, face, facts, number=number)
-        )
-    return found
-
-
-def facts_of_face(
-    item: Item, face: Face, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
-) -> dict[str, float]:
-    """Measure a face in a photo [H, W, 3], and its matte [H, W] if that is given.
-
-    Raises InputError for a matte that does not show it.
-    """
-    if (view := face.view) is None:
-        return {}
-    facts = face_facts(view, photo)
-    if matte is None:
-        return facts
-    with naming(matte_path(item, options)):
-        return facts | given_matte_facts(view, matte)
-
-
-def fit_facts(fit: FaceFit) -> dict[str, Any]:
-    """A fit's error and quality for the report; a regressed head has no error."""
-    error = {} if math.isnan(fit.error_iod) else {"error_iod": round(fit.error_iod, 5)}
-    return {**error, "quality": fit.quality}
-
-
-def facts_of(faces: list[dict[str, Any]], options: PhotoOptions) -> dict[str, Any]:
-    """The report's entries of a photo: those of its one face, or of each in a list."""
-    return (faces[0] if len(faces) == 1 else {"faces": faces}) | facts_of_networks(options)
-
-
-def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
-    """Return the report's entries of the networks that were used: file and digest of each."""
-    return {"networks": load_models_once(options).networks.served()}
-
-
-def stamp(item: Item) -> dict[str, str | int]:
-    """Metadata for parts of a photo, which stay photographs."""
-    return Provenance(item.input_path.name, source_type="", key=item.key).attributes()
-
-
-def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
-    """Metadata for the outputs of a photo."""
-    stamp_of_model = face_model(options).stamp
-    return Provenance(item.input_path.name, checkpoint_name, **stamp_of_model, key=item.key).attributes()
+    faces = find_people(item, image, options, matte)
+    return (_fitted(faces.pop(), image, options, matte) for _ in range(len(faces)))
 
 
 def _fitted(
@@ -287,37 +181,140 @@ def _fitted(
     return fitted_face(face, head, matte)
 
 
+def fit_faces(item: Item, image: LinearImage, options: PhotoOptions) -> list[FittedFace]:
+    """Fit the faces of a photo that the options choose; return them from left to right."""
+    return list(fit_each(item, image, options))[::-1]
+
+
+def write_each(
+    item: Item, image: LinearImage, options: PhotoOptions, write: Callable[[FittedFace], dict[str, Any]]
+) -> tuple[list[str], dict[str, Any]]:
+    """Fit, write and rate one face after the other.
+
+    Returns their tags and their facts for the report, including those that `write` returns.
+    """
+    faces: list[tuple[str, dict[str, Any]]] = []
+    people = load_models_once(options).networks.people
+    for face in fit_each(item, image, options):
+        added, landmarks_px = write(face), face.fit.crop.to_photo(face.head.landmarks_px)
+        face.see(segment(people, to_display(image.pixels), landmarks_px, face.matte, face.head.others))
+        faces.insert(0, (face.tag, face.described() | added))
+    return [tag for tag, _ in faces], facts_of([facts for _, facts in faces], options)
+
+
+def find_people(
+    item: Item, image: LinearImage, options: PhotoOptions, matte: np.ndarray | None
+) -> list[PhotoFace]:
+    """Find the faces that the options choose, from left to right.
+
+    Raises InputError if the user's landmarks or matte [H, W] do not show the face.
+    """
+    models, name = load_models_once(options), str(item.input_path)
+    if options.landmarks is not None:
+        path = companion(item, options.landmarks, "--landmarks")
+        landmarks_px = read_landmarks(path)
+        with naming(path):
+            faces = [face_with(models.networks.people, to_display(image.pixels), landmarks_px)]
+    else:
+        faces = find_faces(models, image.pixels, options.face, name)
+    people = []
+    for face in faces:
+        number, (left, top, right, bottom) = face.number, face.box_px
+        x_px, y_px = round((left + right) / 2), round((top + bottom) / 2)
+        which = f": face {number} from the left, at x {x_px}, y {y_px} px" if len(faces) > 1 else ""
+        facts = facts_of_face(item, face, image.pixels, options, matte)
+        tag = f"_face{number}" if options.face == "all" else ""
+        people.append(PhotoFace(tag, name + which, face, facts, number=number))
+    return people
+
+
+def facts_of_face(
+    item: Item, face: Face, photo: np.ndarray, options: PhotoOptions, matte: np.ndarray | None
+) -> dict[str, float]:
+    """Measure a face in a photo [H, W, 3], and the user's matte [H, W].
+
+    Raises InputError if the matte does not show the face.
+    """
+    if (view := face.view) is None:
+        return {}
+    facts = face_facts(view, photo)
+    if matte is None:
+        return facts
+    with naming(_matte_path(item, options)):
+        return facts | given_matte_facts(view, matte)
+
+
+def fit_facts(fit: FaceFit) -> dict[str, Any]:
+    """Return a fit's error and quality for the report; a regressed head has no error."""
+    error = {} if math.isnan(fit.error_iod) else {"error_iod": round(fit.error_iod, 5)}
+    return {**error, "quality": fit.quality}
+
+
+def facts_of(faces: list[dict[str, Any]], options: PhotoOptions) -> dict[str, Any]:
+    """Return the facts of a photo's one face, or of each face in a list, and the networks, for the report."""
+    return (faces[0] if len(faces) == 1 else {"faces": faces}) | facts_of_networks(options)
+
+
+def facts_of_networks(options: PhotoOptions) -> dict[str, Any]:
+    """Return file and digest of each network that was used, for the report."""
+    return {"networks": load_models_once(options).networks.served()}
+
+
+def stamp(item: Item) -> dict[str, str | int]:
+    """Return the metadata of an output that is still a photograph, such as a cut-out."""
+    return Provenance(item.input_path.name, source_type="", key=item.key).attributes()
+
+
+def provenance(item: Item, options: PhotoOptions, checkpoint_name: str = "") -> dict[str, str | int]:
+    """Return the metadata of a synthetic output of a photo."""
+    stamp_of_model = face_model(options).stamp
+    return Provenance(item.input_path.name, checkpoint_name, **stamp_of_model, key=item.key).attributes()
+
+
 def fitted_face(face: PhotoFace, head: Head, matte: np.ndarray | None) -> FittedFace:
-    """A face with its head, and its person's matte [H, W] if given; warns of a fit that is poor."""
+    """Add a face's head, and its person's matte [H, W]; warn if the fit is poor."""
     if head.fit.quality == "poor":
         log.warning(
-            "%s: the face model fits badly (its points are off by %.1f %% of the eyes' distance): look at it "
-            "with `facerf fit-geometry`, or give the face's points by --landmarks",
+            "%s: the face model fits poorly (landmarks are off by %.1f %% of the eye distance); check it "
+            "with `facerf fit-geometry`, or pass --landmarks",
             face.name,
             100 * head.fit.error_iod,
         )
     return FittedFace(face.tag, face.name, face.found, face.facts, number=face.number, head=head, matte=matte)
 
 
-def read_matte(item: Item, given: Path, size_px: tuple[int, ...], in_shot: bool = False) -> np.ndarray:
-    """A photo's matte [H, W] in 0..1, of the photo's size: the file's alpha, or the mean of its values."""
-    path = companion(item, given, "--matte")
+def companion(item: Item, path: Path, option: str) -> Path:
+    """Return the file of an option that goes with a photo; raise InputError if there is none."""
+    places = companions(item, path, option)
+    for place in places:
+        if place == path or place.is_file():
+            return place
+    missing = str(places[0])
+    if path.is_dir():
+        kinds = " ".join(dict.fromkeys(place.suffix for place in places))
+        missing = f"{places[0].with_suffix('')} with one of the suffixes {kinds}"
+    raise InputError(f"{item.input_path}: {option} has no {missing}; add it there")
+
+
+def read_matte(item: Item, file: Path, size_px: tuple[int, ...], in_shot: bool = False) -> np.ndarray:
+    """Read a photo's --matte [H, W] in 0..1: the file's alpha, or the mean of its channels."""
+    path = companion(item, file, "--matte")
     matte = _grey_or_alpha(path, size_px, _LABEL)
     if matte.shape != tuple(size_px):
-        raise InputError(f"{path}: {_sizes(matte, size_px)}; give one of the photo's size")
+        raise InputError(f"{path}: {_sizes(matte, size_px)}; use a matte of the photo's size")
     if not in_shot and not matte.any():
-        log.warning("%s: the matte is black, and leaves out all of %s", path, item.input_path)
+        log.warning("%s: the matte is black and masks out all of %s", path, item.input_path)
     return matte
 
 
-def read_normals(item: Item, given: Path | None, size_px: tuple[int, ...]) -> np.ndarray | None:
-    """A photo's normals [H, W, 3] of `--normals-from`, at its size, 0 where none are; None if not given.
+def read_normals(item: Item, file: Path | None, size_px: tuple[int, ...]) -> np.ndarray | None:
+    """Read a photo's normals [H, W, 3] of `--normals-from`, at its size, 0 where they are missing.
 
-    An EXR and NumPy's file hold vectors; in other images 0..1 stand for -1..1.
+    EXR and NumPy files contain vectors; other images encode -1..1 as 0..1.
     """
-    if given is None:
+    if file is None:
         return None
-    path = companion(item, given, "--normals-from")
+    path = companion(item, file, "--normals-from")
     with beside(size_px, images=1):
         if path.suffix.lower() == ".npy":
             normals = read_array(path)
@@ -328,40 +325,37 @@ def read_normals(item: Item, given: Path | None, size_px: tuple[int, ...]) -> np
         return unit_normals(normals, (size_px[0], size_px[1]))
 
 
-def matte_path(item: Item, options: PhotoOptions) -> Path:
-    """Return the file of a photo's `--person`; without it, the photo."""
+def _matte_path(item: Item, options: PhotoOptions) -> Path:
     return item.input_path if options.person is None else companion(item, options.person, "--person")
 
 
 def person_matte(
     item: Item, pixels: np.ndarray, options: PhotoOptions, in_shot: bool = False
 ) -> np.ndarray | None:
-    """The person's matte [H, W] in 0..1 that is given for a photo [H, W, 3], at its size; None if none is.
+    """Read the --person matte [H, W] in 0..1 of a photo [H, W, 3], at its size; None without --person.
 
-    Raises InputError where that of a photo alone is black, or that of `--person` nowhere white.
+    Raises InputError if its aspect ratio differs, and unless in a shot, if it is nowhere white.
     """
     height, width = pixels.shape[:2]
     if options.person is None:
         return None
-    path = matte_path(item, options)
+    path = _matte_path(item, options)
     matte = _grey_or_alpha(path, (height, width), _WHITE)
     scale = height / len(matte)
     if abs(width - scale * matte.shape[1]) > 2 * max(1.0, scale):  # sides were rounded
         sizes, turned = _sizes(matte, (height, width)), abs(height - width * matte.shape[1] / len(matte)) <= 2
-        cause = "; the likely cause: the photo's EXIF orientation was not applied" if turned else ""
+        cause = ", probably because EXIF orientation was not applied" if turned else ""
         raise InputError(f"{path}: {sizes}{cause}; use a matte of the upright photo")
-    if not in_shot and not matte.any():
-        raise InputError(f"{path}: the matte is black and shows nobody; make it white where the person is")
     if not in_shot and (most := matte.max()) < _WHITE:
-        at_most = f"nowhere white, {255 * most:.0f} of 255 at most"
-        raise InputError(f"{path}: the matte is {at_most}; make it white where the person is")
+        level = f"nowhere white (at most {255 * most:.0f} of 255)" if most else "completely black"
+        raise InputError(f"{path}: the matte is {level}; make it white where the person is")
     return matte if matte.shape == (height, width) else resized(matte, height, width).clip(0, 1)
 
 
 def _grey_or_alpha(path: Path, size_px: tuple[int, ...], white: float) -> np.ndarray:
-    """Values [h, w] in 0..1 of an image for a photo [H, W]: its alpha, if that varies, or its grey.
+    """Read an image for a photo [H, W] as values [h, w] in 0..1: its alpha, if that varies, or its grey.
 
-    Of black and one colour, less bright than `white`, the colour is a label, as of a palette: it reads white.
+    If it is black and one colour below `white`, that colour is a label, as in a palette, and becomes 1.
     """
     with beside(size_px, images=1):
         image = read_image(path, "linear")
@@ -370,7 +364,7 @@ def _grey_or_alpha(path: Path, size_px: tuple[int, ...], white: float) -> np.nda
     matte = values.mean(-1).clip(0, 1)
     labelled = (values == values.reshape(matte.size, -1)[matte.argmax()]).all(-1)
     if 0 < matte.max() < white and not matte.min() and not matte[~labelled].any():
-        log.info("%s: is black and one colour, which counts as white", path)
+        log.info("%s: contains black and one colour, which is treated as white", path)
         return labelled.astype(np.float32)
     return np.asarray(matte)
 
@@ -381,6 +375,6 @@ def _sizes(matte: np.ndarray, size_px: tuple[int, ...]) -> str:
 
 
 def rotation_of(pose: str | None) -> torch.Tensor | None:
-    """The head_to_camera rotation [3, 3] of `--pose`; None keeps the photo's pose."""
+    """Return the head_to_camera rotation [3, 3] of `--pose`; None keeps the photo's pose."""
     pose_deg = parse_pose(pose)
     return None if pose_deg is None else pose_to_rotation(*pose_deg)

@@ -1,4 +1,4 @@
-"""What `facerf predict-olat` writes: the OLAT stack of a photo's person, and its contact sheet."""
+"""Write the OLAT stack of a photo's person, and its contact sheet, for `facerf predict-olat`."""
 
 import math
 from collections.abc import Iterator
@@ -25,8 +25,10 @@ from facerf_cli.person import Target, fit, olat_images
 from facerf_cli.raster.camera import crop_camera
 from facerf_cli.relighting.field import Field
 from facerf_cli.relighting.fitting import reflectance_of
+from facerf_cli.relighting.memory import require_face
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run.threads import one_ahead
+from facerf_cli.work.photo_work import PredictOlat, Written
 from facerf_cli.work.photos import (
     FittedFace,
     load_models_once,
@@ -37,11 +39,9 @@ from facerf_cli.work.photos import (
     rotation_of,
     write_each,
 )
-from facerf_cli.work.plan import require_face
-from facerf_cli.work.verbs import PredictOlat, Written
 from facerf_cli.work.view import write_page
 
-_TILE_PX, _SHEET_PX = 128, 1 << 22  # the longer side of a contact sheet's tile; pixels of all tiles, at most
+_TILE_PX, _SHEET_PX = 128, 1 << 22  # longer side of a contact sheet's tile; most pixels of all tiles
 
 
 def write_stacks(item: Item, work: PredictOlat) -> Written:
@@ -58,10 +58,8 @@ def write_stacks(item: Item, work: PredictOlat) -> Written:
             header, olats = _of_face(item, face, directions, work, tiles)
         write_olat_stack(stack, header, olats)
         write_display(sheet, _contact_sheet(tiles, header.directions), "auto", metadata=header.metadata)
-        for page in pages:
-            write_page(
-                page, item, work.photo, image.pixels, face, work.size_px, work.white, work.normals_from
-            )
+        for path in pages:
+            write_page(path, item, image.pixels, face, work)
         return {}
 
     tags, facts = write_each(item, image, work.photo, write)
@@ -76,14 +74,13 @@ def _of_person(
     work: PredictOlat,
     tiles: list[np.ndarray],
 ) -> tuple[StackHeader, Iterator[Tensor]]:
-    """The header and OLATs [l, 3, H, W] of the whole person over black; small images go to `tiles`."""
+    """Return the header and OLATs [l, 3, H, W] of the person over black; add thumbnails to `tiles`."""
     models = load_models_once(work.photo)
     photo, head = shrunk_photo(image.pixels, face.head, work.size_px)
-    require_face(models.face, head.fit, photo.shape[:2])
-    alpha, matte = (
-        None if one is None else resized(one, *photo.shape[:2]) for one in (image.alpha, face.matte)
-    )
-    normals = read_normals(item, work.normals_from, photo.shape[:2])
+    size_px = photo.shape[:2]
+    require_face(models.face, head.fit, size_px)
+    alpha, matte = (None if part is None else resized(part, *size_px) for part in (image.alpha, face.matte))
+    normals = read_normals(item, work.normals_from, size_px)
     choices: dict[str, Any] = {"network_alone": work.network_alone, "white": work.white}
     with naming(item.input_path):
         person = fit(models, photo, matte=matte, head=head, normals=normals, **choices)
@@ -98,15 +95,14 @@ def _of_person(
             yield batch
 
     first = next(subject.relit(Light.each(directions[:1])))
-    normals = subject.rendered(RenderRequest(first, layers=("normal",)))["normal"]
     header = StackHeader(
         kind="photo",
         rotation=head.fit.rotation.numpy(),
         source=photo,
         seen=subject.matte,
-        normals=normals,
+        normals=subject.rendered(RenderRequest(first, layers=("normal",)))["normal"],
         fit=fit_to_arrays(head.fit),
-        **_about(item, directions, work),
+        **_common_header(item, directions, work),
     )
     return header, one_ahead(olats())
 
@@ -114,7 +110,7 @@ def _of_person(
 def _of_face(
     item: Item, face: FittedFace, directions: Tensor, work: PredictOlat, tiles: list[np.ndarray]
 ) -> tuple[StackHeader, Iterator[Tensor]]:
-    """The header and OLATs [l, 3, H, W] of the face alone, images or textures; small images go to `tiles`."""
+    """Return the header and OLATs [l, 3, H, W] of only the face, as images or textures; see `_of_person`."""
     models, maps, rotation = load_models_once(work.photo), face.head.face, rotation_of(work.pose)
     posed = face.fit if rotation is None else replace(face.fit, rotation=rotation)
     vertices, side_px = posed.vertices_camera(models.face), face.fit.crop.size_px
@@ -142,25 +138,24 @@ def _of_face(
         seen=seen.numpy(),
         normals=normals.permute(1, 2, 0).numpy(),
         fit=fit_to_arrays(face.fit),
-        **_about(item, directions, work),
+        **_common_header(item, directions, work),
     )
     return header, olats()
 
 
-def _about(item: Item, directions: Tensor, work: PredictOlat) -> dict[str, Any]:
-    """Entries of a header that say what the stack is of."""
+def _common_header(item: Item, directions: Tensor, work: PredictOlat) -> dict[str, Any]:
     metadata = provenance(item, work.photo, load_models_once(work.photo).checkpoint_name())
     metadata |= {"facerf:network_alone": 1} if work.network_alone else {}
     return {"directions": directions.numpy(), "layout_version": LAYOUT_VERSION, "metadata": metadata}
 
 
 def _tile_px(lights: int) -> int:
-    """The longer side of a contact sheet's tiles, such that their sum does not grow with the lights."""
+    """Return the longer side of a contact sheet's tiles, whose total size is independent of the lights."""
     return min(_TILE_PX, math.isqrt(_SHEET_PX // lights))
 
 
 def _contact_sheet(tiles: list[np.ndarray], directions: np.ndarray) -> np.ndarray:
-    """Every light's image, with a mark at the light's direction."""
+    """Return a sheet of every light's image, with the light's direction marked."""
     images = np.concatenate(tiles)
     white = float(np.percentile(images, 99.5))
     for image, direction in zip(images, directions, strict=True):

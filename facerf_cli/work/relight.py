@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from facerf_cli.batch.inputs import Item
 from facerf_cli.batch.recipe import recipe_of
@@ -22,21 +23,33 @@ from facerf_cli.image.light_wrap import LightWrap
 from facerf_cli.image.strips import Empty, Rows, Scaled, covering, rows_of
 from facerf_cli.light.envmap import Backdrop
 from facerf_cli.light.light import Light, intensity_of
+from facerf_cli.light.over_rig import (
+    LightsOf,
+    as_lit,
+    lights_over_rig,
+    lights_over_stack,
+    off_rig_deg,
+    read_map,
+    with_room,
+)
+from facerf_cli.light.setups import LightSetup
 from facerf_cli.person import Person, Target, fit
 from facerf_cli.raster.camera import Camera, rays_of_rows
+from facerf_cli.relighting.memory import beside, beside_people, canvas, require_face, require_people
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.relightable import Relightable, RenderRequest
-from facerf_cli.run.logs import LOGGER_NAME, json_line, step
+from facerf_cli.run.logs import LOGGER_NAME, attributes_of_sum, json_line, step
 from facerf_cli.run.memory import batches
-from facerf_cli.work.light_setups import LightSetup
-from facerf_cli.work.lights import LightsOf, as_lit, lights_over_rig, read_map, with_room
+from facerf_cli.work.light_setups import image_path
 from facerf_cli.work.outputs import OutputImage, write_output
 from facerf_cli.work.photos import (
     FittedFace,
     PhotoFace,
     companion,
+    face_model,
     facts_of,
     find_people,
+    fit_facts,
     fitted_face,
     load_models_once,
     naming,
@@ -47,16 +60,16 @@ from facerf_cli.work.photos import (
     read_photo,
     rotation_of,
 )
-from facerf_cli.work.plan import beside, beside_people, canvas, require_face, require_people
 from facerf_cli.work.relight_options import BackgroundChoice, RelightPlan
 
+_OFF_RIG_DEG = 1.0  # angle from a stack's nearest light above which an interpolated light is logged
 log = logging.getLogger(LOGGER_NAME)
 _digest_once = lru_cache(maxsize=256)(file_sha256)
-Behind = Callable[[LightSetup, float], Rows | None]  # the image behind a person, for a setup and an exposure
+Behind = Callable[[LightSetup, float], Rows | None]  # the background image, for a setup and an exposure
 
 
 def relight_item(plan: RelightPlan, item: Item) -> Outcome:
-    """Relight a photo or a stack under every setup."""
+    """Relight a photo or an OLAT stack under every setup, and write the images."""
     written: dict[Path, dict[str, float]] = {}
     people: list[dict[str, Any]] = []
     facts: Mapping[str, Any] = {}
@@ -69,29 +82,23 @@ def relight_item(plan: RelightPlan, item: Item) -> Outcome:
         people[:0] = [face.described() for face in scene.people]
         facts = facts_of(people, plan.photo) if people else scene.facts
     outputs = [path.with_suffix(suffix) for path in written for suffix in plan.options.output.suffixes]
-    names = dict.fromkeys(name for one in written.values() for name in one)
-    each = {name: {path.stem: one[name] for path, one in written.items()} for name in names}
+    names = dict.fromkeys(name for values in written.values() for name in values)
+    each = {name: {path.stem: values[name] for path, values in written.items()} for name in names}
     return Outcome(outputs, {**facts, **each})
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What one image shows: people of a photo, a face alone, or a stack; their lights, and what is behind.
+    """The subject of an image (people in a photo, only a face, or an OLAT stack), its lights and background.
 
     Attributes:
-        subject: What is relit.
-        setups: The lights of each image.
-        lights_of: Gives setups as sums of far and near lights.
-        metadata: Of all images.
-        people: Of a photo, from left to right.
-        faces: Their numbers, from the left, the nearest first.
-        evens: Brightness of even light on each.
-        tag: What follows the photo's name in those of its images.
-        alpha: The photo's [H, W].
-        behind: Gives the image behind the person.
-        plate: Metadata of the photo that results keep.
-        identity: Distance of an exposed image to the photo.
-        facts: Of a stack's fit, for the report.
+        people: The people of a photo, from left to right.
+        faces: Numbers of their faces, counted from the left, nearest first.
+        uniforms: Per face, the intensity of uniform light that makes skin as bright as in the photo.
+        tag: Suffix of the photo's name in the images' names.
+        plate: Metadata of the photo that images keep.
+        identity: Returns the distance of an exposed image from the photo.
+        facts: Facts about a stack's fit, for the report.
     """
 
     subject: Relightable
@@ -100,7 +107,7 @@ class Scene:
     metadata: Mapping[str, Any]
     people: Sequence[FittedFace] = ()
     faces: tuple[int, ...] = (0,)
-    evens: tuple[float, ...] = (1.0,)
+    uniforms: tuple[float, ...] = (1.0,)
     tag: str = ""
     alpha: np.ndarray | None = None
     behind: Behind | None = None
@@ -110,48 +117,45 @@ class Scene:
 
     @cached_property
     def lights(self) -> list[Light]:
-        """The lights of all setups, as `as_lit` lists them, on each of the people."""
-        people = zip(self.faces, self.evens, strict=True)
-        return [self.lights_of(as_lit(self.setups, *one)) for one in people]
+        """The lights of all setups, in the order of `as_lit`, for each person."""
+        people = zip(self.faces, self.uniforms, strict=True)
+        return [self.lights_of(as_lit(self.setups, *person)) for person in people]
 
     @property
     def sums(self) -> list[int]:
-        """How many of the lights each setup needs: all together, then each that has a name."""
+        """Number of sums of lights per setup: all lights, then each named light."""
         return [1 + (len(with_room(setup).names) if setup.names else 0) for setup in self.setups]
 
     def relit(self) -> Iterable[list[Any]]:
-        """The people under each setup, and under each of its lights that has a name.
+        """Return the subject under each setup, and under each of its named lights.
 
-        What fits the memory at once is kept; else it is predicted again whenever it is asked for.
+        If everything fits in memory at once, it is kept; otherwise every call predicts it again.
         """
-        return self._whole or self._relit()
+        return self._kept or self._relit()
 
     @cached_property
     @step("render")
-    def _whole(self) -> list[list[Any]]:
+    def _kept(self) -> list[list[Any]]:
         return list(self._relit()) if len(self.subject.parts(self.sums)) == 1 else []
 
     def _relit(self) -> Iterator[list[Any]]:
         def lights_of(part: slice) -> Any:
-            each = [of_one.some(part) for of_one in self.lights]
+            each = [lights.some(part) for lights in self.lights]
             return each if isinstance(self.subject, PeopleInPhoto) else each[0]
 
         return self.subject.relit_images(lights_of, self.sums)
 
 
 def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
-    """All chosen people of a photo in one image, or each face alone, the last first; or a stack."""
+    """Yield one scene with all chosen people of a photo, a scene per face, last face first, or a stack."""
     if item.input_path.suffix.lower() == ".exr":
         from facerf_cli.files.olat_stack import is_olat_stack
 
         if is_olat_stack(item.input_path):
-            from facerf_cli.work.relight_stack import open_stack
-
             _check_faces(item, [0], plan)
-            setups = plan.setups if plan.has_room else tuple(replace(one, room=0.0) for one in plan.setups)
-            yield Scene(setups=setups, **open_stack(item, plan)._asdict())
+            yield _scene_of_stack(item, plan)
             return
-    _over_rig(plan)(as_lit(plan.setups, 0))  # maps are read before the photo, not beside it
+    _over_rig(plan)(as_lit(plan.setups, 0))  # reads the maps before the photo, to hold one at a time
     read = _read(item, plan)
     _check_faces(item, [face.number for face in read.faces], plan)
     if plan.options.composite == "photo":
@@ -164,7 +168,7 @@ def _scenes_of(item: Item, plan: RelightPlan) -> Iterator[Scene]:
 
 
 class _Read(NamedTuple):
-    """A photo, the faces found in it from left to right, and what is given for it: matte and normals."""
+    """A photo, its faces from left to right, and the user's matte and normals."""
 
     image: LinearImage
     faces: Sequence[PhotoFace]
@@ -174,7 +178,7 @@ class _Read(NamedTuple):
 
 
 def _read(item: Item, plan: RelightPlan) -> _Read:
-    """Read a photo and find its faces; a frame of a shot has one, which is fitted already."""
+    """Read a photo and find its faces; the face of a shot's frame is fitted already."""
     faces: Sequence[PhotoFace]
     if place := _in_shot(item, plan):
         shot, frame = place
@@ -193,19 +197,18 @@ def _over_rig(plan: RelightPlan) -> LightsOf:
 
 
 def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
-    """The people of a photo in one image."""
     photo, alpha, options = read.image.pixels, read.image.alpha, plan.options
-    keeps_photo, shown = options.background.kind == "photo", None
+    keeps_photo, part = options.background.kind == "photo", None
     if options.matte is not None:
-        shown = read_matte(item, options.matte, photo.shape[:2], in_shot=read.in_shot)
+        part = read_matte(item, options.matte, photo.shape[:2], in_shot=read.in_shot)
     target = Target(
-        matte=shown,
+        matte=part,
         alpha=None if keeps_photo else alpha,
         background=options.background.kind if options.background.kind in ("photo", "none") else "given",
     )
     fitted = [_fitted(plan, read, face) for face in read.faces]
     people = [face for face, _ in fitted]
-    fitted.sort(key=lambda one: -one[0].fit.crop.side_px)  # the nearest first
+    fitted.sort(key=lambda pair: -pair[0].fit.crop.side_px)  # nearest first
     with naming(item.input_path):
         for face, person in fitted:
             require_face(person.models.face, face.fit, photo.shape[:2])
@@ -218,7 +221,7 @@ def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
         metadata=_metadata(item, plan),
         people=people,
         faces=tuple(face.number for face, _ in fitted),
-        evens=tuple(person.uniform_intensity for _, person in fitted),
+        uniforms=tuple(person.uniform_intensity for _, person in fitted),
         alpha=alpha if keeps_photo else None,
         behind=_backdrop(options.background, options.background_blur, camera),
         plate=plate_metadata(read.image.metadata),
@@ -227,7 +230,7 @@ def _scene_in_photo(item: Item, plan: RelightPlan, read: _Read) -> Scene:
 
 
 def _scene_of_face(item: Item, plan: RelightPlan, read: _Read, face: PhotoFace) -> Scene:
-    """One face alone, in the photo's pose or in that of `--pose`."""
+    """Return only a face, in the photo's pose or in that of `--pose`."""
     fitted, person = _fitted(plan, read, face)
     rotation = rotation_of(plan.options.pose)
     posed = None if rotation is None else replace(fitted.fit, rotation=rotation)
@@ -240,16 +243,64 @@ def _scene_of_face(item: Item, plan: RelightPlan, read: _Read, face: PhotoFace) 
         metadata=_metadata(item, plan),
         people=[fitted],
         faces=(fitted.number,),
-        evens=(person.uniform_intensity,),
+        uniforms=(person.uniform_intensity,),
         tag=fitted.tag,
         plate=plate_metadata(read.image.metadata),
     )
 
 
+def _scene_of_stack(item: Item, plan: RelightPlan) -> Scene:
+    """Open a stack; raise InputError for options that need the photo, and for a stack of UV textures."""
+    from facerf_cli.files.olat_stack import read_olat_header
+    from facerf_cli.relighting.stack import StackImages, face_in_stack
+
+    path, options = item.input_path, plan.options
+    lights = [light for setup in plan.setups for light in setup.lights]
+    needs_photo = {
+        "--pose": options.pose is not None,
+        "--background": options.background.kind not in ("photo", "none"),
+        "--reflectance": options.reflectance not in ("field", "portrait"),
+        "--white": options.white != "photo",
+        "--network-alone": options.network_alone,
+        "--normals-from": options.normals_from is not None,
+        "--person": plan.photo.person is not None,
+        "--light own": any(light.own for light in lights),
+        "--light even": any(light.even for light in lights),
+        "--light at=": any(light.at_m is not None for light in lights),
+    }
+    for option in (option for option, is_used in needs_photo.items() if is_used):
+        raise InputError(
+            f"{path}: {option} needs the photo, not its stack; pass the photo, or remove {option}"
+        )
+    header = read_olat_header(path)
+    if header.kind == "texture":
+        raise InputError(
+            f"{path}: a stack of UV textures cannot be relit; pass the photo, or predict with --frame photo"
+        )
+    directions = torch.from_numpy(header.directions).float()
+    if (off_deg := off_rig_deg(plan.setups, directions)) > _OFF_RIG_DEG:
+        log.warning(
+            "%s: no light there (the nearest is %.1f degrees away); interpolating the three around it. Pass "
+            "the photo for other lights",
+            path,
+            off_deg,
+        )
+    face, facts = None, dict[str, Any]()
+    if header.kind == "photo":
+        face_fit, face = face_in_stack(path, header, face_model(plan.photo))
+        facts = fit_facts(face_fit)
+    return Scene(
+        subject=StackImages(header, path, face),
+        setups=plan.setups if plan.has_room else tuple(replace(setup, room=0.0) for setup in plan.setups),
+        lights_of=partial(lights_over_stack, directions=directions, sampling=plan.sampling),
+        metadata=attributes_of_sum(header.metadata, path.name, item.key),
+        facts=facts,
+    )
+
+
 def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace, Person]:
-    """The person of a face, with what is known of its fit and its matte."""
     options = plan.options
-    known = face if isinstance(face, FittedFace) else None  # of a frame of a shot
+    of_shot = face if isinstance(face, FittedFace) else None
     with naming(face.name):
         person = fit(
             load_models_once(plan.photo),
@@ -261,30 +312,30 @@ def _fitted(plan: RelightPlan, read: _Read, face: PhotoFace) -> tuple[FittedFace
             texture_side=plan.photo.texture_side,
             white=options.white,
             face=face.found,
-            head=known.head if known else None,
-            steady=known.steady if known else None,
+            head=of_shot.head if of_shot else None,
+            steady=of_shot.steady if of_shot else None,
             normals=read.normals,
         )
-    if known:
-        return known, person
-    found = fitted_face(face, person.head, read.matte)
+    if of_shot:
+        return of_shot, person
+    fitted = fitted_face(face, person.head, read.matte)
     if person.balance is not None and person.balance.is_strongly_coloured and options.white == "photo":
-        log.info("%s: its light has a strong colour (--white scene takes it out)", face.name)
-    found.see(person.segmentation)
-    return found, person
+        log.info("%s: its light is strongly coloured (--white scene neutralises it)", face.name)
+    fitted.see(person.segmentation)
+    return fitted, person
 
 
 def _identity_of(photo: np.ndarray, face: FittedFace) -> Callable[[np.ndarray], float]:
-    """The distance of an image [H, W, 3] from its photo by descriptors, both at the photo's landmarks."""
+    """Return a function: the distance of an image [H, W, 3] from its photo by face descriptors."""
     from facerf_cli.face.descriptor import face_descriptor
 
     landmarks_px = face.fit.crop.to_photo(face.head.landmarks_px)
 
-    def descriptor(shown: np.ndarray) -> np.ndarray:
-        return face_descriptor(linear_to_srgb(shown.clip(0, 1)), landmarks_px)
+    def descriptor(pixels: np.ndarray) -> np.ndarray:
+        return face_descriptor(linear_to_srgb(pixels.clip(0, 1)), landmarks_px)
 
-    own = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
-    return lambda shown: round(float(np.linalg.norm(descriptor(shown) - own)), 3)
+    of_photo = descriptor(photo * np.float32(2.0 ** display_ev(photo)))
+    return lambda pixels: round(float(np.linalg.norm(descriptor(pixels) - of_photo)), 3)
 
 
 def _metadata(item: Item, plan: RelightPlan) -> dict[str, str | int]:
@@ -298,7 +349,7 @@ def _metadata(item: Item, plan: RelightPlan) -> dict[str, str | int]:
 
 
 def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
-    """Return the exposures of the middle frame of an item's take; None for a photo and that frame itself."""
+    """Return the exposures of the middle frame of an item's take; None for a photo, and for that frame."""
     if not (place := _in_shot(item, plan)):
         return None
     shot, number = place
@@ -315,7 +366,7 @@ def _shared_exposures(item: Item, plan: RelightPlan) -> dict[str, float] | None:
 
 
 def _in_shot(item: Item, plan: RelightPlan) -> Any:
-    """The open shot of an item and its number there; None for a photo alone."""
+    """Return the open shot of an item and its frame number; None for a photo."""
     if not plan.shots.all:
         return None
     from facerf_cli.work.sequence import open_at
@@ -329,18 +380,18 @@ def _write_images(
     plan: RelightPlan,
     shared_ev: Mapping[str, float] | None,
 ) -> dict[Path, dict[str, float]]:
-    """Write the image of every setup, as many at a time as fit the memory; one prediction serves those.
+    """Write the image of every setup; one prediction serves as many images as fit in memory.
 
-    Where they do not fit at once, an exposure that is to be found needs a second prediction. Returns the EXR
-    of each image, and facts of it for the report: the exposure of the PNG in its place, the identity.
+    If not all fit, finding the exposures needs a second prediction. Returns the EXR's path of each image, and
+    its exposure and identity distance for the report.
     """
     exposures_ev = shared_ev or _exposures_ev(scene, plan)
     written: dict[Path, dict[str, float]] = {}
-    images = iter(scene.relit())  # `zip` would hold one image's beside the next
+    images = iter(scene.relit())  # `zip` would hold one image's maps while the next are made
     for setup in scene.setups:
         relit, *each = next(images)
         _require_finite(item, setup, relit)
-        path, ev = setup.output(item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
+        path, ev = image_path(setup, item, scene.tag, ".exr", plan.options.name), exposures_ev[setup.name]
         with canvas(path, scene.subject.size_px, len(plan.options.output.formats)) as empty:
             image = _rendered(scene, setup, relit, each, ev, plan, empty)
             image = replace(image, header={**scene.plate, **_made_by(setup, plan)})
@@ -350,17 +401,16 @@ def _write_images(
             if scene.identity is not None:
                 written[path]["identity_distance"] = scene.identity(image.pixels * np.float32(2.0**ev))
             del image
-        said = [f"exposed by {ev:+.2f} EV"]
-        if setup.room:
-            said.append(f"with {100 * setup.room:g} % of the light bounced by the room (--room)")
+        room = f", with {100 * setup.room:g} % ambient fill (--room)" if setup.room else ""
         if not shared_ev:
-            log.info("%s under %s: %s", item.input_path, setup.name + setup.frame, ", ".join(said))
-        del relit, each  # of all of its part, beside the next
+            name = setup.name + setup.frame
+            log.info("%s under %s: exposed by %+.2f EV%s", item.input_path, name, ev, room)
+        del relit, each  # frees the maps before the next are made
     return written
 
 
 def _made_by(setup: LightSetup, plan: RelightPlan) -> dict[str, str]:
-    """The lights, the options and the networks of an image, as JSON for its header; files by digests."""
+    """Return an image's lights, options and networks as JSON for its header, with digests of files."""
     served = load_models_once(plan.photo).networks.served()
     networks = {name: {**file, "file": Path(file["file"]).name} for name, file in served.items()}
     lights = json_line(recipe_of(setup, _digest_once))
@@ -378,10 +428,10 @@ def _rendered(
     plan: RelightPlan,
     empty: Empty,
 ) -> OutputImage:
-    """The image of a setup, with its layers and those of its named lights, as arrays that `empty` makes.
+    """Render the image of a setup, its layers and those of its named lights, into arrays from `empty`.
 
-    A soft view leaves what was photographed, and a given background, as it looks; in the photo's own light it
-    bends what other lights add.
+    The soft view keeps the look of photographed pixels and of the user's background. If the photo's original
+    light is used, the view bends only what other lights add.
     """
     subject, lit = scene.subject, with_room(setup)
     behind, wrap = scene.behind(setup, ev) if scene.behind else None, None
@@ -402,20 +452,20 @@ def _rendered(
         others = [layers[name] for name, light in zip(lit.names, lit.lights, strict=True) if not light.own]
         others += [layers["wrap"]] if wrap is not None else []
         added = SumOf(others, subject.size_px[1], alpha)
-    shown_alpha = scene.alpha if alpha is None else alpha
-    return OutputImage(pixels, shown_alpha, layers, matte if keeps else None, added)
+    return OutputImage(
+        pixels, scene.alpha if alpha is None else alpha, layers, matte if keeps else None, added
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class SumOf:
-    """The sum [H, W, 3] of layers over black, by rows, not multiplied by alpha [H, W]."""
+    """The sum [H, W, 3] of layers over black, computed by rows and divided by alpha [H, W]."""
 
     layers: Sequence[np.ndarray]
     width_px: int
     alpha: np.ndarray | None
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
-        """Some rows [h, W, 3]."""
         total = np.zeros((rows.stop - rows.start, self.width_px, 3), np.float32)
         for layer in self.layers:
             total += rows_of(layer, rows)
@@ -423,36 +473,35 @@ class SumOf:
 
 
 def _require_finite(item: Item, setup: LightSetup, relit: Any) -> None:
-    """Raise InputError, before anything is written, where a light gives values that are no numbers."""
-    for one in relit if isinstance(relit, Sequence) else [relit]:
-        if not all(tensor.isfinite().all() for tensor in one.tensors):
+    for person in relit if isinstance(relit, Sequence) else [relit]:
+        if not all(tensor.isfinite().all() for tensor in person.tensors):
             raise InputError(
-                f"{item.input_path}: relit by {setup.name} it has values that are NaN or infinite; check the "
-                "photo, its landmarks and the light"
+                f"{item.input_path}: NaN or infinite values under {setup.name}; check the photo, its "
+                "landmarks and the light"
             )
 
 
 def _exposures_ev(scene: Scene, plan: RelightPlan) -> dict[str, float]:
-    """Exposure by the name of the setup: one for all frames of a map, so that a rotation does not flicker."""
+    """Return exposures by the name of the setup; frames of a rotated map share one, to avoid flicker."""
     if isinstance(rule := plan.exposure_rule, float):
         return dict.fromkeys((setup.name for setup in plan.setups), rule)
-    found: dict[str, float] = {}
+    exposures: dict[str, float] = {}
     strengths, first = scene.lights[0].strengths(), 0
     images = iter(scene.relit())
     for setup in scene.setups:
         relit, *each = next(images)
-        chosen_ev = setup.exposure_ev
-        if chosen_ev is None:
+        ev = setup.exposure_ev
+        if ev is None:
             most_ev = most_exposure_ev(rule, strengths[first])
-            chosen_ev = round(min(scene.subject.exposure_ev(relit, rule), most_ev), 2)
-        found[setup.name] = min(chosen_ev, found.get(setup.name, chosen_ev))
+            ev = round(min(scene.subject.exposure_ev(relit, rule), most_ev), 2)
+        exposures[setup.name] = min(ev, exposures.get(setup.name, ev))
         first += 1 + len(each)
-        del relit, each  # of all of its part, beside the next
-    return found
+        del relit, each  # frees the maps before the next are made
+    return exposures
 
 
 def with_background(plan: RelightPlan, item: Item) -> RelightPlan:
-    """Choose the image of `--background` that goes with an item: by its place in its shot, or by its name."""
+    """Choose an item's image of `--background`, by its frame number in its shot or by its name."""
     choice = plan.options.background
     path = choice.path and companion(item, choice.path, "--background")
     if choice.frames:
@@ -461,10 +510,10 @@ def with_background(plan: RelightPlan, item: Item) -> RelightPlan:
 
 
 def _backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:
-    """Images [H, W, 3] behind a person, scene-linear; None for the photo's own, or for nothing.
+    """Return a function: the background image [H, W, 3], scene-linear, or None for the photo or nothing.
 
-    A file and a colour look as they are at the exposure, in EV. A map is as bright as its light; single
-    lights have a black surrounding.
+    A file or a colour keeps its look at the exposure, in EV. A map is as bright as its light. Single lights
+    have a black background.
     """
     fixed, size_px = None, (camera.height_px, camera.width_px)
     if choice.colour is not None:
@@ -481,14 +530,13 @@ def _backdrop(choice: BackgroundChoice, blur: float, camera: Camera) -> Behind:
         with beside(size_px, images=2):
             envmap = read_map(light.envmap)
         rays, colour = partial(rays_of_rows, camera), intensity_of(light).numpy()
-        around = Backdrop(envmap, size_px, rays, light.rotate_deg, blur)
-        return Scaled(around, colour)
+        return Scaled(Backdrop(envmap, size_px, rays, light.rotate_deg, blur), colour)
 
     return behind
 
 
 def _check_faces(item: Item, relit: Sequence[int], plan: RelightPlan) -> None:
-    """Raise InputError if a light is for a face that is not among the relit ones, given by their numbers."""
+    """Raise InputError if a light is for a face that is not relit."""
     if others := plan.lit_faces.difference(relit):
         numbers = ", ".join(map(str, relit))
         raise InputError(

@@ -1,5 +1,6 @@
-"""`facerf relight`: its options, what each image is made by, and where it goes. Light to import."""
+"""Options of `facerf relight`, the rules between them, and the images to render. Light to import."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -20,67 +21,58 @@ from facerf_cli.batch.inputs import (
 from facerf_cli.batch.recipe import DigestOf, Recipe, recipe_of
 from facerf_cli.batch.settings import NOT_IN_RECIPE
 from facerf_cli.errors import UsageError
+from facerf_cli.files.texts import file_sha256
 from facerf_cli.light.entries import EVEN, OWN, Sampling, is_sweep, numbers, parse_lights
+from facerf_cli.light.setups import LightSetup
 from facerf_cli.option import BATCH, IMAGE, LIGHT, METHOD, option
-from facerf_cli.relighting import White
 from facerf_cli.work.light_setups import (
     BACKGROUND,
-    LightSetup,
+    CachedMap,
     LightSources,
     PhotoLight,
     collect_setups,
+    drawn_maps,
+    image_path,
     in_room,
     photo_lights,
 )
-from facerf_cli.work.output_options import (
-    Exposure,
-    OutputOptions,
-    parse_exposure,
-)
+from facerf_cli.work.output_options import Exposure, OutputOptions, parse_exposure
 from facerf_cli.work.photo_options import (
+    FieldOptions,
     LightOptions,
     PhotoOptions,
+    PortraitOptions,
     check_companion,
     for_other_photos,
-    network_alone_option,
-    normals_option,
     parse_pose,
-    white_option,
+    refuse,
 )
-from facerf_cli.work.shots import (
-    Shots,
-    film_rate,
-    recipe_of_shots,
-)
+from facerf_cli.work.shots import Shots, film_rate, recipe_of_shots
 
 Composite = Literal["photo", "face"]
 BackgroundKind = Literal["photo", "envmap", "none", "file", "colour"]
 _FIELDS = ("field", "portrait")
 _OF_EVERY_IMAGE = ("person", "class", "rgb", "rgba")  # names of layers
 _LAYERS = ("matte", "albedo", "normal", "position", "depth", "shadow", "specular", "classes", "face", "uv")
-_LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; of a dark colour, at most
-_FORMS = "photo, envmap, none, an image file, a folder, black or another name, #RRGGBB or R,G,B"
+_LUMINANCE, _DARK = (0.2126, 0.7152, 0.0722), 0.1  # of linear Rec.709; upper limit of a dark colour
+_FORMS = "photo, envmap, none, an image file, a folder, a colour name such as black, #RRGGBB or R,G,B"
 
 
 @dataclass(frozen=True)
 class BackgroundChoice:
-    """A choice of background; `colour` is scene-linear Rec.709.
-
-    `path` is an image, or a folder or pattern with one for each photo. `frames` are the images behind the
-    frames of a shot, in place of it.
-    """
+    """The background as typed."""
 
     kind: BackgroundKind
     path: Path | None = option(None, metavar=COMPANION)
-    colour: tuple[float, float, float] | None = None
-    frames: tuple[Path, ...] = ()
+    colour: tuple[float, float, float] | None = None  # scene-linear Rec.709
+    frames: tuple[Path, ...] = ()  # for the frames of a shot, instead of `path`
 
     def listed(self, output: Path) -> Self:
-        """This choice with the frames of a folder or pattern, which is not searched in the output folder."""
+        """List the frames of a folder or pattern; the output folder is not searched."""
         return replace(self, path=None, frames=numbered_images(str(self.path), output))
 
     def is_dark(self, setup: LightSetup) -> bool:
-        """True where nothing bright is behind the person: nothing, black, or a dark colour."""
+        """True if the background is empty, black or a dark colour."""
         if self.kind == "envmap":
             return setup.envmap is None
         luminance = sum(k * c for k, c in zip(_LUMINANCE, self.colour or (1.0, 1.0, 1.0), strict=True))
@@ -88,16 +80,16 @@ class BackgroundChoice:
 
 
 def parse_background(text: str) -> BackgroundChoice:
-    """Parse `--background`; raises UsageError where it names none."""
+    """Parse `--background`; raise UsageError if it is not a background."""
     if text in ("photo", "envmap", "none"):
         return BackgroundChoice(text)  # type: ignore[arg-type]
     path = Path(text)
     if path.suffix.lower() in FILM_SUFFIXES:
         advice = f"convert it to images (ffmpeg -i {path.name} bg/%04d.png), and pass their folder"
-        raise UsageError(f"--background {path}: a video is not read; {advice}")
+        raise UsageError(f"--background {path}: videos are not supported; {advice}")
     if path.is_file():
         return BackgroundChoice("file", path)
-    if (colour := _named(text)) is not None:
+    if (colour := _named_colour(text)) is not None:
         return BackgroundChoice("colour", colour=colour)
     if path.is_dir() or "{" in text or is_pattern(text):
         check_companion(None if is_pattern(text) else path, "--background")
@@ -105,60 +97,60 @@ def parse_background(text: str) -> BackgroundChoice:
     if "," in text:
         red, green, blue = numbers(text, ("R,G,B",), "--background")
         if min(red, green, blue) < 0:
-            raise UsageError(f"--background {text!r}: the colour is negative; give values from 0")
+            raise UsageError(f"--background {text!r}: the colour is negative; use values from 0")
         return BackgroundChoice("colour", colour=(red, green, blue))
-    raise UsageError(f"--background {text!r}: no such file; give {_FORMS}")
+    raise UsageError(f"--background {text!r}: no such file; use {_FORMS}")
 
 
 def parse_aov(text: str) -> tuple[str, ...]:
-    """Parse `--aov`, names with commas, singular or plural; the matte, which is always there, is left out."""
+    """Parse `--aov`, names in singular or plural, separated by commas; without the matte, always written."""
     known = {form: name for name in _LAYERS for form in (name, f"{name}s", name.removesuffix("es"))}
     names = dict.fromkeys(name.strip() for name in text.split(",") if name.strip())
     if unknown := [name for name in names if name not in known]:
-        raise UsageError(f"--aov {unknown[0]!r}: no such layer; give some of {', '.join(_LAYERS)}")
+        raise UsageError(f"--aov {unknown[0]!r}: no such layer; use some of {', '.join(_LAYERS)}")
     return tuple(dict.fromkeys(known[name] for name in names if known[name] != "matte"))
 
 
-def _named(text: str) -> tuple[float, float, float] | None:
-    """The colour of a name of CSS or of #RRGGBB, scene-linear; None for another text."""
+def _named_colour(text: str) -> tuple[float, float, float] | None:
+    """Return the scene-linear colour of a CSS name or #RRGGBB; None for other text."""
     from PIL import ImageColor  # --help does without it
 
     try:
-        red, green, blue, *_ = (_linear(value / 255) for value in ImageColor.getrgb(text))
+        red, green, blue, *_ = (_srgb_to_linear(value / 255) for value in ImageColor.getrgb(text))
     except ValueError:
         return None
     return red, green, blue
 
 
-def _linear(encoded: float) -> float:
-    """Decode sRGB; without numpy, which --help does without."""
+def _srgb_to_linear(encoded: float) -> float:
     return encoded / 12.92 if encoded <= 0.04045 else ((encoded + 0.055) / 1.055) ** 2.4
 
 
-@dataclass(frozen=True)
-class RelightOptions:
-    """The options that images share.
+@dataclass(frozen=True, kw_only=True)
+class RelightOptions(FieldOptions, PortraitOptions):
+    """The options that all images share.
 
     Attributes:
-        rig: Approximate maps by a rig of N lights, or by a file of directions (az,el or x y z; .lp).
-        pose: Turn the head to a pose, in degrees; shows the face alone.
-        reflectance: Relight the whole portrait, or the face by the paper's field; or by a baseline:
-            diffuse-sh, specular-sh, prt.
-        exposure: Expose PNG and JPEG by EV, or the face as in the photo (auto) or well lit (face).
-        composite: Show the photo with its face relit, or the rendered face alone, with alpha.
-        background: Show behind the person the photo, an image, images by frame (bg/b.%04d.png) or name
-            (bg/{stem}.png), a folder of either, or a colour (#RRGGBB or linear R,G,B), which keep their look;
-            the envmap; or none (alpha).
-        background_blur: Blur the map behind the person as a lens does, in percent of the longer side.
-        light_wrap: Let so much of the background's light run over the matte's edge; the EXR's layer wrap.
-        aov: Add layers to the EXR besides its matte: albedo, normal, position, depth, shadow, specular,
+        rig: Lights that approximate maps: the number of a uniform rig, or a file of directions (az,el or
+            x y z; .lp).
+        pose: Head pose in degrees; renders only the face.
+        reflectance: Reflectance model: portrait (the whole person), field (the paper's face field), or a
+            baseline: diffuse-sh, specular-sh, prt.
+        exposure: Exposure of PNG and JPEG: auto (the face as bright as in the photo), face (the face well
+            exposed), or EV.
+        composite: Image to write: the photo with the relit person, or only the rendered face, with alpha.
+        background: Background: photo, an image, images by frame (bg/b.%04d.png) or name (bg/{stem}.png), a
+            folder, or a colour (#RRGGBB or linear R,G,B), which keep their look; envmap; or none (alpha).
+        background_blur: Lens blur of a map used as background, in percent of the longer side.
+        light_wrap: Amount of background light that wraps over the matte's edge (EXR layer: wrap).
+        aov: Additional EXR layers besides the matte: albedo, normal, position, depth, shadow, specular,
             classes, face, uv.
-        matte: Change only what a grey image shows (mattes/{stem}.png: of each its own); --person replaces the
-            matte.
-        identity: Report `identity_distance`: how far an image is from its photo by dlib's descriptor of faces
+        matte: Grey image of the part of the photo to change (mattes/{stem}.png); --person replaces the
+            detected matte.
+        identity: Report identity_distance, the distance of an image from its photo by dlib's face descriptor
             (an extra).
-        fps: Set the frames per second of -o FILE.mp4, such as 25 or 24000/1001.
-        name: Name the images by a pattern of {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
+        fps: Frame rate of -o FILE.mp4, such as 25 or 24000/1001.
+        name: Pattern of the images' names: {dir}, {parent}, {stem}, {ext}, {light} and {frame:04}.
     """
 
     photo: PhotoOptions
@@ -195,15 +187,12 @@ class RelightOptions:
         parse=lambda percent: percent / 100,
         panel=IMAGE,
     )
-    light_wrap: float = option(0.0, metavar="SHARE", least=0.0, most=1.0, panel=IMAGE)
+    light_wrap: float = option(0.0, metavar="FRACTION", least=0.0, most=1.0, panel=IMAGE)
     aov: tuple[str, ...] = option(
         (), metavar="NAME,...", shown_default="none", default_text="", parse=parse_aov, panel=IMAGE
     )
     matte: Path | None = option(None, metavar=COMPANION, shown_default=False, panel=IMAGE)
     identity: bool = option(False, in_recipe=False, panel=METHOD)
-    network_alone: bool = network_alone_option()
-    white: White = white_option()
-    normals_from: Path | None = normals_option()
     fps: Fraction | None = option(
         None, metavar="RATE", in_recipe=False, shown_default="the EXR's, or 24", parse=film_rate, panel=IMAGE
     )
@@ -216,27 +205,30 @@ class RelightOptions:
         panel=BATCH,
     )
 
+    @property
+    def is_face_only(self) -> bool:
+        """True if only the rendered face is written."""
+        return self.composite == "face" or self.pose is not None
+
 
 @dataclass(frozen=True)
 class RelightPlan:
-    """The images that each photo gets; see `plan_relight`.
+    """The images of each photo; see `plan_relight`.
 
     Attributes:
-        options: With what depends on other options.
-        setups: The lights of each image; a recipe has its own.
-        sampling: How maps give a rig's lights their weights.
-        photos: The lights of photos, whose maps are among the setups.
-        keeps_photo: True by --composite photo, which no stack can have.
-        has_room: True by --room; a stack has none else.
-        shots: The films and sequences among the inputs.
-        exposures: Exposure by setup of the middle frame of each take that this process knows.
+        options: The options, with defaults that depend on other options filled in.
+        setups: The lights of each image; each recipe contains its own setup.
+        sampling: How maps become weights of a rig's lights.
+        cached: Maps in the user's cache that the setups use.
+        has_room: True if --room was given; without it, OLAT stacks get no ambient fill.
+        shots: Videos and image sequences among the inputs.
+        exposures: Exposures by setup of each take's middle frame, as far as this process knows them.
     """
 
     options: RelightOptions
     setups: tuple[LightSetup, ...] = field(metadata=NOT_IN_RECIPE)
     sampling: Sampling
-    photos: tuple[PhotoLight, ...] = field(default=(), metadata=NOT_IN_RECIPE)
-    keeps_photo: bool = field(default=False, metadata=NOT_IN_RECIPE)
+    cached: tuple[CachedMap, ...] = field(default=(), metadata=NOT_IN_RECIPE)
     has_room: bool = field(default=False, metadata=NOT_IN_RECIPE)
     shots: Shots = field(default_factory=Shots, metadata=NOT_IN_RECIPE)
     exposures: dict[Path, dict[str, float]] = field(
@@ -245,38 +237,43 @@ class RelightPlan:
 
     @property
     def photo(self) -> PhotoOptions:
-        """Settings of reading photos."""
         return self.options.photo
 
     @property
     def exposure_rule(self) -> Exposure:
-        """EV, or the rule that chooses it."""
+        """The exposure in EV, or the rule that chooses it."""
         return "auto" if self.options.exposure is None else self.options.exposure
 
     @property
     def lit_faces(self) -> set[int]:
-        """The numbers of the faces that have lights of their own."""
+        """Numbers of the faces that have their own lights."""
         lights = (light for setup in self.setups for light in setup.lights)
         return {light.face for light in lights if light.face is not None}
 
+    def write_maps(self) -> None:
+        """Draw the maps, and estimate the lights of photos, that are not in the user's cache yet."""
+        for made in self.cached:
+            if not made.envmap.is_file():
+                made.write()
+
     def outputs_of(self, item: Item) -> list[Path]:
-        """A file of each format for each setup."""
+        """List the files of an item: one per format and setup."""
         return [path for setup in self.setups for path in self._images(item, setup)]
 
     def _images(self, item: Item, setup: LightSetup) -> list[Path]:
         options = self.options
         tag = "" if options.composite == "photo" else self.photo.first_tag
-        return [setup.output(item, tag, suffix, options.name) for suffix in options.output.suffixes]
+        return [image_path(setup, item, tag, suffix, options.name) for suffix in options.output.suffixes]
 
     def setups_of(self, item: Item) -> tuple[LightSetup, ...]:
-        """The lights of an item's stale images; a light has all of its frames."""
+        """Return the setups of an item's stale images, with all frames of each light."""
         stale = {setup.name for setup in self.setups if not item.stale.isdisjoint(self._images(item, setup))}
         return tuple(setup for setup in self.setups if not item.stale or setup.name in stale)
 
     def of_items(self, items: Sequence[Item], shots: Shots, output: Path) -> Self:
-        """This plan for some photos, and frames of shots.
+        """Return this plan for photos and frames of shots.
 
-        Raises UsageError where two images have one path, and where frames lack an image of `--background`.
+        Raises UsageError if two images would have one path, or if a frame lacks an image of `--background`.
         """
         behind = self.options.background
         if shots.all and behind.path is not None and behind.path.is_dir():
@@ -291,107 +288,110 @@ class RelightPlan:
                 raise UsageError(
                     f"{where}, but the shot has {len(frames)} frames; add images or remove frames"
                 )
-        for path in self.outputs_of(items[0]) if self.options.output.file_suffix else ():
-            if len(self.setups) > 1:
-                raise UsageError(
-                    f"-o {path}: is one file, and these lights make {len(self.setups)} images; give a "
-                    "folder, or names to lights that shine together, as in key=60,25"
-                )
+        if self.options.output.file_suffix:
             all_faces = self.photo.face == "all" and self.options.composite == "face"
-            only_item(items, path, several=all_faces)
-        which = self.photo.face
-        relit = {int(which)} if which.isdecimal() else set()
-        if (which.isdecimal() or shots.all) and (others := self.lit_faces - relit):
-            advice = f"add --face {min(others) if shots.all else 'all'}"
-            raise UsageError(f"--light face={min(others)}: --face {which} is not that face; {advice}")
-        paths: set[Path] = set()
-        for item, path in ((one, path) for one in items for path in self.outputs_of(one)):
-            if path in paths:
-                raise UsageError(
-                    f"{item.input_path}: {path} would be the name of two images; give --name more fields"
-                )
-            paths.add(path)
-        options = replace(self.options, background=behind)
-        return replace(self, options=options, shots=shots)
+            only_item(items, self.outputs_of(items[0])[0], several=all_faces or len(self.setups) > 1)
+        face = {int(self.photo.face)} if self.photo.face.isdecimal() else set()
+        if shots.all and (others := self.lit_faces - face):  # its other faces are not tracked
+            raise UsageError(f"--light face={min(others)}: not the tracked face; add --face {min(others)}")
+        (path, count), *_ = Counter(path for item in items for path in self.outputs_of(item)).most_common(1)
+        if count > 1:
+            raise UsageError(f"--name: {path} would be the name of two images; add fields to the pattern")
+        return replace(self, options=replace(self.options, background=behind), shots=shots)
 
     def recipes_of(self, digest_of: DigestOf) -> list[Recipe]:
-        """The recipe of every output, which holds the light of its own setup alone."""
+        """Return the recipe of every output, which contains only its own setup."""
         shared = recipe_of(self, digest_of)
         shared |= recipe_of_shots(self.shots.all, digest_of)
         lit = [recipe_of(setup, digest_of) | shared for setup in self.setups]
         return [recipe | {"format": name} for recipe in lit for name in self.options.output.formats]
 
 
-def plan_relight(options: RelightOptions, sources: LightSources, output: Path) -> RelightPlan:
-    """Give each photo its images: lights, and what depends on other options; raises UsageError."""
-    alone, is_field = options.composite == "face" or options.pose is not None, options.reflectance in _FIELDS
-    if options.pose is not None and options.composite == "photo":
-        raise UsageError("--pose: turns the head out of its photo; use --composite face with it")
-    parse_pose(options.pose)
-    parse_lights(options.rig)
-    if options.network_alone and not is_field:
-        raise UsageError("--network-alone: is for --reflectance portrait or field; leave it out")
-    if options.white != "photo" and not is_field:
-        raise UsageError("--white: is for --reflectance portrait or field; leave it out")
+def plan_relight(
+    options: RelightOptions, sources: LightSources, output: Path, digest_of: DigestOf = file_sha256
+) -> RelightPlan:
+    """List the images of each photo; raise UsageError for options that exclude each other.
+
+    Args:
+        options: The options that all images share.
+        sources: The lights.
+        output: The output folder, which is not searched for inputs.
+        digest_of: Returns the SHA-256 of a photo whose light is used, or of a network.
+    """
     photo = replace(options.photo, ocio_config=options.output.config)
     photo.check()
-    if options.background.kind != "photo" and alone:
-        raise UsageError("--background: is for the whole photo; leave out --pose and --composite face")
-    behind = options.background.kind
-    if options.light_wrap and behind in ("photo", "none"):
-        raise UsageError("--light-wrap: is of another background; add --background FILE, COLOUR or envmap")
-    if options.identity and alone:
-        raise UsageError("--identity: is for the whole photo; leave out --pose and --composite face")
+    parse_pose(options.pose)
+    parse_lights(options.rig)
     check_companion(options.matte, "--matte")
     check_companion(options.normals_from, "--normals-from")
-    if options.normals_from is not None and (alone or options.reflectance != "portrait"):
-        raise UsageError(
-            "--normals-from: is for the portrait field; leave out --reflectance, --pose and --composite face"
-        )
-    of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
-    how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
     background = options.background
     if background.path is not None and not background.path.is_file():
         from_behind = any(entry.rpartition("=")[2] == BACKGROUND for entry in sources.light_from or ())
         if from_behind or is_pattern(str(background.path)):
             background = background.listed(output)
-    photos = photo_lights(sources, how, (*background.frames, background.path)[0], output)
-    setups = collect_setups(sources, output, photo.settings.seed, photos)
-    layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
-    for name in (name for setup in setups for name in setup.names):
-        if name in layers:
-            raise UsageError(f"a light has the name {name}, as a layer of the EXR; give it another")
-    if alone and any(setup.has_own for setup in setups):
-        raise UsageError("--light own: needs the whole photo; leave out --pose and --composite face")
-    by_photo = [light for setup in setups for light in setup.by_photo]
-    if by_photo and not is_field:
-        word = OWN if by_photo[0].own else EVEN
-        raise UsageError(f"--light {word}: is not for --reflectance {options.reflectance}; leave one out")
-    if options.exposure is None:  # 0 under lights as bright as the photo, or as the picture behind it
-        behind_it = {light.envmap for light in photos if light.is_background}
-        setups = tuple(
-            replace(one, exposure_ev=0.0)
-            if one.by_photo or not behind_it.isdisjoint(light.envmap for light in one.lights)
-            else one
-            for one in setups
-        )
-    if sources.room not in (None, "none") and all(not setup.has_single for setup in setups):
-        raise UsageError(f"--room {sources.room}: is added to lights; add --light, or leave it out")
+    of_light: Kind = "field" if options.reflectance == "portrait" else options.reflectance
+    how = LightOptions(photo=for_other_photos(photo), reflectance=of_light)
+    image_behind = (*background.frames, background.path)[0]
+    lights = photo_lights(sources, how, image_behind, output, digest_of)
+    cached: tuple[CachedMap, ...] = (*drawn_maps(sources, photo.settings.seed), *lights)
+    setups = collect_setups(sources, output, cached)
+    refuse(_rules(options, setups))
+    if options.exposure is None:
+        setups = _at_photos_exposure(setups, lights)
+    face_only, dark = options.is_face_only, background.is_dark
     sweeps = sources.rotate is not None and is_sweep(sources.rotate)
-    dark = options.background.is_dark
     filled = replace(
         options,
         photo=photo,
         background=background,
-        composite="face" if alone else "photo",
+        composite="face" if face_only else "photo",
         exposure="auto" if options.exposure is None else options.exposure,
-        reflectance="field" if alone and options.reflectance == "portrait" else options.reflectance,
+        reflectance="field" if face_only and options.reflectance == "portrait" else options.reflectance,
     )
     return RelightPlan(
         filled,
-        tuple(in_room(one, sources.room, alone or dark(one)) for one in setups),
+        tuple(in_room(setup, sources.room, face_only or dark(setup)) for setup in setups),
         sources.sampling or ("smooth" if sweeps else "cell"),
-        photos,
-        keeps_photo=options.composite == "photo",
+        cached,
         has_room=sources.room is not None,
+    )
+
+
+def _rules(options: RelightOptions, setups: Sequence[LightSetup]) -> dict[str, bool]:
+    """Return whether each rule between options is broken, by its message."""
+    baseline, whole = options.reflectance not in _FIELDS, not options.is_face_only
+    of_field = "requires --reflectance portrait or field"
+    of_whole = "requires the whole photo; remove --pose and --composite face"
+    by_photo = [light for setup in setups for light in setup.by_photo]
+    word = OWN if by_photo and by_photo[0].own else EVEN
+    layers = {*_OF_EVERY_IMAGE, *options.aov, *(["wrap"] if options.light_wrap else [])}
+    taken = [name for setup in setups for name in setup.names if name in layers]
+    keeps_background = options.background.kind in ("photo", "none")
+    return {
+        "--pose: turns the head away from its photo; use --composite face": (
+            options.pose is not None and options.composite == "photo"
+        ),
+        f"--network-alone: {of_field}": options.network_alone and baseline,
+        f"--white: {of_field}": options.white != "photo" and baseline,
+        f"--light {word}: {of_field}": bool(by_photo) and baseline,
+        f"--background: {of_whole}": options.background.kind != "photo" and not whole,
+        f"--light {OWN}: {of_whole}": any(setup.has_own for setup in setups) and not whole,
+        "--normals-from: requires --reflectance portrait and the whole photo": (
+            options.normals_from is not None and (options.reflectance != "portrait" or not whole)
+        ),
+        "--light-wrap: requires a new background; add --background FILE, COLOUR or envmap": (
+            bool(options.light_wrap) and keeps_background
+        ),
+        f"--light: {''.join(taken[:1])} is also a layer of the EXR; rename the light": bool(taken),
+    }
+
+
+def _at_photos_exposure(setups: Sequence[LightSetup], lights: Sequence[PhotoLight]) -> tuple[LightSetup, ...]:
+    """Set the exposure to 0 EV if the lights are as bright as the photo, or as the background image."""
+    behind = {light.envmap for light in lights if light.is_background}
+    return tuple(
+        replace(setup, exposure_ev=0.0)
+        if setup.by_photo or not behind.isdisjoint(light.envmap for light in setup.lights)
+        else setup
+        for setup in setups
     )

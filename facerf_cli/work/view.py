@@ -1,4 +1,4 @@
-"""The pages of photos, and the list of them."""
+"""Write the pages of `facerf view`, and the list of pages."""
 
 import glob
 import shlex
@@ -23,10 +23,12 @@ from facerf_cli.person import fit
 from facerf_cli.relighting import White
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
+from facerf_cli.relighting.stack import face_in_stack
 from facerf_cli.synth.sky.skies import KINDS, draw_sky
 from facerf_cli.viewer.basis import Basis, basis_of_photo, basis_of_stack
 from facerf_cli.viewer.page import IndexEntry, PageMap, Plate, index_page, packed, page, strip_jpeg, strip_of
 from facerf_cli.work.photo_options import PhotoOptions, photo_words
+from facerf_cli.work.photo_work import PageWork, Written
 from facerf_cli.work.photos import (
     FittedFace,
     face_model,
@@ -36,53 +38,40 @@ from facerf_cli.work.photos import (
     read_photo,
     write_each,
 )
-from facerf_cli.work.relight_stack import face_in_stack
 
 _MAP_WIDTH_PX, _DRAWN_WIDTH_PX = 64, 512
-_HEAD_RADIUS = 0.55  # of a head, in sides of the crop around its face
+_HEAD_RADIUS = 0.55  # of a head, relative to the side of the crop around its face
 _STRIP_PX = 160  # longer side of an image of the strip
 _STRIP_LIGHTS = ((-60.0, 15.0), (20.0, 30.0), (150.0, 15.0))  # azimuth and elevation, degrees
 
 
-def write_pages(
-    item: Item, options: PhotoOptions, size_px: int, white: White, normals_from: Path | None = None
-) -> tuple[list[str], dict[str, Any]]:
-    """Write a page for each chosen face of a photo, or for a stack; their tags, and facts for the report."""
+def write_pages(item: Item, work: PageWork) -> Written:
+    """Write a page for each chosen face of a photo, or for a stack."""
     if is_olat_stack(item.input_path):
-        if normals_from is not None:
-            raise InputError(f"{item.input_path}: a stack holds its normals; leave out --normals-from")
-        tag = options.first_tag
-        return [tag], write_page_of_stack(item.output(tag + ".html"), item, options, size_px)
-    image = read_photo(item, options)
+        if work.normals_from is not None:
+            raise InputError(f"{item.input_path}: a stack contains its normals; remove --normals-from")
+        tag = work.photo.first_tag
+        return [tag], _write_page_of_stack(item.output(tag + ".html"), item, work)
+    image = read_photo(item, work.photo)
 
     def write(face: FittedFace) -> dict[str, Any]:
-        path = item.output(face.tag + ".html")
-        write_page(path, item, options, image.pixels, face, size_px, white, normals_from)
+        write_page(item.output(face.tag + ".html"), item, image.pixels, face, work)
         return {}
 
-    return write_each(item, image, options, write)
+    return write_each(item, image, work.photo, write)
 
 
-def write_page(
-    path: Path,
-    item: Item,
-    options: PhotoOptions,
-    photo: np.ndarray,
-    face: FittedFace,
-    size_px: int,
-    white: White,
-    normals_from: Path | None = None,
-) -> None:
-    """Write the page of a face of a photo [H, W, 3], shown with `size_px` pixels at most."""
-    photo, head = shrunk_photo(photo, face.head, size_px)
+def write_page(path: Path, item: Item, photo: np.ndarray, face: FittedFace, work: PageWork) -> None:
+    """Write the page of a face of a photo [H, W, 3]."""
+    photo, head = shrunk_photo(photo, face.head, work.size_px)
     matte = None if face.matte is None else resized(face.matte, *photo.shape[:2])
-    normals = read_normals(item, normals_from, photo.shape[:2])
+    normals = read_normals(item, work.normals_from, photo.shape[:2])
     with naming(item.input_path):
-        basis, plate = of_photo(load_models_once(options), photo, head, matte, white, normals)
+        basis, plate = of_photo(load_models_once(work.photo), photo, head, matte, work.white, normals)
     title = item.input_path.name + face.tag.replace("_", " ")
-    more = ["--white", white] if white != "photo" else []
-    more += [] if normals_from is None else ["--normals-from", str(normals_from)]
-    words = [str(item.input_path), *photo_words(options, face.number), *more]
+    more = ["--white", work.white] if work.white != "photo" else []
+    more += [] if work.normals_from is None else ["--normals-from", str(work.normals_from)]
+    words = [str(item.input_path), *photo_words(work.photo, face.number), *more]
     _write(path, title, words, basis, plate, head_place(head.fit.crop, plate.matte), item.key)
 
 
@@ -94,32 +83,30 @@ def of_photo(
     white: White | None = None,
     normals: np.ndarray | None = None,
 ) -> tuple[Basis, Plate]:
-    """The basis of a photo's person, and what a page shows around it; matte and normals may be given."""
+    """Return the basis of a photo's person, and the images that a page shows around it."""
     person = fit(models, photo, matte=matte, white=white, head=head, normals=normals)
     people = PeopleInPhoto([person.in_photo()])
     basis = basis_of_photo(person, people)
     return basis, Plate(photo, people.matte, photo - people.own_layer(), person.uniform_intensity)
 
 
-def write_page_of_stack(path: Path, item: Item, options: PhotoOptions, size_px: int) -> dict[str, Any]:
-    """Write the page of an OLAT stack, shown with `size_px` pixels at most; facts for the report."""
+def _write_page_of_stack(path: Path, item: Item, work: PageWork) -> dict[str, Any]:
     header = read_olat_header(item.input_path)
     face, head = None, (0.5, 0.5, 0.5)
     if header.kind == "photo":
-        fit, share = face_in_stack(item, header, face_model(options))
-        face, head = share * header.seen, head_place(fit.crop, header.seen)
-    basis = basis_of_stack(
-        header.directions, stream_olats(item.input_path), header.seen, size_px, face, header.source
-    )
+        face_fit, coverage = face_in_stack(item.input_path, header, face_model(work.photo))
+        face, head = coverage * header.seen, head_place(face_fit.crop, header.seen)
+    olats = stream_olats(item.input_path)
+    basis = basis_of_stack(header.directions, olats, header.seen, work.size_px, face, header.source)
     size = basis.guide.shape[:2]
     plate = Plate(resized(header.source, *size), resized(header.seen, *size))
-    words = [str(item.input_path), *photo_words(options)]
+    words = [str(item.input_path), *photo_words(work.photo)]
     _write(path, item.input_path.name, words, basis, plate, head, item.key)
     return {"lights": len(header.directions)}
 
 
 def head_place(crop: Crop, matte: np.ndarray) -> tuple[float, float, float]:
-    """The middle of the face as shares of the photo's sides, and the radius of the head in the shorter."""
+    """Return the face's centre relative to the photo's sides, and the head's radius to the shorter one."""
     height, width = matte.shape
     middle = crop.x0_px + crop.side_px / 2, crop.y0_px + crop.side_px / 2
     return middle[0] / width, middle[1] / height, _HEAD_RADIUS * crop.side_px / min(height, width)
@@ -135,20 +122,19 @@ def _write(
     key: str,
 ) -> None:
     document = packed(basis, plate, head, page_maps())
-    text = page(title, words, document, _strip(basis, plate), key)
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(page(title, words, document, _strip(basis, plate), key), encoding="utf-8")
 
 
 def write_index(path: Path, items: Sequence[Item], options: PhotoOptions) -> None:
     """Write the list of all pages that exist, and print its path."""
     entries = []
     for item in items:
-        for made in sorted(item.output_base.parent.glob(f"{glob.escape(item.output_base.name)}*.html")):
-            tag = made.stem.removeprefix(item.output_base.name)
+        for file in sorted(item.output_base.parent.glob(f"{glob.escape(item.output_base.name)}*.html")):
+            tag = file.stem.removeprefix(item.output_base.name)
             if tag == "" if options.face != "all" else tag.startswith("_face"):
-                address = quote(made.relative_to(path.parent).as_posix().encode("utf-8", "surrogateescape"))
-                strip = strip_of(made.read_text(encoding="utf-8"))
+                address = quote(file.relative_to(path.parent).as_posix().encode("utf-8", "surrogateescape"))
+                strip = strip_of(file.read_text(encoding="utf-8"))
                 entries.append(IndexEntry(item.name + tag.replace("_", " "), address, strip))
     with atomic_path(path) as temporary:
         temporary.write_text(index_page(entries), encoding="utf-8")
@@ -157,19 +143,19 @@ def write_index(path: Path, items: Sequence[Item], options: PhotoOptions) -> Non
 
 @cache
 def page_maps() -> tuple[PageMap, ...]:
-    """A procedural map of each kind, small, with the command that draws it."""
-    found = []
+    """Draw a small procedural map of each kind, with the command that draws it."""
+    maps = []
     for kind in KINDS:
         pixels, _ = draw_sky(0, 0, _DRAWN_WIDTH_PX, (kind,))
         step = _DRAWN_WIDTH_PX // _MAP_WIDTH_PX
         small = pixels.reshape(_MAP_WIDTH_PX // 2, step, _MAP_WIDTH_PX, step, 3).mean((1, 3))
         command = f"facerf envmap --kind {shlex.quote(kind)} --count 1 -o maps"
-        found.append(PageMap(kind, small, command, f"maps/00000_{kind}.exr"))
-    return tuple(found)
+        maps.append(PageMap(kind, small, command, f"maps/00000_{kind}.exr"))
+    return tuple(maps)
 
 
 def _strip(basis: Basis, plate: Plate) -> str:
-    """The photo and the person under a few lights, small and side by side."""
+    """Return a JPEG of the photo and the person under a few lights, side by side."""
     size = fitted(plate.matte.shape[0], plate.matte.shape[1], _STRIP_PX)
     images = [resized(plate.before.clip(0, 1), *size)]
     seen = resized(plate.matte, *basis.ratios.shape[1:3])

@@ -367,7 +367,7 @@ def test_numbered_photos_may_be_a_shot(names: str, hints: int, tmp_path: Path, c
         batch = BatchOptions(output=tmp_path / "out")
         with suppress(InputError):  # for the frame that a sequence lacks
             collect_frames([str(folder)], ShotOptions(sequence), batch, PhotoOptions(Settings()))
-        assert sum("give --sequence if" in record.message for record in caplog.records) == hints
+        assert sum("add --sequence if" in record.message for record in caplog.records) == hints
 
 
 def test_sequences_meet_by_the_names_of_their_images(tmp_path: Path) -> None:

@@ -98,5 +98,5 @@ def test_nothing_is_overwritten_or_written_in_a_dry_run(bare: Path, capsys: Said
 def test_options_of_preparing_are_refused(bare: Path, capsys: Said, line: str) -> None:
     option, *_ = {"-j": "--jobs"}.get(line[:2], line).split()
     assert main(["prepare-dataset", str(bare), *DESCRIBE, *line.split()]) == 2
-    assert f"{option} is for preparing; leave it out with --describe" in capsys.readouterr().err
+    assert f"{option} has no effect with --describe" in capsys.readouterr().err
     assert not (bare / "stage.json").exists()

@@ -9,9 +9,9 @@ import pytest
 from safetensors.numpy import save_file
 
 from facerf_cli._version import __version__
+from facerf_cli.cli.doctor import EXTRAS
 from facerf_cli.files.texts import file_sha256
 from facerf_cli.main import main
-from facerf_cli.work.doctor import EXTRAS
 from tests.kinds import Patch, Said
 
 ROOT = Path(__file__).parents[2]

@@ -111,6 +111,6 @@ def test_a_folder_of_maps_is_read_without_its_sheet_whose_balls_are_lit_by_them(
     assert sheet[height:].max() > 0.2  # the name
     maps = tmp_path / "maps"
     assert main(["envmap", "-o", str(maps), "--count", "2", "--size", "32"]) == 0
-    setups = collect_setups(LightSources(envmap=[str(maps)]), tmp_path / "out", 0)
+    setups = collect_setups(LightSources(envmap=[str(maps)]), tmp_path / "out")
     found = [light.envmap for setup in setups for light in setup.lights]
     assert found == sorted(maps.glob("*.exr")) and len(setups) == 2

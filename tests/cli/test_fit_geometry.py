@@ -187,7 +187,7 @@ def test_no_other_run_loads_that_network_and_it_serves_no_other_face_model(
     save_face_model(tmp_path / "mine.npz", replace(load_face_model(), name="mine"))
     assert fit(tmp_path / "out", "--geometry", "network", "--face-model", str(tmp_path / "mine.npz")) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "mine.npz" in said and "give --geometry landmarks" in said
+    assert "mine.npz" in said and "use --geometry landmarks" in said
 
 
 def test_a_checkpoint_of_both_networks_regresses_by_default(tmp_path: Path) -> None:

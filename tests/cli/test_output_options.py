@@ -17,8 +17,8 @@ from facerf_cli.files.texts import file_sha256
 from facerf_cli.files.write import write_exr
 from facerf_cli.image import colour
 from facerf_cli.main import main
+from facerf_cli.relighting.memory import canvas
 from facerf_cli.work.output_options import OutputOptions, check_stdout, parse_formats
-from facerf_cli.work.plan import canvas
 from tests.astronaut import PATH
 from tests.cli import lines
 from tests.exr_layers import exr_layers
@@ -116,7 +116,7 @@ def test_one_image_on_standard_output(
     line, _ = said.err.decode().splitlines()  # the other one rates the person
     # no path that is gone
     assert re.fullmatch(
-        rf"{given}/astronaut.png under light_\S+: exposed by \S+ EV, with \S+ % of the light .*", line
+        rf"{given}/astronaut.png under light_\S+: exposed by \S+ EV, with \S+ % ambient fill .*", line
     )
     with Image.open(io.BytesIO(said.out)) as image:
         assert image.format == "PNG" and image.size == (SIDE, SIDE)

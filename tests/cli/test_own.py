@@ -13,11 +13,11 @@ from facerf_cli.files.read import read_image
 from facerf_cli.image.colour import SOFT_VIEW, encode_display, linear_to_srgb, luminance
 from facerf_cli.light.entries import EVEN, OWN, LitImage, lit_images
 from facerf_cli.light.light import Light
+from facerf_cli.light.over_rig import lights_over_rig, with_room
 from facerf_cli.person import Target
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto
 from facerf_cli.relighting.white import WhiteBalance
 from facerf_cli.work.light_setups import LightSources, collect_setups, in_room
-from facerf_cli.work.lights import as_in_photo, lights_over_rig, with_room
 from tests import astronaut
 from tests.astronaut import PATH as PHOTO
 from tests.cli.lines import relight
@@ -135,7 +135,7 @@ def test_even_is_a_light_of_that_name_from_all_around(entry: str) -> None:
 
 def test_its_brightness_is_that_of_each_person_and_it_is_its_own_room() -> None:
     (setup,) = collect_setups(LightSources(light=["even;rgb=1,.5,.5", "key=40,20"]), Path("out"))
-    lit = with_room(in_room(as_in_photo(setup, 3.0), None, False))
+    lit = with_room(in_room(setup.on_person(0, 3.0), None, False))
     assert [light.rgb for light in lit.lights] == [(3.0, 1.5, 1.5), (1.0, 1.0, 1.0)]
     assert lit.lights[0].is_around and not lit.lights[0].even
 

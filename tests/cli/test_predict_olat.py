@@ -150,6 +150,6 @@ def test_bad_photos_leave_the_good_one_unharmed(given: Path, tmp_path: Path, cap
     assert main([*head, "-o", str(tmp_path / "o"), "--lights", "1"]) == 1
     err = capsys.readouterr().err
     assert all(f"error: {photos / name}" in err for name in ("cut.jpg", "text.exr", "empty.png", "dot.png"))
-    assert "good.jpg: facerf is sure" in err  # the one word about a photo
+    assert "good.jpg: detection is sure" in err  # the one word about a photo
     assert "4 of 5 failed" in err and "Traceback" not in err and err.count("\n") == 6
     assert (tmp_path / "o" / "good_olat.exr").is_file()

@@ -182,7 +182,7 @@ def test_a_person_before_another_is_not_sure_and_the_line_says_why(
     row = only_row(tmp_path)
     assert row["certainty"] != "sure" and row["factors"]["disputed"] < 0.6
     line = capsys.readouterr().err
-    assert f"facerf is {row['certainty']} of the person" in line
+    assert f"detection is {row['certainty']}" in line
     assert "unclear outline" in line
 
 

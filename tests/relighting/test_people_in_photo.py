@@ -21,6 +21,7 @@ from facerf_cli.portrait.find import Face, choose_face
 from facerf_cli.portrait.parse import CLASSES, class_index
 from facerf_cli.portrait.proxy import Proxy
 from facerf_cli.raster.camera import PIXEL_CENTRE, project
+from facerf_cli.relighting.memory import beside_people, require_people
 from facerf_cli.relighting.people_in_photo import PeopleInPhoto, Surface
 from facerf_cli.relighting.relightable import RenderRequest
 from facerf_cli.run import memory
@@ -28,7 +29,6 @@ from facerf_cli.run.memory import batches
 from facerf_cli.work import photos
 from facerf_cli.work.photo_options import PhotoOptions
 from facerf_cli.work.photos import PhotoFace
-from facerf_cli.work.plan import beside_people, require_people
 from facerf_cli.work.sequence import OpenShot
 from tests.refusals import refused
 

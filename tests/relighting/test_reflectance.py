@@ -18,10 +18,10 @@ from facerf_cli.raster.camera import pose_to_rotation
 from facerf_cli.relighting.face_alone import FaceAlone
 from facerf_cli.relighting.field import Field, photo_evidence, weighted_sum
 from facerf_cli.relighting.fitting import fit_photo, reflectance_of
+from facerf_cli.relighting.memory import require_face
 from facerf_cli.relighting.models import Models
 from facerf_cli.relighting.photo_light import Estimator, estimate_light
 from facerf_cli.run import memory
-from facerf_cli.work.plan import require_face
 from tests import astronaut
 from tests.refusals import refused
 

@@ -15,16 +15,17 @@ from facerf_cli.files.light_files import LightRecord, write_light
 from facerf_cli.files.write import write_exr
 from facerf_cli.light.entries import StudioLight, lit_images, parse_lights, preset_names
 from facerf_cli.light.light import rig_by_text
-from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
-from facerf_cli.main import main, repeat_options
-from facerf_cli.work.light_setups import LightSetup, LightSources, collect_setups, parse_rotations
-from facerf_cli.work.lights import (
+from facerf_cli.light.over_rig import (
     lights_over_rig,
     lights_over_stack,
     off_rig_deg,
-    readable,
+    readable_setups,
     single_lights,
 )
+from facerf_cli.light.setups import LightSetup
+from facerf_cli.light.sphere import azel_to_direction, direction_to_azel, latlong_solid_angles, rig_directions
+from facerf_cli.main import main, repeat_options
+from facerf_cli.work.light_setups import LightSources, collect_setups, drawn_maps, image_path, parse_rotations
 from tests.refusals import refused
 
 HEIGHT_PX = 16
@@ -58,10 +59,10 @@ def test_a_light_of_estimate_light_is_a_map_too(tmp_path: Path, caplog: pytest.L
     weights = 0.01 + lamp * torch.tensor([1, 0.8, 0.6])
     write_light(tmp_path / "a_light.json", LightRecord(rig, weights))
     (tmp_path / "c.json").write_text("{}")
-    given = [str(tmp_path / name) for name in ("a_light.json", "c.json")]
-    setups = readable(collect_setups(LightSources(envmap=given, rotate="90"), tmp_path / "out"))
-    assert [setup.name for setup in setups] == ["a_light_rot90"]
-    assert "c.json: format: is missing; add it" in caplog.text
+    given = [str(tmp_path / name) for name in ("a_light.json", "b.json", "c.json")]
+    setups = readable_setups(collect_setups(LightSources(envmap=given, rotate="90"), tmp_path / "out"))
+    assert [setup.name for setup in setups] == ["a_light_rot90", "b_rot90"]
+    assert "c.json has no 'format'; add it" in caplog.text
     (setup,) = collect_setups(LightSources(envmap=given[:1]), tmp_path / "out")
     found = lights_over_stack((setup,), rig, "cell").weights[0]
     assert float((found - weights).abs().max()) < 0.02 * float(weights.max())
@@ -156,9 +157,9 @@ def test_frame_numbers_stay_at_the_end() -> None:
     still = Item(Path("a.jpg"), Path("out/a"), "a")
     moving = Item(Path("setup.0007.jpg"), Path("out/b/setup.0007"), "b/setup.0007")
     turned = LightSetup("sky", ".0001")
-    assert turned.output(still, "", ".exr") == Path("out/a_sky.0001.exr")
-    assert LightSetup("sky").output(moving, "_face0", ".png") == Path("out/b/setup_face0_sky.0007.png")
-    assert turned.output(moving, "", ".exr") == Path("out/b/setup_sky.0001.0007.exr")
+    assert image_path(turned, still, "", ".exr") == Path("out/a_sky.0001.exr")
+    assert image_path(LightSetup("sky"), moving, "_face0", ".png") == Path("out/b/setup_face0_sky.0007.png")
+    assert image_path(turned, moving, "", ".exr") == Path("out/b/setup_sky.0001.0007.exr")
 
 
 def test_bad_maps_cost_a_line_and_not_the_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -166,7 +167,7 @@ def test_bad_maps_cost_a_line_and_not_the_others(tmp_path: Path, caplog: pytest.
     write_exr(tmp_path / "square.exr", np.ones((8, 8, 3), np.float32))
     (tmp_path / "text.exr").write_text("not a picture")
     given = [str(tmp_path), str(tmp_path / "missing.exr")]
-    setups = readable(
+    setups = readable_setups(
         collect_setups(LightSources(envmap=given, light=["0,0"], rotate="0:360:2"), tmp_path / "out")
     )
     assert [setup.name + setup.frame for setup in setups] == ["good.0000", "good.0001", "light_0_0"]
@@ -186,7 +187,7 @@ def test_a_map_of_display_values_has_one_warning_for_its_missing_highlights(
         rotate="0:360:2",
     )
     for _ in range(2):
-        readable(collect_setups(sources, tmp_path / "out"))
+        readable_setups(collect_setups(sources, tmp_path / "out"))
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     clipped = [text for text in warnings if "clipped" in text]
     assert len(clipped) == bool(bits) and all(f"{tmp_path / name}: " in text for text in clipped)
@@ -254,16 +255,21 @@ def test_lamps_of_a_stack_are_shared_by_the_lights_around_them() -> None:
 def test_procedural_maps_are_those_that_envmap_writes(tmp_path: Path) -> None:
     assert main(["envmap", "-o", str(tmp_path), "--count", "2", "--seed", "3"]) == 0
     files = collect_setups(LightSources(envmap=[str(tmp_path)], rotate="0:360:2"), tmp_path / "out")
-    drawn = collect_setups(LightSources(envmap=["procedural:2"], rotate="0:360:2"), tmp_path / "out", seed=3)
+    sources = LightSources(envmap=["procedural:2"], rotate="0:360:2")
+    maps = drawn_maps(sources, seed=3)
+    assert not any(one.envmap.exists() for one in maps)  # until the work begins
+    for one in maps:
+        one.write()
+    drawn = collect_setups(sources, tmp_path / "out", maps)
     assert [(setup.name, setup.frame) for setup in drawn] == [(setup.name, setup.frame) for setup in files]
-    assert readable(drawn) == drawn
+    assert readable_setups(drawn) == drawn
     rigs = [lights_over_rig(setups, "12", "cell").weights for setups in (files, drawn)]
     np.testing.assert_allclose(rigs[0], rigs[1], rtol=2e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("word", ["procedural:", "procedural:x", "procedural:10000"])
-def test_a_bad_number_of_procedural_maps_is_refused(word: str, tmp_path: Path) -> None:
-    refused(UsageError, "procedural", collect_setups, LightSources(envmap=[word]), tmp_path)
+def test_a_bad_number_of_procedural_maps_is_refused(word: str) -> None:
+    refused(UsageError, "procedural", drawn_maps, LightSources(envmap=[word]), 0)
 
 
 def single(text: str) -> StudioLight:
@@ -358,7 +364,8 @@ def test_lights_apart_from_those_with_names_are_said(caplog: pytest.LogCaptureFi
 
     def said(*entries: str, maps: tuple[str, ...] = ()) -> str:
         caplog.clear()
-        collect_setups(LightSources(light=[*entries], envmap=[*maps]), Path("out"))
+        sources = LightSources(light=[*entries], envmap=[*maps])
+        collect_setups(sources, Path("out"), drawn_maps(sources, 0))
         return "\n".join(caplog.messages)
 
     assert said("40,20", "rembrandt") == said("key=40,20", "fill=rembrandt") == said("key=40,20") == ""
@@ -375,7 +382,7 @@ def test_sweeps_number_their_frames_and_other_lights_shine_in_each() -> None:
     assert {setup.name for setup in setups} == {"light_from_-90_90_3_20"}  # and so of one exposure
     assert [setup.lights[0].azel_deg for setup in setups] == [(-90, 20), (-30, 20), (30, 20)]
     item = Item(Path("a.jpg"), Path("out/a"), "a")
-    assert setups[1].output(item, "", ".exr") == Path("out/a_light_from_-90_90_3_20.0001.exr")
+    assert image_path(setups[1], item, "", ".exr") == Path("out/a_light_from_-90_90_3_20.0001.exr")
     both = collect_setups(LightSources(light=["0:20:2,0:90:2;stops=1"]), Path("out"))
     assert [setup.lights[0].azel_deg for setup in both] == [(0, 0), (10, 45)]
     assert collect_setups(LightSources(light=["0:20:1,5"]), Path("out"))[0].name == "light_0_20_1_5"

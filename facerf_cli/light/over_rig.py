@@ -1,4 +1,4 @@
-"""The lights of setups: maps and single lights."""
+"""Lights of setups as weights over a rig's lights, or over the lights of an OLAT stack."""
 
 import logging
 import math
@@ -16,19 +16,19 @@ from facerf_cli.files.image_metadata import read_header
 from facerf_cli.light.entries import Sampling, StudioLight
 from facerf_cli.light.envmap import NO_KEYS, lights_around, rotated_weights, turned, without_keys
 from facerf_cli.light.light import Light, far_samples, intensity_of, is_narrow, rig_by_text
+from facerf_cli.light.setups import ROOM, LightSetup
 from facerf_cli.run.logs import LOGGER_NAME, step
-from facerf_cli.work.light_setups import ROOM, LightSetup
 
-_CLIPPED = 2.0  # above what display values have in linear Rec.709, of any gamut
-LightsOf = Callable[[tuple[LightSetup, ...]], Light]  # gives the lights of M setups
-FarLight = tuple[int, Tensor, Tensor]  # its setup, directions [n, 3] and rgb weights [n, 3]
+_CLIPPED = 2.0  # linear Rec.709: display values of any gamut are below it
+LightsOf = Callable[[tuple[LightSetup, ...]], Light]  # from M setups to M sums of lights
+FarLight = tuple[int, Tensor, Tensor]  # index of its setup, directions [n, 3], rgb weights [n, 3]
 log = logging.getLogger(LOGGER_NAME)
 
 
-def readable(setups: Sequence[LightSetup]) -> tuple[LightSetup, ...]:
-    """The setups whose maps can be read; each map that cannot is logged in one line."""
-    good = {one: _is_readable(one) for one in dict.fromkeys(_maps_of(setups))}
-    return tuple(setup for setup in setups if all(good[envmap] for envmap in _maps_of([setup])))
+def readable_setups(setups: Sequence[LightSetup]) -> tuple[LightSetup, ...]:
+    """Return the setups whose maps can be read; log an error for each map that cannot."""
+    good = {path: _is_readable(path) for path in dict.fromkeys(_maps_of(setups))}
+    return tuple(setup for setup in setups if all(good[path] for path in _maps_of([setup])))
 
 
 def _maps_of(setups: Sequence[LightSetup]) -> list[Path]:
@@ -45,8 +45,7 @@ def _is_readable(envmap: Path) -> bool:
     header = read_header(envmap)
     if header and not header.is_floating and brightest < _CLIPPED:
         log.warning(
-            "%s: its %d-bit values are clipped at white, so its highlights are missing and its light is too "
-            "flat; use an .hdr or .exr map",
+            "%s: its %d-bit values are clipped at white, so highlights are missing; use an .hdr or .exr map",
             envmap,
             header.bits,
         )
@@ -54,15 +53,15 @@ def _is_readable(envmap: Path) -> bool:
 
 
 def read_map(envmap: Path) -> Tensor:
-    """A lat-long map [H, W, 3], scene-linear; raises InputError that names what is wrong with it."""
-    from facerf_cli.files.light_files import read_map_file  # single lights do without it
+    """Read a lat-long map [H, W, 3], scene-linear; raise InputError if it is not one."""
+    from facerf_cli.files.light_files import read_map_file  # imports pydantic
 
     return read_map_file(envmap)
 
 
 @step("light")
 def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Light:
-    """The lights of M setups: maps integrated over the rig's lights, their keys, and single lights."""
+    """Return the lights of M setups: maps integrated over a rig's lights, their key lights, single lights."""
     single = single_lights(setups)
     if not _maps_of(setups):
         return single
@@ -73,15 +72,18 @@ def lights_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling
 
 @lru_cache(maxsize=1)
 def _maps_over_rig(setups: tuple[LightSetup, ...], rig: str, sampling: Sampling) -> Light:
-    """The maps of M setups over a rig's lights, and their keys, which the paper's sampling does not know."""
+    """Integrate the maps of M setups over a rig; the paper's sampling has no separate key lights."""
     directions = rig_by_text(rig)
     weights, keys = _map_weights(setups, directions, sampling, with_keys=sampling != "paper")
     return Light(directions, weights) + _far(len(setups), keys)
 
 
 def single_lights(setups: Sequence[LightSetup]) -> Light:
-    """The lights of M setups without their maps; at least one far light, if dark, and each near one once."""
-    far = replace(_far(len(setups), _far_lights(setups)), own_rgb=own_weights(setups))
+    """Return the lights of M setups without their maps.
+
+    Equal lights of several setups are listed once. There is at least one far light, if necessary a dark one.
+    """
+    far = replace(_far(len(setups), _far_lights(setups)), own_rgb=_own_weights(setups))
     near = [
         (row, replace(light, rgb=(1.0, 1.0, 1.0), kelvin=None, stops=0.0), intensity_of(light))
         for row, setup in enumerate(setups)
@@ -98,13 +100,13 @@ def single_lights(setups: Sequence[LightSetup]) -> Light:
 
 
 def _far(count: int, lights: Iterable[FarLight]) -> Light:
-    """Far lights of so many setups, each once; at least one, if dark."""
-    found: dict[bytes, tuple[Tensor, Tensor]] = {}
+    """Join the far lights of `count` setups; lights from the same directions are listed once."""
+    by_place: dict[bytes, tuple[Tensor, Tensor]] = {}
     for row, towards, rgb in lights:
         new = towards, torch.zeros(count, len(towards), 3)
-        found.setdefault(towards.numpy().tobytes(), new)[1][row] += rgb
+        by_place.setdefault(towards.numpy().tobytes(), new)[1][row] += rgb
     dark = [(torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(count, 1, 3))]
-    directions, weights = zip(*(found.values() or dark), strict=True)
+    directions, weights = zip(*(by_place.values() or dark), strict=True)
     ends = [0, *accumulate(map(len, directions))]
     keys = tuple(
         slice(*at) for at, toward in zip(pairwise(ends), directions, strict=True) if is_narrow(toward)
@@ -112,65 +114,47 @@ def _far(count: int, lights: Iterable[FarLight]) -> Light:
     return Light(torch.cat(directions), torch.cat(weights, 1), keys=keys)
 
 
-def own_weights(setups: Sequence[LightSetup]) -> Tensor | None:
-    """Weights [M, 3] of the photo's own light in M setups; None where it shines in none."""
+def _own_weights(setups: Sequence[LightSetup]) -> Tensor | None:
+    """Return the weights [M, 3] of the photo's original light; None if no setup uses it."""
     each = [[intensity_of(light) for light in setup.lights if light.own] for setup in setups]
     return torch.stack([sum(own, torch.zeros(3)) for own in each]) if any(each) else None
 
 
-def on_face(setup: LightSetup, number: int) -> LightSetup:
-    """A setup in which the lights of other faces than one are dark."""
-    dark = (0.0, 0.0, 0.0)
-    lights = (light if light.face in (None, number) else replace(light, rgb=dark) for light in setup.lights)
-    return replace(setup, lights=tuple(lights))
-
-
-def as_in_photo(setup: LightSetup, brightness: float) -> LightSetup:
-    """A setup whose even light has the brightness by which a person's skin is as in the photo."""
-
-    def bright(light: StudioLight) -> StudioLight:
-        red, green, blue = (brightness * value for value in light.rgb)
-        return replace(light, rgb=(red, green, blue), even=False)
-
-    return replace(setup, lights=tuple(bright(light) if light.even else light for light in setup.lights))
-
-
 def with_room(setup: LightSetup) -> LightSetup:
-    """A setup with the light of its room as one of its lights."""
+    """Return the setup with its ambient fill as one more light."""
     if not setup.room:
         return setup
     lights = [light for light in setup.lights if light.envmap is None and not light.own]
-    sent = torch.stack([intensity_of(light) for light in lights]).sum(0)
-    red, green, blue = (setup.room * float(value) for value in sent)
+    total = torch.stack([intensity_of(light) for light in lights]).sum(0)
+    red, green, blue = (setup.room * float(value) for value in total)
     names = (*setup.names, ROOM) if setup.names else ()
     return replace(setup, lights=(*setup.lights, StudioLight(rgb=(red, green, blue))), names=names)
 
 
-def each_alone(setup: LightSetup) -> tuple[LightSetup, ...]:
-    """A setup for each light of a setup."""
-    return tuple(replace(setup, lights=(light,)) for light in setup.lights)
+def as_lit(setups: Sequence[LightSetup], face: int, uniform: float = 1.0) -> tuple[LightSetup, ...]:
+    """Return the setups as they light one person, with ambient fill; see `LightSetup.on_person`.
 
-
-def as_lit(setups: Sequence[LightSetup], face: int, even: float = 1.0) -> tuple[LightSetup, ...]:
-    """Setups as they shine on one of the people, with the light of their rooms.
-
-    After one whose lights have names comes each of these alone.
+    A setup whose lights have names is followed by one setup for each of its lights.
     """
-    lit = [with_room(as_in_photo(on_face(setup, face), even)) for setup in setups]
-    return tuple(one for setup in lit for one in (setup, *(each_alone(setup) if setup.names else ())))
+    lit = [with_room(setup.on_person(face, uniform)) for setup in setups]
+    each = [[replace(setup, lights=(light,)) for light in setup.lights if setup.names] for setup in lit]
+    return tuple(setup for whole, parts in zip(lit, each, strict=True) for setup in (whole, *parts))
 
 
 def lights_over_stack(setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling) -> Light:
-    """The lights of M setups by a stack's own [L, 3]; single lights are shared by those around."""
+    """Return the lights of M setups over a stack's lights [L, 3].
+
+    A single light between them is interpolated from the three around it.
+    """
     weights, _ = _map_weights(setups, directions, sampling, with_keys=False)
     for row, towards, rgb in _far_lights(setups):
         index, share = lights_around(towards, directions)
         weights[row].index_add_(0, index.flatten(), (share[..., None].float() * rgb[:, None]).flatten(0, 1))
-    return Light(directions, weights, own_weights(setups))
+    return Light(directions, weights, _own_weights(setups))
 
 
 def off_rig_deg(setups: Sequence[LightSetup], directions: Tensor) -> float:
-    """The largest angle between a single far light and the nearest of a stack's own [L, 3], in degrees."""
+    """Return the largest angle between a far light and the nearest of a stack's lights [L, 3], in degrees."""
     far = [light for setup in setups for light in setup.lights if light.azel_deg is not None]
     cosines = [float((far_samples(light)[0] @ directions.T).amax(1).min()) for light in far]
     return math.degrees(math.acos(min(1.0, *cosines))) if cosines else 0.0
@@ -187,13 +171,16 @@ def _far_lights(setups: Sequence[LightSetup]) -> Iterator[FarLight]:
 def _map_weights(
     setups: tuple[LightSetup, ...], directions: Tensor, sampling: Sampling, with_keys: bool
 ) -> tuple[Tensor, list[FarLight]]:
-    """[M, L, 3], zero for setups without a map, and keys apart; a map is read once for all its rotations."""
+    """Return weights [M, L, 3], zero for setups without a map, and the maps' key lights.
+
+    A map is read once for all its rotations.
+    """
     weights, keys = torch.zeros(len(setups), len(directions), 3), list[FarLight]()
     maps = [(row, light) for row, setup in enumerate(setups) for light in setup.lights if light.envmap]
-    for source, group in groupby(maps, lambda one: one[1].envmap):
+    for path, group in groupby(maps, lambda entry: entry[1].envmap):
         rows, lights = zip(*group, strict=True)
-        assert source is not None
-        envmap = read_map(source)
+        assert path is not None
+        envmap = read_map(path)
         rest, suns = without_keys(envmap) if with_keys else (envmap, NO_KEYS)
         for row, light in zip(rows, lights, strict=True):
             key_light = turned(suns, light.rotate_deg)

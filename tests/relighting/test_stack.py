@@ -8,7 +8,7 @@ import torch
 from facerf_cli.errors import UsageError
 from facerf_cli.files.olat_stack import StackHeader
 from facerf_cli.relighting.relightable import Relit, RenderRequest
-from facerf_cli.work.relight_stack import StackImages
+from facerf_cli.relighting.stack import StackImages
 from tests.refusals import refused
 from tests.stacks import header_of
 

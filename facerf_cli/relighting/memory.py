@@ -1,7 +1,7 @@
-"""Memory of a photo's work (docs/reliability.md): what is refused, and what goes to disk.
+"""Memory of a photo's work (docs/reliability.md): photos that are rejected, and layers that are kept on disk.
 
-One rule: all is counted in images of `IMAGE_PX` bytes a pixel, on top of what a reader decodes. Images are
-made some rows at a time, and a slow test measures the peak (tests/run/test_memory.py).
+All sizes are multiples of an image of `IMAGE_PX` bytes per pixel, on top of what a reader decodes. Images are
+rendered by strips; a slow test measures the peak (tests/run/test_memory.py).
 """
 
 import math
@@ -18,22 +18,21 @@ from facerf_cli.files.atomic import hidden_folder
 from facerf_cli.image.strips import Empty
 from facerf_cli.run import memory
 
-IMAGE_PX = 12  # bytes of a pixel of an image of floats
-KEPT_PX = 18  # of what work makes of a photo: an 8-bit copy, the matte, the view of a face
+IMAGE_PX = 12  # bytes per pixel of a float image
+KEPT_PX = 18  # bytes per pixel of work on a photo: an 8-bit copy, the matte, the view of a face
 _MATTE_PX = 4
-_PERSON_BYTES = 80 << 20  # of each of several people: transport, and maps of the light that is shown
+_PERSON_BYTES = 80 << 20  # per person of a group: transport, and maps under the current light
 _STRIPS_BYTES = 32 << 20
-# Layers that are not only written as half floats.
-_FLOATS = ("rgb", "A", "person.A", "position", "depth", "uv")
+_FLOATS = ("rgb", "A", "person.A", "position", "depth", "uv")  # layers that need full floats
 
 
 def beside(size_px: tuple[int, ...], images: int) -> AbstractContextManager[None]:
-    """Count so many images [H, W] with what is read meanwhile: 1 of a photo, 2 with its person."""
+    """Reserve memory for a number of images [H, W] while others are read: 1 per photo, 2 with its person."""
     return memory.holding(images * IMAGE_PX * math.prod(size_px))
 
 
 def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) -> None:
-    """Raise InputError where a face, drawn in its photo [H, W], does not fit."""
+    """Raise InputError if rendering a face in its photo [H, W] needs too much memory."""
     height, width = size_px
     window = face_window(fit.vertices_camera(model), photo_camera(fit.crop, height, width))[2]
     needed = height * width * (IMAGE_PX + _MATTE_PX) + window.height_px * window.width_px * 3 * IMAGE_PX
@@ -42,13 +41,13 @@ def require_face(model: MorphableModel, fit: FaceFit, size_px: tuple[int, ...]) 
 
 
 def require_people(count: int, size_px: tuple[int, ...]) -> None:
-    """Raise InputError where so many people of a photo [H, W], composed into one image, do not fit."""
+    """Raise InputError if composing a number of people of a photo [H, W] needs too much memory."""
     what = f"{count} people in one image"
     memory.require(what, _people_bytes(count, size_px), "--composite face or --face INDEX")
 
 
 def beside_people(count: int, size_px: tuple[int, ...]) -> AbstractContextManager[None]:
-    """Count so many people of a photo [H, W], composed into one image, with what is made meanwhile."""
+    """Reserve memory for a number of people of a photo [H, W] that are composed into one image."""
     return memory.holding(_people_bytes(count, size_px))
 
 
@@ -58,11 +57,10 @@ def _people_bytes(count: int, size_px: tuple[int, ...]) -> int:
 
 @contextmanager
 def canvas(path: Path, size_px: tuple[int, int], images: int) -> Iterator[Empty]:
-    """Yield a function that makes arrays for the layers of an output, whose writers hold so many images.
+    """Yield a function that allocates the layers of an output, whose writers hold a number of `images`.
 
-    Arrays that do not fit the budget, with what is held already, are mapped to files in a hidden folder of
-    the output: the parts of an EXR are written one after the other. There layers that an EXR holds in half
-    floats are half floats.
+    Arrays that exceed the memory budget are mapped to files in a hidden folder of the output. These are half
+    floats if the EXR stores the layer as half floats.
     """
     with ExitStack() as stack:
         left, folders = memory.left_bytes() - images * IMAGE_PX * math.prod(size_px), list[Path]()
