@@ -43,9 +43,9 @@ def train(context: typer.Context, options: TrainOptions, pace: PaceOptions) -> N
     network of that baseline.
 
     Synthetic heads are drawn from a face model, and their light transport is baked once; each step draws new
-    skins, lights and cameras. A dataset is unwrapped once into DATASET/textures-PX. Training uses its split
-    train and validation its split validation; the split test stays unused. Sources are those of
-    relight-dataset or, if there are none, the stacks under random lights.
+    skins, lights and cameras. A dataset is read from its OLAT stacks: sources are lit as the recipes of
+    relight-dataset say or, if there are none, by random lights. Training uses its split train and validation
+    its split validation; the split test stays unused.
 
     DIR gets last.safetensors and best.safetensors (for --checkpoint and --start-from), log.jsonl,
     validation-STEP.png, TensorBoard events (tensorboard --logdir DIR), and state.pt for --resume. On a CPU a

@@ -104,15 +104,13 @@ class Dataset(DatasetFolder):
 
 
 def people_of(dataset: Dataset, split: str) -> tuple[str, ...]:
-    """Subjects of a split, of whom a training learns ('train') or is judged ('validation').
+    """Return the subjects of a split, to train on ('train') or to validate on ('validation').
 
-    The only person of a dataset is both, and a line says so. Raises InputError where there is nobody.
+    If a dataset has only one person, they are used for both, and a warning is logged. Raises InputError for
+    an empty split.
     """
     if split == "validation" and len(dataset.subjects) == 1 and dataset.splits["train"]:
-        log.warning(
-            "%s: has one person, so nobody is held out: the validation is of who is trained on",
-            dataset.folder,
-        )
+        log.warning("%s: only one person: validating on the training data", dataset.folder)
         return dataset.splits["train"]
     if not dataset.splits[split]:
         advice = "run prepare-dataset with another --split"

@@ -21,11 +21,11 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from facerf_cli.batch.recipe import is_made_from
+from facerf_cli.batch.recipe import is_made_from, text_of_state
 from facerf_cli.dataset.dataset import Dataset, people_of, provenance_of, read_dataset
-from facerf_cli.dataset.unwrapped import stamp
 from facerf_cli.errors import InputError
 from facerf_cli.face.morphable import load_face_model
+from facerf_cli.face.topology import LAYOUT_VERSION
 from facerf_cli.files.atomic import atomic_path
 from facerf_cli.files.olat_stack import read_olat_header, read_olats
 from facerf_cli.files.write import HALF_MAX
@@ -143,7 +143,8 @@ def _make_missing(dataset: Dataset, networks: Networks, jobs: int) -> None:
 
 def _made_from(dataset: Dataset, networks: Networks, subject: str, camera: str) -> str:
     """The stamp of a portrait: of its stack, and of the network that looks at the person."""
-    return f"{stamp(dataset, subject, camera)}-{networks.sha256('parsing')}"
+    stack = text_of_state(dataset.stack_path(subject, camera))
+    return f"{LAYOUT_VERSION}-{stack}-{networks.sha256('parsing')}"
 
 
 def _make_shard(dataset: Dataset, networks: Networks, views: list[tuple[str, str]]) -> None:

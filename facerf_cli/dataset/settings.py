@@ -34,7 +34,7 @@ class PairSettings:
             file, or N maps drawn from --seed.
         envmaps_test: Relight the people of the split test with these maps, which no other split has.
         per_subject: Make so many images of each subject.
-        lazy: Write the recipes alone; training relights when it needs them.
+        lazy: Write only the recipes; training does not need the images.
     """
 
     envmaps: str = option(..., metavar="DIR|FILE|procedural:N", shown_default=False)

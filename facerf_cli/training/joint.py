@@ -2,10 +2,9 @@
 
 The Geometry Network estimates a head for the source and one for the target crop. The source is unwrapped
 with its head, relit by the Reflectance Network, rendered with the target's head and compared with the target
-(paper, 'Loss Functions'). A share of the batches are photos, for the geometry terms alone ('Training').
+(paper, 'Loss Functions'). Some of the batches are photos, which train only the geometry ('Training').
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,10 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, PhotoCrops, Photos, open_pairs, spread_pairs
+from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs, unwrap_crops
 from facerf_cli.dataset.dataset import Dataset, provenance_of
+from facerf_cli.dataset.faces import mean_face_of
 from facerf_cli.dataset.pairs import Pair
-from facerf_cli.dataset.textures import DatasetTextures
+from facerf_cli.dataset.photos import PhotoCrops, Photos
 from facerf_cli.face.fit import fit_batch
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import (
@@ -36,7 +36,7 @@ from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize,
 from facerf_cli.network.vgg import VGG16_LICENCE
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
-from facerf_cli.raster.texture import UnwrapSettings, inpaint, normal_map, sample_texture, unwrap
+from facerf_cli.raster.texture import inpaint, normal_map, sample_texture
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -62,10 +62,6 @@ LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011
 def chosen(points: Tensor, landmarks: tuple[int, ...]) -> Tensor:
     """Some of the 68 landmarks [B, 68, C]."""
     return points.index_select(1, on_device(points.device, torch.tensor, landmarks))
-
-
-# Side of the depth map of unwrapping: so many times the crop's, but at most _DEPTH_PX.
-_DEPTH_PX, _DEPTH_PER_PX = 512, 3
 
 
 @dataclass(frozen=True)
@@ -109,12 +105,9 @@ class UnwrappedHeads(Batch):
     normals: Tensor
 
 
-def unwrap_images(images: Tensor, heads: PosedHeads, camera: Camera, side: int) -> UnwrappedHeads:
+def unwrap_images(images: Tensor, heads: PosedHeads, side: int) -> UnwrappedHeads:
     """Unwrap images [B, 3, S, S] of the heads: T_s and N_s."""
-    triangles = on_device(images.device, grid_triangles)
-    depth_px, samples = min(_DEPTH_PX, _DEPTH_PER_PX * camera.width_px), math.ceil(camera.width_px / side)
-    settings = UnwrapSettings(depth_side_px=depth_px, samples=samples, measured=False)
-    texture, visible = unwrap(images, heads.vertices, triangles, camera, side, settings)
+    texture, visible = unwrap_crops(images, heads.vertices, side)
     return UnwrappedHeads(inpaint(texture, visible), visible[:, None], head_normals(heads, side))
 
 
@@ -206,8 +199,7 @@ class JointObjective(Objective):
         self._validation: dict[str, list[CropPairs]] | None = None
         network: Any = reflectance  # of any form (`network/reflectance.py`)
         if network.rig_lights and not network.has_mean_face:
-            textures = DatasetTextures(dataset, model, 0, {}, {}, network.rig_lights)
-            network.set_mean_face(*textures.mean_face())
+            network.set_mean_face(*mean_face_of(model, network.rig_lights))
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compile the networks alone; shapes in the rasterizer depend on what the camera sees."""
@@ -276,7 +268,7 @@ class JointObjective(Objective):
         side, count = self.settings.texture_side, len(batch.source)
         target = heads.each(lambda x: x[count:])
         images = torch.cat([batch.source, batch.target]) if self.feature_networks else batch.source
-        faces = unwrap_images(images, heads.each(lambda x: x[: len(images)]), self.camera, side)
+        faces = unwrap_images(images, heads.each(lambda x: x[: len(images)]), side)
         face = faces.each(lambda x: x[:count])
         network: Any = self.networks["reflectance"]
         with self.mixed_precision():
@@ -315,7 +307,7 @@ class JointObjective(Objective):
             powers = torch.zeros(len(FEATURE_LAYERS), device=self.device)
             if process_rank() == 0:
                 pairs = spread_pairs(self._train, _TARGETS_MEASURED, lambda pair: True)
-                targets = (self._train.read(pair).target.to(self.device) for pair in pairs)
+                targets = (self._train.read_target(pair).to(self.device) for pair in pairs)
                 seen = (
                     channels_apart(target, colour_shares(target)) if apart else target for target in targets
                 )
@@ -369,9 +361,7 @@ class JointObjective(Objective):
             kind: spread_pairs(self._held_out, self.settings.validation_pairs, wanted)
             for kind, wanted in kinds.items()
         }
-        return {
-            kind: [self._held_out.read(pair) for pair in pairs] for kind, pairs in chosen.items() if pairs
-        }
+        return {kind: self._held_out.read(pairs) for kind, pairs in chosen.items() if pairs}
 
 
 def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tensor:

@@ -7,7 +7,7 @@ does not see the face.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
-from facerf_cli.dataset.light_crops import LightCrops, LightStacks, LightTextures
+from facerf_cli.dataset.faces import DatasetFaces, LightTextures, LitCrops
 from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import concatenate, head_rotation, resize
@@ -37,27 +37,27 @@ class LightFeaturesObjective(HeadsObjective):
 
     def __init__(
         self,
-        source: SampleSource | LightStacks,
+        source: SampleSource | DatasetFaces,
         network: LightNetwork | None = None,
         settings: HeadsSettings = _HEADS,
     ) -> None:
         super().__init__("light_features", network or LightNetwork(), source, settings)
-        if not isinstance(source, LightStacks):
+        if not isinstance(source, DatasetFaces):
             self.mean_normals = resize(source.mean_face()[0][None], _NORMALS_SIDE)[0]
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LightCrops:
-        if isinstance(self.source, LightStacks):
-            return self.source.draw(head, self.settings.lights, generator)
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> LightTextures | LitCrops:
+        if isinstance(self.source, DatasetFaces):
+            return self.source.draw_lights(head, self.settings.lights, generator)
         sample = self.source.draw(head, self.settings.lights, generator)
         seen = (sample.weight > 0).float()
         head_to_camera = head_rotation(self.mean_normals, sample.normals_target)
         lights_head = sample.lights @ head_to_camera  # row vectors: R^T w
         return LightTextures(sample.target * seen[:, None], lights_head, head)
 
-    def _unwrapped(self, batch: LightTextures | LightCrops) -> LightTextures:
-        return batch.unwrapped(self.network.settings.side) if isinstance(batch, LightCrops) else batch
+    def _unwrapped(self, batch: LightTextures | LitCrops) -> LightTextures:
+        return batch.unwrapped(self.source.side) if isinstance(batch, LitCrops) else batch
 
-    def forward(self, batch: LightTextures | LightCrops) -> dict[str, Tensor]:
+    def forward(self, batch: LightTextures | LitCrops) -> dict[str, Tensor]:
         """Compute the term `light`, a mean over faces and lights."""
         faces = self._unwrapped(batch)
         with self.mixed_precision():
@@ -129,8 +129,8 @@ class AppearanceObjective(Objective):
         super().__init__({"appearance_features": network}, provenance_of(dataset, model))
         pairs = open_pairs(dataset, "train", network.settings.side)
         kept = [pair for place, pair in enumerate(pairs.pairs) if place % settings.every]
-        self._train = pairs.of(kept)
-        self._left_out = pairs.of(pairs.pairs[:: settings.every])
+        self._train = replace(pairs, pairs=kept)
+        self._left_out = replace(pairs, pairs=pairs.pairs[:: settings.every])
         self._held_out = open_pairs(dataset, "validation", network.settings.side)
         self.settings = settings
         self._validation: list[list[CropPairs]] | None = None  # of people that are known, and of others
@@ -159,8 +159,7 @@ class AppearanceObjective(Objective):
             count = self.settings.held_out_pairs
             readers = (self._left_out, self._held_out)
             self._validation = [
-                [reader.read(pair) for pair in spread_pairs(reader, count, lambda pair: True)]
-                for reader in readers
+                reader.read(spread_pairs(reader, count, lambda pair: True)) for reader in readers
             ]
         known, strangers = self._validation
         right, angles = [], []

@@ -46,8 +46,8 @@ class TrainOptions:
         resume: Continue the run in DIR from its last save; give the same options.
         start_from: Start from a checkpoint; networks that the stage does not train are copied.
         dataset: Train on a dataset of prepare-dataset and relight-dataset instead of synthetic heads.
-        texture_size: Unwrap a dataset to textures of this side; the stages joint and appearance-features
-            read its crops at this side, too.
+        texture_size: Side of the textures that a dataset is unwrapped to, in texels; in the stages joint and
+            appearance-features also of its crops.
         photos: Train on photos of faces, too, in a fifth of the batches of the stage joint.
         heads_from: Draw synthetic heads from this face model; of whole people, from several with commas.
         fit_with: Fit this face model to the heads; a dataset's own model. In the stage joint it needs
@@ -55,7 +55,7 @@ class TrainOptions:
         heads: Bake so many synthetic heads.
         views: Fit so many views of each head.
         bank: Keep baked heads in this folder.
-        jobs: Bake or unwrap in so many processes.
+        jobs: Number of worker processes that bake heads or detect faces.
         vgg_weights: Add the feature loss of VGG-16 to the stage joint: imagenet downloads its weights; or a
             file.
         appearance_features: Use a checkpoint of the stage appearance-features in place of --vgg-weights.

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
 from facerf_cli.batch.settings import Settings, torch_device
-from facerf_cli.dataset.crops import mean_translation_m, open_photos, require_crops
+from facerf_cli.dataset.crops import mean_translation_m, require_crops
 from facerf_cli.dataset.dataset import read_dataset
-from facerf_cli.dataset.light_crops import open_light_stacks
+from facerf_cli.dataset.faces import DatasetFaces, open_faces
+from facerf_cli.dataset.photos import open_photos
 from facerf_cli.dataset.portraits import open_dataset_portraits
-from facerf_cli.dataset.textures import open_dataset_textures
 from facerf_cli.errors import FacerfError, UsageError
 from facerf_cli.face.morphable import load_face_model, save_face_model
 from facerf_cli.face.topology import LAYOUT_VERSION
@@ -146,10 +146,9 @@ class _TrainedStage:
     def light_features(self) -> Objective:
         """S_f on textures."""
         side = self.make.texture_side
-        network, options = self.make.features("light_features", side), self.options
+        network = self.make.features("light_features", side)
         settings = HeadsSettings(held_out_heads=self.make.sizes.held_out_heads)
-        stacks = open_light_stacks(options.dataset, options.fit_with) if options.dataset else None
-        return self._kind(LightFeaturesObjective)(stacks or self._samples(), network, settings)
+        return self._kind(LightFeaturesObjective)(self._samples(), network, settings)
 
     def appearance_features(self) -> Objective:
         """V_f on a dataset's crops."""
@@ -269,13 +268,12 @@ class _TrainedStage:
             raise UsageError(f"--objective {name}: is no subclass of {needed}, the stage's own")
         return kind
 
-    def _samples(self) -> SampleSource:
-        """Open a dataset's textures, or the bank of synthetic heads, whose missing views are fitted first."""
+    def _samples(self) -> SampleSource | DatasetFaces:
+        """Open a dataset, or the bank of synthetic heads, whose missing views are fitted first."""
         options, folder = self.options, self._bank
         if options.dataset:
             rig_lights = TINY_LIGHTS if options.preset == "tiny" else RIG_LIGHTS
-            side = self.make.texture_side
-            return open_dataset_textures(options.dataset, options.fit_with, side, options.jobs, rig_lights)
+            return open_faces(options.dataset, options.fit_with, self.make.texture_side, rig_lights)
         provenance, fitted_with = self._bake(), options.fit_with
         if options.mean_face:  # a fit of a model without shapes is a pose alone
             still = load_face_model(fitted_with).pose_only()

@@ -3,6 +3,7 @@
 With S_f the paper's feature loss on textures, L_L, is added to the default form's loss.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from facerf_cli.dataset.faces import DatasetFaces, SampleCrops
 from facerf_cli.errors import InputError
 from facerf_cli.network.checkpoint import new_network
 from facerf_cli.network.features import LightNetwork, feature_distance
-from facerf_cli.network.inputs import Batch, SourceColours, from_root, mean_colours, without_cast
+from facerf_cli.network.inputs import (
+    Batch,
+    SourceColours,
+    concatenate,
+    from_root,
+    mean_colours,
+    without_cast,
+)
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, metrics_by_pose, seeded
@@ -52,6 +61,31 @@ class HeadsObjective(Objective):
         raise NotImplementedError
 
 
+class SamplesObjective(HeadsObjective):
+    """A stage that trains one network on samples: sources, and their targets under single lights."""
+
+    def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Any:
+        """Draw `count` samples; those of a dataset share the stacks of their sources with other steps."""
+        if not isinstance(self.source, DatasetFaces):
+            return super().draw(count, generator_of, step)
+        drawn = []
+        for index in range(count):
+            head, crops = self.source.draw_shared(self.settings.lights, generator_of, index, step)
+            drawn.append(self.batch_of(crops, head, generator_of(index)))
+        return concatenate(drawn)
+
+    def draw_head(self, head: Tensor, generator: torch.Generator) -> Any:
+        return self.batch_of(self.source.draw(head, self.settings.lights, generator), head, generator)
+
+    def batch_of(self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator) -> Any:
+        """Make the batch of a sample of a head [1]."""
+        raise NotImplementedError
+
+    def textures(self, sample: Sample | SampleCrops) -> Sample:
+        """Unwrap the crops of a dataset; samples of baked heads are textures already."""
+        return sample.unwrapped(self.source.side) if isinstance(sample, SampleCrops) else sample
+
+
 @dataclass(frozen=True)
 class TextureObjectiveSettings(HeadsSettings):
     """Settings of the stage `reflectance`."""
@@ -65,18 +99,18 @@ class TextureObjectiveSettings(HeadsSettings):
 class TextureBatch(Batch):
     """Samples and the indices of their heads [B]."""
 
-    sample: Sample
+    sample: Sample | SampleCrops
     heads: Tensor
 
 
-class TextureObjective(HeadsObjective):
+class TextureObjective(SamplesObjective):
     """`root_loss` of OLAT textures at the network's exposure; `light` is a frozen S_f."""
 
     chooses_by = "si_mse"
 
     def __init__(
         self,
-        source: SampleSource,
+        source: SampleSource | DatasetFaces,
         network: Any = None,
         light: LightNetwork | None = None,
         settings: TextureObjectiveSettings = TextureObjectiveSettings(),
@@ -90,23 +124,34 @@ class TextureObjective(HeadsObjective):
                 raise InputError(f"{error}, as the heads were baked; {advice}") from None
         super().__init__("reflectance", network, source, settings)
         self.light = light
-        colours = []  # of sources of the training heads
+        self.source_colours = SourceColours.of(self._measure_colours())
+
+    def _measure_colours(self) -> Tensor:
+        """Measure mean colours [N, 3] of sources of the training heads."""
+        if isinstance(self.source, DatasetFaces):
+            return self.source.source_colours(_COLOURS_MEASURED, seeded(_COLOUR_SEED))
+        colours = []
         for index in range(_COLOURS_MEASURED):
             generator = seeded(_COLOUR_SEED, index)
             head = self.heads[torch.randint(len(self.heads), (1,), generator=generator)]
-            sample = source.draw(head, 1, generator)
+            sample = self.source.draw(head, 1, generator)
             colours.append(mean_colours(sample.source, sample.visible))
-        self.source_colours = SourceColours.of(torch.cat(colours))
+        return torch.cat(colours)
 
-    def draw_head(self, head: Tensor, generator: torch.Generator) -> TextureBatch:
-        return TextureBatch(self.source.draw(head, self.settings.lights, generator), head)
+    def batch_of(
+        self, sample: Sample | SampleCrops, head: Tensor, generator: torch.Generator
+    ) -> TextureBatch:
+        return TextureBatch(sample, head)
 
-    def draw_held_out(self, person: int, generator: torch.Generator) -> Sample:
-        return self.source.draw(torch.tensor([person]), self.settings.held_out_lights, generator)
+    def draw_held_out(self, person: int, generator: torch.Generator) -> Sample | SampleCrops:
+        drawn: Sample | SampleCrops = self.source.draw(
+            torch.tensor([person]), self.settings.held_out_lights, generator
+        )
+        return drawn
 
     def forward(self, batch: TextureBatch) -> dict[str, Tensor]:
         """Compute the term `root` and, with S_f, `light_features`, means over faces."""
-        network, sample = self.network, batch.sample
+        network, sample = self.network, self.textures(batch.sample)
         with self.mixed_precision():
             encoded = self._encoded(sample)
             root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
@@ -130,11 +175,11 @@ class TextureObjective(HeadsObjective):
         errors: list[Tensor] = []
         same_pose: list[bool] = []
         rows: list[np.ndarray] = []
-        for sample in self.held_out_samples():
-            there = sample.to(self.device)
-            encoded = self._encoded(there)
-            predicted = self.network.decode(encoded, there.normals_target, there.lights).cpu()
-            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean())
+        for held_out in self.held_out_samples():
+            sample = self.textures(held_out.to(self.device))
+            encoded = self._encoded(sample)
+            predicted = self.network.decode(encoded, sample.normals_target, sample.lights)
+            errors.append(clipped_si_mse(predicted, sample.target, sample.weight).mean().cpu())
             turned = (sample.normals_source - sample.normals_target).abs().max()
             same_pose.append(bool(turned < 1e-3))
             rows += [_sheet_rows(sample, predicted)] if len(rows) < _SHEET_FACES else []
