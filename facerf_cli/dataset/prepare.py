@@ -19,7 +19,7 @@ from torch import Tensor
 from facerf_cli.batch.recipe import Recipe
 from facerf_cli.capture.capture import Capture
 from facerf_cli.capture.findings import Finding, Selection
-from facerf_cli.dataset.dataset import DatasetFolder
+from facerf_cli.dataset.dataset import CameraRecord, Dataset, DatasetFolder, SubjectRecord
 from facerf_cli.errors import InputError
 from facerf_cli.face.crop import Crop
 from facerf_cli.face.fit import (
@@ -36,7 +36,7 @@ from facerf_cli.face.morphable import MorphableModel
 from facerf_cli.face.topology import LAYOUT_VERSION, grid_triangles
 from facerf_cli.face.view import draw_fit
 from facerf_cli.files.atomic import atomic_path
-from facerf_cli.files.documents import Document, Name, read_document, write_document
+from facerf_cli.files.documents import read_document, write_document
 from facerf_cli.files.olat_stack import StackHeader, write_olat_stack
 from facerf_cli.files.sheets import contact_sheet, filled_page, mark_light
 from facerf_cli.files.write import HALF_MAX, write_display
@@ -55,14 +55,10 @@ _DIMMEST = 1e-3  # largest radiance under a constant map of 1 below which half f
 log = logging.getLogger(LOGGER_NAME)
 
 
-class _SubjectRecord(Document):
-    cameras: dict[Name, Any]
-
-
 def subject_outputs(capture: Capture, subject: str, dataset: DatasetFolder) -> list[Path]:
-    """All files of a subject, from its record if it has one; the last one is written last."""
+    """List all files of a subject, from its record if it has one; the last one is written last."""
     record = dataset.record_path(subject)
-    cameras = read_document(record, _SubjectRecord, "").cameras if record.exists() else capture.cameras
+    cameras = read_document(record, SubjectRecord, "").cameras if record.exists() else capture.cameras
     paths = [of(subject, camera) for camera in cameras for of in (dataset.stack_path, dataset.fit_path)]
     return [*paths, dataset.sheet_path(subject), record]
 
@@ -79,7 +75,7 @@ class Preparation:
     strict: bool = False  # a camera that does not see the face is an error
 
 
-def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Preparation) -> dict[str, Any]:
+def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Preparation) -> SubjectRecord:
     """Write a subject's stacks, fits, sheet and record, and return the record."""
     how.dataset.record_path(subject).unlink(missing_ok=True)
     person = _Subject(capture, subject, chosen.lights, how)
@@ -92,7 +88,8 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
     middle_m = head.vertices(how.model)[0].mean(0).numpy()
     person = replace(person, capture=capture.about(middle_m))
     mean_error_iod = float(np.nanmean(errors_iod))
-    cameras, rows, dropped = {}, [], dict(chosen.dropped)
+    cameras: dict[str, CameraRecord] = {}
+    rows, dropped = [], dict(chosen.dropped)
     for camera, landmarks_px, error_iod in zip(chosen.cameras, landmarks, errors_iod.tolist(), strict=True):
         lost = math.isnan(error_iod)  # landmarks are missing or rejected
         seen_px, error_iod = (None, mean_error_iod) if lost else (landmarks_px, error_iod)
@@ -105,33 +102,37 @@ def prepare_subject(capture: Capture, subject: str, chosen: Selection, how: Prep
             dropped[camera] = str(error)
             continue
         rows.append(_write_camera(person, camera, fit, header))
-        cameras[camera] = {
-            "face_found": seen_px is not None,
-            "error_iod": round(fit.error_iod, 5),
-            "quality": fit.quality,
-            "crop_px": fit.crop.size_px,
-            "crop_off_iod": round(off_iod, 5),
-        }
+        cameras[camera] = CameraRecord(
+            face_found=seen_px is not None,
+            error_iod=round(fit.error_iod, 5),
+            quality=fit.quality,
+            crop_px=fit.crop.size_px,
+            crop_off_iod=round(off_iod, 5),
+        )
     chosen = replace(chosen, dropped=dropped)
     _remove_dropped(subject, chosen, how, bool(cameras))
     sheet = contact_sheet(np.concatenate(rows), len(rows[0]))
     write_display(how.dataset.sheet_path(subject), sheet, metadata=person.provenance())
-    record = {
-        "prepared": how.made_from,
-        "error_iod": round(mean_error_iod, 5),
-        "quality": quality_of(mean_error_iod),
-        "faces_found": sum(entry["face_found"] is True for entry in cameras.values()),
-        "cameras": cameras,
-        **_optional_entries(person, chosen),
-    }
-    write_document(how.dataset.record_path(subject), record)
+    record = SubjectRecord(
+        prepared=how.made_from,
+        error_iod=round(mean_error_iod, 5),
+        quality=quality_of(mean_error_iod),
+        faces_found=sum(entry.face_found for entry in cameras.values()),
+        cameras=cameras,
+        dropped=chosen.dropped,
+        missing=list(chosen.missing),
+        lights=[capture.light_ids[light] for light in chosen.lights] if chosen.left_out else None,
+        left_out=chosen.left_out,
+        ambient_kept=_ambient_kept(person, chosen.cameras),
+    )
+    write_document(how.dataset.record_path(subject), record.model_dump(exclude_defaults=True))
     return record
 
 
-def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, dict[str, Any]]:
-    """Records of the finished subjects, by subject; 'prepared' is what they were made from."""
+def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, SubjectRecord]:
+    """Read the records of the finished subjects, by subject."""
     return {
-        subject: read_document(dataset.record_path(subject), dict[str, Any], "")
+        subject: read_document(dataset.record_path(subject), SubjectRecord, "")
         for subject in capture.subjects
         if all(path.exists() for path in subject_outputs(capture, subject, dataset))
     }
@@ -172,21 +173,8 @@ def _remove_dropped(subject: str, chosen: Selection, how: Preparation, any_left:
         how.dataset.fit_path(subject, camera).unlink(missing_ok=True)
 
 
-def _optional_entries(person: _Subject, chosen: Selection) -> dict[str, Any]:
-    """Entries of a record that it has where they are not empty: missing and uncorrected frames."""
-    capture = person.capture
-    entries = {
-        "dropped": chosen.dropped,
-        "missing": list(chosen.missing),
-        "lights": [capture.light_ids[light] for light in chosen.lights] if chosen.left_out else [],
-        "left_out": chosen.left_out,
-        "ambient_kept": _ambient_kept(person, chosen.cameras),
-    }
-    return {name: entry for name, entry in entries.items() if entry}
-
-
 def _ambient_kept(person: _Subject, cameras: Iterable[str]) -> list[str]:
-    """Cameras whose ambient image should be subtracted but is missing; logs a warning for them."""
+    """List cameras whose ambient image should be subtracted but is missing, and log a warning."""
     if not person.capture.subtract_ambient:
         return []
     without = [camera for camera in cameras if person.capture.ambient(person.name, camera) is None]
@@ -298,17 +286,12 @@ def _crops(
 
 
 def index_page(
-    dataset: Mapping[str, Any],
-    records: Mapping[str, Mapping[str, Any]],
-    findings: Mapping[str, Sequence[Finding]],
+    dataset: Dataset, records: Mapping[str, SubjectRecord], findings: Mapping[str, Sequence[Finding]]
 ) -> str:
-    """Make the page from the content of `dataset.json`, the records of finished subjects and the findings."""
+    """Return the HTML page of a dataset: the records of finished subjects and the findings."""
+    template = Path(__file__).with_name("index.html")
     return filled_page(
-        Path(__file__).with_name("index.html"),
-        dataset=dataset,
-        records=records,
-        findings=findings,
-        split_of={name: split for split, names in dataset["splits"].items() for name in names},
+        template, dataset=dataset, records=records, findings=findings, split_of=dataset.split_of
     )
 
 

@@ -36,6 +36,7 @@ from facerf_cli.dataset.dataset import (
     LARGEST_CROP_PX,
     DatasetFolder,
     Split,
+    SubjectRecord,
     describe_dataset,
     preparation,
 )
@@ -84,7 +85,7 @@ def prepare_capture(
     model, is_builtin = load_face_model(content.face_model), content.face_model == BUILTIN
     model_sha256 = file_sha256(BUILTIN_PATH if is_builtin else Path(content.face_model))
     made_from = preparation(capture, model_sha256, content.crop, networks.sha256("parsing"))
-    how = Preparation(model, networks, DatasetFolder(output), content.crop, made_from, checking.strict)
+    how = Preparation(model, networks, DatasetFolder(folder=output), content.crop, made_from, checking.strict)
     if not overwrite:
         _judge_earlier(capture, output, made_from, batch.dry_run)
     elif not batch.dry_run:
@@ -184,14 +185,13 @@ def _judge_earlier(capture: Capture, output: Path, made_from: Recipe, dry_run: b
 
     Removes the records of subjects whose missing frames exist by now, so that they are prepared again.
     """
-    dataset = DatasetFolder(output)
+    dataset = DatasetFolder(folder=output)
     earlier = prepared_subjects(capture, dataset)
     for subject, record in earlier.items():
-        before, said = record.get("prepared"), f"{output}: {subject} was prepared otherwise"
-        advice = "give --overwrite always to prepare all subjects again, or another folder with -o"
-        require_same(before if isinstance(before, dict) else {}, made_from, said, advice)
+        advice = "pass --overwrite always to prepare all subjects again, or another folder with -o"
+        require_same(record.prepared, made_from, f"{output}: {subject} was prepared otherwise", advice)
     for subject, record in () if dry_run else earlier.items():
-        if has_new_frames(capture, subject, record.get("missing", ())):
+        if has_new_frames(capture, subject, record.missing):
             log.info("%s: frames that were missing exist now; it is prepared again", subject)
             dataset.record_path(subject).unlink()
 
@@ -215,12 +215,11 @@ class Prepare(Job):
         with one_thread():
             chosen = self._choose(item.name)
             record = prepare_subject(self.capture, item.name, chosen, self.how)
-        if record["quality"] == "poor":
-            log.warning("%s: the fit is poor; look at sheets/%s.jpg", item.input_path, item.name)
-        worst = max(entry["crop_off_iod"] for entry in record["cameras"].values())
-        facts = {name: record[name] for name in ("error_iod", "quality", "faces_found")}
-        facts |= {"cameras": len(record["cameras"]), "worst_crop_off_iod": worst}
-        facts |= {"lights": len(chosen.lights)}
+        if record.quality == "poor":
+            log.warning("%s: the fit is poor; check sheets/%s.jpg", item.input_path, item.name)
+        facts = record.model_dump(include={"error_iod", "quality", "faces_found"})
+        facts |= {"cameras": len(record.cameras), "lights": len(chosen.lights)}
+        facts |= {"worst_crop_off_iod": max(camera.crop_off_iod for camera in record.cameras.values())}
         return Outcome(self.outputs_of(item), facts)
 
     def _choose(self, subject: str) -> Selection:
@@ -236,23 +235,28 @@ def _write_dataset(
     capture: Capture, how: Preparation, split: Split, seed: int, face_model_sha256: str
 ) -> None:
     """Write findings.jsonl, the index page and dataset.json of the subjects prepared with these options."""
-    folder, found = how.dataset.folder, prepared_subjects(capture, how.dataset).items()
-    records = {subject: record for subject, record in found if record.get("prepared") == how.made_from}
+    folder = how.dataset.folder
+    records: dict[str, SubjectRecord] = {
+        subject: record
+        for subject, record in prepared_subjects(capture, how.dataset).items()
+        if record.prepared == how.made_from
+    }
     findings = collect_findings(folder, capture.subjects)
-    show_findings([found for of_subject in findings.values() for found in of_subject], how.strict)
+    show_findings([finding for of_subject in findings.values() for finding in of_subject], how.strict)
     if not records:
         return
     for older in folder.glob("colour_chart*.png"):
         older.unlink()
     write_chart_overlays(capture, folder)
-    dataset = describe_dataset(capture, records, split, seed, how.model, face_model_sha256)
+    dataset = describe_dataset(folder, capture, records, split, seed, how.model, face_model_sha256)
     with atomic_path(folder / "index.html") as temporary:
         text = index_page(dataset, records, findings)
         temporary.write_text(text, encoding="utf-8", errors="replace")  # folder names may be any bytes
-    write_document(folder / DATASET_FILE, dataset)
+    write_document(folder / DATASET_FILE, dataset.content())
     print(folder / DATASET_FILE)
-    split_of = {subject: name for name, members in dataset["splits"].items() for subject in members}
     pairs = json_rows(folder / RELIT / PAIRS_NAME)
-    if moved := {row.get("subject") for row in pairs if split_of.get(row.get("subject")) != row.get("split")}:
-        words = "%s: the pairs of %d subjects are of another split; %s"
+    if moved := {
+        row.get("subject") for row in pairs if dataset.split_of(str(row.get("subject"))) != row.get("split")
+    }:
+        words = "%s: the pairs of %d subjects belong to another split; %s"
         log.warning(words, folder / RELIT, len(moved), GIVE_BEFORE)

@@ -300,7 +300,7 @@ class DatasetPerson:
 
     def _skin(self, trait: str) -> float | None:
         """A number of their skin in the capture; faces of random colours have none."""
-        traits = self.dataset.traits.get(self.name, {})
+        traits = self.dataset.traits_of(self.name)
         value = traits.get(trait)
         if not isinstance(value, int | float) or traits.get("random_texture"):
             return None

@@ -98,7 +98,7 @@ def test_jobs_and_a_second_run(wrong: Path, corrected: Path, tmp_path: Path, cap
     corners = " ".join(f"{x + 1:g},{y:g}" for x, y in CORNERS)
     for line in ([], [*chart[:2], "--chart-corners", corners]):
         assert prepare(wrong, corrected, *SPLIT, *line) == 2
-        assert "other stage values; give --overwrite" in capsys.readouterr().err and tree(corrected) == before
+        assert "other stage values; pass --overwrite" in capsys.readouterr().err and tree(corrected) == before
 
 
 def test_an_older_charts_image_does_not_outlive_its_dataset_and_a_file_is_none(
