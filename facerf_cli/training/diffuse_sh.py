@@ -18,8 +18,9 @@ from facerf_cli.light.sphere import RigLight
 from facerf_cli.network.diffuse_sh import ORDER, DiffuseEstimate, DiffuseNetwork, shading
 from facerf_cli.network.inputs import Batch, to_root
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
+from facerf_cli.training.build import Run
 from facerf_cli.training.losses import clipped_si_mse, root_loss
-from facerf_cli.training.objective import Validation, metrics_by_pose
+from facerf_cli.training.objective import Objective, Validation, metrics_by_pose
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsSettings, SamplesObjective
 
@@ -145,3 +146,10 @@ def _sheet_rows(sample: Sample, estimate: DiffuseEstimate, own: Tensor, relit: T
     guess = [own[0, 0] * seen, *(relit[0] * mask)]
     blank = torch.zeros_like(albedo)
     return tiled([[*truth, blank, blank], [*guess, albedo, lit / 4]])
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage."""
+    settings = SumSettings(held_out_heads=run.sizes.held_out_heads)
+    objective: Objective = run.objective(DiffuseObjective)(run.faces(), run.network("diffuse_sh"), settings)
+    return objective

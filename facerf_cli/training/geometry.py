@@ -18,7 +18,8 @@ from facerf_cli.face.topology import CONTOUR, OUTER_EYE_CORNERS
 from facerf_cli.network.geometry import GeometryEstimate, GeometryNetwork, GeometryNetworkSettings
 from facerf_cli.network.inputs import concatenate
 from facerf_cli.raster.camera import crop_camera, project
-from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces
+from facerf_cli.synth.bank.face_crops import FaceCrops, RenderedFaces, add_head_images
+from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import FOUND_COLOUR, TRUE_COLOUR, in_rows, mark, tiled
 
@@ -150,3 +151,15 @@ class GeometryObjective(Objective):
             mark(image, true_px * size / side, TRUE_COLOUR)
             mark(image, found_px * size / side, FOUND_COLOUR)
         return tiled(in_rows([*images], _SHEET_COLUMNS))
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage; bake heads and render their images where they are missing."""
+    options, sizes, images = run.options, run.sizes, run.bank / "pictures"
+    provenance = run.bake_heads()
+    add_head_images(run.bank / "heads", images, sizes.images, options.jobs, options.settings.seed)
+    faces = RenderedFaces(images, provenance)
+    settings = GeometryObjectiveSettings(held_out_heads=sizes.held_out_heads)
+    network = run.geometry(faces.mean_translation_m())
+    objective: Objective = run.objective(GeometryObjective)(faces, network, settings)
+    return objective

@@ -5,21 +5,32 @@ with its head, relit by the Reflectance Network, rendered with the target's head
 (paper, 'Loss Functions'). Some of the batches are photos, which train only the geometry ('Training').
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs, unwrap_crops
+from facerf_cli.batch.inputs import PHOTO_SUFFIXES, collect_items
+from facerf_cli.dataset.crops import (
+    CropPairs,
+    mean_translation_m,
+    open_pairs,
+    require_crops,
+    spread_pairs,
+    unwrap_crops,
+)
 from facerf_cli.dataset.dataset import Dataset, provenance_of
 from facerf_cli.dataset.faces import mean_face_of
 from facerf_cli.dataset.pairs import Pair
-from facerf_cli.dataset.photos import PhotoCrops, Photos
+from facerf_cli.dataset.photos import PhotoCrops, Photos, open_photos
+from facerf_cli.errors import UsageError
 from facerf_cli.face.fit import fit_batch
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.face.topology import (
     CONTOUR,
     INNER_MOUTH_CORNERS,
@@ -33,10 +44,11 @@ from facerf_cli.face.topology import (
 from facerf_cli.network.features import FEATURE_LAYERS, TrainedFeatures, VggFeatures, layer_powers
 from facerf_cli.network.geometry import GeometryEstimate
 from facerf_cli.network.inputs import Batch, SourceColours, concatenate, resize, without_cast
-from facerf_cli.network.vgg import VGG16_LICENCE
+from facerf_cli.network.vgg import VGG16_LICENCE, load_vgg
 from facerf_cli.raster.camera import Camera, crop_camera, project
 from facerf_cli.raster.rasterize import interpolate, rasterize
 from facerf_cli.raster.texture import inpaint, normal_map, sample_texture
+from facerf_cli.training.build import Run
 from facerf_cli.training.losses import (
     Features,
     MaskedPair,
@@ -47,6 +59,7 @@ from facerf_cli.training.losses import (
     colour_shares,
     landmark_loss,
     light_loss,
+    load_features,
     photometric_loss,
     regularisation,
     slid_contour,
@@ -393,3 +406,44 @@ def _provenance(
     terms = [name for name, there in ((f"V_f, {of}", appearance), ("S_f", light)) if there is not None]
     found = {"feature_losses": terms, "photos": len(photos.paths) if photos else 0}
     return provenance_of(dataset, model) | found
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage; detect faces in new photos."""
+    options, dataset, side = run.options, run.dataset, run.crop_side
+    appearance, light = _appearance(run, side), run.light_features(side)
+    if options.preset == "paper" and (appearance is None or light is None):
+        raise UsageError(
+            "the paper's loss needs V_f and S_f; pass --vgg-weights imagenet (553 MB), a file of it, or "
+            "--appearance-features FILE, and --light-features FILE, checkpoints of `facerf train --stage "
+            f"appearance-features --texture-size {side}` and of the stage light-features"
+        )
+    require_crops(dataset, dataset.crop_px, side)
+    reflectance, geometry = run.reflectance(side), None  # without one, heads are fitted to landmarks
+    if options.geometry == "network":
+        geometry = run.geometry(mean_translation_m(dataset))
+    photos = None
+    if options.photos:
+        items = collect_items([str(options.photos)], options.output, PHOTO_SUFFIXES)
+        cache = _cache_of(options.photos, options.output)
+        photos = open_photos([item.input_path for item in items], cache, run.people, side, options.jobs)
+    settings = JointSettings(side, side, weights=run.training.loss, seed=options.settings.seed)
+    model = load_face_model(options.fit_with)  # whatever fitted the dataset
+    kind = run.objective(JointObjective)
+    objective: Objective = kind(dataset, model, reflectance, geometry, appearance, light, photos, settings)
+    return objective
+
+
+def _appearance(run: Run, side: int) -> nn.Module | None:
+    """Load the frozen V_f, if the options name one."""
+    options = run.options
+    if options.appearance_features:
+        network: nn.Module = load_features(options.appearance_features, "appearance_features", side)
+        return network
+    return load_vgg(options.vgg_weights) if options.vgg_weights else None
+
+
+def _cache_of(photos: Path, output: Path) -> Path:
+    """Return the folder of faces found in photos: next to them for all runs, or the run's if not writable."""
+    folder = photos if photos.is_dir() else photos.parent
+    return folder / ".facerf-faces" if os.access(folder, os.W_OK) else output / "photos"

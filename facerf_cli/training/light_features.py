@@ -17,10 +17,11 @@ from torch import Tensor
 from facerf_cli.dataset.crops import CropPairs, open_pairs, spread_pairs
 from facerf_cli.dataset.dataset import Dataset, provenance_of
 from facerf_cli.dataset.faces import DatasetFaces, LightTextures, LitCrops
-from facerf_cli.face.morphable import MorphableModel
+from facerf_cli.face.morphable import MorphableModel, load_face_model
 from facerf_cli.network.features import AppearanceNetwork, LightNetwork
 from facerf_cli.network.inputs import concatenate, head_rotation, resize
 from facerf_cli.synth.bank.texture_samples import SampleSource
+from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsObjective, HeadsSettings
@@ -175,3 +176,20 @@ class AppearanceObjective(Objective):
             "recognised": float(torch.cat(right).double().mean()),
         }
         return Validation(metrics, None)
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage `light-features`."""
+    network = run.features("light_features", run.texture_side)
+    settings = HeadsSettings(held_out_heads=run.sizes.held_out_heads)
+    objective: Objective = run.objective(LightFeaturesObjective)(run.faces(), network, settings)
+    return objective
+
+
+def build_appearance(run: Run) -> Objective:
+    """Make the objective of the stage `appearance-features`: V_f on a dataset's crops."""
+    dataset = run.dataset
+    network = run.features("appearance_features", run.crop_side, people=len(dataset.subjects))
+    model = load_face_model(dataset.face_model)
+    objective: Objective = run.objective(AppearanceObjective)(dataset, model, network)
+    return objective

@@ -7,16 +7,24 @@ adaptation*, 2022).
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from facerf_cli.dataset.portraits import open_dataset_portraits
 from facerf_cli.network.inputs import Batch, concatenate
 from facerf_cli.network.portrait import PortraitMaps, PortraitNetwork
 from facerf_cli.portrait.parse import class_index
-from facerf_cli.synth.bank.portrait_samples import SMALL, PortraitSample, PortraitSource
+from facerf_cli.synth.bank.portrait_samples import (
+    SMALL,
+    PortraitSample,
+    PortraitSource,
+    StoredTransport,
+)
+from facerf_cli.synth.bank.transport import TINY_BANK, TransportBankSettings, add_proxies, add_transport
+from facerf_cli.training.build import Run
 from facerf_cli.training.objective import Objective, Validation, seeded
 from facerf_cli.training.sheets import tiled
 
@@ -202,3 +210,30 @@ def _best_scale(found: Tensor, targets: Tensor, alpha: Tensor, clamp: bool = Tru
         )
         scale = scale.clamp(*_SCALE) if clamp else scale
     return scale.view(-1, 1, 1, 1, 1)
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage, on a dataset or on synthetic people."""
+    options, sizes = run.options, run.sizes
+    held_out = min(sizes.held_out_heads, max(1, sizes.heads // 8))  # an eighth of a small bank
+    source: PortraitSource
+    if options.dataset:
+        backgrounds = run.backgrounds(options.output)
+        source = open_dataset_portraits(options.dataset, backgrounds, run.people, options.jobs)
+    else:
+        source = _stored_transport(run, held_out)
+    settings = PortraitObjectiveSettings(held_out_people=held_out)
+    settings = replace(settings, targets=2) if run.is_tiny else settings
+    objective: Objective = run.objective(PortraitObjective)(source, run.network("portrait"), settings)
+    return objective
+
+
+def _stored_transport(run: Run, held_out: int) -> StoredTransport:
+    """Open the bank of synthetic people; bake and analyse those that are missing."""
+    options, folder = run.options, run.bank / "transport"
+    people, models, provenance = run.whole_people(held_out)
+    settings, seed = TINY_BANK if run.is_tiny else TransportBankSettings(), options.settings.seed
+    add_transport(folder, models, people, options.jobs, seed, settings)
+    backgrounds = run.backgrounds(run.bank)
+    add_proxies(folder, backgrounds, run.people, options.jobs, seed)
+    return StoredTransport(folder, backgrounds, provenance)

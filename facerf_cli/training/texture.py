@@ -24,6 +24,7 @@ from facerf_cli.network.inputs import (
     without_cast,
 )
 from facerf_cli.synth.bank.texture_samples import Sample, SampleSource
+from facerf_cli.training.build import Run
 from facerf_cli.training.losses import clipped_si_mse, root_loss
 from facerf_cli.training.objective import Objective, Validation, metrics_by_pose, seeded
 from facerf_cli.training.sheets import tiled
@@ -195,3 +196,12 @@ def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
     mask = (sample.weight[0] > 0).float()
     truth = [sample.source[0], *(sample.target[0] * mask)]
     return tiled([truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]])
+
+
+def build(run: Run) -> Objective:
+    """Make the objective of the stage."""
+    side = run.texture_side
+    light, network = run.light_features(side), run.reflectance(side)
+    settings = TextureObjectiveSettings(held_out_heads=run.sizes.held_out_heads)
+    objective: Objective = run.objective(TextureObjective)(run.faces(), network, light, settings)
+    return objective
