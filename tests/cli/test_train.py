@@ -68,7 +68,7 @@ def test_the_configuration_of_a_run_repeats_it(run: Path, tmp_path: Path, capsys
     assert metadata["training"][-1]["optimizer"]["learning_rate"] == 0.5
     capsys.readouterr()
     assert main(["train", *config]) == 2
-    assert "give --resume" in capsys.readouterr().err
+    assert "pass --resume" in capsys.readouterr().err
 
 
 def test_a_configuration_reaches_loss_and_optimizer(tmp_path: Path, monkeypatch: Patch) -> None:
@@ -132,7 +132,7 @@ def test_a_run_goes_on_by_the_command_and_is_not_written_over(
     assert steps_of(tmp_path / "run") == [1, 2, 3]
     capsys.readouterr()
     assert main([*line, "--steps", "3"]) == 2
-    assert "holds a run already; give --resume" in capsys.readouterr().err
+    assert "pass --resume" in capsys.readouterr().err
     assert main([*line, "--steps", "4", "--resume", "--mean-face"]) == 2
     assert "the run began with other data" in capsys.readouterr().err
 
