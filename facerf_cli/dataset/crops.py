@@ -7,8 +7,8 @@ has a mean radiance of `MEAN_RADIANCE` on the face, the target would have it und
 radiance 1. The stages that train on textures read crops through `dataset/faces.py`.
 
 Crops are moved at random, because at test time a crop is cut around a detector's box, not around landmarks.
-The spreads are those of `face.crop.from_box` against `face.crop.from_landmarks` on synthetic people in eight
-cameras: the box of a turned head is shifted sideways.
+The spreads were measured between `face.crop.from_box` and `face.crop.from_landmarks` on synthetic people in
+eight cameras: the box of a turned head is shifted sideways.
 """
 
 import math
@@ -51,7 +51,7 @@ _DEPTH_PX, _DEPTH_PER_PX = 512, 3
 
 @dataclass(frozen=True)
 class CropMove:
-    """A scale about a crop's centre, then a shift (right, down) in units of its side.
+    """Scale about a crop's centre, then shift (right, down) in units of its side.
 
     The crop's camera is fixed: the face moves within the image, as if the box had been another.
     """
@@ -285,7 +285,7 @@ def mean_translation_m(dataset: Dataset) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class StackInfo:
-    """The part of a stack's header that crops need."""
+    """Part of a stack's header that crops need."""
 
     directions: Tensor  # [L, 3] camera space
     rotation: Tensor  # [3, 3] head_to_camera
@@ -304,7 +304,7 @@ class StackInfo:
 
     @property
     def face(self) -> Tensor:
-        """Pixels [H, W] that show the face."""
+        """Boolean mask [H, W] of the face."""
         bits = np.unpackbits(self.face_bits, count=self.side_px**2)
         return torch.from_numpy(bits).view(self.side_px, self.side_px).bool()
 

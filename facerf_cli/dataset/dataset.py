@@ -1,4 +1,4 @@
-"""The prepared dataset on disk (DESIGN, 'Files'): its paths, and the model of `dataset.json`.
+"""Paths of a prepared dataset (DESIGN, 'Files'), and the model of its `dataset.json`.
 
     dataset.json               lights, cameras, normalisation, splits, subjects; written last
     findings.jsonl             findings of the capture's checks (`capture/findings.py`)
@@ -78,7 +78,7 @@ def _unit(direction: list[float]) -> list[float]:
 
 
 class RigLight(Document):
-    """A light of the capture: the unit vector toward it, and the position if it is near."""
+    """Unit vector toward a light, and the position of a near one."""
 
     id: Name
     direction_world: Annotated[list[float], AfterValidator(_unit)]
@@ -86,13 +86,13 @@ class RigLight(Document):
 
 
 class Rig(Document):
-    """The lights of the capture."""
+    """Lights of the capture."""
 
     lights: Annotated[list[RigLight], Field(min_length=1, max_length=MOST_LIGHTS)]
 
 
 class _Subject(Document):
-    """What both descriptions of a prepared subject contain."""
+    """Entries that both descriptions of a prepared subject contain."""
 
     error_iod: float | None = None
     quality: str = ""
@@ -104,7 +104,7 @@ class _Subject(Document):
 
 
 class SubjectEntry(_Subject):
-    """A subject in `dataset.json`: its traits, and what was prepared unless `status` is "failed"."""
+    """Subject in `dataset.json`; it has stacks unless `status` is "failed"."""
 
     traits: dict[str, Any] = Field(default_factory=dict)
     status: str
@@ -112,7 +112,7 @@ class SubjectEntry(_Subject):
 
 
 class CameraRecord(Document):
-    """The fit of a subject in one camera."""
+    """Fit of a subject in one camera."""
 
     face_found: bool
     error_iod: float
@@ -122,7 +122,7 @@ class CameraRecord(Document):
 
 
 class SubjectRecord(_Subject):
-    """The content of a finished subject's fits/SUBJECT.json."""
+    """Content of a finished subject's fits/SUBJECT.json."""
 
     prepared: Recipe = Field(default_factory=dict)  # what the subject was prepared from
     cameras: dict[Name, CameraRecord]
@@ -130,7 +130,7 @@ class SubjectRecord(_Subject):
 
 
 class Dataset(DatasetFolder):
-    """A prepared dataset: its folder, and the content of `dataset.json`."""
+    """Folder of a prepared dataset, and the content of its `dataset.json`."""
 
     format: Format
     capture: Any = ""  # name of the capture's folder
@@ -159,17 +159,17 @@ class Dataset(DatasetFolder):
         members = [name for split in SPLITS for name in self.splits[split]]
         for name in distinct(members, "in the splits, one split only may hold a subject:"):
             if name not in self._done:
-                raise ValueError(f"the splits name {name}, which is no prepared subject")
+                raise ValueError(f"the splits name {name}, but there is no such prepared subject")
         return self
 
     @cached_property
     def _done(self) -> dict[str, SubjectEntry]:
-        """The subjects that did not fail, sorted."""
+        """Subjects that did not fail, sorted."""
         return {name: entry for name, entry in sorted(self.entries.items()) if entry.status == "done"}
 
     @cached_property
     def subjects(self) -> tuple[str, ...]:
-        """All prepared subjects, sorted."""
+        """Names of the prepared subjects, sorted."""
         return tuple(self._done)
 
     @cached_property
@@ -247,7 +247,7 @@ def read_dataset(folder: Path) -> Dataset:
 
 
 def read_stack(path: Path) -> tuple[StackHeader, FaceFit]:
-    """Read the header and the fit of a stack; raise InputError if they are not those of a face crop."""
+    """Read the header and the fit of a stack; raise InputError if it is not a stack of a face crop."""
     header = read_olat_header(path)
     try:
         if header.layout_version != LAYOUT_VERSION or header.kind != "image":
@@ -303,7 +303,7 @@ class Split:
         return train, validation, test
 
     def of(self, subjects: Mapping[str, Mapping[str, Any]], seed: int) -> dict[str, list[str]]:
-        """Assign subjects, with their traits, to splits, each sorted; those of one "person" stay together.
+        """Assign subjects, with their traits, to splits, each sorted; takes of one "person" stay together.
 
         The order that is cut into splits depends only on each subject's name and the seed, so that adding or
         removing a subject moves few of the others.

@@ -30,7 +30,7 @@ from facerf_cli.synth.bank.texture_samples import CameraResponse, Sample, camera
 _LEAST_INSIDE = 0.9  # fraction of a texel's pixels that must lie on the face and inside the photo
 _AROUND_PX = 16  # rows read beyond the face, for texels that cross its border
 _CROP_PER_TEXTURE = 2  # largest side of a crop that is unwrapped, in sides of the texture
-_MEAN_SIDE = 64  # texels along a side of the mean face's shadows, as in the network
+_MEAN_SIDE = 64  # texels along a side of the mean face's shadows
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class LightTextures(Batch):
 
 @dataclass(frozen=True)
 class LitCrops(Batch):
-    """B faces under L single lights; `colours` [B, 3, 3] map true colours to those of an exposed camera."""
+    """B faces under L single lights; `colours` [B, 3, 3] map true colours to an exposed camera's."""
 
     crops: FaceCrops
     colours: Tensor
@@ -88,14 +88,14 @@ class LitCrops(Batch):
 
 @dataclass(frozen=True)
 class SampleCrops(Batch):
-    """The crops of a `Sample`: B sources, and their targets under L lights each.
+    """Crops of a `Sample`: B sources, and their targets under L lights each.
 
     Attributes:
         source: One image of each face.
         target: L images of each face, by the target's camera.
         turn: [B, 3, 3], from the source's camera space to the target's.
         lights: [B, L, 3], unit vectors in the target's camera space.
-        colours: [B, 3, 3], from true colours to those of an exposed camera.
+        colours: [B, 3, 3], from true colours to an exposed camera's.
         response: The cameras of the sources.
     """
 
@@ -116,7 +116,7 @@ class SampleCrops(Batch):
             source=inpaint(photo, visible[:, 0]),
             visible=visible,
             normals_source=normals,
-            # The source's normals turned, as in `Field.olats`.
+            # the source's normals, rotated, like in `Field.olats`
             normals_target=torch.einsum("bdc,bcij->bdij", self.turn, normals),
             lights=self.lights,
             target=_coloured(target, self.colours),
@@ -190,8 +190,8 @@ class DatasetFaces:
     def _sample(self, pair: Pair, source: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
         """Add target lights, the pair's first, and a camera to a source [3, H, W].
 
-        The albedo of real skin is unknown. The exposure is that of the face under a constant map of radiance
-        1 instead, which equals the albedo except for light that other parts of the face occlude.
+        The albedo of real skin is unknown. The face under a constant map of radiance 1 gives the exposure
+        instead; it equals the albedo except for light that other parts of the face occlude.
         """
         path = self.dataset.stack_path(pair.subject, pair.target_camera)
         source_info, info = (

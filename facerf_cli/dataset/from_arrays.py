@@ -33,7 +33,7 @@ People = np.ndarray | Mapping[str, np.ndarray]  # images [L, H, W, 3] of a perso
 
 @dataclass(frozen=True, eq=False)
 class _Arrays(Capture):
-    """A capture whose frames are arrays in memory, [L, H, W, 3] of each subject, or of its cameras."""
+    """Capture whose frames are arrays in memory, [L, H, W, 3] of each subject, or of its cameras."""
 
     images: Mapping[str, People] = field(default_factory=dict)
 

@@ -1,8 +1,8 @@
 """Prepare one subject of a capture: landmarks, one head fit, crops, OLAT stacks and a contact sheet.
 
-Images are read one by one, twice: for the fully lit sum on which the face is detected, and for the stack. At
-most one camera's sum is in memory. A `Selection` gives the lights and cameras to use; a camera that does not
-see the face is left out as well. `index_page` shows all subjects: each one's sheet, split, fit and findings.
+Images are read one at a time, twice: for the fully lit sum that the face is detected in, and for the stack.
+At most one camera's sum is in memory. A `Selection` lists the lights and cameras to use; a camera that does
+not see the face is also left out. `index_page` shows each subject's sheet, split, fit and findings.
 """
 
 import logging
@@ -65,7 +65,7 @@ def subject_outputs(capture: Capture, subject: str, dataset: DatasetFolder) -> l
 
 @dataclass(frozen=True, eq=False)
 class Preparation:
-    """All that subjects are prepared with; `networks` find the faces."""
+    """Settings that all subjects are prepared with; `networks` find the faces."""
 
     model: MorphableModel
     networks: Networks
@@ -140,7 +140,7 @@ def prepared_subjects(capture: Capture, dataset: DatasetFolder) -> dict[str, Sub
 
 @dataclass(frozen=True, eq=False)
 class _Subject:
-    """A subject of a capture, and the lights of their stacks (indices into the capture's)."""
+    """Subject of a capture, and the lights of their stacks (indices into the capture's)."""
 
     capture: Capture
     name: str
@@ -149,11 +149,11 @@ class _Subject:
 
     @property
     def directions_world(self) -> np.ndarray:
-        """Unit vectors toward the lights [L, 3]."""
+        """Unit vectors [L, 3] toward the lights."""
         return self.capture.directions_world[list(self.lights)]
 
     def provenance(self, *camera: str) -> dict[str, str | int]:
-        """Metadata of files made from their images, marked as synthetic where the capture is."""
+        """Return metadata for files made from their images, marked as synthetic if the capture is."""
         synthetic = self.capture.provenance.get("synthetic") is True
         source_type = COMPUTER_GRAPHICS_SOURCE_TYPE if synthetic else ""
         name = "/".join([self.name, *camera])
@@ -161,7 +161,7 @@ class _Subject:
 
 
 def _remove_dropped(subject: str, chosen: Selection, how: Preparation, any_left: bool) -> None:
-    """Log what is left out and delete an earlier run's files of it; raise where that is not allowed."""
+    """Log what is left out and delete its files of an earlier run; raise InputError if not allowed."""
     if chosen.dropped and (how.strict or not any_left):
         reasons = "; ".join(f"{camera}: {why}" for camera, why in chosen.dropped.items())
         advice = "without --strict the other cameras are used" if any_left else "no camera is left"
@@ -185,7 +185,7 @@ def _ambient_kept(person: _Subject, cameras: Iterable[str]) -> list[str]:
 
 
 def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
-    """Detect landmarks [68, 2] on the fully lit sum, in the camera's pixels; None where there is no face."""
+    """Detect landmarks [68, 2] in the fully lit sum, in the camera's pixels; None without a face."""
     weights = constant_weights(person.directions_world)
     posed = person.capture.cameras[camera]
     lit = np.zeros((posed.height_px, posed.width_px, 3), np.float32)
@@ -196,7 +196,7 @@ def _find_landmarks(person: _Subject, camera: str) -> np.ndarray | None:
 
 
 def constant_weights(directions: np.ndarray) -> np.ndarray:
-    """Weights [L] of lights [L, 3] under a constant map of radiance 1: their cells' solid angles / pi."""
+    """Return weights [L] of lights [L, 3] under a constant map of radiance 1: their solid angles / pi."""
     white = torch.ones(2, 4, 3)
     return envmap_weights(white, torch.from_numpy(directions).float())[:, 0].numpy()
 
@@ -235,7 +235,7 @@ def stack_header(
 def _header(person: _Subject, camera: str, head: Heads, fit: FaceFit) -> StackHeader:
     """Make the header of a camera's stack with a black source; raise InputError where it sees no face."""
     posed = person.capture.cameras[camera]
-    # World to crop by way of the head, so that lights turn with the normals.
+    # World to crop through the head, so that lights rotate with the normals.
     world_to_crop = fit.rotation.double() @ head.rotation[0].mT
     directions = person.directions_world @ world_to_crop.numpy().T
     source = np.zeros((fit.crop.size_px, fit.crop.size_px, 3), np.float32)
@@ -274,7 +274,7 @@ def _crops(
         if place in sheet_images:
             sheet_images[place] = image
         yield torch.from_numpy(image).permute(2, 0, 1)[None]
-    # Under a constant map of 1 a face is below 1; what leaves the range of half floats is warned of.
+    # Under a constant map of 1 a face is below 1; warn about values outside the range of half floats.
     name, lit = f"{person.name}/{camera}", float(header.source.max())
     np.minimum(header.source, HALF_MAX, out=header.source)
     if clipped:
@@ -296,23 +296,23 @@ def index_page(
 
 
 def sheet_lights(directions: np.ndarray) -> list[int]:
-    """Indices of the sheet's three lights: those nearest to front, left and right; directions [L, 3]."""
+    """Return indices of the sheet's three lights, nearest to front, left and right; directions [L, 3]."""
     wanted = np.stack([azel_to_direction(*azel).numpy() for azel in _SHEET_AZEL_DEG])
     return (wanted @ directions.T).argmax(1).tolist()
 
 
 def sheet_tiles(
-    header: StackHeader, fit: FaceFit, model: MorphableModel, shown: Mapping[int, np.ndarray]
+    header: StackHeader, fit: FaceFit, model: MorphableModel, images: Mapping[int, np.ndarray]
 ) -> np.ndarray:
-    """Tiles of one camera [6, h, w, 3]: fully lit, the fit over it, masked, and three single lights.
+    """Draw the tiles of one camera [6, h, w, 3]: fully lit, with the fit, masked, and three single lights.
 
-    Scene-linear, exposed for display; the three lights share one exposure.
+    They are scene-linear, exposed for display; the three lights share one exposure.
     """
     side_px = fit.crop.size_px
     lit = header.source * np.float32(2 ** auto_exposure_ev(header.source))
     overlay = draw_fit(header.source, replace(fit, crop=Crop(0.0, 0.0, float(side_px), side_px)), model)
     masked = lit * (0.1 + 0.9 * header.seen[..., None])
-    single = np.stack([shown[light] for light in sheet_lights(header.directions)])
+    single = np.stack([images[light] for light in sheet_lights(header.directions)])
     single *= np.float32(2 ** auto_exposure_ev(single.reshape(-1, side_px, 3)))
     small = Crop(0.0, 0.0, float(side_px), _TILE_PX)  # crops of a subject may differ in size
     tiles = np.stack([small.apply(tile.clip(0, 1)) for tile in (lit, overlay, masked, *single)])

@@ -1,4 +1,4 @@
-"""All subjects of a capture checked and prepared, for `facerf prepare-dataset`."""
+"""Check and prepare all subjects of a capture, for `facerf prepare-dataset`."""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -75,7 +75,7 @@ def prepare_capture(
     """Prepare all subjects of the capture in a folder, or only check them; return the exit code."""
     split, overwrite, output = Split.parse(content.split), batch.overwrite == "always", batch.output
     if (px := content.crop) is not None and (px % CROP_STEP_PX or not 0 < px <= LARGEST_CROP_PX):
-        raise UsageError(f"--crop {px}: give a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
+        raise UsageError(f"--crop {px}: use a multiple of {CROP_STEP_PX} up to {LARGEST_CROP_PX}")
     capture = _open_capture(folder, reading, chart)
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
@@ -109,9 +109,9 @@ def check_all(
     UsageError with `--shard`, because the file covers all subjects.
     """
     if batch.shard.of > 1:
-        raise UsageError("--shard: --checks only checks all subjects; omit it, and give --jobs or --ray")
+        raise UsageError("--shard: --checks only checks all subjects; use --jobs or --ray instead")
     results = spread_with_bar(work, items, "checks", batch.workers(settings), settings, _not_checked)
-    findings = [found for of_subject in results for found in of_subject]
+    findings = [finding for of_subject in results for finding in of_subject]
     write_findings(batch.output / FINDINGS_FILE, findings)
     show_findings(findings, strict)
     if not findings:
@@ -130,11 +130,11 @@ def _not_checked(item: Item, error: Exception) -> list[Finding]:
 
 
 def _open_capture(folder: Path, reading: ReadSettings, chart: ChartSettings) -> Capture:
-    """Read a capture's description and --colour-chart, and log the corrections; UsageError for wrong ones."""
+    """Read a capture's description and --colour-chart, and log the corrections."""
     image, corners = chart.colour_chart, chart.chart_corners
     if bool(corners) != bool(image):
         raise UsageError(
-            "--colour-chart, --chart-corners: one is missing; give the image and its chart's corners"
+            "--colour-chart, --chart-corners: one is missing; pass the image and its chart's corners"
         )
     try:
         capture = read_capture(folder, reading)
@@ -161,29 +161,29 @@ def _parse_corners(text: str) -> np.ndarray:
     except ValueError:
         corners_px = np.empty(0)
     if corners_px.shape[1:] != (4, 2) or not np.isfinite(corners_px).all():
-        raise UsageError(f"--chart-corners '{text}': give four corners in pixels, as 'x,y x,y x,y x,y'")
+        raise UsageError(f"--chart-corners '{text}': use four corners in pixels, as 'x,y x,y x,y x,y'")
     return corners_px
 
 
 def _check_subjects(capture: Capture, output: Path, split: Split) -> None:
-    """Raise for faults that concern all subjects; log what the options leave out."""
+    """Raise UsageError for faults that concern all subjects; log what the options leave out."""
     if not capture.subjects:
         raise UsageError(
             f"{capture.folder}: no subjects found at {capture.pattern}; check the pattern and the images"
         )
     if output.resolve() == capture.folder.resolve():
-        raise UsageError(f"-o {output}: is the capture itself; give another folder")
+        raise UsageError(f"-o {output}: the folder of the capture itself; use another folder")
     if marked := sum(map(len, capture.marked.values())):
-        log.info("%s: %d images that are marked as damaged (.bad) are left out", capture.folder, marked)
+        log.info("%s: left out %d images that are marked as damaged (.bad)", capture.folder, marked)
     left = len(capture.subjects) - sum(split.counts(len(capture.subjects)))
     if left:
         log.warning("--split leaves %d of %d subjects out of every split", left, len(capture.subjects))
 
 
 def _judge_earlier(capture: Capture, output: Path, made_from: Recipe, dry_run: bool) -> None:
-    """Raise UsageError where finished subjects were prepared with other options than this run has.
+    """Raise UsageError if finished subjects were prepared with other options.
 
-    Removes the records of subjects whose missing frames exist by now, so that they are prepared again.
+    Removes the records of subjects whose missing frames exist now, so that they are prepared again.
     """
     dataset = DatasetFolder(folder=output)
     earlier = prepared_subjects(capture, dataset)
@@ -192,13 +192,13 @@ def _judge_earlier(capture: Capture, output: Path, made_from: Recipe, dry_run: b
         require_same(record.prepared, made_from, f"{output}: {subject} was prepared otherwise", advice)
     for subject, record in () if dry_run else earlier.items():
         if has_new_frames(capture, subject, record.missing):
-            log.info("%s: frames that were missing exist now; it is prepared again", subject)
+            log.info("%s: missing frames exist now; preparing the subject again", subject)
             dataset.record_path(subject).unlink()
 
 
 @dataclass(frozen=True)
 class Prepare(Job):
-    """Prepares one subject; settings only."""
+    """Job that prepares one subject."""
 
     verb = "prepare-dataset"
 
@@ -207,7 +207,7 @@ class Prepare(Job):
     with_checks: bool
 
     def outputs_of(self, item: Item) -> Sequence[Path]:
-        """Files of a subject."""
+        """Return the files of a subject."""
         return subject_outputs(self.capture, item.name, self.how.dataset)
 
     def __call__(self, item: Item) -> Outcome:

@@ -1,4 +1,4 @@
-"""What a stage's `build` makes its objective from: options, networks of a preset's sizes, and data."""
+"""Provide what a stage's `build` needs: options, networks of a preset's sizes, and data."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -27,7 +27,7 @@ from facerf_cli.training.settings import Sizes, TrainSettings, network_settings_
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A run of `facerf train`.
+    """Run of `facerf train`.
 
     Attributes:
         training: Settings of the loop.
@@ -57,7 +57,7 @@ class Run:
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The dataset of --dataset."""
+        """Prepared dataset of --dataset."""
         if self.options.dataset is None:
             raise UsageError(f"--stage {self.options.stage}: needs a prepared dataset; pass --dataset")
         return read_dataset(self.options.dataset)

@@ -130,7 +130,7 @@ def predicted_images(
 ) -> tuple[Tensor, Tensor]:
     """Predict sources [B, 1, 3, T, T] and targets [B, M, 3, T, T], at the network's exposure.
 
-    coefficients [B, M, 9, 3] are those of the targets' lights.
+    coefficients: [B, M, 9, 3], of the targets' lights.
     """
     albedo = estimate.albedo[:, None]
     own = shading(sample.normals_source, estimate.coefficients[:, None])
@@ -138,7 +138,7 @@ def predicted_images(
 
 
 def _sheet_rows(sample: Sample, estimate: DiffuseEstimate, own: Tensor, relit: Tensor) -> np.ndarray:
-    """Two rows of textures [2T, (M + 3) T, 3] of one face."""
+    """Draw two rows of textures [2T, (M + 3) T, 3] of one face."""
     seen, mask = sample.visible[0], (sample.weight[0] > 0).float()
     albedo, exposure = estimate.albedo[0], estimate.exposure[0]
     lit = shading(sample.normals_source, estimate.coefficients[:, None])[0, 0]

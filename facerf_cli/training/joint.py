@@ -73,7 +73,7 @@ LANDMARKS = (*CONTOUR, *FIXED_LANDMARKS)  # the paper's 66 (Saragih et al., 2011
 
 
 def chosen(points: Tensor, landmarks: tuple[int, ...]) -> Tensor:
-    """Some of the 68 landmarks [B, 68, C]."""
+    """Select some of the 68 landmarks [B, 68, C]."""
     return points.index_select(1, on_device(points.device, torch.tensor, landmarks))
 
 
@@ -111,7 +111,7 @@ def leading(model: MorphableModel, identities: int, expressions: int) -> Morphab
 
 @dataclass(frozen=True)
 class UnwrappedHeads(Batch):
-    """Textures [B, 3, T, T] with unseen texels filled, visibility [B, 1, T, T] and normals [B, 3, T, T]."""
+    """B unwrapped heads: textures with unseen texels filled, visibility and normals, [B, C, T, T]."""
 
     texture: Tensor
     visible: Tensor
@@ -146,7 +146,7 @@ _SHEET_ROWS, _SHEET_PX = 8, 256
 
 @dataclass(frozen=True)
 class JointSettings:
-    """The paper's settings."""
+    """Settings of the stage; the defaults are the paper's."""
 
     crop_px: int = 512
     texture_side: int = 512
@@ -168,12 +168,11 @@ class _Relit:
 
 
 class JointObjective(Objective):
-    """The paper's loss on a prepared dataset's pairs, and on photos.
+    """Minimise the paper's loss on a prepared dataset's pairs, and on photos.
 
-    Without `geometry` heads are fitted to the crops' landmarks, and the geometry terms are left out. `model`
-    is the face model of the coefficients.
-    `appearance` is V_f, `light` S_f; the term of one that is missing is left out. They are frozen and not
-    saved.
+    Without `geometry`, heads are fitted to the crops' landmarks, and the geometry terms are omitted. `model`
+    is the face model of the coefficients. `appearance` is V_f, `light` S_f; without one, its term is omitted.
+    They are frozen and not saved.
     """
 
     chooses_by = "si_mse"
@@ -193,7 +192,7 @@ class JointObjective(Objective):
         super().__init__(trained, _provenance(dataset, model, photos, appearance, light))
         self.settings = settings
         self.photos = photos
-        self.skips_networks = photos is not None  # photos train the geometry alone
+        self.skips_networks = photos is not None  # photos train only the geometry
         self.feature_networks = nn.ModuleDict(
             {
                 name: network.requires_grad_(False).eval()
@@ -215,7 +214,7 @@ class JointObjective(Objective):
             network.set_mean_face(*mean_face_of(model, network.rig_lights))
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
-        """Compile the networks alone; shapes in the rasterizer depend on what the camera sees."""
+        """Compile only the networks; shapes in the rasterizer depend on the camera's view."""
         called = {"reflectance": ("encode", "decode"), "geometry": ("forward",)}
         for name, network in (*self.networks.items(), *self.feature_networks.items()):
             for function in called.get(name, ("layers",)):
@@ -231,14 +230,14 @@ class JointObjective(Objective):
         return self._train.draw(count, generator_of, step)
 
     def forward(self, batch: CropPairs | PhotoCrops) -> dict[str, Tensor]:
-        """Compute the weighted terms: landmarks and regularisation for both, the others for pairs alone."""
+        """Compute the weighted terms: landmarks and regularisation for both, the others only for pairs."""
         if isinstance(batch, PhotoCrops):
             terms = self._geometry_terms(*self._heads(batch.crops, batch.landmarks_px), batch.landmarks_px)
             return {name: term.mean() for name, term in terms.items()}
         detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
         estimate, heads = self._heads(torch.cat([batch.source, batch.target]), detected_px)
         terms = self._geometry_terms(estimate, heads, detected_px) if self._regresses else {}
-        # Times two, for the mean is over twice the samples: source and target each add their terms.
+        # times two: the mean is over twice the samples, because source and target each add their terms
         result = {name: 2 * term.mean() for name, term in terms.items()}
         relit = self._relit(batch, heads)
         return result | {name: term.mean() for name, term in self._image_terms(batch, relit).items()}
@@ -276,7 +275,7 @@ class JointObjective(Objective):
     def _relit(self, batch: CropPairs, heads: PosedHeads) -> _Relit:
         """Relight and pose the sources of pairs as their targets; `heads` are of both, sources first.
 
-        Sources and targets are unwrapped together, for the device then waits once for the host.
+        Sources and targets are unwrapped together, so that the device waits only once for the host.
         """
         side, count = self.settings.texture_side, len(batch.source)
         target = heads.each(lambda x: x[count:])
@@ -312,7 +311,7 @@ class JointObjective(Objective):
     def measure(self) -> None:
         """Measure the powers of the feature networks' layers, on targets spread over the training pairs.
 
-        The first process alone measures.
+        Only rank 0 measures.
         """
         networks: Any = self.feature_networks.items()
         for name, network in networks:
@@ -332,8 +331,7 @@ class JointObjective(Objective):
         """Measure the images' Si-MSE, clipped at white, for the same and another pose; and landmarks.
 
         `landmarks_iod` is the mean error of the 66 landmarks over the distance of the outer eye corners.
-        `tint_red` and `tint_blue` are red and blue over green of all faces, over those of the truth: 1 and 1
-        where skin has its colour.
+        `tint_red` and `tint_blue` are red and blue over green of all faces, relative to the ground truth.
         """
         if self._validation is None:
             self._validation = self._held_out_pairs()
@@ -364,7 +362,7 @@ class JointObjective(Objective):
         return Validation(metrics, np.concatenate(rows))
 
     def _held_out_pairs(self) -> dict[str, list[CropPairs]]:
-        """Validation pairs by kind; a dataset of one camera has no other pose."""
+        """Read validation pairs by kind; a dataset of one camera has no other pose."""
 
         def same(pair: Pair) -> bool:
             return pair.source_camera == pair.target_camera
@@ -378,7 +376,7 @@ class JointObjective(Objective):
 
 
 def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tensor:
-    """Mean landmark error over the distance of the outer eye corners, of sources and targets [2 B]."""
+    """Return mean landmark errors [2 B] of sources and targets over the distance of the outer eye corners."""
     detected_px = torch.cat([batch.source_landmarks_px, batch.target_landmarks_px])
     distance_px = (heads.landmarks_px(detected_px, camera) - chosen(detected_px, LANDMARKS)).norm(dim=-1)
     left, right = (detected_px[:, corner] for corner in OUTER_EYE_CORNERS)
@@ -386,7 +384,7 @@ def _landmark_error(heads: PosedHeads, batch: CropPairs, camera: Camera) -> Tens
 
 
 def _sheet_row(batch: CropPairs, relit: _Relit, camera: Camera) -> np.ndarray:
-    """Source, target, prediction in M_t and estimated normals of the first pair: [S, 4 S, 3]."""
+    """Draw source, target, prediction in M_t and estimated normals of the first pair: [S, 4 S, 3]."""
     normals = head_normals(relit.target, _SHEET_PX)
     shape, _ = render_textures((normals + 1) / 4, relit.target, camera)
     images = (batch.source, batch.target, relit.image * relit.mask, shape)
@@ -400,12 +398,12 @@ def _provenance(
     appearance: nn.Module | None,
     light: nn.Module | None,
 ) -> dict[str, Any]:
-    """Provenance of the dataset, the feature losses and the photos."""
+    """Return the provenance of the dataset, the feature losses and the photos."""
     published = isinstance(appearance, VggFeatures)
     of = VGG16_LICENCE if published else "trained on people and lights of a dataset (--appearance-features)"
     terms = [name for name, there in ((f"V_f, {of}", appearance), ("S_f", light)) if there is not None]
-    found = {"feature_losses": terms, "photos": len(photos.paths) if photos else 0}
-    return provenance_of(dataset, model) | found
+    count = len(photos.paths) if photos else 0
+    return provenance_of(dataset, model) | {"feature_losses": terms, "photos": count}
 
 
 def build(run: Run) -> Objective:

@@ -1,9 +1,9 @@
 """Stage `light-features`: S_f learns to predict the direction of the single light of a texture.
 
 The paper trains S_f 'to predict the light direction from images' after Meka et al. (*Deep reflectance
-fields*, 2019) and gives no details. Its features respond to shading, shadows and highlights, which the loss
-L_L compares. Textures are the Reflectance Network's targets, of one light each, black where the target pose
-does not see the face.
+fields*, 2019), without details. Its features respond to shading, shadows and highlights, which the loss L_L
+compares. Textures are the Reflectance Network's targets, of one light each, black if the target pose does not
+see the face there.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ from facerf_cli.training.objective import Objective, Validation
 from facerf_cli.training.sheets import tiled
 from facerf_cli.training.texture import HeadsObjective, HeadsSettings
 
-_NORMALS_SIDE = 64  # texels along a side of the normals from which head rotations are computed
+_NORMALS_SIDE = 64  # texels along a side of the normals that head rotations are computed from
 _SHEET_FACES, _CPU = 6, torch.device("cpu")
 _HEADS = HeadsSettings()
 
@@ -80,25 +80,25 @@ class LightFeaturesObjective(HeadsObjective):
 
 
 def _cosines(network: LightNetwork, batch: LightTextures) -> Tensor:
-    """Cosines between predicted and true directions [B, L]."""
+    """Return cosines [B, L] between predicted and true directions."""
     predicted = network(batch.textures.flatten(0, 1)).view(batch.lights_head.shape)
     return (predicted * batch.lights_head).sum(-1)
 
 
 def _sheet(network: LightNetwork, batch: LightTextures) -> np.ndarray:
-    """Three rows for some faces: textures, balls under the true lights, balls under the predicted lights.
+    """Draw three rows for each face: textures, and balls under the true and under the predicted lights.
 
     The balls are seen from the front, in the head's frame.
     """
     rows = []
     for textures, lights in zip(batch.textures[:_SHEET_FACES], batch.lights_head[:_SHEET_FACES], strict=True):
         predicted = network(textures.to(next(network.parameters()).device)).cpu()
-        rows += [textures, *(_balls(one, textures.shape[-1]) for one in (lights, predicted))]
+        rows += [textures, *(_balls(directions, textures.shape[-1]) for directions in (lights, predicted))]
     return tiled(rows)
 
 
 def _balls(lights: Tensor, side: int) -> Tensor:
-    """Grey balls [N, 3, side, side] under lights [N, 3], a little brighter than the black background."""
+    """Draw grey balls [N, 3, side, side] under lights [N, 3], slightly brighter than the background."""
     along = torch.linspace(-1, 1, side) * 1.05
     y, x = torch.meshgrid(-along, along, indexing="ij")
     inside = 1 - x**2 - y**2
@@ -109,10 +109,10 @@ def _balls(lights: Tensor, side: int) -> Tensor:
 
 @dataclass(frozen=True)
 class AppearanceObjectiveSettings:
-    """Held-out pairs of people that are not trained on, and training pairs that are left out."""
+    """Number of held-out pairs, and of training pairs that are left out."""
 
     held_out_pairs: int = 48
-    every: int = 10  # of the training pairs, one is left out to measure the people
+    every: int = 10  # one in this many training pairs is left out to measure the people
 
 
 class AppearanceObjective(Objective):
@@ -134,7 +134,7 @@ class AppearanceObjective(Objective):
         self._left_out = replace(pairs, pairs=pairs.pairs[:: settings.every])
         self._held_out = open_pairs(dataset, "validation", network.settings.side)
         self.settings = settings
-        self._validation: list[list[CropPairs]] | None = None  # of people that are known, and of others
+        self._validation: list[list[CropPairs]] | None = None  # of known people, and of others
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> CropPairs:
         return self._train.draw(count, generator_of, step)

@@ -1,4 +1,4 @@
-"""The training loop: draw a batch, compute losses, step, log, validate, save, resume.
+"""Run the training loop: draw a batch, compute losses, step, log, validate, save, resume.
 
 An `Objective` provides the stage's batches, losses and validation; the loop is the same for all stages. With
 torchrun, several processes train together (`training/processes.py`).
@@ -81,7 +81,7 @@ def train(
 
 
 class Trainer:
-    """A run between two steps: networks, optimizer, the weights' average, and how far it is."""
+    """State of a run between two steps, and the methods that take a step."""
 
     def __init__(
         self,
@@ -196,8 +196,8 @@ class Trainer:
         totals: dict[str, Tensor] = {}
         parts = self.settings.accumulate
         for number, part in enumerate(batch.parts(parts), 1):
-            alone = isinstance(model, DistributedDataParallel) and number < parts
-            with model.no_sync() if alone else nullcontext():  # type: ignore[operator]
+            waits = isinstance(model, DistributedDataParallel) and number < parts
+            with model.no_sync() if waits else nullcontext():  # type: ignore[operator]
                 terms = {name: term / parts for name, term in model(part.to(self.device)).items()}
                 torch.stack(list(terms.values())).sum().backward()  # type: ignore[no-untyped-call]
             totals = {name: totals.get(name, 0) + term.detach() for name, term in terms.items()}
@@ -227,7 +227,7 @@ class Trainer:
         self.report(row)
 
     def _metadata(self, row: Row) -> dict[str, Any]:
-        """Return the metadata of the checkpoint, with that of --start-from as its history."""
+        """Return the metadata of the checkpoint, with --start-from's as its history."""
         start, provenance, colours = (
             self.start,
             dict(self.objective.provenance),
@@ -383,7 +383,7 @@ def _leave_signals(_: int) -> None:
 
 
 class _Draws(Dataset[Batch | FacerfError]):
-    """An objective's batches by step, for data-loading workers."""
+    """Batches of an objective by step, for data-loading workers."""
 
     def __init__(self, objective: Objective, samples: range, seed: int) -> None:
         self.objective = copy.copy(objective)

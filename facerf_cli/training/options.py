@@ -1,4 +1,4 @@
-"""The options of `facerf train`. Light to import."""
+"""Options of `facerf train`. Light to import."""
 
 import re
 from collections.abc import Callable, Mapping
@@ -66,8 +66,8 @@ class TrainOptions:
             only the Reflectance Network.
         workers: Number of processes that draw samples ahead.
         learning_rate: Highest learning rate.
-        steps: Number of steps after which the run ends.
-        max_time: Time after which the run ends, such as 90s, 45m or 2h, summed over all resumptions.
+        steps: Number of steps of the run.
+        max_time: Duration of the run, such as 90s, 45m or 2h, summed over all resumptions.
         validate_every: Number of steps between validations on held-out people, each followed by a save.
         batch: Samples per step, of all processes together.
         gradient_clip: Largest norm of the gradient; a larger one is scaled down. 0: no clipping.

@@ -1,4 +1,4 @@
-"""One run of `facerf train`: build the objective of its stage and start the training loop."""
+"""Run `facerf train`: build the objective of its stage and start the training loop."""
 
 import importlib
 import logging

@@ -102,7 +102,7 @@ def _tensorboard(folder: Path, step: int) -> Any:
 
 @dataclass
 class Stop:
-    """The signal that asked the run to end; 0 for none."""
+    """Signal that asked the run to end; 0 for none."""
 
     signal: int = 0
 

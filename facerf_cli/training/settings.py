@@ -108,7 +108,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class PaperWeights:
-    """The paper's lambda_l, lambda_r, lambda_p and lambda_f, and lambda_alpha and lambda_beta of L_r.
+    """Weights of the paper: lambda_l, lambda_r, lambda_p, lambda_f; of L_r, lambda_alpha and lambda_beta.
 
     With `channels_apart`, S_f and a V_f trained by facerf compare each colour channel separately; ImageNet's
     V_f always sees colours, as in the paper.

@@ -1,6 +1,6 @@
-"""Stage `reflectance`: the Reflectance Network alone, on textures of synthetic heads or of a dataset.
+"""Stage `reflectance`: train only the Reflectance Network, on textures of synthetic heads or a dataset.
 
-With S_f the paper's feature loss on textures, L_L, is added to the default form's loss.
+With S_f, the paper's feature loss on textures, L_L, is added to the default form's loss.
 """
 
 from collections.abc import Callable
@@ -35,7 +35,7 @@ _SHEET_FACES = 5
 
 @dataclass(frozen=True)
 class HeadsSettings:
-    """Lights of a face and step, and held-out heads, each drawn `held_out_draws` times."""
+    """Lights per face and step, and held-out heads, each drawn `held_out_draws` times."""
 
     lights: int = 8
     held_out_heads: int = 12
@@ -43,10 +43,10 @@ class HeadsSettings:
 
 
 class HeadsObjective(Objective):
-    """A stage that trains one network on textures of heads."""
+    """Base of the stages that train one network on textures of heads."""
 
     def __init__(self, name: str, network: nn.Module, source: Any, settings: HeadsSettings) -> None:
-        """Train a network `name` on a `SampleSource`, or what has its heads and provenance."""
+        """Train a network `name` on a `SampleSource`, or another source of heads with provenance."""
         super().__init__({name: network}, source.provenance)
         self.source, self.settings = source, settings
         self.heads, self.held_out = source.heads(settings.held_out_heads)
@@ -63,10 +63,10 @@ class HeadsObjective(Objective):
 
 
 class SamplesObjective(HeadsObjective):
-    """A stage that trains one network on samples: sources, and their targets under single lights."""
+    """Base of the stages that train one network on sources and their targets under single lights."""
 
     def draw(self, count: int, generator_of: Callable[..., torch.Generator], step: int) -> Any:
-        """Draw `count` samples; those of a dataset share the stacks of their sources with other steps."""
+        """Draw `count` samples; a dataset's samples share the stacks of their sources with other steps."""
         if not isinstance(self.source, DatasetFaces):
             return super().draw(count, generator_of, step)
         drawn = []
@@ -121,8 +121,8 @@ class TextureObjective(SamplesObjective):
             try:
                 network.set_mean_face(*source.mean_face())
             except ValueError as error:
-                advice = "give another --bank or --start-from"
-                raise InputError(f"{error}, as the heads were baked; {advice}") from None
+                advice = "use another --bank or --start-from"
+                raise InputError(f"{error} when the heads were baked; {advice}") from None
         super().__init__("reflectance", network, source, settings)
         self.light = light
         self.source_colours = SourceColours.of(self._measure_colours())
@@ -156,7 +156,7 @@ class TextureObjective(SamplesObjective):
         with self.mixed_precision():
             encoded = self._encoded(sample)
             root = network.decode_root(encoded, sample.normals_target, sample.lights).float()
-        # The network measures the exposure on seen texels alone, and divides by it.
+        # the network divides by the exposure that it measures on visible texels
         target = sample.target / encoded.exposure[:, None]
         terms = {"root": root_loss(root, target, sample.weight)}
         if self.light is not None:
@@ -171,7 +171,7 @@ class TextureObjective(SamplesObjective):
     def validate(self) -> Validation:
         """Measure the mean Si-MSE of held-out heads, clipped at white: of all, and by the target's pose.
 
-        The sheet has two rows a face: source and true OLATs; visible source and predicted OLATs.
+        The sheet has two rows per face: source and true OLATs; visible source and predicted OLATs.
         """
         errors: list[Tensor] = []
         same_pose: list[bool] = []
@@ -192,7 +192,7 @@ class TextureObjective(SamplesObjective):
 
 
 def _sheet_rows(sample: Sample, predicted: Tensor) -> np.ndarray:
-    """Two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
+    """Draw two rows of textures [2T, (L + 1) T, 3] of a sample's face."""
     mask = (sample.weight[0] > 0).float()
     truth = [sample.source[0], *(sample.target[0] * mask)]
     return tiled([truth, [sample.source[0] * sample.visible[0], *(predicted[0] * mask)]])

@@ -289,7 +289,7 @@ def test_a_line(
 
 
 CONFIGURATIONS = {
-    "[train.loss]\nphotometric = -9": "[train.loss] photometric is -9; use numbers from 0",
+    "[train.loss]\nphotometric = -9": "[train.loss] photometric is -9",
     "[train.optimizer]\nname = 'SGD'": "name is 'SGD'; use one of AdamW, Adadelta",
     "[train.optimizer]\nbetas = [0.9]": "[train.optimizer] betas",
     "[train]\nschedule = 3": "[train.schedule] is not a table",
