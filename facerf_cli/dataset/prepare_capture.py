@@ -1,7 +1,7 @@
 """Check and prepare all subjects of a capture, for `facerf prepare-dataset`."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -80,7 +80,7 @@ def prepare_capture(
     _check_subjects(capture, output, split)
     items = [Item(capture.folder / name, output / name, name) for name in capture.subjects]
     if checking.checks == "only" and not batch.dry_run:
-        return check_all(partial(_check, capture), items, batch, checking.strict, settings)
+        return _check_all(capture, items, batch, checking.strict, settings)
     networks = Networks(serving_files(settings.checkpoints, user="facerf"), torch_device(settings))
     model, is_builtin = load_face_model(content.face_model), content.face_model == BUILTIN
     model_sha256 = file_sha256(BUILTIN_PATH if is_builtin else Path(content.face_model))
@@ -97,17 +97,14 @@ def prepare_capture(
     return code
 
 
-def check_all(
-    work: Callable[[Item], list[Finding]],
-    items: Sequence[Item],
-    batch: BatchOptions,
-    strict: bool,
-    settings: Settings,
+def _check_all(
+    capture: Capture, items: Sequence[Item], batch: BatchOptions, strict: bool, settings: Settings
 ) -> int:
     """Check all subjects, print the table and write findings.jsonl; return 1 if a subject would be stopped.
 
     UsageError with `--shard`, because the file covers all subjects.
     """
+    work = partial(_check, capture)
     if batch.shard.of > 1:
         raise UsageError("--shard: --checks only checks all subjects; use --jobs or --ray instead")
     results = spread_with_bar(work, items, "checks", batch.workers(settings), settings, _not_checked)

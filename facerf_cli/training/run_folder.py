@@ -47,7 +47,16 @@ class RunLog:
             with atomic_path(path) as temporary:
                 temporary.write_text("".join(f"{line}\n" for line in rows))
         self.file = path.open("a")
-        self.board = _tensorboard(folder / "tensorboard", step)
+        self.board: Any = None
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+
+            self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1)
+        except ImportError:
+            words = (
+                "TensorBoard is not installed (pip install 'facerf[tensorboard]'); the log is in log.jsonl"
+            )
+            log.info(words)
 
     def __enter__(self) -> "RunLog":
         return self
@@ -61,9 +70,10 @@ class RunLog:
         """Write a row; entries of its dictionaries are named OUTER/INNER in TensorBoard."""
         self.file.write(json_line(row) + "\n")
         self.file.flush()
-        if self.board:
-            for name, value in _flat(row).items():
-                self.board.add_scalar(name, value, row["step"])
+        for name, value in row.items() if self.board else ():
+            numbers = value if isinstance(value, dict) else {"": value}
+            for inner, number in numbers.items() if name != "step" else ():
+                self.board.add_scalar(f"{name}/{inner}".rstrip("/"), number, row["step"])
 
     def sheet(self, step: int, sheet: np.ndarray) -> None:
         """Write a contact sheet [H, W, 3], scene-linear."""
@@ -79,25 +89,6 @@ def _step_of(line: str) -> float:
         return float(parse_json(line)["step"])
     except (ValueError, KeyError, TypeError):
         return math.inf
-
-
-def _flat(row: dict[str, Any]) -> dict[str, float]:
-    flat: dict[str, float] = {}
-    for name, value in row.items():
-        if isinstance(value, dict):
-            flat |= {f"{name}/{inner}": number for inner, number in value.items()}
-        elif name != "step":
-            flat[name] = value
-    return flat
-
-
-def _tensorboard(folder: Path, step: int) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        log.info("TensorBoard is not installed (pip install 'facerf[tensorboard]'); the log is in log.jsonl")
-        return None
-    return SummaryWriter(folder, purge_step=step + 1)
 
 
 @dataclass
