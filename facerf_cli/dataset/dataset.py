@@ -147,8 +147,8 @@ class Dataset(DatasetFolder):
 
     @model_validator(mode="after")
     def _is_consistent(self) -> "Dataset":
-        light_ids = distinct([light.id for light in self.rig.lights], "the light")
-        for name, subject in self._done.items():
+        light_ids, done = distinct(self.light_ids, "the light"), self._done
+        for name, subject in done.items():
             if not distinct(subject.cameras, f"in {name}, the camera"):
                 raise ValueError(f"subject {name} needs at least one camera")
             lights = light_ids if subject.lights is None else subject.lights
@@ -158,28 +158,28 @@ class Dataset(DatasetFolder):
             raise ValueError(f"the split {missing[0]} is missing")
         members = [name for split in SPLITS for name in self.splits[split]]
         for name in distinct(members, "in the splits, one split only may hold a subject:"):
-            if name not in self._done:
+            if name not in done:
                 raise ValueError(f"the splits name {name}, but there is no such prepared subject")
         return self
 
-    @cached_property
+    @property
     def _done(self) -> dict[str, SubjectEntry]:
         """Subjects that did not fail, sorted."""
         return {name: entry for name, entry in sorted(self.entries.items()) if entry.status == "done"}
 
     @cached_property
-    def subjects(self) -> tuple[str, ...]:
-        """Names of the prepared subjects, sorted."""
-        return tuple(self._done)
-
-    @cached_property
     def cameras(self) -> dict[str, tuple[str, ...]]:
-        """Cameras of each prepared subject, in a split or not."""
+        """Cameras of each prepared subject, in a split or not, sorted by subject."""
         return {name: tuple(entry.cameras) for name, entry in self._done.items()}
 
-    @cached_property
-    def light_ids(self) -> tuple[str, ...]:
-        return tuple(light.id for light in self.rig.lights)
+    @property
+    def subjects(self) -> tuple[str, ...]:
+        """Names of the prepared subjects, sorted."""
+        return tuple(self.cameras)
+
+    @property
+    def light_ids(self) -> list[str]:
+        return [light.id for light in self.rig.lights]
 
     @cached_property
     def directions_world(self) -> np.ndarray:
@@ -187,17 +187,13 @@ class Dataset(DatasetFolder):
         directions = [np.array(light.direction_world) for light in self.rig.lights]
         return np.array([direction / np.linalg.norm(direction) for direction in directions])
 
-    @cached_property
-    def _lights_by_subject(self) -> dict[str, tuple[int, ...]]:
-        places = {name: place for place, name in enumerate(self.light_ids)}
-        return {
-            name: tuple(places[light] for light in (entry.lights or self.light_ids))
-            for name, entry in self._done.items()
-        }
-
     def lights_of(self, subject: str) -> tuple[int, ...]:
         """Return the lights of a subject's stacks, in the order of the parts, as indices into `light_ids`."""
-        return self._lights_by_subject[subject]
+        lights = self.entries[subject].lights
+        if lights is None:
+            return tuple(range(len(self.rig.lights)))
+        places = {name: place for place, name in enumerate(self.light_ids)}
+        return tuple(places[light] for light in lights)
 
     def traits_of(self, subject: str) -> dict[str, Any]:
         """Return a subject's traits; {} if the capture lists none."""

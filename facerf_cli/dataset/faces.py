@@ -6,7 +6,6 @@ written. Samples replace the synthetic ones of `synth/bank/texture_samples.py`.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -136,8 +135,11 @@ class DatasetFaces:
     dataset: Dataset
     model: MorphableModel
     side: int
+    crop_px: int  # side of the crops that are unwrapped
+    train: PairReader  # of the split train
+    fewest_lights: int  # that a subject has
+    rig_lights: int  # of the mean face's shadows
     provenance: dict[str, Any]
-    rig_lights: int = RIG_LIGHTS  # of the mean face's shadows
 
     def heads(self, held_out: int) -> tuple[Tensor, Tensor]:
         """Return heads of the split train, and at most `held_out` of the split validation."""
@@ -151,17 +153,9 @@ class DatasetFaces:
         """See `mean_face_of`."""
         return mean_face_of(self.model, self.rig_lights)
 
-    @cached_property
-    def _train(self) -> PairReader:
-        return pairs_of_split(self.dataset, "train", self._crop_px)
-
-    @property
-    def _crop_px(self) -> int:
-        return min(self.dataset.crop_px, _CROP_PER_TEXTURE * self.side)
-
     def source_colours(self, count: int, generator: torch.Generator) -> Tensor:
         """Measure mean colours [N, 3] of about `count` training sources, as random cameras see them."""
-        colours = self._train.source_colours(count)
+        colours = self.train.source_colours(count)
         return torch.stack([camera_matrix(generator) @ colour for colour in colours]).double()
 
     def draw_shared(
@@ -171,7 +165,7 @@ class DatasetFaces:
 
         See `PairReader.draw_source`.
         """
-        pair, source = self._train.draw_source(generator_of, index, step)
+        pair, source = self.train.draw_source(generator_of, index, step)
         head = torch.tensor([self.dataset.subjects.index(pair.subject)])
         return head, self._sample(pair, source, lights, generator_of(index))
 
@@ -179,13 +173,9 @@ class DatasetFaces:
         """Draw a sample of a head [1]; its stack is opened for this sample only."""
         subject = self.dataset.subjects[int(head)]
         pairs = load_pairs(self.dataset).get(subject, ([],))[0]
-        reader = PairReader(self.dataset, (subject,), pairs, self._crop_px)
+        reader = PairReader(self.dataset, (subject,), pairs, self.crop_px)
         pair, source = reader.draw_sources(generator.initial_seed())[0]
         return self._sample(pair, source.float(), lights, generator)
-
-    @cached_property
-    def _fewest_lights(self) -> int:
-        return min(len(self.dataset.lights_of(subject)) for subject in self.dataset.subjects)
 
     def _sample(self, pair: Pair, source: Tensor, lights: int, generator: torch.Generator) -> SampleCrops:
         """Add target lights, the pair's first, and a camera to a source [3, H, W].
@@ -198,9 +188,9 @@ class DatasetFaces:
             stack_info(self.dataset.stack_path(pair.subject, pair.source_camera)),
             stack_info(path),
         )
-        chosen = draw_target_lights(info.directions, min(lights, self._fewest_lights), generator)
+        chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator)
         chosen = torch.cat([torch.tensor([pair.target_light]), chosen[chosen != pair.target_light]])
-        chosen = chosen[: min(lights, self._fewest_lights)]
+        chosen = chosen[: min(lights, self.fewest_lights)]
         colours = camera_matrix(generator)
         exposure = MEAN_RADIANCE / (colours @ source_info.lit_colour).mean()
         return SampleCrops(
@@ -219,7 +209,7 @@ class DatasetFaces:
         camera = cameras[int(torch.randint(len(cameras), (), generator=generator))]
         path = self.dataset.stack_path(subject, camera)
         info = stack_info(path)
-        chosen = draw_target_lights(info.directions, min(lights, self._fewest_lights), generator).tolist()
+        chosen = draw_target_lights(info.directions, min(lights, self.fewest_lights), generator).tolist()
         crops = self._crops(info, _read_face(path, info, chosen))
         colours = camera_matrix(generator) * (MEAN_RADIANCE / info.lit_mean)
         directions = info.directions[chosen] @ info.rotation  # R^T w, of row vectors
@@ -227,9 +217,9 @@ class DatasetFaces:
 
     def _crops(self, info: StackInfo, images: Tensor) -> FaceCrops:
         """Resample images [N, 3, H, W] of a stack to the side that is unwrapped."""
-        if info.side_px != self._crop_px:
-            images = resize(images.float(), self._crop_px)
-        seen = resize(info.face[None, None].float(), self._crop_px)
+        if info.side_px != self.crop_px:
+            images = resize(images.float(), self.crop_px)
+        seen = resize(info.face[None, None].float(), self.crop_px)
         return FaceCrops(images[None], seen, info.fit.vertices_camera(self.model)[None])
 
 
@@ -259,4 +249,8 @@ def open_faces(folder: Path, face_model: str, side: int, rig_lights: int = RIG_L
     if model.name != dataset.face_model:
         fitted = f"fitted with the face model {dataset.face_model}, not {model.name}"
         raise InputError(f"{dataset.folder}: {fitted}; pass {dataset.face_model} to --fit-with")
-    return DatasetFaces(dataset, model, side, provenance_of(dataset, model), rig_lights)
+    crop_px = min(dataset.crop_px, _CROP_PER_TEXTURE * side)
+    train = pairs_of_split(dataset, "train", crop_px)
+    lights = min(len(dataset.lights_of(subject)) for subject in dataset.subjects)
+    provenance = provenance_of(dataset, model)
+    return DatasetFaces(dataset, model, side, crop_px, train, lights, rig_lights, provenance)

@@ -1,7 +1,6 @@
 """Provide what a stage's `build` needs: options, networks of a preset's sizes, and data."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,7 @@ class Run:
     trained: dict[str, Any]
     people: Networks
 
-    @cached_property
+    @property
     def sizes(self) -> Sizes:
         """Sizes of the preset, with --heads and --views if given."""
         options, sizes = self.options, sizes_of(self.options.preset)
@@ -55,9 +54,8 @@ class Run:
         """Folder of baked heads and people."""
         return self.options.bank or self.options.output / "bank"
 
-    @cached_property
     def dataset(self) -> Dataset:
-        """Prepared dataset of --dataset."""
+        """Read the dataset of --dataset."""
         if self.options.dataset is None:
             raise UsageError(f"--stage {self.options.stage}: needs a prepared dataset; pass --dataset")
         return read_dataset(self.options.dataset)
@@ -69,10 +67,9 @@ class Run:
             return self.options.texture_size or self.sizes.texture_side
         return self.sizes.bake_side
 
-    @property
-    def crop_side(self) -> int:
-        """Side of the crops of the stages that read crops; `tiny` accepts any dataset's."""
-        side = min(self.sizes.joint_side, self.dataset.crop_px) if self.is_tiny else self.sizes.joint_side
+    def crop_side(self, dataset: Dataset) -> int:
+        """Return the side of the crops of the stages that read crops; `tiny` accepts any dataset's."""
+        side = min(self.sizes.joint_side, dataset.crop_px) if self.is_tiny else self.sizes.joint_side
         return self.options.texture_size or side
 
     def objective(self, kind: type[Objective]) -> Any:

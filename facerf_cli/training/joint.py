@@ -408,7 +408,8 @@ def _provenance(
 
 def build(run: Run) -> Objective:
     """Make the objective of the stage; detect faces in new photos."""
-    options, dataset, side = run.options, run.dataset, run.crop_side
+    options, dataset = run.options, run.dataset()
+    side = run.crop_side(dataset)
     appearance, light = _appearance(run, side), run.light_features(side)
     if options.preset == "paper" and (appearance is None or light is None):
         raise UsageError(

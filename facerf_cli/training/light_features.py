@@ -188,8 +188,8 @@ def build(run: Run) -> Objective:
 
 def build_appearance(run: Run) -> Objective:
     """Make the objective of the stage `appearance-features`: V_f on a dataset's crops."""
-    dataset = run.dataset
-    network = run.features("appearance_features", run.crop_side, people=len(dataset.subjects))
+    dataset = run.dataset()
+    network = run.features("appearance_features", run.crop_side(dataset), people=len(dataset.subjects))
     model = load_face_model(dataset.face_model)
     objective: Objective = run.objective(AppearanceObjective)(dataset, model, network)
     return objective

@@ -108,7 +108,7 @@ def test_a_sample_is_exposed_and_weighed_as_the_banks_are(faces: DatasetFaces) -
 def test_sources_are_the_pairs_and_their_light_is_among_the_targets(faces: DatasetFaces) -> None:
     """In training neighbouring steps share the stack of their sources."""
     pairs, weights = load_pairs(faces.dataset)["0000"]
-    reader = replace(faces._train, pairs=pairs)
+    reader = replace(faces.train, pairs=pairs)
     for pair, source in reader.draw_sources(3)[:4]:
         olats = read_olat_stack(faces.dataset.stack_path("0000", pair.source_camera)).olats.float()
         expected = torch.einsum("lc,lchw->chw", torch.from_numpy(np.array(weights[pair.index])), olats)
@@ -141,7 +141,7 @@ def test_without_pairs_the_light_is_drawn(dataset: Dataset, faces: DatasetFaces,
     free = open_faces(tmp_path, "builtin", SIDE, LIGHTS)
     sample = sample_of(free)
     assert sample.source.isfinite().all() and sample.source.std() > 0.02
-    drawn = free._train.draw_sources(1)
+    drawn = free.train.draw_sources(1)
     assert len({pair.source_camera for pair, _ in drawn}) == 1
     assert {pair.target_camera for pair, _ in drawn} == {"C0", "C1"}
     assert len({float(source.float().sum()) for _, source in drawn}) > len(drawn) / 2  # flashes are alike
@@ -150,7 +150,7 @@ def test_without_pairs_the_light_is_drawn(dataset: Dataset, faces: DatasetFaces,
 
 
 def test_crops_are_resized_to_twice_the_texture_at_most(faces: DatasetFaces) -> None:
-    small = replace(faces, side=16)
+    small = open_faces(faces.dataset.folder, "builtin", 16, LIGHTS)
     crops = draw(small, 0)
     assert crops.source.images.shape[-1] == crops.target.seen.shape[-1] == 32
     whole, half = draw(faces, 0).target.unwrapped(16)[0], crops.target.unwrapped(16)[0]

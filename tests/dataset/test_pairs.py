@@ -225,8 +225,9 @@ def test_parts_of_a_stack_and_a_stack_of_another_rig(dataset: Dataset) -> None:
     header = read_olat_header(path)
     np.testing.assert_array_equal(header.normals, stack.header.normals)
     np.testing.assert_array_equal(header.directions, stack.header.directions)
-    lights = {"directions_world": dataset.directions_world[:12], "light_ids": dataset.light_ids[:12]}
-    fewer = dataset.model_copy(update=lights)
+    content = dataset.content() | {"folder": dataset.folder}
+    content["rig"]["lights"] = content["rig"]["lights"][:12]
+    fewer = Dataset.model_validate(content)
     refused(InputError, "20 lights, the dataset has 12", world_to_map, fewer)
     with pytest.raises(InputError, match="20 lights, the dataset has 12"):
         list(relit_images(dataset.stack_path("0000", "C0"), torch.ones(1, 12, 3)))
